@@ -20,10 +20,12 @@ def identify(
             help="CSV of the robot: time, action_..., position_JOINT, velocity_JOINT; a row per action.",
         ),
     ] = None,
-    excite: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a safe trajectory to log instead.")] = None,
+    excite: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Instead, write a safe trajectory to play and log.")
+    ] = None,
     events: Annotated[
         list[str],
-        typer.Option("--event", metavar="NAME", help="Find the values of this event only; repeat it for more."),
+        typer.Option("--event", metavar="NAME", help="Estimate the values of this event only; repeatable."),
     ] = [],
     seconds: Annotated[
         float, typer.Option(help="Length of the trajectory of --excite [s].", min=1.0, max=3600.0)
@@ -32,7 +34,7 @@ def identify(
     seed: Annotated[int, typer.Option(help="Seed of the search, or of the trajectory.", min=0)] = 0,
     json: Json = None,
 ) -> None:
-    """Find the physical values that make the simulation follow a recording of the robot."""
+    """Estimate the physical values with which the simulation follows a log of the robot."""
     claim_stdout()
     from rlctl import output
     from rlctl.deploy.identify import report
@@ -46,12 +48,12 @@ def identify(
         report.show_excitation(write_excitation(spec, excite, seconds=seconds, seed=seed), json)
         return
     if log is None or excite is not None:
-        raise UsageError(f"give one of: rlctl identify {task} --excite FILE, or --log FILE")
-    found = identify(
+        raise UsageError("give either --excite FILE or --log FILE")
+    result = identify(
         spec,
         log,
         events=events,
         seed=seed,
         report=lambda line: output.err().print(f"identify: {line}", highlight=False),
     )
-    report.show(found, json)
+    report.show(result, json)

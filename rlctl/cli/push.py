@@ -14,7 +14,7 @@ def push(
     address: Annotated[str, typer.Argument(help="hf://ORG/NAME, s3://BUCKET/NAME or another scheme of fsspec.")],
     json: Json = None,
 ) -> None:
-    """Upload a run's best policy, recipe, scores, film and a model card to an address."""
+    """Upload a run's best policy, recipe, scores, recording and a model card to an address."""
     claim_stdout()
     from rlctl.runs.push import push_run, show
 

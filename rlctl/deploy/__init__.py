@@ -1,4 +1,4 @@
-"""What comes after export: a safety filter, and a server that policies act through. NumPy, no torch."""
+"""After export: a safety filter and a policy server. Both use NumPy, not torch."""
 
 from __future__ import annotations
 

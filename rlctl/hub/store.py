@@ -1,7 +1,7 @@
-"""Files at an address: uploaded with a manifest, downloaded into a cache that is named by content.
+"""Uploads files to an address with a manifest, and downloads them into a cache whose folders are named by SHA-256.
 
 A pushed folder has a manifest, `rlctl.json`, with the size and SHA-256 of each file. Nothing is unpickled. Only file
-types of rlctl are downloaded, and each file is checked before it gets its name in the cache.
+types of rlctl are downloaded, and each file is checked before it enters the cache.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ MANIFEST = "rlctl.json"
 _ADDRESS = re.compile(r"^(?!wss?:)[a-z][a-z0-9+.-]+://.")
 _SUFFIXES = (".safetensors", ".onnx", ".json", ".yaml", ".csv", ".md", ".rrd")
 _BUCKETS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "hf"}
-_MOST_FILES = 1000
-_LARGEST = 2 * 2**30  # [bytes] of one file
+_MAX_FILES = 1000
+_MAX_SIZE = 2 * 2**30  # [bytes] of one file
 _CHUNK = 2**20  # [bytes]
 
 
 class StoredFile(pydantic.BaseModel, extra="forbid"):
     """A file of a manifest."""
 
-    size: int = pydantic.Field(ge=0, le=_LARGEST)
+    size: int = pydantic.Field(ge=0, le=_MAX_SIZE)
     """[bytes]"""
     sha256: str = pydantic.Field(pattern="^[0-9a-f]{64}$")
 
 
 class Manifest(pydantic.BaseModel, extra="forbid"):
-    """What is at an address, by the path below it."""
+    """The files at an address, by their paths below it."""
 
     format: int = pydantic.Field(1, ge=1, le=1)
-    files: dict[str, StoredFile] = pydantic.Field(max_length=_MOST_FILES)
+    files: dict[str, StoredFile] = pydantic.Field(max_length=_MAX_FILES)
 
 
 def is_address(text: str | None) -> bool:
-    """Say whether a text is the address of a store, such as `s3://bucket/name`; `ws://` is one of a policy server."""
+    """Return whether a text is an address of files, such as `s3://bucket/name`; `ws://` addresses a policy server."""
     return text is not None and _ADDRESS.match(text) is not None
 
 
@@ -57,25 +57,25 @@ def is_cached(path: Path) -> bool:
 
 
 def fetch(address: str) -> Path:
-    """Return the folder or file in the cache that has what is at an address; download what is not there yet.
+    """Download the run or the file at an address, unless it is cached, and return its path in the cache.
 
-    `#sha256=HEX` after the address of a file is checked. Raises `ArtifactError` for what does not exist, is incomplete
-    or differs from its checksum, `UsageError` for a scheme that is not installed.
+    A file is checked against `#sha256=HEX` after its address. Raises `ArtifactError` if it is missing, incomplete or
+    differs from its checksum, `UsageError` if the package for its scheme is not installed.
     """
-    place, _, wanted = address.partition("#sha256=")
-    with _open_store(place) as (store, path):
+    base, _, expected = address.partition("#sha256=")
+    with _open_store(base) as (store, path):
         if PurePosixPath(path).suffix in _SUFFIXES:
-            return _fetch_file(store, path, place, wanted)
-        content = _read_manifest(store, path, place)
+            return _fetch_file(store, path, base, expected)
+        content = _read_manifest(store, path, base)
         folder = _cache() / hashlib.sha256(content).hexdigest()
         if not folder.exists():
-            manifest = _parse_manifest(content, place)
+            manifest = _parse_manifest(content, base)
             with _temporary_folder() as new:
                 for name, entry in manifest.files.items():
                     target = new / name
                     target.parent.mkdir(parents=True, exist_ok=True)
-                    _download(store, f"{path}/{name}", f"{place}/{name}", target, entry)
-                _keep(new, folder)
+                    _download(store, f"{path}/{name}", f"{base}/{name}", target, entry)
+                _move_to_cache(new, folder)
         return folder
 
 
@@ -92,7 +92,7 @@ def push(contents: Mapping[str, Path | bytes], address: str) -> Manifest:
         protocols = (store.protocol,) if isinstance(store.protocol, str) else store.protocol
         for name, value in data.items():
             target = f"{path}/{name}"
-            if not _BUCKETS.intersection(protocols):  # there it would make a bucket
+            if not _BUCKETS.intersection(protocols):  # there makedirs would create a bucket
                 store.makedirs(target.rpartition("/")[0], exist_ok=True)
             store.pipe_file(target, value)
     return manifest
@@ -100,7 +100,7 @@ def push(contents: Mapping[str, Path | bytes], address: str) -> Manifest:
 
 @contextlib.contextmanager
 def _open_store(address: str) -> Iterator[tuple[Any, str]]:
-    """Open the file system of an address; what it raises becomes an error that names the address."""
+    """Open the file system of an address; turn its exceptions into errors that name the address."""
     scheme = address.partition("://")[0]
     try:
         fsspec: Any = importlib.import_module("fsspec")
@@ -114,20 +114,19 @@ def _open_store(address: str) -> Iterator[tuple[Any, str]]:
     except ArtifactError:
         raise
     except FileNotFoundError:
-        raise ArtifactError(f"{address}: there is nothing at this address, or no permission to see it") from None
-    except Exception as error:  # each file system has its own
+        raise ArtifactError(f"{address}: nothing exists at this address, or reading it is not permitted") from None
+    except Exception as error:  # each file system has its own exceptions
         raise ArtifactError(f"{address}: {short_repr(describe_exception(error), 300)}") from None
 
 
 def _read_manifest(store: Any, path: str, address: str) -> bytes:
     try:
         with store.open(f"{path}/{MANIFEST}", "rb") as stream:
-            content: bytes = stream.read(untrusted.JSON_LIMIT)
+            return bytes(stream.read(untrusted.JSON_LIMIT))
     except FileNotFoundError:
         raise ArtifactError(
-            f"{address}: no {MANIFEST} there, which rlctl push writes; give the address of a .safetensors or .onnx file"
+            f"{address}: no {MANIFEST} there; give an address that rlctl push wrote to, or a .safetensors or .onnx file"
         ) from None
-    return content
 
 
 def _parse_manifest(content: bytes, address: str) -> Manifest:
@@ -139,27 +138,29 @@ def _parse_manifest(content: bytes, address: str) -> Manifest:
         parts = PurePosixPath(name).parts
         is_plain = bool(parts) and "/".join(parts) == name and ".." not in parts and not name.startswith("/")
         if not is_plain or "\\" in name or not name.isprintable() or PurePosixPath(name).suffix not in _SUFFIXES:
-            raise ArtifactError(f"{address}/{MANIFEST}: it lists {short_repr(name)}, which rlctl does not download")
+            raise ArtifactError(
+                f"{address}/{MANIFEST}: it lists {short_repr(name)}, a name or file type that rlctl does not download"
+            )
     return manifest
 
 
-def _fetch_file(store: Any, path: str, address: str, wanted: str) -> Path:
+def _fetch_file(store: Any, path: str, address: str, expected: str) -> Path:
     name = PurePosixPath(path).name
-    if wanted and (cached := _cache() / wanted / name).is_file():
+    if expected and (cached := _cache() / expected / name).is_file():
         return cached
     with _temporary_folder() as new:
         sha256 = _download(store, path, address, new / name, None)
-        if wanted and sha256 != wanted:
-            raise ArtifactError(f"{address}: its SHA-256 is {sha256}, not {short_repr(wanted, 80)}")
+        if expected and sha256 != expected:
+            raise ArtifactError(f"{address}: its SHA-256 is {sha256}, not {short_repr(expected, 80)}")
         folder = _cache() / sha256
         if not folder.exists():
-            _keep(new, folder)
+            _move_to_cache(new, folder)
     return folder / name
 
 
 def _download(store: Any, path: str, address: str, target: Path, entry: StoredFile | None) -> str:
-    """Download a file and return its SHA-256; raises `ArtifactError` where it is not what the manifest says."""
-    largest, size, digest = (_LARGEST if entry is None else entry.size), 0, hashlib.sha256()
+    """Download a file and return its SHA-256; raises `ArtifactError` if it differs from its manifest entry."""
+    largest, size, digest = (_MAX_SIZE if entry is None else entry.size), 0, hashlib.sha256()
     with store.open(path, "rb") as stream, target.open("wb") as file:
         while size <= largest and (chunk := stream.read(_CHUNK)):
             size += len(chunk)
@@ -170,7 +171,7 @@ def _download(store: Any, path: str, address: str, target: Path, entry: StoredFi
     if size > largest:
         raise ArtifactError(f"{address}: larger than {largest:,} bytes")
     if entry is not None and digest.hexdigest() != entry.sha256:
-        raise ArtifactError(f"{address}: its SHA-256 is not the one in {MANIFEST}: it was changed after it was pushed")
+        raise ArtifactError(f"{address}: its SHA-256 differs from {MANIFEST}: the file was changed after the push")
     return digest.hexdigest()
 
 
@@ -189,7 +190,7 @@ def _temporary_folder() -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _keep(new: Path, folder: Path) -> None:
+def _move_to_cache(new: Path, folder: Path) -> None:
     try:
         new.rename(folder)
     except OSError:

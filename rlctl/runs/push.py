@@ -1,4 +1,4 @@
-"""`rlctl push`: a run's best policy, recipe, scores and film to an address, with a model card from its measurements."""
+"""`rlctl push`: uploads a run's best policy, recipe, scores and recording, with a model card of measured numbers."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from rlctl.run.directory import RunDirectory
 from rlctl.run.lookup import find_run
 
 _CARD = "README.md"
-_MOST_FILMS = 1
 _PRIVATE = ("folder", "command", "host", "pid")
-"""Of run.json: where it was trained."""
+"""Keys of run.json about the machine that trained it; not uploaded."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,15 +29,15 @@ class PushResult:
 
 
 def push_run(run: str | None, address: str) -> PushResult:
-    """Upload a run to an address; raises `UsageError` for text that is none, `ArtifactError` if it fails."""
+    """Upload a run to an address; raises `UsageError` for an invalid address, `ArtifactError` if the upload fails."""
     if not store.is_address(address):
         raise UsageError(f"{address}: not an address, such as hf://ORG/NAME or s3://BUCKET/NAME")
     directory = find_run(run)
     policy = directory.policy_file("best")
     info = PolicyFile.read_info(policy)
     contents: dict[str, Path | bytes] = {"policies/best.safetensors": policy}
-    films = sorted(directory.episodes.glob("*.rrd"))[-_MOST_FILMS:]
-    others = (directory.recipe_file, directory.evals_file, directory.onnx_file, *films)
+    recordings = sorted(directory.episodes.glob("*.rrd"))[-1:]
+    others = (directory.recipe_file, directory.evals_file, directory.onnx_file, *recordings)
     contents |= {file.relative_to(directory.path).as_posix(): file for file in others if file.is_file()}
     status = {key: value for key, value in directory.status().items() if key not in _PRIVATE}
     contents["run.json"] = json.dumps(status, indent=2).encode()
@@ -48,7 +47,7 @@ def push_run(run: str | None, address: str) -> PushResult:
 
 
 def describe(run: RunDirectory, info: PolicyInfo, names: list[str]) -> str:
-    """Return the model card of a run's best policy, in Markdown; it has measured numbers only."""
+    """Return the model card of a run's best policy in Markdown, with measured numbers only."""
     score = info.evaluation
     measured = ["not evaluated"] if score is None else [f"mean return {score.mean_return:.4g}"]
     if score is not None and score.success is not None:
@@ -69,7 +68,7 @@ def describe(run: RunDirectory, info: PolicyInfo, names: list[str]) -> str:
     return (
         "---\nlibrary_name: rlctl\ntags: [reinforcement-learning, robotics]\n---\n\n"
         f"# {_escape(info.spec.task)}, {info.algo}\n\n| | |\n|---|---|\n{table}\n\n"
-        "Play it with `rlctl eval ADDRESS`, where ADDRESS is where these files are. Nothing in them is pickled.\n\n"
+        "Evaluate it with `rlctl eval ADDRESS`, the address of these files. They contain no pickled data.\n\n"
         f"{files}\n"
     )
 

@@ -97,7 +97,7 @@ def test_one_file_and_its_checksum(run, pushed):
     [
         (lambda content: content[:-1], "best.safetensors: truncated: "),
         (lambda content: content + b"x", "best.safetensors: larger than "),
-        (lambda content: content[:-1] + b"x", "its SHA-256 is not the one in rlctl.json"),
+        (lambda content: content[:-1] + b"x", "its SHA-256 differs from rlctl.json"),
     ],
 )
 def test_files_that_are_not_what_was_pushed(pushed, change, message):
@@ -114,14 +114,14 @@ def test_files_that_are_not_what_was_pushed(pushed, change, message):
 def test_names_that_are_not_downloaded(name):
     entry = {"size": 0, "sha256": "0" * 64}
     fsspec.filesystem("memory").pipe_file("/bad/rlctl.json", json.dumps({"format": 1, "files": {name: entry}}).encode())
-    with pytest.raises(ArtifactError, match="which rlctl does not download"):
+    with pytest.raises(ArtifactError, match="that rlctl does not download"):
         store.fetch("memory://bad")
 
 
 def test_addresses_without_a_run():
     with pytest.raises(ArtifactError, match=r"no rlctl\.json there"):
         find_run("memory://none")
-    with pytest.raises(ArtifactError, match="nothing at this address"):
+    with pytest.raises(ArtifactError, match="nothing exists at this address"):
         find_policy("memory://none/policy.safetensors")
     fsspec.filesystem("memory").pipe_file("/odd/rlctl.json", b"[1]")
     with pytest.raises(ArtifactError, match="not a manifest of rlctl"):

@@ -1,4 +1,4 @@
-"""The arithmetic of limits: what a command may be next, so that every limit holds now and can hold later."""
+"""Computes which next command keeps every limit now and allows the robot to keep it later."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 OnLimit = Callable[[str, Array, Array, tuple[Array, Array]], None]
-"""Called with the name of a limit, the wanted values, the allowed ones and the two ends, where they differ."""
+"""Called if a limit changes a command: its name, the requested and the allowed values, the lower and upper bounds."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -27,24 +27,24 @@ class Bounds:
     """Control step [s]."""
     is_value: bool
     factor: Array
-    """What 1 of the action is in the unit of `x`."""
+    """Change of `x` per 1 of the action."""
     offset: Array
-    """What action 0 is in the unit of a value."""
+    """The value of action 0."""
     low: Array
     """Bounds of the command: of a value, or of `x`."""
     high: Array
     position: Array
-    """Bounds of where `x` leads, shape (2, count); infinite where there is none, as those below."""
+    """Bounds of the position after `x`, shape (2, count); infinite where unlimited, as in `speed` and `change`."""
     speed: Array | None
     """Largest `x`."""
     change: Array | None
     """Largest change of `x` from one control step to the next."""
     precision: float
-    """Relative precision of an action: its type may have few digits."""
+    """Relative precision of the action's type."""
     resolution: Array
-    """Smallest difference between two commands about an action of 1."""
+    """Difference between two neighbouring commands near action 1."""
     position_name: str
-    """What a bound of where `x` leads is called in events."""
+    """Name of the position bounds in events."""
     speed_name: str
 
     def __post_init__(self) -> None:
@@ -69,13 +69,13 @@ class Bounds:
     def bound(self, x: Array, before: Array, reference: Array | None, on_limit: OnLimit) -> Array:
         """Return the motion closest to `x` that keeps the limits.
 
-        `before` is the motion of the last step, `reference` where it led; None if positions are not bounded.
+        `before` is the motion of the last step, `reference` the position after it; None if positions are not bounded.
         """
         return x if self._keeps_all(x, before, reference) else self._bound_in_turn(x, before, reference, on_limit)
 
     def keeps_ends(self, value: Array) -> bool:
-        """Say whether a value is within its bounds."""
-        # To compare bytes takes a tenth of the time of `(a != b).any()`.
+        """Return whether a value is within its bounds."""
+        # Comparing bytes takes a tenth of the time of `(a != b).any()`.
         return np.minimum(np.maximum(value, self.low), self.high).tobytes() == value.tobytes()
 
     def clip_ends(self, value: Array, on_limit: OnLimit) -> Array:
@@ -86,14 +86,14 @@ class Bounds:
         return allowed
 
     def keeps_limits(self, command: Array, before: Array, reference: Array | None) -> bool:
-        """Say whether a command keeps every limit, to the precision of an action. NaN keeps none.
+        """Return whether a command keeps every limit, to the precision of an action. NaN keeps none.
 
         This is the last check, of the action that was computed: it uses none of the results of `bound`.
         """
         if not self._is_between(command, self._slack_low, self._slack_high):
             return False
         if reference is None and self.is_value:
-            return True  # nobody knows where it is
+            return True  # the position is unknown
         bounds_position = self.bounds_position and not self.is_value and reference is not None
         if self.speed is None and self.change is None and not bounds_position:
             return True
@@ -104,7 +104,7 @@ class Bounds:
             x = command - reference if self.is_value else command
         if self.change is not None:
             least, most = before - self.change, before + self.change
-            if not self.is_value:  # a robot that is pushed past its bounds brakes faster
+            if not self.is_value:  # a robot pushed past its bounds may brake faster
                 least, most = np.minimum(least, 0.0), np.maximum(most, 0.0)
         if self.speed is not None:
             least, most = np.maximum(least, -self.speed), np.minimum(most, self.speed)
@@ -117,7 +117,7 @@ class Bounds:
         return bool(((low <= x) & (x <= high)).tobytes() == self._all)
 
     def _keeps_all(self, x: Array, before: Array, reference: Array | None) -> bool:
-        """Say whether a motion clearly keeps all limits, in as few operations as it takes: most motions do."""
+        """Return whether a motion clearly keeps all limits: a fast check, which most motions pass."""
         low, high = self._least, self._most
         if self.change is not None:
             low, high = np.maximum(low, before - self.change), np.minimum(high, before + self.change)
@@ -126,14 +126,14 @@ class Bounds:
         return not self.bounds_position or reference is None or self._keeps_position(x, reference)
 
     def _keeps_position(self, x: Array, reference: Array) -> bool:
-        """Say whether there is clearly room to brake after a motion."""
+        """Return whether there is clearly room to brake after a motion."""
         end = x if self.change is None else x * (np.abs(x) * self._per_square + self._per_step)
         end = end + reference
         inside = np.minimum(np.maximum(end, self._quick_low), self._quick_high)
         return bool(inside.tobytes() == end.tobytes())
 
     def _bound_in_turn(self, x: Array, before: Array, reference: Array | None, on_limit: OnLimit) -> Array:
-        """Apply one limit after the other: what is stricter first, what is more important last."""
+        """Apply the limits in order of importance: the last one wins."""
         if self.change is not None:
             x = _clip(x, before - self.change, before + self.change, "acceleration", on_limit)
         if self.speed is not None:

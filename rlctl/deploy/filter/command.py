@@ -1,4 +1,4 @@
-"""From the actions a policy wants to commands within limits: low-pass, blend, and the bounds of motion."""
+"""Turns a policy's actions into commands within limits: low-pass, blend, and the bounds of motion."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from rlctl.deploy.filter.limits import Limits
 from rlctl.deploy.filter.safety_events import Intervention
 
 Array = NDArray[np.float64]
-_MOST_STEPS = 1e9
+_MAX_STEPS = 1e9
 
 
 class UnsafeCommand(Exception):
-    """No command is safe: a joint is outside its limits at the start, or a result does not keep a limit."""
+    """No command is safe: a joint starts outside its limits, or the computed command breaks a limit."""
 
     def __init__(self, text: str, limit: str, value: float | str = "", bound: float | None = None) -> None:
         super().__init__(text)
         self.limit, self.value, self.bound = limit, value, bound
-        """Name of the limit (`elbow.position`), the value, and what it may be."""
+        """Name of the limit (`elbow.position`), the value, and its bound."""
 
 
 class Command:
-    """The command that a robot is given, step by step. `report` is called with what limits do, without its time."""
+    """Computes the robot's command in each step. Calls `report` with each intervention, whose time is still 0."""
 
     def __init__(
         self, limits: Limits, fitted: FittedLimits, bounds: Bounds, report: Callable[[Intervention], None]
@@ -41,7 +41,7 @@ class Command:
         self._space = fitted.space
         self._safe, self._home = fitted.safe, fitted.home
         self._is_position = limits.command == "position"
-        self._blend_steps = round(min(limits.blend_in_s / bounds.dt, _MOST_STEPS))
+        self._blend_steps = round(min(limits.blend_in_s / bounds.dt, _MAX_STEPS))
         cutoff = limits.lowpass_hz
         self._alpha = 1.0 if cutoff is None else 1.0 - math.exp(-2.0 * math.pi * cutoff * bounds.dt)
         self._is_action = bool((bounds.factor == 1.0).all() and not bounds.offset.any())
@@ -51,13 +51,13 @@ class Command:
         self.reset()
 
     def reset(self) -> None:
-        """Begin an episode: nothing is known of where the robot is."""
+        """Begin an episode: the robot's position is unknown."""
         self.position: Array | None = None
         """Measured positions of the joints."""
         self._expected: Array | None = None
-        """Where the last command should have brought the joints."""
+        """Positions that the joints should have reached by the last command."""
         self._reference: Array | None = None
-        """Where the last command led: its value, or the measured positions."""
+        """The last command's value, or the measured positions."""
         self._before = self._zeros
         """The motion of the last step."""
         self._sent: NDArray[Any] | None = None
@@ -67,12 +67,12 @@ class Command:
         self.begin_blend()
 
     def begin_blend(self) -> None:
-        """Let what comes next take over gradually."""
+        """Blend gradually from the present command into the next ones."""
         self._blend_left = self._blend_steps
         self._blend_from = None
 
     def measure(self, position: Array) -> None:
-        """Take the measured positions of the joints."""
+        """Store the measured positions of the joints."""
         self._expected = self._reference if self._bounds.is_value else None
         if self._reference is not None and not self._bounds.is_value:
             with np.errstate(over="ignore"):
@@ -80,22 +80,22 @@ class Command:
         self.position = position.copy()
 
     def find_error(self) -> float:
-        """Return the largest difference between where a joint is and where the last command should have brought it."""
+        """Return the largest difference between a joint's position and the expected one; NaN if unknown."""
         if self._expected is None or self.position is None:
             return math.nan
         with np.errstate(over="ignore"):
             return float(np.abs(self._expected - self.position).max())
 
     def follow(self, action: Array) -> NDArray[Any]:
-        """Return the action closest to a wanted one. Raises `UnsafeCommand`."""
-        with np.errstate(over="ignore"):  # a policy may want anything
+        """Return the allowed action closest to the policy's. Raises `UnsafeCommand`."""
+        with np.errstate(over="ignore"):  # actions may be arbitrarily large
             start = self._present(action)
             target = action if self._is_action else self._bounds.offset + action * self._bounds.factor
             if self._alpha < 1.0 or self._blend_left:
-                target = self._smoothe(self._bounds.clip_ends(target, self._note), start)
+                target = self._apply_smoothing(self._bounds.clip_ends(target, self._note), start)
             return self._move(target)
 
-    def _smoothe(self, target: Array, start: Array) -> Array:
+    def _apply_smoothing(self, target: Array, start: Array) -> Array:
         """Apply low-pass and blend to a command within its bounds, so that neither overflows nor winds up."""
         if self._alpha < 1.0:
             before = start if self._smooth is None else self._smooth
@@ -124,7 +124,7 @@ class Command:
     def stand_still(self) -> NDArray[Any]:
         """Return the action of the last command that kept its limits: its value, or no motion. Forgets all smoothing.
 
-        This is what a stopped robot gets where even braking is not safe.
+        A stopped robot gets it if even braking is unsafe.
         """
         self._smooth = self._blend_from = None
         self._blend_left, self._before = 0, self._zeros
@@ -135,7 +135,7 @@ class Command:
         return self._as_action(self._safe if self._reference is None else self._reference)
 
     def _present(self, action: Array | None) -> Array:
-        """Return what the command is now: a value, or a motion. At the first step the robot says where it is."""
+        """Return the present command: a value, or a motion. The first value comes from the measured positions."""
         if not self._bounds.is_value:
             self._reference = self.position
             return self._before
@@ -147,7 +147,7 @@ class Command:
             start = self.position
         elif action is not None:
             start = self._bounds.offset + action * self._bounds.factor
-        else:  # where it is is not measured
+        else:  # positions are not measured
             return self._safe if self._home is None else self._home
         self._reference = np.minimum(np.maximum(start, self._bounds.low), self._bounds.high)
         away = np.abs(self._reference - start)
@@ -158,7 +158,7 @@ class Command:
         return self._reference
 
     def _move(self, target: Array) -> NDArray[Any]:
-        """Return the action for a value or motion that is wanted, within the bounds. Raises `UnsafeCommand`."""
+        """Return the action for a requested value or motion, within the bounds. Raises `UnsafeCommand`."""
         bounds, reference, before = self._bounds, self._reference, self._before
         x = self._zeros
         if not bounds.is_value:
@@ -188,6 +188,6 @@ class Command:
         return result
 
     def _note(self, limit: str, x: Array, allowed: Array, ends: tuple[Array, Array]) -> None:
-        acted = np.abs(allowed - x) > 1e-9  # bounds are reached exactly: what is less is rounding
+        acted = np.abs(allowed - x) > 1e-9  # smaller differences are rounding errors: bounds are reached exactly
         if acted.tobytes() != self._none:
             self._report(Intervention(0.0, self._bounds, limit, x, allowed, ends, self._before, self._reference, acted))

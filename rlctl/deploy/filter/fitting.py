@@ -32,7 +32,7 @@ _NO_CONTROL_DT = "limits: this policy has no control_dt; write control_dt: SECON
 
 @dataclasses.dataclass(frozen=True)
 class FittedLimits:
-    """What limits mean for one policy."""
+    """The limits of one policy, as arrays."""
 
     layout: ObservationLayout
     space: spaces.Space[Any]
@@ -44,16 +44,16 @@ class FittedLimits:
     """Where the joints' positions are in the flat observation."""
     home: Array | None
     safe: Array
-    """The command that is given while holding or stopped, where it is a value."""
+    """The command while holding or stopped, if commands are values."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # such numbers are refused
+@np.errstate(over="ignore", invalid="ignore")  # a later check refuses such numbers
 def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
-    """Return what limits mean for a policy; raises `RecipeError` for limits that it cannot have."""
+    """Convert limits to arrays for a policy; raises `RecipeError` for limits that do not fit it."""
     layout = ObservationLayout(info)
     control_dt = limits.control_dt or info.control_dt
     if control_dt is not None and not 1e-9 <= control_dt <= 1e9:
-        raise RecipeError(f"limits: control_dt is {control_dt:g} s; from 1e-9 to 1e9 s can be controlled")
+        raise RecipeError(f"limits: control_dt is {control_dt:g} s; it must be from 1e-9 to 1e9 s")
     _, space = info.spaces()
     count = math.prod(space.shape or ())
     bounds: Bounds | None = None
@@ -68,7 +68,9 @@ def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
             raise RecipeError(f"limits: joints: {len(set(names))} different names, the action has {count} elements")
         bounds = _make_bounds(limits, space, names, control_dt, known)
     elif limits.limits or limits.lowpass_hz:
-        raise UsageError("limits: the actions of this policy are choices, not quantities that can be bounded")
+        raise UsageError(
+            "limits: the actions of this policy are discrete choices; only continuous actions can be limited"
+        )
     measured = _find_measured(limits, layout, count)
     home = _read_list(limits, "home", count)
     if (limits.lowpass_hz or limits.blend_in_s) and control_dt is None:
@@ -108,7 +110,7 @@ def _make_bounds(
         high = np.minimum(np.minimum(high, position[1]), torque)
         position = np.array([low, high])
     elif ((low > 0) | (high < 0)).any():
-        raise UsageError("limits: an action of this policy cannot stand still: its bounds exclude zero")
+        raise UsageError("limits: the action bounds of this policy exclude zero, so the robot could not stand still")
     if (low > high).any():
         name = names[int(np.argmax(low > high))]
         raise RecipeError(f"limits: {name}: no action keeps these limits and the policy's own action bounds")
@@ -135,9 +137,9 @@ def _make_bounds(
 
 
 def _describe_numbers(dtype: Any) -> tuple[float, float]:
-    """Return the largest number that an action may be and the relative precision of its type.
+    """Return the largest allowed action and the relative precision of its type.
 
-    Actions without bounds get these: differences of two commands stay finite.
+    Unbounded actions get this bound, so that differences of two commands stay finite.
     """
     if np.dtype(dtype).kind == "f":
         return min(float(np.finfo(dtype).max), 1e30), float(np.finfo(dtype).eps)
@@ -149,16 +151,17 @@ def _drop_infinite(values: Array) -> Array | None:
 
 
 def _merge(limits: Limits, name: str, known: dict[str, Any]) -> JointLimits:
-    own = limits.limits.get(name, JointLimits())
-    every = limits.limits.get("all", JointLimits())
-    given = {**every.model_dump(exclude_none=True), **own.model_dump(exclude_none=True)}
-    return JointLimits(**{**known, **given})
+    merged = dict(known)
+    for key in ("all", name):
+        if key in limits.limits:
+            merged |= limits.limits[key].model_dump(exclude_none=True)
+    return JointLimits(**merged)
 
 
 def _list_known(limits: Limits, joints: Joints | None, index: int) -> dict[str, Any]:
-    """Return the limits of one joint that the task's model of the robot has, as far as they can be kept.
+    """Return one joint's limits in the task's robot model, as far as the filter can keep them.
 
-    Model files write a limit that is none as one of 0, or as a lower end that is not below the upper.
+    Model files write a missing limit as 0, or as a lower end that is not below the upper end.
     """
     known: dict[str, Any] = {}
     if joints is None:
@@ -193,15 +196,15 @@ def _choose_units(limits: Limits, space: spaces.Box, known: Joints | None, names
         scale, offset = known.action_scale, known.default_positions or 0.0
     elif limits.scale is None and limits.command != "action" and (space.low == -1).all() and (space.high == 1).all():
         raise RecipeError(
-            f"limits: scale: how much {limits.command} is 1 of the action? The policy's go from -1 to 1; write scale: "
-            "NUMBER, in rad, rad/s or N m, and 1 if they are in that unit"
+            f"limits: scale: required when actions range from -1 to 1; write scale: NUMBER, the {limits.command} of "
+            "action 1 in rad, rad/s or N m; 1 if actions are in that unit"
         )
     return _spread("scale", limits.scale, scale, names), _spread("offset", limits.offset, offset, names)
 
 
-def _spread(key: str, given: Any, default: Any, names: list[str]) -> Array:
-    """Return a number per joint: what was given, or the default."""
-    values = np.atleast_1d(np.asarray(default if given is None else given, np.float64))
+def _spread(key: str, numbers: Any, default: Any, names: list[str]) -> Array:
+    """Return a number per joint: the user's, or the default."""
+    values = np.atleast_1d(np.asarray(default if numbers is None else numbers, np.float64))
     if len(values) not in (1, len(names)):
         raise RecipeError(f"limits: {key} has {len(values)} numbers, the action {len(names)}")
     return np.broadcast_to(values, (len(names),)).copy()
@@ -232,16 +235,16 @@ def _read_list(limits: Limits, key: str, count: int) -> Array | None:
 def _check_home(limits: Limits, bounds: Bounds | None, home: Array | None) -> None:
     if home is None:
         if limits.on_fault == "home":
-            raise RecipeError("limits: on_fault: home: write where home is: home: [positions]")
+            raise RecipeError("limits: on_fault: home: it needs the home position; write home: [positions]")
         return
     if limits.command in ("torque", "action") or bounds is None:
         raise RecipeError(f"limits: home: actions that command {limits.command!r} cannot bring a robot to positions")
     if ((home < bounds.position[0]) | (home > bounds.position[1])).any():
-        raise RecipeError("limits: home: it is outside the limits of position")
+        raise RecipeError("limits: home: outside the position limits")
 
 
 def _check_measured(limits: Limits, bounds: Bounds | None, measured: slice | None, layout: ObservationLayout) -> None:
-    """Raise `RecipeError` where limits need the joints' positions and nothing says which observation has them."""
+    """Raise `RecipeError` if limits need joint positions and no observation with them is named."""
     if measured is not None or bounds is None:
         return
     moves = bounds.speed is not None or bounds.change is not None or limits.blend_in_s > 0
@@ -267,5 +270,5 @@ def _make_safe_command(limits: Limits, bounds: Bounds | None, count: int) -> Arr
     wanted = bounds.offset + (np.zeros(count) if safe is None else safe) * bounds.factor
     clipped: Array = np.clip(wanted, bounds.low, bounds.high)
     if safe is not None and not np.allclose(clipped, wanted):
-        raise RecipeError("limits: safe_action: it is outside the limits of the action")
+        raise RecipeError("limits: safe_action: outside the action's limits")
     return clipped

@@ -1,4 +1,4 @@
-"""A policy in simulation whose actions go through the safety filter."""
+"""A player in simulation whose actions pass the safety filter."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rlctl.policy.players.player import Exploration, Player
 
 
 class LimitedPlayer(Player):
-    """Plays what another player wants, within limits; reports how often they stepped in."""
+    """Plays another player's actions within limits; reports the number of interventions."""
 
     def __init__(self, player: Player, info: EnvInfo, limits: Limits) -> None:
         self._player = player
@@ -29,24 +29,24 @@ class LimitedPlayer(Player):
         self._player.explore(exploration)
 
     def begin_segment(self, seed: int, step: int) -> None:
-        """Begin to play on at a step of an episode."""
+        """Begin a segment at a step of an episode."""
         self._player.begin_segment(seed, step)
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Return the limited action, stored and taken."""
+        """Return the limited action twice, to record and to step with."""
         if step == 0:
             self._safety.resume()
             self._safety.reset()
             self._before = self._safety.counts
         is_usable = self._safety.observe(observation)
-        wanted = self._player.act(observation, seed, step)[1] if is_usable else None
-        action = self._safety.limit(wanted)
+        policy_action = self._player.act(observation, seed, step)[1] if is_usable else None
+        action = self._safety.limit(policy_action)
         return action, action
 
     def close(self) -> None:
-        """Give back what the player holds."""
+        """Close the player."""
         self._player.close()
 
     def report(self) -> dict[str, Any]:
-        """Return how often each limit stepped in and each fault occurred in this episode."""
+        """Return the player's report with the number of interventions per limit and of faults in this episode."""
         return {**self._player.report(), "interventions": dict(self._safety.counts - self._before)}

@@ -44,16 +44,16 @@ class JointLimits(Section):
 
 
 class Sensor(Section):
-    """What is checked of one named observation; every observation must be finite in any case."""
+    """Checks of one named observation; every observation must also be finite."""
 
     range: Interval | None = None
     """Lowest and highest value."""
     frozen_s: Positive | None = None
-    """Time after which a value that has not changed by a single bit is a fault [s]."""
+    """A value that has not changed by a single bit for this time is a fault [s]."""
 
 
 class Measured(Section):
-    """Which observations are the joints' own state, an element per element of the action."""
+    """Which observations hold the joints' state, one element per element of the action."""
 
     position: str | None = None
     """Name of the observation with the joint positions."""
@@ -65,7 +65,7 @@ class Limits(Section):
     command: Literal["position", "step", "speed", "torque", "action"] = "action"
     """What an action commands: joint positions, steps from the present positions, speeds, torques, or anything."""
     scale: Positive | list[Positive] | None = None
-    """Size of 1 of the action in the unit of the command; one number, or one per joint. null: the task's, or 1."""
+    """Command per 1 of the action, in the command's unit; one number, or one per joint. null: the task's, or 1."""
     offset: Number | list[Number] | None = None
     """Command of action 0, for commands of position, torque and action. null: the task's default positions, or 0."""
     joints: list[str] | None = None
@@ -78,25 +78,25 @@ class Limits(Section):
     blend_in_s: Annotated[Number, Field(ge=0)] = 0.0
     """Time in which the policy's command takes over after a start, a hold or an override [s]."""
     measured: Measured = Measured()
-    """Which observations are the joints' own state."""
+    """Which observations hold the joints' state."""
     sensors: dict[str, Sensor] = {}
     """Checks by the name of the observation."""
     max_age_periods: Positive = 3.0
-    """Age of an observation, in control periods, beyond which it is a fault."""
+    """An older observation is a fault; in control periods."""
     watchdog_periods: Annotated[Number, Field(ge=0)] = 3.0
-    """Control periods without an observation after which a server stops; 0: never."""
+    """A server stops after this many control periods without an observation; 0: never."""
     on_fault: Literal["hold", "home", "stop"] = "hold"
-    """What a fault of a sensor or of the policy leads to: `hold` and `home` end with the fault."""
+    """Reaction to a fault of a sensor or of the policy; `hold` and `home` end with the fault."""
     home: list[Number] | None = None
     """Joint positions to go to."""
     safe_action: list[Number] | None = None
-    """The action that is given while holding or stopped, for commands of torque and action; null: zero."""
+    """Action while holding or stopped, for commands of torque and action; null: zero."""
     control_dt: Positive | None = None
     """Time between two actions [s]; null: the policy's."""
 
 
 def read_limits(path: Path) -> Limits:
-    """Read a limits file; raises `ArtifactError` if it cannot be read, `RecipeError` for what is wrong in it."""
+    """Read a limits file; raises `ArtifactError` if it cannot be read, `RecipeError` if its content is invalid."""
     text = yaml_text.read_text(path)
     content = yaml_text.load(text, str(path))
     if not isinstance(content, dict):

@@ -1,4 +1,4 @@
-"""Observations: as clients send them, as a policy takes them, and whether they may be used."""
+"""Converts clients' observations to the form that the policy takes, and checks their values."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ WHOLE = "observation"
 
 
 class ObservationError(ValueError):
-    """What somebody sent is not an observation of this policy; the message says why."""
+    """The data is not an observation of this policy; the message gives the reason."""
 
 
 class ObservationLayout:
-    """Where each named observation is in what a policy takes."""
+    """Names, shapes and places of the parts of a policy's observation."""
 
     def __init__(self, info: EnvInfo) -> None:
         self.space, _ = info.spaces()
@@ -34,46 +34,45 @@ class ObservationLayout:
         self.shapes: dict[str, tuple[int, ...]] = {key: part.shape or () for key, part in parts.items()}
         """The shape of each named observation."""
         if SINGLE in parts:
-            # With stacked observations the names are those of one of them.
+            # The names describe a single observation, not a stack of them.
             named = len(shape) == 1 and sum(sizes.values()) == shape[0]
             self.shapes = {name: (size,) for name, size in sizes.items()} if named else {WHOLE: shape}
         self._dtypes = {name: np.dtype(parts.get(name, self.space).dtype) for name in self.shapes}
         self.slices: dict[str, slice] = {}
-        """Where each named observation is in the flat vector; pictures are not in it."""
+        """Place of each named observation in the flat vector, which has no images."""
         self.size = 0
         for name, part in self.shapes.items():
-            if SINGLE in parts or not _is_picture(parts[name]):
+            if SINGLE in parts or not _is_image(parts[name]):
                 self.slices[name] = slice(self.size, self.size + math.prod(part))
                 self.size += math.prod(part)
 
-    def read(self, given: Any) -> Any:
-        """Return an observation as the policy takes it, from names and values or the flat vector.
+    def read(self, values: Any) -> Any:
+        """Return an observation in the policy's form, from values by name or the flat vector.
 
-        Raises `ObservationError` that names what is missing, unknown, or of another size.
+        Raises `ObservationError` that names missing and unknown observations and wrong shapes.
         """
-        if isinstance(given, dict):
-            parts = self._read_names(given)
+        if isinstance(values, dict):
+            parts = self._read_names(values)
             if isinstance(self.space, spaces.Dict):
                 return parts
             return np.concatenate([parts[name].ravel() for name in self.slices]).reshape(self.space.shape or ())
         if isinstance(self.space, spaces.Dict):
             raise ObservationError(f"this policy takes observations by name: {', '.join(self.shapes)}")
-        return _convert(given, WHOLE, self.space.shape or (), np.dtype(self.space.dtype))
+        return _convert(values, WHOLE, self.space.shape or (), np.dtype(self.space.dtype))
 
-    def _read_names(self, given: dict[Any, Any]) -> dict[str, Array]:
-        known = self.shapes
-        problems = []
-        if unknown := [name for name in given if name not in known]:
+    def _read_names(self, values: dict[Any, Any]) -> dict[str, Array]:
+        known, problems = self.shapes, []
+        if unknown := [name for name in values if name not in known]:
             close = did_you_mean(str(unknown[0]), known)
             problems.append(f"unknown: {_list(unknown)}{close and f' ({close.strip()})'}")
-        if missing := [name for name in known if name not in given]:
+        if missing := [name for name in known if name not in values]:
             problems.append(f"missing: {_list(missing)}")
         if problems:
             raise ObservationError(f"observation names {'; '.join(problems)}")
-        return {name: _convert(given[name], name, shape, self._dtypes[name]) for name, shape in known.items()}
+        return {name: _convert(values[name], name, shape, self._dtypes[name]) for name, shape in known.items()}
 
     def flatten(self, observation: Any) -> NDArray[np.float64]:
-        """Return the numbers of an observation that are not pictures, shape (size,)."""
+        """Return the numbers of an observation without its images, shape (size,)."""
         parts = split(observation)
         if SINGLE in parts:
             return np.asarray(parts[SINGLE], np.float64).ravel()
@@ -90,16 +89,16 @@ def _convert(value: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]
     if array.dtype.kind not in "biuf":
         raise ObservationError(f"observation {name!r} is {array.dtype}, not numbers")
     if array.shape != shape:
-        # Only what has one axis, but for those of length 1, can be put in order: a picture on its side cannot.
-        axes, wanted = ([axis for axis in given if axis != 1] for given in (array.shape, shape))
-        if array.size != math.prod(shape) or (axes != wanted and min(len(axes), len(wanted)) > 1):
+        # A flat array is reshaped; otherwise only axes of length 1 may differ, so a transposed image is refused.
+        axes, expected = ([axis for axis in sizes if axis != 1] for sizes in (array.shape, shape))
+        if array.size != math.prod(shape) or (axes != expected and min(len(axes), len(expected)) > 1):
             raise ObservationError(f"observation {name!r} has shape {array.shape}, the policy takes {shape}")
         array = array.reshape(shape)
     if array.dtype != dtype:
-        with np.errstate(all="ignore"):  # what is not finite then is found by the checks of sensors
-            given, array = array, array.astype(dtype)
-        if dtype.kind in "iu" and (odd := given[given != array]).size:
-            raise ObservationError(f"observation {name!r} has {odd.flat[0]:g}, the policy takes {dtype}")
+        with np.errstate(all="ignore"):  # the sensor checks refuse numbers that are not finite
+            original, array = array, array.astype(dtype)
+        if dtype.kind in "iu" and (wrong := original[original != array]).size:
+            raise ObservationError(f"observation {name!r} has {wrong.flat[0]:g}, the policy takes {dtype}")
     return array
 
 
@@ -108,7 +107,7 @@ def _list(names: list[Any]) -> str:
     return f"{shown}, ..." if len(names) > 8 else shown
 
 
-def _is_picture(space: spaces.Space[Any]) -> bool:
+def _is_image(space: spaces.Space[Any]) -> bool:
     return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3
 
 
@@ -117,7 +116,7 @@ Fault = tuple[str, str, float, float]
 
 
 class SensorChecks:
-    """Checks the numbers of one observation after the other."""
+    """Checks the numbers of successive observations: finite, in range, not too old, not frozen."""
 
     def __init__(self, limits: Limits, layout: ObservationLayout, control_dt: float | None) -> None:
         for name in limits.sensors:
@@ -146,9 +145,9 @@ class SensorChecks:
         self._same = [0] * len(self._frozen)
 
     def check(self, values: Array, age_s: float) -> Fault | None:
-        """Return the first fault of the numbers of an observation; None if there is none."""
+        """Return a fault of an observation's numbers; None if there is none. `age_s` is its age [s]."""
         fault: Fault | None = None
-        # To compare bytes takes a tenth of the time of `all()`.
+        # Comparing bytes takes a tenth of the time of `all()`.
         if np.isfinite(values).tobytes() != self._all_finite:
             index = int(np.argmin(np.isfinite(values)))
             fault = ("finite", self._name(index), float(values[index]), math.inf)

@@ -1,4 +1,4 @@
-"""What a safety filter did in a step: kept as arrays, which take no time, until somebody reads the events."""
+"""Events of a safety filter, stored as arrays until somebody reads them: this keeps each step fast."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Kind = Literal["limit", "fault", "state"]
 
 @dataclasses.dataclass(frozen=True)
 class SafetyEvent:
-    """Something that the filter did: an action limited, a fault, or another state."""
+    """An event of the filter: a limited action, a fault, or a change of state."""
 
     time_s: float
     kind: Kind
     name: str
-    """Of a limit `joint.speed` and its like, of a fault what was wrong, of a state the new one."""
+    """The limit (`elbow.speed`), the kind of fault, or the new state."""
     value: float | str = ""
     limit: float | None = None
 

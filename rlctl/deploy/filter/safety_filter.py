@@ -23,8 +23,7 @@ from rlctl.errors import UsageError, short_repr
 Array = NDArray[Any]
 FilterState = Literal["idle", "running", "holding", "stopped"]
 
-_NO_FILE = Limits()
-_KEPT = 1000  # of the last events
+_MAX_EVENTS = 1000  # of the last events
 
 
 class SafetyFilter:
@@ -36,33 +35,33 @@ class SafetyFilter:
         action = safety.limit(policy.predict(observation) if safety.trusts_observation else None)
 
     States: `idle` before the first action and after `reset`; `running`; `holding` at a fault or by `hold` and `home`;
-    `stopped`, which only `resume` leaves. A fault that is over ends the holding that it caused. While holding or
+    `stopped`, which only `resume` leaves. Holding ends when the fault that caused it ends. While holding or
     stopped a robot is braked within its limits and kept where it is, or brought home.
 
-    `info` describes the policy's environment (`policy.info.env`), `limits` is a file or what it says; without them the
-    bounds of the policy's own actions hold. Raises `RecipeError` for limits that this policy cannot have.
+    `info` describes the policy's environment (`policy.info.env`), `limits` is a file or its content; by default
+    only the policy's action bounds apply. Raises `RecipeError` for limits that do not fit the policy.
     """
 
     def __init__(
         self, info: EnvInfo, limits: Limits | Path | str | None = None, *, clock: Callable[[], float] = time.time
     ) -> None:
         if not isinstance(limits, Limits):
-            limits = _NO_FILE if limits is None else read_limits(Path(limits))
+            limits = Limits() if limits is None else read_limits(Path(limits))
         fitted = fit_limits(limits, info)
         self.limits, self.layout, self.control_dt = limits, fitted.layout, fitted.control_dt
         self._space, self._measured, self._home = fitted.space, fitted.measured, fitted.home
         self._sensors = SensorChecks(limits, fitted.layout, fitted.control_dt)
         self._command: Command | None = None
         if fitted.bounds is not None:
-            self._command = Command(limits, fitted, fitted.bounds, self._limited)
+            self._command = Command(limits, fitted, fitted.bounds, self._record_intervention)
         self._clock = clock
-        self._history: collections.deque[SafetyEvent | Intervention] = collections.deque(maxlen=_KEPT)
+        self._history: collections.deque[SafetyEvent | Intervention] = collections.deque(maxlen=_MAX_EVENTS)
         self._limits_acted: dict[str, NDArray[np.int64]] = {}
-        self._counted: collections.Counter[str] = collections.Counter()
+        self._faults: collections.Counter[str] = collections.Counter()
         self.on_event: Callable[[SafetyEvent | Intervention], None] | None = None
         """Called with each event, those of one limit in a step together."""
         self.steps = 0
-        """Actions since the filter was made."""
+        """Actions since the filter was created."""
         self.state: FilterState = "idle"
         self.reason = ""
         """Why it is holding or stopped."""
@@ -73,7 +72,7 @@ class SafetyFilter:
         self._manual: Array | None = None
 
     def reset(self) -> None:
-        """Begin an episode. A stop, an order to hold or to go home, and an action by hand stay."""
+        """Begin an episode. A stop, a `hold` or `home`, and an override stay in effect."""
         self._fault, self._observed = "", False
         self._sensors.reset()
         if self._command is not None:
@@ -95,29 +94,28 @@ class SafetyFilter:
     def home(self, reason: str = "home ordered") -> None:
         """Bring the robot home and keep it there until `resume`; ends a stop. Raises `UsageError` without a home."""
         if self._home is None:
-            raise UsageError("there is no home: write home: [positions] into the limits file")
+            raise UsageError("the limits define no home; write home: [positions] in the limits file")
         self._ordered = self._goes_home = True
         self.begin_blend()
         self._enter("holding", reason)
 
     def resume(self) -> None:
-        """Let the policy act again, from where the robot is; a fault that is still there holds it at once."""
+        """Let the policy act again from the robot's present position; a fault that persists holds it again at once."""
         self._ordered = False
         self._fault = ""
         self.begin_blend()
         self._enter("idle", "")
 
     def override(self, action: Any | None) -> None:
-        """Give an action by hand instead of the policy's from now on; None: the policy acts again.
+        """Replace the policy's actions by this one from now on; None ends the override.
 
-        Both begin with a blend. The limits hold, and neither a stop nor a fault ends.
-        Raises `ValueError` for what is not an action of this policy.
+        Both begin with a blend. Limits, stops and faults stay in effect. Raises `ValueError` for an invalid action.
         """
         if action is not None:
             action, fault = self._read_action(action)
             if action is None:
-                wanted = f"has {len(self._zeros)} finite numbers" if self._command else f"is one of {self._space}"
-                raise ValueError(f"an action by hand {wanted}, not {fault}")
+                expected = f"{len(self._zeros)} finite numbers" if self._command else f"one of {self._space}"
+                raise ValueError(f"override: expected {expected}, got {fault}")
         if (action is None) != (self._manual is None):
             self.begin_blend()
             self._record("state", "policy" if action is None else "override")
@@ -126,7 +124,7 @@ class SafetyFilter:
     @property
     def events(self) -> list[SafetyEvent]:
         """The last 1000 events, oldest first."""
-        return self.find_last_events(_KEPT)
+        return self.find_last_events(_MAX_EVENTS)
 
     def find_last_events(self, count: int) -> list[SafetyEvent]:
         """Return the last events, oldest first."""
@@ -139,8 +137,8 @@ class SafetyFilter:
 
     @property
     def counts(self) -> collections.Counter[str]:
-        """How often each limit acted on each joint and each fault occurred, since the filter was made."""
-        counts = collections.Counter(self._counted)
+        """Number of interventions per limit and joint, and of each fault, since the filter was created."""
+        counts = collections.Counter(self._faults)
         if self._command is not None:
             for limit, times in self._limits_acted.items():
                 acted = zip(self._command.names, times.tolist(), strict=True)
@@ -149,26 +147,26 @@ class SafetyFilter:
 
     @property
     def is_overridden(self) -> bool:
-        """Whether an action by hand is given instead of the policy's."""
+        """Whether an override replaces the policy's actions."""
         return self._manual is not None
 
     def begin_blend(self) -> None:
-        """Let what comes next take over gradually, as after a change of the policy."""
+        """Blend gradually into the next actions, as after a change of the policy."""
         if self._command is not None:
             self._command.begin_blend()
 
     @property
     def control_error(self) -> float:
-        """Largest difference between where a joint is and where the last command should have brought it; or NaN."""
+        """Largest difference between a joint's position and the one expected from the last command; NaN if unknown."""
         return math.nan if self._command is None else self._command.find_error()
 
     @property
     def trusts_observation(self) -> bool:
-        """Whether the last observation was without a fault, so that a policy may act on it."""
+        """Whether the last observation had no fault, so that the policy may use it."""
         return self._observed and not self._fault
 
     def observe(self, observation: Any, age_s: float = 0.0) -> bool:
-        """Check an observation, as the policy takes it; None: there is none. Return whether it may be used.
+        """Check an observation in the policy's form; None: it is missing. Return whether it may be used.
 
         `age_s` is its age [s].
         """
@@ -186,18 +184,18 @@ class SafetyFilter:
         return True
 
     def fail(self, what: str, value: float | str = "", limit: float | None = None) -> bool:
-        """Note a fault of the observation, which leads to what the limits say; return False."""
+        """Record a fault of the observation, which triggers `on_fault` of the limits; return False."""
         self._record("fault", what, value, limit)
         self._fault = what
         return False
 
     def limit(self, action: Any | None) -> Array:
-        """Return the action that the robot gets for one that the policy wants; None: it could not act."""
+        """Return the robot's action for the policy's action; None: the policy could not act."""
         self.steps += 1
         wanted, problem = (self._manual, "") if self._manual is not None else self._read_action(action)
         fault = self._fault or self._find_fault(wanted, problem)
         if self.state != "stopped" and not self._ordered:
-            self._follow(fault)
+            self._update_state(fault)
         if self._command is None:
             return self._choose(wanted if self.state == "running" else None)
         try:
@@ -210,7 +208,7 @@ class SafetyFilter:
             return self._command.stand_still()
 
     def _read_action(self, action: Any | None) -> tuple[Array | None, str]:
-        """Return an action as numbers, or None and why it is not one of this policy."""
+        """Return an action as numbers, or None and why it is invalid."""
         if action is None:
             return None, ""
         try:
@@ -230,7 +228,7 @@ class SafetyFilter:
         return numbers, ""
 
     def _find_fault(self, wanted: Array | None, problem: str) -> str:
-        """Say why an action cannot be taken; empty if it can."""
+        """Return and record why an action cannot be used; empty if it can."""
         fault = ""
         if problem:
             fault = "action"
@@ -242,8 +240,8 @@ class SafetyFilter:
             self._record("fault", fault, problem)
         return fault
 
-    def _follow(self, fault: str) -> None:
-        """Enter the state that this step's fault, or its end, leads to."""
+    def _update_state(self, fault: str) -> None:
+        """Enter the state for this step's fault, or for its end."""
         if fault and self.limits.on_fault == "stop":
             self._enter("stopped", fault)
         elif fault:
@@ -265,19 +263,19 @@ class SafetyFilter:
             self.state, self.reason = state, reason
             self._record("state", state, reason)
 
-    def _limited(self, intervention: Intervention) -> None:
+    def _record_intervention(self, intervention: Intervention) -> None:
         intervention.time_s = self._clock()
         if (counts := self._limits_acted.get(intervention.limit)) is None:
             counts = self._limits_acted[intervention.limit] = np.zeros(len(intervention.acted), np.int64)
         np.add(counts, intervention.acted, out=counts)
-        self._keep(intervention)
+        self._append(intervention)
 
     def _record(self, kind: Kind, name: str, value: float | str = "", limit: float | None = None) -> None:
         if kind != "state":
-            self._counted[name] += 1
-        self._keep(SafetyEvent(self._clock(), kind, name, value, limit))
+            self._faults[name] += 1
+        self._append(SafetyEvent(self._clock(), kind, name, value, limit))
 
-    def _keep(self, event: SafetyEvent | Intervention) -> None:
+    def _append(self, event: SafetyEvent | Intervention) -> None:
         self._history.append(event)
         if self.on_event is not None:
             self.on_event(event)

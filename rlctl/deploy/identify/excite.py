@@ -1,4 +1,4 @@
-"""A trajectory that tells much about a robot and stays within its limits: every action a sum of sines."""
+"""An informative trajectory within a robot's limits: each action is a sum of sines."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.deploy.identify.follow import describe_expected, find_joints, open_world
-from rlctl.deploy.identify.log import LEAST_ROWS, Array, Log, write_log
+from rlctl.deploy.identify.log import MIN_ROWS, Array, Log, write_log
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.task.env import TaskEnv
@@ -30,26 +30,26 @@ class Excitation:
     task: str
     seconds: float
     amplitude: float
-    """Part of the actions' range that it uses."""
+    """Fraction of the action range that it uses."""
     largest_share: float
-    """How far the joints went, of their range without its margins; 0 where no joint has limits."""
+    """Largest used fraction of a joint's range without its margins; 0 if no joint has limits."""
 
 
 def write_excitation(spec: EnvSpec, path: Path, *, seconds: float, seed: int) -> Excitation:
-    """Write the largest trajectory that is safe in simulation, as a log: actions, and what the simulation did.
+    """Write the largest trajectory that is safe in simulation as a log: the actions and the simulated joint states.
 
     Safe: every joint stays 10 % of its range away from its ends and below its top speed, no body that is fixed to the
-    world touches another one, and the task does not end. Raises `AnswerIsNo` if even 5 % of the actions' range is not,
-    `UsageError` for actions without bounds and too short a trajectory.
+    world touches another one, and the task does not end. Raises `AnswerIsNo` if even 5 % of the action range is unsafe,
+    `UsageError` for unbounded actions or a trajectory that is too short.
     """
     env = open_world(spec)
     try:
         if not np.isfinite([env.action_space.low, env.action_space.high]).all():  # type: ignore[attr-defined]
-            raise UsageError(f"{spec.task}: its actions have no bounds, of which a safe trajectory would be a part")
-        if (steps := round(seconds / env.task.control_dt)) < LEAST_ROWS:
-            raise UsageError(f"--seconds {seconds:g}: {steps} actions of {spec.task}; a log has {LEAST_ROWS} or more")
+            raise UsageError(f"{spec.task}: its actions have no bounds; --excite scales its trajectory by them")
+        if (steps := round(seconds / env.task.control_dt)) < MIN_ROWS:
+            raise UsageError(f"--seconds {seconds:g}: {steps} actions of {spec.task}; a log needs at least {MIN_ROWS}")
         expected = describe_expected(env, spec.task)
-        # A world as the task builds it; what acts by chance would only disturb.
+        # No random events: they would only disturb the motion.
         env.set_events(EventSettings())
         shape = _draw_sines(env, steps, seed)
         reason = ""
@@ -59,14 +59,14 @@ def write_excitation(spec: EnvSpec, path: Path, *, seconds: float, seed: int) ->
                 write_log(path, log, expected)
                 return Excitation(path, spec.task, seconds, amplitude, share)
         raise AnswerIsNo(
-            f"{spec.task}: no safe trajectory found: even at {_AMPLITUDES[-1]:.0%} of the actions {reason}"
+            f"{spec.task}: no safe trajectory found: even at {_AMPLITUDES[-1]:.0%} of the action range, {reason}"
         )
     finally:
         env.close()
 
 
 def _draw_sines(env: TaskEnv, steps: int, seed: int) -> Array:
-    """Return a trajectory of shape (steps, actions), within [-1, 1] of half the actions' range, from rest to rest."""
+    """Return a trajectory of shape (steps, actions) in [-1, 1], the action range, that begins and ends at 0."""
     rng = np.random.default_rng(seed)
     count = int(np.prod(env.action_space.shape or ()))
     time = np.arange(steps)[:, None] * env.task.control_dt
@@ -82,7 +82,7 @@ def _draw_sines(env: TaskEnv, steps: int, seed: int) -> Array:
 
 
 def _try(env: TaskEnv, shape: Array, driven: tuple[str, ...]) -> tuple[str, Log, float]:
-    """Play a trajectory; return why it is not safe, or nothing, the log, and how far the joints went."""
+    """Play a trajectory; return why it is unsafe (or empty), the log, and the largest fraction of a range."""
     joints = find_joints(env)
     names = driven or tuple(joints)
     low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]

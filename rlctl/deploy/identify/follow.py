@@ -1,4 +1,4 @@
-"""Plays a log's actions in the task's world and compares what the joints do with what was measured."""
+"""Plays a log's actions in the task's world and compares simulated joint states with the measured ones."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
 
 WINDOW_S = 1.0
-"""After so long [s] the simulation begins again from what was measured: small errors do not add up without end."""
-_SMOOTHED = 9  # rows, around the one that a window begins from
-_TRIED = 200  # rows at least, on which it is found out whether that is better than what was measured
+"""The simulation restarts from the measured state after this time [s], so that small errors do not accumulate."""
+_SMOOTHING_ROWS = 9  # rows of the smoothing filter for start states
+_COMPARED_ROWS = 200  # rows at least, to compare smoothed with measured start states
 
 
 def open_world(spec: EnvSpec) -> TaskEnv:
@@ -41,14 +41,14 @@ def find_joints(env: TaskEnv) -> dict[str, tuple[Any, int]]:
 
 
 def describe_expected(env: TaskEnv, task: str) -> Expected:
-    """Return what a log of this task has to hold; raises `UsageError` if no joint of a fixed body is there."""
+    """Return what a log of this task must contain; raises `UsageError` if no fixed body has joints."""
     joints = find_joints(env)
     described = env.task.describe_joints()
     driven = tuple(described.names) if described else ()
     free = [body.name for body, _ in joints.values() if not body.fixed and body.joint_names]
     if not joints or (free and not any(body.fixed for body, _ in joints.values())):
         if not free:
-            raise UsageError(f"{task}: it has no joints; identify compares what joints do with a log")
+            raise UsageError(f"{task}: it has no joints; identify compares simulated joint states with a log")
         raise UsageError(
             f"{task}: the base of {free[0]!r} is free, and a log of joints does not say where it is; log the robot "
             "hanging in a frame, and identify a task that loads it with fixed=True"
@@ -58,7 +58,7 @@ def describe_expected(env: TaskEnv, task: str) -> Expected:
 
 
 class Follower:
-    """A world and a log; `compare` says how far apart they are for some values."""
+    """Simulates a log; `compare` returns the errors for given values of the unknowns."""
 
     def __init__(self, env: TaskEnv, log: Log, unknowns: Unknowns) -> None:
         from scipy.signal import savgol_filter
@@ -70,7 +70,7 @@ class Follower:
         self._bodies = {body.name: body for body, _ in self._joints}
         steps = max(10, round(WINDOW_S / env.task.control_dt))
         self.starts = list(range(0, len(log.actions) - 2, steps))
-        """Rows that the simulation begins from."""
+        """First row of each window."""
         self.steps = steps
         self.control_dt = env.task.control_dt
         self._measured = np.concatenate([log.positions, log.velocities], axis=1)
@@ -79,19 +79,19 @@ class Follower:
         low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
         self._resting = np.clip(np.zeros(shape), low, high)
         self._dtype = env.action_space.dtype
-        rows = min(_SMOOTHED, len(log.actions) // 2 * 2 - 1)
+        rows = min(_SMOOTHING_ROWS, len(log.actions) // 2 * 2 - 1)
         self._begin = self._choose_begin(savgol_filter(self._measured, rows, 2, axis=0))
 
     @property
     def spread(self) -> Array:
-        """How much each measured position and velocity varies, shape (2 * joints,)."""
+        """Standard deviation of each measured position and velocity, shape (2 * joints,)."""
         spread: Array = np.maximum(self._measured.std(axis=0), 1e-9)
         return spread
 
     def compare(self, positions: Array | None, delay: int) -> Array:
-        """Return simulated less measured positions and velocities, shape (rows, 2 * joints), window by window.
+        """Return simulated minus measured positions and velocities, shape (rows, 2 * joints), window by window.
 
-        `positions` are those of the unknowns in their ranges; None is the world as the task builds it.
+        `positions` are the unknowns' positions in their ranges, in [0, 1]; None is the world as the task builds it.
         """
         changes = {} if positions is None else self.unknowns.settings(positions.tolist())
         self._env.set_events(EventSettings(False, changes))
@@ -101,12 +101,12 @@ class Follower:
         return errors
 
     def _choose_begin(self, smoothed: Array) -> Array:
-        """Return the states to begin from: each column smoothed, or as measured if the next row is better predicted.
+        """Return the start states: each column smoothed, or measured where that predicts the next row better.
 
-        Smoothing takes noise away, and the peaks of a joint that a quickly changing torque moves.
+        Smoothing removes noise, but also the peaks of a joint under a quickly changing torque.
         """
         self._env.set_events(EventSettings(False, {}))
-        starts = range(0, len(self._actions) - 1, max(1, len(self._actions) // _TRIED))
+        starts = range(0, len(self._actions) - 1, max(1, len(self._actions) // _COMPARED_ROWS))
         errors = []
         for begin in (self._measured, smoothed):
             self._begin = begin

@@ -1,4 +1,4 @@
-"""Finds the physical values of a task's events from a log, and says how well the log determines each."""
+"""Estimates the physical values of a task's events from a log, each with a confidence interval."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from rlctl.rollout.workers import available_cores
 CONFIDENCE = 1.96
 """Standard deviations of a 95 % interval."""
 WIDEST = 0.3
-"""A value whose interval goes further than this part of it to each side is not known from the log."""
-_SHARE = 0.3  # of a direction that a value has at least, to be named with it
-_LEAST_WIDTH = 0.02
-"""Of a value, to train on: an interval is about the noise of the log, and the model is not the robot."""
-_STILL = 1e-3  # [rad or m]
-_TOLD_APART = 1.05  # ratio of two delays' errors from which on they differ
+"""A value is unknown if its interval is wider than this fraction of it, to each side."""
+_MIN_COMPONENT = 0.3  # smallest component of a value in a direction, for its name to be listed
+_MIN_WIDTH = 0.02
+"""Smallest half width of a training interval, relative to the value: intervals leave out the model's errors."""
+_MIN_MOTION = 1e-3  # [rad or m]
+_MIN_COST_RATIO = 1.05  # smallest ratio of two delays' costs that tells them apart
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ class IdentifiedValue:
     high: float
     known: bool
     note: str = ""
-    """Why it is not known, or that it is at the end of the range it was looked for in."""
+    """Why the value is unknown: no information, or it is at the end of its search range."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,14 +61,14 @@ class Identification:
     velocity_error: tuple[float, float]
     """[rad/s or m/s]."""
     curves: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Of the joint that was followed worst: its name, measured positions, and those simulated before and after."""
+    """Of the joint with the largest error: its name, its measured positions, and those simulated before and after."""
 
     def events(self) -> dict[str, dict[str, Any]]:
-        """Return what is known as a recipe's `events`: the intervals, to train on, at least 2 % to each side."""
+        """Return the known values as a recipe's `events`: intervals for training, at least 2 % to each side."""
         settings: dict[str, dict[str, Any]] = {}
         for value in self.values:
             if value.known:
-                least = _LEAST_WIDTH * abs(value.value)
+                least = _MIN_WIDTH * abs(value.value)
                 low, high = min(value.low, value.value - least), max(value.high, value.value + least)
                 settings.setdefault(value.event, {})[value.key] = [_round(low), _round(high)]
         if self.delay_event and self.delay_known:
@@ -89,10 +89,10 @@ def identify(
     n_workers: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Identification:
-    """Find the values of a task's events, all or those named, with which the simulation follows a log.
+    """Estimate the values of a task's events (all, or those in `events`) from a log.
 
-    Raises `ArtifactError` for a log that cannot be used, `UsageError` for what the task does not have, and `AnswerIsNo`
-    if the log contains no information about any value.
+    Raises `ArtifactError` for an invalid log, `UsageError` for an event or joint that the task does not have, and
+    `AnswerIsNo` if the log determines none of the values.
     """
     env = open_world(spec)
     try:
@@ -101,10 +101,11 @@ def identify(
         log = read_log(log_file, expected)
         space: Any = env.action_space
         check_actions(log, log_file, np.ravel(space.low), np.ravel(space.high))
-        if log.positions.std(axis=0).max() < _STILL:
+        if log.positions.std(axis=0).max() < _MIN_MOTION:
+            names = [parameter.name for parameter in unknowns.parameters] + [unknowns.delay] * bool(unknowns.delay)
             raise AnswerIsNo(
                 f"{log_file}: nothing moves in this log, so it contains no information about "
-                f"{', '.join(_list_names(unknowns))}; a trajectory that does: rlctl identify {spec.task} --excite FILE"
+                f"{', '.join(names)}; a trajectory that moves: rlctl identify {spec.task} --excite FILE"
             )
         follower = Follower(env, log, unknowns)
         weights = 1.0 / follower.spread
@@ -112,7 +113,7 @@ def identify(
             fits = search(workers, unknowns, weights, seed, report)
         best = min(fits.values(), key=lambda fit: fit.cost)
         values = _estimate_values(unknowns, best)
-        delay_known = all(fit.cost > _TOLD_APART * best.cost for fit in fits.values() if fit is not best)
+        delay_known = all(fit.cost > _MIN_COST_RATIO * best.cost for fit in fits.values() if fit is not best)
         if not any(value.known for value in values) and not (unknowns.delay and delay_known):
             notes = "; ".join(dict.fromkeys(value.note for value in values))
             raise AnswerIsNo(
@@ -122,10 +123,6 @@ def identify(
         return _summarise(spec.task, log_file, follower, log, best, values, delay_known)
     finally:
         env.close()
-
-
-def _list_names(unknowns: Unknowns) -> list[str]:
-    return [*(parameter.name for parameter in unknowns.parameters), *([unknowns.delay] if unknowns.delay else [])]
 
 
 def _summarise(
@@ -169,15 +166,15 @@ def _estimate_values(unknowns: Unknowns, fit: Fit) -> list[IdentifiedValue]:
     if not unknowns.parameters:
         return []
     spans = np.array([parameter.relative_span for parameter in unknowns.parameters])
-    # As changes of the values' logarithms (or of the values themselves), not of positions in their ranges.
+    # In units of the values' logarithms (or of the values themselves), not of positions in their ranges.
     information = fit.information / np.outer(spans, spans)
     regular = information + 1e-9 * np.trace(information) * np.eye(len(spans)) + 1e-12 * np.eye(len(spans))
-    # What the model leaves out, and where a window begins, shifts all rows of a window alike: they count as one.
+    # Errors of the model and of a start state shift all rows of a window alike: they count as one sample.
     variance = fit.cost * fit.rows_per_window
     deviations = np.sqrt(variance * np.diag(np.linalg.inv(regular)))
-    alone = np.sqrt(variance / np.diag(regular))  # if all others were known
+    alone = np.sqrt(variance / np.diag(regular))  # if all other values were known
     without_trace = np.diag(information) <= 1e-9 * np.trace(information)
-    deviations[without_trace] = alone[without_trace] = 1e6  # whatever the errors are that are left
+    deviations[without_trace] = alone[without_trace] = 1e6  # regardless of the remaining errors
     return [
         _estimate_value(unknowns, index, fit, float(deviations[index]), float(alone[index]), regular)
         for index in range(len(spans))
@@ -205,7 +202,7 @@ def _estimate_value(
         )
     elif min(position, 1 - position) < 0.005:
         end = parameter.low if position < 0.5 else parameter.high
-        note = f"at the end of the range it was looked for in, {end:.3g}: is something else different?"
+        note = f"at the end of its search range, {end:.3g}: something else may differ"
         known = False
     return IdentifiedValue(
         parameter.name, parameter.event, parameter.key, value, float(low), float(high), bool(known), note
@@ -213,12 +210,14 @@ def _estimate_value(
 
 
 def _explain_unknown(unknowns: Unknowns, index: int, information: Array) -> str:
-    """Say which values together can change without a trace in the log."""
+    """Name the values that can change together without an effect on the log."""
     sizes, directions = np.linalg.eigh(information)
     shares = np.abs(directions[index]) / np.sqrt(np.maximum(sizes, 1e-12 * sizes[-1]))
     direction = directions[:, int(shares.argmax())]
     names = [
-        parameter.name for parameter, part in zip(unknowns.parameters, direction, strict=True) if abs(part) >= _SHARE
+        parameter.name
+        for parameter, part in zip(unknowns.parameters, direction, strict=True)
+        if abs(part) >= _MIN_COMPONENT
     ]
     own: Parameter = unknowns.parameters[index]
     others = [name for name in names if name != own.name] or ["the others"]

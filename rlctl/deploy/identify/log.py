@@ -20,17 +20,17 @@ Array = NDArray[np.float64]
 TIME = "time"
 _POSITION, _VELOCITY = "position_", "velocity_"
 _USED = (TIME, "action_", _POSITION, _VELOCITY)
-_GAP = 1.5
-"""Control periods between two rows from which on something is missing between them."""
-_OTHER_RATE = 0.1
-"""Relative difference of the rows' period from the control period that is no jitter."""
-_LARGEST = 200 * 2**20  # [bytes]
-LEAST_ROWS = 20
+_MAX_PERIODS = 1.5
+"""A longer time between two rows is a gap; in control periods."""
+_RATE_TOLERANCE = 0.1
+"""Tolerated relative difference between the rows' period and the control period."""
+_MAX_SIZE = 200 * 2**20  # [bytes]
+MIN_ROWS = 20
 
 
 @dataclasses.dataclass(frozen=True)
 class Log:
-    """The commands that a robot got and what was measured: a row per control step.
+    """The commands of a robot and its measured joint states: a row per control step.
 
     `positions[t]` and `velocities[t]` were measured when `actions[t]` was commanded.
     """
@@ -46,10 +46,10 @@ class Log:
 
 @dataclasses.dataclass(frozen=True)
 class Expected:
-    """What a task needs of a log."""
+    """What a log of a task must contain."""
 
     joints: Mapping[str, tuple[float, float]]
-    """Joints of the world with their limits [rad or m]; a pair that is not rising says that there are none."""
+    """Joints of the world with their limits [rad or m]; a pair with low >= high means no limits."""
     driven: tuple[str, ...]
     """Joints in the order of the action, where the task describes them."""
     actions: int
@@ -64,7 +64,7 @@ class Expected:
 
 
 def write_log(path: Path, log: Log, expected: Expected) -> None:
-    """Write a log as CSV, whole or not at all."""
+    """Write a log as CSV, atomically."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     measured = [f"{kind}{joint}" for kind in (_POSITION, _VELOCITY) for joint in log.joints]
@@ -75,7 +75,7 @@ def write_log(path: Path, log: Log, expected: Expected) -> None:
 
 
 def read_log(path: Path, expected: Expected) -> Log:
-    """Read and check a log; raises `ArtifactError` that names the line, or the column, and what to do."""
+    """Read and check a log; raises `ArtifactError` that names the line or column, and what to change."""
     columns, lines = _read_columns(path)
     _check_time(path, _take(path, columns, TIME), expected.control_dt, lines)
     measured = [name.removeprefix(_POSITION) for name in columns if name.startswith(_POSITION)]
@@ -85,7 +85,7 @@ def read_log(path: Path, expected: Expected) -> Log:
         check_name(joint, expected.joints, no_joint, ArtifactError)
     if not joints:
         raise ArtifactError(
-            f"{path}: no column of a joint's position: call it {_POSITION}{next(iter(expected.joints))}"
+            f"{path}: no column with a joint's position, such as {_POSITION}{next(iter(expected.joints))}"
         )
     stacked = {
         kind: np.column_stack([_take(path, columns, f"{kind}{joint}") for joint in joints])
@@ -99,7 +99,7 @@ def read_log(path: Path, expected: Expected) -> Log:
 def _read_columns(path: Path) -> tuple[dict[str, Array], list[int]]:
     """Return the columns, and the line of each row."""
     try:
-        rows = list(csv.reader(io.StringIO(untrusted.read_bytes(path, _LARGEST).decode("utf-8-sig"))))
+        rows = list(csv.reader(io.StringIO(untrusted.read_bytes(path, _MAX_SIZE).decode("utf-8-sig"))))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ArtifactError(f"{path}: not a CSV file: {error}") from None
     if not rows or TIME not in [name.strip() for name in rows[0]]:
@@ -107,13 +107,11 @@ def _read_columns(path: Path) -> tuple[dict[str, Array], list[int]]:
             f"{path}: its first line must name the columns, with commas: {TIME}, action_..., position_JOINT"
         )
     names = [name.strip() for name in rows[0]]
-    if doubled := [name for name in names if names.count(name) > 1]:
-        raise ArtifactError(f"{path}: there are two columns {doubled[0]!r}")
+    if repeated := [name for name in names if names.count(name) > 1]:
+        raise ArtifactError(f"{path}: two columns are named {repeated[0]!r}")
     numbered = [(line, row) for line, row in enumerate(rows[1:], start=2) if row]
-    if len(numbered) < LEAST_ROWS:
-        raise ArtifactError(
-            f"{path}: {len(numbered)} rows; a recording of a few seconds is needed, at least {LEAST_ROWS} rows"
-        )
+    if len(numbered) < MIN_ROWS:
+        raise ArtifactError(f"{path}: {len(numbered)} rows; a log needs at least {MIN_ROWS}; record a few seconds")
     values = np.array([_read_row(path, line, row, names) for line, row in numbered])
     return dict(zip(names, values.T, strict=True)), [line for line, _ in numbered]
 
@@ -142,17 +140,17 @@ def _check_time(path: Path, time: Array, control_dt: float, lines: list[int]) ->
     periods = np.diff(time)
     if (back := np.flatnonzero(periods <= 0)).size:
         raise ArtifactError(
-            f"{path}, line {lines[back[0] + 1]}: time does not go forward: {time[back[0]]:g} s, then "
+            f"{path}, line {lines[back[0] + 1]}: time does not increase: {time[back[0]]:g} s, then "
             f"{time[back[0] + 1]:g} s"
         )
     usual = float(np.median(periods))
-    if abs(usual - control_dt) > _OTHER_RATE * control_dt:
+    if abs(usual - control_dt) > _RATE_TOLERANCE * control_dt:
         raise ArtifactError(
             f"{path}: a row every {usual:.4g} s, but the task acts every {control_dt:.4g} s: write a row per action"
         )
-    if (gaps := np.flatnonzero(periods > _GAP * control_dt)).size:
+    if (gaps := np.flatnonzero(periods > _MAX_PERIODS * control_dt)).size:
         raise ArtifactError(
-            f"{path}, line {lines[gaps[0] + 1]}: a gap of {periods[gaps[0]]:.3g} s; give the longest part without gaps"
+            f"{path}, line {lines[gaps[0] + 1]}: a gap of {periods[gaps[0]]:.3g} s; cut the log to a part without gaps"
         )
 
 
@@ -168,11 +166,11 @@ def _check_units(path: Path, joints: Sequence[str], positions: Array, expected: 
 
 
 def check_actions(log: Log, path: Path, low: Array, high: Array) -> None:
-    """Raise `UsageError` for actions that are far outside the task's: other units, or another controller's."""
+    """Raise `UsageError` for actions far outside the task's bounds: other units, or another controller's commands."""
     outside = np.maximum(low - log.actions, log.actions - high).max(axis=0)
     if (outside > 0.01 * (high - low)).any():
         worst = int(outside.argmax())
         raise UsageError(
-            f"{path}: action {worst} reaches {np.abs(log.actions[:, worst]).max():.3g}, the task's goes from "
-            f"{low[worst]:.3g} to {high[worst]:.3g}: log the policy's action, not the motor's command"
+            f"{path}: action {worst} reaches {np.abs(log.actions[:, worst]).max():.3g}, its bounds in the task are "
+            f"{low[worst]:.3g} and {high[worst]:.3g}: log the policy's action, not the motor's command"
         )

@@ -1,4 +1,4 @@
-"""The physical values of a task's events that a log can determine: those of a whole episode, and the delay."""
+"""The physical values that a log can determine: those of events that hold for a whole episode, and the delay."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from rlctl.task.events import Event, delay, set_color, shift_gravity
 from rlctl.task.events.ranges import Widening
 
 _WIDER = 2.0
-"""How far beyond the range of the task's event a value is looked for, as a factor."""
+"""Factor by which the search range is wider than the event's range."""
 _SMALLEST = 0.01  # of the upper end, where a range begins at 0
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """A value of an event, looked for between `low` and `high`; on a logarithmic scale if both are above 0."""
+    """A value of an event, searched between `low` and `high`; on a logarithmic scale if both are above 0."""
 
     event: str
     key: str
     low: float
     high: float
     nominal: float | None = None
-    """Of the built world, where that is known."""
+    """Value in the world as the task builds it, if known."""
 
     @property
     def name(self) -> str:
@@ -33,7 +33,7 @@ class Parameter:
 
     @property
     def is_logarithmic(self) -> bool:
-        """Whether a change of the value by a factor counts, and not by a difference."""
+        """Whether the search scale is logarithmic."""
         return self.low > 0
 
     def value(self, position: float) -> float:
@@ -44,7 +44,7 @@ class Parameter:
 
     @property
     def first(self) -> float:
-        """The position to try first: that of the built world, or the middle."""
+        """The position to try first: that of the nominal value, or the middle."""
         if self.nominal is None or not self.low <= self.nominal <= self.high:
             return 0.5
         if self.is_logarithmic:
@@ -53,17 +53,17 @@ class Parameter:
 
     @property
     def relative_span(self) -> float:
-        """By how much a value changes over the range: of its logarithm, or in its own unit."""
+        """Width of the range: of the value's logarithm, or in its own unit."""
         return math.log(self.high / self.low) if self.is_logarithmic else self.high - self.low
 
 
 @dataclasses.dataclass(frozen=True)
 class Unknowns:
-    """All that is looked for."""
+    """The values to estimate."""
 
     parameters: tuple[Parameter, ...]
     delay: str = ""
-    """The event that delays actions; empty if none does, or it is not looked for."""
+    """The event that delays actions; empty if there is none, or it was not chosen."""
     longest_delay: int = 0
     """[control steps]."""
 
@@ -76,9 +76,9 @@ class Unknowns:
 
 
 def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: str) -> Unknowns:
-    """Return what can be found of a task's events, or of the chosen ones.
+    """Return the unknown values of a task's events, or of the chosen events.
 
-    Raises `UsageError` for a name that the task does not have, an event that no log can tell, and if nothing is left.
+    Raises `UsageError` for an unknown name, an event that no log can determine, and if there is no value to estimate.
     """
     for name in chosen:
         check_name(name, events, f"--event: {task} has no event", UsageError)
@@ -90,8 +90,8 @@ def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: st
         possible = is_delay or (event.when == "reset" and event.function not in (set_color, shift_gravity) and ranges)
         if name in chosen and not possible:
             raise UsageError(
-                f"--event: {name} is not a physical value that holds for an episode; those that are act at 'reset', "
-                "and the delay of actions"
+                f"--event: {name} has no physical value that holds for an episode; identify estimates events at "
+                "'reset' and the delay of actions"
             )
         if not possible or (chosen and name not in chosen):
             continue
@@ -100,7 +100,7 @@ def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: st
         else:
             parameters += [_make_parameter(name, key, *values, event.nominal(key)) for key, values in ranges.items()]
     if not parameters and not delayed:
-        raise UsageError(f"{task} has no event with a physical value to find: see rlctl tasks show {task}")
+        raise UsageError(f"{task} has no event with a physical value to estimate: see rlctl tasks show {task}")
     return Unknowns(tuple(parameters), delayed, longest)
 
 
@@ -113,7 +113,7 @@ def _make_parameter(event: str, key: str, low: float, high: float, nominal: floa
     if low < 0:
         middle, half = (low + high) / 2, _WIDER * max((high - low) / 2, 1e-6)
         return Parameter(event, key, middle - half, middle + half, nominal)
-    if low == 0 and nominal is None:  # as of damping: nothing, most likely
+    if low == 0 and nominal is None:  # such as damping, which is most likely 0
         nominal = _SMALLEST * max(high, 1e-6)
     low = low / _WIDER if low > 0 else _SMALLEST * max(high, 1e-6)
     return Parameter(event, key, low, _WIDER * max(high, low), nominal)

@@ -25,12 +25,12 @@ def show(result: Identification, json: str | None) -> None:
         out.print(line, highlight=False)
     if sys.stdout.isatty():
         out.print(draw_curves(result), highlight=False)
-    out.print("\nto train on what was found, in a recipe:", highlight=False)
+    out.print("\nto train with these values, add to a recipe:", highlight=False)
     out.print(write_fragment(result), end="", highlight=False)
 
 
 def write_fragment(result: Identification) -> str:
-    """Return the part of a recipe that lets the found values act, as intervals."""
+    """Return the part of a recipe with the estimated values as intervals."""
     return yaml.safe_dump({"events": result.events()}, sort_keys=False, default_flow_style=None)
 
 
@@ -38,7 +38,7 @@ def _list_lines(result: Identification) -> list[str]:
     width = max([len(value.name) for value in result.values] + [len(result.delay_event) + 6, len("position error")])
     lines = [f"{value.name:<{width}}  {_format_value(value)}" for value in result.values]
     if result.delay_event:
-        note = "" if result.delay_known else "; this log cannot tell it from one step more or less"
+        note = "" if result.delay_known else "; one step more or less fits this log as well"
         lines.append(f"{result.delay_event + '.steps':<{width}}  {result.delay}{note}")
     for name, (before, after) in (("position error", result.position_error), ("velocity error", result.velocity_error)):
         lines.append(f"{name:<{width}}  {before:.3g} -> {after:.3g}, root mean square over windows of 1 s")
@@ -52,7 +52,7 @@ def _format_value(value: IdentifiedValue) -> str:
 
 
 def draw_curves(result: Identification) -> str:
-    """Return the joint that was followed worst, measured and simulated, drawn with characters."""
+    """Return a plot in characters of the joint with the largest error, measured and simulated."""
     import plotext
 
     plotext.clear_figure()
@@ -64,14 +64,14 @@ def draw_curves(result: Identification) -> str:
 
 
 def show_excitation(result: Excitation, json: str | None) -> None:
-    """Print where a trajectory is and how it was bounded."""
+    """Print the trajectory's file and how much of the ranges it uses."""
     if output.present(result, json):
         return
     lines = [
-        f"{result.path}: {result.seconds:g} s for {result.task}, {result.amplitude:.0%} of the actions' range",
-        f"in simulation the joints use {result.largest_share:.0%} of their range without its margins, touch nothing "
+        f"{result.path}: {result.seconds:g} s for {result.task}, {result.amplitude:.0%} of the action range",
+        f"in simulation the joints use {result.largest_share:.0%} of their range (without margins), touch nothing "
         "and stay below their top speeds; the robot's cables and surroundings are not simulated",
-        f"play its actions on the robot, log in the same columns, then: rlctl identify {result.task} --log FILE",
+        f"play its actions on the robot, log the same columns, then: rlctl identify {result.task} --log FILE",
     ]
     for line in lines:
         output.out().print(line, highlight=False)

@@ -1,4 +1,4 @@
-"""The search, in worker processes, for the values that make the simulation follow a log: trials, least squares."""
+"""Searches in worker processes for the values with which the simulation follows a log: trials, then least squares."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault, answ
 from rlctl.processes.printed_lines import write_stderr
 from rlctl.rollout.failures import describe_failure, make_error
 
-_TRIALS = 12  # per unknown, and as many again
+_TRIALS = 12  # per unknown, and for one unknown more
 _STARTS = 3
 _EVALUATIONS, _LAST_EVALUATIONS = 12, 25
 _STEP = 0.004
-"""Of a position in [0, 1], for derivatives: above what contacts and solvers make uneven."""
+"""Step of a position in [0, 1] for derivatives: larger than the irregularities of contacts and solvers."""
 _TOLERANCE = 1e-5
-_LONGEST_DELAY = 50  # steps that the search may go to from the longest that is tried first
+_MAX_DELAY = 50  # [control steps], beyond which the search does not go
 
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """Where a search ended: positions of the values in their ranges."""
+    """The result of least squares: positions of the values in their ranges, in [0, 1]."""
 
     at: Array
     delay: int
@@ -44,7 +44,7 @@ class Fit:
 
 @dataclasses.dataclass(frozen=True)
 class Follow:
-    """What a worker is asked first: to get ready to follow a log."""
+    """The first request to a worker: load the log and build the world."""
 
     spec: EnvSpec
     log: Log
@@ -61,7 +61,7 @@ class SearchPoint:
 
 @dataclasses.dataclass(frozen=True)
 class ComputeCosts:
-    """What a worker is asked: the cost of each trial."""
+    """Asks a worker for the cost of each trial."""
 
     trials: list[SearchPoint]
     weights: Array
@@ -69,7 +69,7 @@ class ComputeCosts:
 
 @dataclasses.dataclass(frozen=True)
 class FindFit:
-    """What a worker is asked: the best fit near a trial."""
+    """Asks a worker for the best fit near a trial."""
 
     start: SearchPoint
     weights: Array
@@ -77,7 +77,7 @@ class FindFit:
 
 
 class SearchWorkers:
-    """Processes that follow a log. Answers come in the order of the questions; errors of the task are raised here."""
+    """Worker processes that simulate a log; `ask` raises the task's errors."""
 
     def __init__(self, spec: EnvSpec, log: Log, unknowns: Unknowns, count: int) -> None:
         self.count = count
@@ -90,7 +90,7 @@ class SearchWorkers:
             raise
 
     def ask(self, questions: Sequence[Follow | ComputeCosts | FindFit]) -> list[Any]:
-        """Return the answers to questions, each given to the next worker that is free."""
+        """Return the answers in the order of the questions; each goes to the next free worker."""
         try:
             answers = self._pool.ask_each(questions, "following the log")
         except WorkerFault as fault:
@@ -109,14 +109,14 @@ class SearchWorkers:
 def search(
     workers: SearchWorkers, unknowns: Unknowns, weights: Array, seed: int, report: Callable[[str], None]
 ) -> dict[int, Fit]:
-    """Return the best fit per delay that was followed up; the best of all has the lowest cost.
+    """Return the best fit for the best delay and its neighbours; the lowest cost is the best.
 
-    Trials all over the ranges choose where least squares start; then the delays beside the best one are tried, and the
-    errors are weighted anew, each measured signal by how well it can be followed.
+    Trials all over the ranges choose the starts of least squares. Then delays next to the best one are tried, and the
+    errors are weighted again: each measured signal by its remaining error.
     """
     fits: dict[int, Fit] = {}
 
-    def follow_up(questions: list[FindFit]) -> None:
+    def fit_all(questions: list[FindFit]) -> None:
         for fit in workers.ask(questions):
             if fit.delay not in fits or fit.cost < fits[fit.delay].cost:
                 fits[fit.delay] = fit
@@ -129,10 +129,10 @@ def search(
     ranked = [trial for _, trial in sorted(by_cost, key=lambda pair: pair[0])]
     starts = _choose_starts(trials[0], ranked)
     report(f"least squares from {len(starts)} starts")
-    follow_up([FindFit(start, weights, _EVALUATIONS) for start in starts])
+    fit_all([FindFit(start, weights, _EVALUATIONS) for start in starts])
     best = _best(fits)
-    while beside := [d for d in (best.delay - 1, best.delay + 1) if 0 <= d <= _LONGEST_DELAY and d not in fits]:
-        follow_up([FindFit(SearchPoint(best.at.tolist(), delay), weights, _EVALUATIONS) for delay in beside])
+    while neighbours := [d for d in (best.delay - 1, best.delay + 1) if 0 <= d <= _MAX_DELAY and d not in fits]:
+        fit_all([FindFit(SearchPoint(best.at.tolist(), delay), weights, _EVALUATIONS) for delay in neighbours])
         if _best(fits).delay == best.delay:
             break
         best = _best(fits)
@@ -142,7 +142,7 @@ def search(
     near = [d for d in (best.delay - 1, best.delay, best.delay + 1) if d in fits]
     fits = {}
     evaluations = {delay: _LAST_EVALUATIONS if delay == best.delay else _EVALUATIONS for delay in near}
-    follow_up([FindFit(SearchPoint(best.at.tolist(), delay), weights, evaluations[delay]) for delay in near])
+    fit_all([FindFit(SearchPoint(best.at.tolist(), delay), weights, evaluations[delay]) for delay in near])
     return fits
 
 
@@ -151,7 +151,7 @@ def _best(fits: dict[int, Fit]) -> Fit:
 
 
 def _make_trials(unknowns: Unknowns, seed: int) -> list[SearchPoint]:
-    """Return the built world with every delay, then points all over the ranges, with every delay in turn."""
+    """Return the nominal values with every delay, then points all over the ranges, with the delays in turn."""
     from scipy.stats import qmc
 
     size = len(unknowns.parameters)
@@ -165,7 +165,7 @@ def _make_trials(unknowns: Unknowns, seed: int) -> list[SearchPoint]:
 
 
 def _choose_starts(built: SearchPoint, ranked: list[SearchPoint]) -> list[SearchPoint]:
-    """Return the best trial of each of the best delays, then the next best ones, and the built world."""
+    """Return the best trial of each of the best delays, then the next best trials, and the nominal one."""
     firsts = list({trial.delay: trial for trial in reversed(ranked)}.values())
     firsts = [trial for trial in ranked if trial in firsts][:_STARTS]
     others = [trial for trial in ranked if trial not in firsts]
@@ -193,11 +193,11 @@ def main(connection: Connection) -> None:
 
 def _compute_cost(follower: Follower, trial: SearchPoint, weights: Array) -> float:
     cost = float(np.square(follower.compare(np.array(trial.at), trial.delay) * weights).mean())
-    return cost if np.isfinite(cost) else np.inf  # a simulation that diverged costs more than any other
+    return cost if np.isfinite(cost) else np.inf  # a simulation diverged
 
 
 def _find_fit(follower: Follower, question: FindFit) -> Fit:
-    """Return the best positions near a trial, with what intervals are made from."""
+    """Return the best positions near a trial, with the data for intervals."""
     weights, delay, at = question.weights, question.start.delay, np.array(question.start.at)
 
     def residuals(positions: Array) -> Array:
@@ -227,7 +227,7 @@ def _find_fit(follower: Follower, question: FindFit) -> Fit:
             ftol=_TOLERANCE,
         )
         at, errors, derivatives = solution.x, solution.fun, np.asarray(solution.jac)
-    else:  # only the delay is looked for
+    else:  # only the delay is unknown
         errors, derivatives = residuals(at), np.zeros((0, 0))
     by_row = errors.reshape(-1, len(weights))
     return Fit(

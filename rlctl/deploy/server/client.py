@@ -1,4 +1,4 @@
-"""A client of policy servers, and a task played with it: `rlctl eval TASK --policy ws://...`, a server's self-test."""
+"""A client of policy servers, and the player that `rlctl eval TASK --policy ws://...` and the self-test use."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from rlctl.errors import PolicyError, UsageError, describe_exception, short_repr
 from rlctl.policy.players.player import Player
 
 _TIMEOUT_S = 10.0
-_LARGEST = 16 * 2**20  # [bytes] of an answer
+_MAX_ANSWER = 16 * 2**20  # [bytes]
 
 
 class PolicyClient:
-    """A connection to a policy server; `act` waits for each answer. The key is that of the environment, if any.
+    """A connection to a policy server; `act` waits for each answer. Sends the key in `RLCTL_API_KEY`, if it is set.
 
-    Raises `UsageError` if no server answers, `PolicyError` for what is not an answer.
+    Raises `UsageError` if no server answers, `PolicyError` for an invalid answer.
     """
 
     def __init__(self, url: str) -> None:
@@ -43,7 +43,7 @@ class PolicyClient:
         try:
             self._session = aiohttp.ClientSession(headers=self._headers)
             self._socket = await self._session.ws_connect(
-                self.url, compress=0, max_msg_size=_LARGEST, timeout=aiohttp.ClientWSTimeout(ws_close=1.0)
+                self.url, compress=0, max_msg_size=_MAX_ANSWER, timeout=aiohttp.ClientWSTimeout(ws_close=1.0)
             )
             return self._unpack(await self._socket.receive(_TIMEOUT_S))
         except (aiohttp.ClientError, OSError, ValueError) as error:
@@ -63,7 +63,7 @@ class PolicyClient:
         except messages.MessageError as error:
             raise PolicyError(f"{self.url}: {error}") from None
         if not isinstance(content, dict):
-            raise PolicyError(f"{self.url}: a {type(content).__name__}, not an answer")
+            raise PolicyError(f"{self.url}: the server sent a {type(content).__name__}, expected a map")
         return content
 
     def act(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -79,7 +79,7 @@ class PolicyClient:
             await self._socket.send_bytes(content)
             return await self._socket.receive(_TIMEOUT_S)
         except (aiohttp.ClientError, OSError) as error:
-            raise PolicyError(f"{self.url}: the connection is lost: {describe_exception(error)}") from None
+            raise PolicyError(f"{self.url}: connection lost: {describe_exception(error)}") from None
 
     def close(self) -> None:
         """Close the connection."""
@@ -89,7 +89,7 @@ class PolicyClient:
 
 
 class RemotePlayer(Player):
-    """Plays the actions of a policy server; reports its round trips and what the server said was wrong."""
+    """Plays the actions of a policy server; reports round-trip times, late answers, and faults."""
 
     def __init__(self, url: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
         self._client = PolicyClient(url)
@@ -99,30 +99,30 @@ class RemotePlayer(Player):
         own = {"observation_space": observation_space, "action_space": action_space}
         if isinstance(env, dict) and any(key in env and space_from_json(env[key]) != own[key] for key in own):
             self._client.close()
-            raise UsageError(f"{url}: the policy that is served there is for other spaces than this task has")
+            raise UsageError(f"{url}: the served policy has other observation or action spaces than this task")
         dt = self._client.metadata.get("control_dt")
         self._control_dt = dt if isinstance(dt, int | float) else math.inf
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Return the server's action twice: as it is stored and as it is taken. Raises `PolicyError`."""
+        """Return the server's action twice, to record and to step with. Raises `PolicyError` for an invalid one."""
         request = dict(observation) if isinstance(observation, dict) else {"observation": observation}
         if step == 0:
             request["reset"] = True
             self._report = {"round_trips_s": [], "misses": 0, "not_running": 0}
         begin = time.perf_counter()
         answer = self._client.act(request)
-        taken_s = time.perf_counter() - begin
-        self._report["round_trips_s"].append(taken_s)
-        self._report["misses"] += taken_s > self._control_dt
+        round_trip_s = time.perf_counter() - begin
+        self._report["round_trips_s"].append(round_trip_s)
+        self._report["misses"] += round_trip_s > self._control_dt
         self._report["not_running"] += answer.get("state", "running") != "running"
         if "error" in answer:
             raise PolicyError(f"{self._client.url}: {short_repr(answer['error'], 300)}")
-        given, shape = answer.get("actions"), self._action_space.shape or ()
+        values, shape = answer.get("actions"), self._action_space.shape or ()
         try:
-            action = np.asarray(given, self._action_space.dtype)[:1].reshape(shape)
+            action = np.asarray(values, self._action_space.dtype)[:1].reshape(shape)
         except (ValueError, TypeError, IndexError, OverflowError):
             raise PolicyError(
-                f"{self._client.url}: actions {short_repr(given)}; the task takes a list of them, each of shape {shape}"
+                f"{self._client.url}: actions are {short_repr(values)}, expected a list of one action, shape {shape}"
             ) from None
         return action, action
 
@@ -131,5 +131,5 @@ class RemotePlayer(Player):
         self._client.close()
 
     def report(self) -> dict[str, Any]:
-        """Return the round trips [s] of this episode, how many missed `control_dt`, and in how many it did not run."""
+        """Return this episode's round-trip times [s], how many exceeded `control_dt`, and answers not `running`."""
         return self._report

@@ -1,4 +1,4 @@
-"""Open connections: how long one may wait for a request, and how many there may be."""
+"""Limits of a server's connections: how many may be open, and how long each may wait for a request."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _Times = dict[_Handler, float]
 BACKLOG = 64  # connections that the kernel accepts before the loop sees them
 _FIRST_REQUEST_S = 10.0
 _NEXT_REQUEST_S = 75.0
-_RESERVE = 32  # file descriptors for files, policies and logs
-_POSTING = 16  # connections besides those of WebSocket clients
+_RESERVED_FILES = 32  # file descriptors for files, policies and logs
+_HTTP_CONNECTIONS = 16  # connections for HTTP requests
 
 
 def count_allowed_connections(max_clients: int) -> int:
-    """Return how many connections there may be, so that one with a stop is always accepted and served.
+    """Return how many connections may be open, so that the server can always accept a stop request.
 
-    Raises `UsageError` where this process may not open enough files for `max_clients`.
+    Raises `UsageError` if this process may open too few files for `max_clients`.
     """
     limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed = limit - len(os.listdir("/proc/self/fd" if os.path.isdir("/proc/self/fd") else "/dev/fd"))
-    allowed -= BACKLOG + _RESERVE
-    if allowed < max_clients + _POSTING:
-        needed = limit + max_clients + _POSTING - allowed
+    allowed -= BACKLOG + _RESERVED_FILES
+    if allowed < max_clients + _HTTP_CONNECTIONS:
+        needed = limit + max_clients + _HTTP_CONNECTIONS - allowed
         raise UsageError(
             f"--max-clients {max_clients}: this process may open {limit} files, which is too few; "
             f"raise the limit, ulimit -n {needed}, or allow fewer clients"
@@ -41,20 +41,20 @@ def count_allowed_connections(max_clients: int) -> int:
 
 
 class Connections:
-    """The connections of a server, in the order in which they began to wait for a request.
+    """The connections of a server, oldest first.
 
-    A connection that sends no whole request head in time is closed. Where there are too many, the one that has waited
-    for longest is closed, then the one whose request has taken longest; never that of a WebSocket client.
+    A connection that sends no complete request header in time is closed. If too many are open, the server closes the
+    one that has waited longest, then the one whose request has taken longest, but never a WebSocket client.
     """
 
     def __init__(self, allowed: int) -> None:
         self._allowed = allowed
-        self._waiting: _Times = {}  # until when
+        self._waiting: _Times = {}  # time.monotonic() at which it is closed
         self._answering: _Times = {}
         self._clients: _Times = {}
 
     def accept(self, handler: _Handler) -> _Handler:
-        """Register a new connection, and close another where there are too many."""
+        """Register a new connection, and close an old one if too many are open."""
         self._waiting[handler] = time.monotonic() + _FIRST_REQUEST_S
         if self._count() > self._allowed:
             self._forget_closed()
@@ -64,7 +64,7 @@ class Connections:
 
     @web.middleware
     async def follow(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Answer a request; its connection does not count as waiting meanwhile. A middleware of aiohttp."""
+        """Answer a request, and count its connection as active until then. A middleware of aiohttp."""
         connection = request.protocol
         is_client = request.headers.get("Upgrade", "").lower() == "websocket"
         group = self._clients if is_client else self._answering
@@ -75,14 +75,14 @@ class Connections:
         except (ConnectionError, web.RequestPayloadError, RuntimeError):
             if connection.transport is not None:
                 raise
-            return web.Response(status=400)  # the client died in its request; nobody receives this answer
+            return web.Response(status=400)  # the client disconnected during its request; nobody receives this answer
         finally:
             group.pop(connection, None)
             if connection.transport is not None:
                 self._waiting[connection] = time.monotonic() + _NEXT_REQUEST_S
 
     async def close_slow(self) -> None:
-        """Close connections that have waited for too long; runs until it is cancelled."""
+        """Close connections that have waited too long; runs until cancelled."""
         while True:
             await asyncio.sleep(1.0)
             self._forget_closed()

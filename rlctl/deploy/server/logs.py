@@ -1,4 +1,4 @@
-"""What a server writes: a log of events as JSON lines, and a Rerun recording. Both are bounded."""
+"""A server's event log as rotated JSON lines, and its Rerun recording."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from rlctl.deploy.filter.safety_events import Intervention, SafetyEvent
 from rlctl.deploy.server.messages import as_json
 from rlctl.errors import ArtifactError, short_repr
 
-_LARGEST = 10_000_000  # [bytes] of one file
-_KEPT = 3
+_MAX_FILE_SIZE = 10_000_000  # [bytes]
+_OLD_FILES = 3
 _REPEAT_S = 1.0
-_MOST_NAMES = 1000
-_MOST_ROWS = 100_000  # that wait for the next `flush`
+_MAX_NAMES = 1000
+_MAX_ROWS = 100_000  # that wait for the next `flush`
 
 
 class EventLog:
     """Writes events as JSON lines; without a file it writes nothing.
 
-    The same limit or fault of a client is written at most once a second, with the number of times since.
+    A repeated limit or fault of a client is written at most once per second, with its count since the last line.
     Raises `ArtifactError` for a file that cannot be written.
     """
 
-    def __init__(self, file: Path | None, *, largest: int = _LARGEST) -> None:
+    def __init__(self, file: Path | None, *, max_file_size: int = _MAX_FILE_SIZE) -> None:
         self._handler: _Handler | None = None
         self._repeated: dict[tuple[int, str], tuple[float, int]] = {}
         if file is None:
             return
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            self._handler = _Handler(file, maxBytes=largest, backupCount=_KEPT, encoding="utf-8")
+            self._handler = _Handler(file, maxBytes=max_file_size, backupCount=_OLD_FILES, encoding="utf-8")
         except OSError as error:
             raise ArtifactError(f"{file}: the log cannot be written: {error.strerror or error}") from None
 
     def write(self, kind: str, client: int | None = None, *, time_s: float | None = None, **fields: Any) -> None:
-        """Write what happened, now or at `time_s`."""
+        """Write an event with its time, `time_s` [s since 1970] or now."""
         if self._handler is None:
             return
         at = datetime.datetime.fromtimestamp(time.time() if time_s is None else time_s, datetime.UTC)
@@ -54,25 +54,25 @@ class EventLog:
         self._handler.emit(logging.LogRecord("rlctl", logging.INFO, "", 0, text, None, None))
 
     def write_event(self, client: int, event: SafetyEvent | Intervention) -> None:
-        """Write what a safety filter did."""
+        """Write the events of a safety filter."""
         if self._handler is None:
             return
         counts = dict.fromkeys(event.names, 1) if event.kind == "state" else self._count(client, event.names)
         if counts:
             for record in event.list_events():
                 if (count := counts.get(record.name)) is not None:
-                    place = {"name": record.name, "value": record.value, "limit": record.limit}
-                    self.write(record.kind, client, time_s=record.time_s, **place, count=count)
+                    fields = {"name": record.name, "value": record.value, "limit": record.limit}
+                    self.write(record.kind, client, time_s=record.time_s, **fields, count=count)
 
     def _count(self, client: int, names: Sequence[str]) -> dict[str, int]:
-        """Return how often each event occurred since it was written, of those that are to be written again."""
+        """Return the events to write now, with their counts since they were last written."""
         due, now = {}, time.monotonic()
         for name in names:
             written, waiting = self._repeated.get((client, name), (-_REPEAT_S, 0))
             if now - written < _REPEAT_S:
                 self._repeated[client, name] = written, waiting + 1
                 continue
-            if len(self._repeated) >= _MOST_NAMES:
+            if len(self._repeated) >= _MAX_NAMES:
                 self._repeated.clear()
             self._repeated[client, name] = now, 0
             due[name] = waiting + 1
@@ -88,7 +88,7 @@ class _Handler(logging.handlers.RotatingFileHandler):
     _warned = False
 
     def handleError(self, record: logging.LogRecord) -> None:
-        # A full disk does not end a server, nor does it fill the terminal.
+        # On a full disk the server continues and warns once.
         if not self._warned:
             self._warned = True
             error = sys.exception()
@@ -96,7 +96,7 @@ class _Handler(logging.handlers.RotatingFileHandler):
 
 
 class RerunLog:
-    """Collects rows and writes them together, which costs a thousandth of writing each.
+    """Collects rows and writes them in batches: a thousand times cheaper than one by one.
 
     Raises `ArtifactError` for a file that cannot be written.
     """
@@ -119,14 +119,14 @@ class RerunLog:
             raise ArtifactError(f"{file}: the recording cannot be written: {reason}") from None
 
     def add(self, entity: str, values: Any) -> None:
-        """Add some numbers of now; what comes faster than it can be written is dropped."""
+        """Add numbers at the present time; dropped while too many rows wait for `flush`."""
         with self._lock:
-            if self._count < _MOST_ROWS:
+            if self._count < _MAX_ROWS:
                 self._count += 1
                 self._rows.setdefault(entity, []).append((time.time(), values))
 
     def flush(self) -> None:
-        """Write what was added; may be called in another thread."""
+        """Write the collected rows; any thread may call this."""
         with self._lock:
             rows, self._rows, self._count = self._rows, {}, 0
         try:
@@ -142,6 +142,6 @@ class RerunLog:
                 print(f"warning: {self._file}: the recording has gaps: {short_repr(str(error))}", file=sys.stderr)
 
     def close(self) -> None:
-        """Write what is left and close the file."""
+        """Write the remaining rows and close the file."""
         self.flush()
         self._stream.disconnect()

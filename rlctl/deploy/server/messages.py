@@ -14,12 +14,12 @@ from rlctl.errors import short_repr
 
 _ARRAY, _SCALAR = b"__ndarray__", b"__npgeneric__"
 _KINDS = "biuf"
-_LONGEST_DTYPE = 8
-_DIMENSIONS = 32
+_MAX_DTYPE_LENGTH = 8
+_MAX_DIMENSIONS = 32
 
 
 class MessageError(ValueError):
-    """Bytes that are not a message; the text says why."""
+    """The bytes are not a valid message; the text gives the reason."""
 
 
 def pack(value: Any) -> bytes:
@@ -37,7 +37,7 @@ def _encode(value: Any) -> Any:
 
 
 def unpack(content: bytes) -> Any:
-    """Return what a message says; raises `MessageError` for what is not one, or has a key twice or another dtype."""
+    """Decode a message. Raises `MessageError` for invalid msgpack, a repeated key, or an unsupported dtype."""
     try:
         return msgpack.unpackb(content, object_pairs_hook=_decode, strict_map_key=True)
     except MessageError:
@@ -59,26 +59,28 @@ def _decode_array(content: dict[Any, Any]) -> Any:
     dtype, shape, data = _check_dtype(content.get(b"dtype")), content.get(b"shape"), content.get(b"data")
     if (
         not isinstance(shape, list)
-        or len(shape) > _DIMENSIONS
+        or len(shape) > _MAX_DIMENSIONS
         or not all(type(size) is int and size >= 0 for size in shape)
     ):
-        raise MessageError(f"an array of shape {short_repr(shape)}")
+        raise MessageError(f"invalid array shape {short_repr(shape)}")
     if not isinstance(data, bytes) or len(data) != math.prod(shape) * dtype.itemsize:
-        raise MessageError(f"an array of shape {short_repr(shape)} and {dtype} is not as large as its data")
+        raise MessageError(
+            f"the data of an array has another size than shape {short_repr(shape)} and dtype {dtype} need"
+        )
     return np.frombuffer(data, dtype).reshape(shape)
 
 
 def _check_dtype(text: Any) -> np.dtype[Any]:
     try:
-        if isinstance(text, str) and len(text) <= _LONGEST_DTYPE and (dtype := np.dtype(text)).kind in _KINDS:
+        if isinstance(text, str) and len(text) <= _MAX_DTYPE_LENGTH and (dtype := np.dtype(text)).kind in _KINDS:
             return dtype
     except (TypeError, ValueError):
         pass
-    raise MessageError(f"an array of dtype {short_repr(text)}; numbers and truth values are read, no V, O or c")
+    raise MessageError(f"unsupported array dtype {short_repr(text)}; supported are bool, int, uint and float")
 
 
 def parse_json(content: bytes) -> Any:
-    """Return what JSON says; raises `MessageError` for what is not JSON, or has a key twice."""
+    """Decode JSON. Raises `MessageError` for invalid JSON or a repeated key."""
     try:
         return json.loads(content, object_pairs_hook=_join)
     except MessageError:
@@ -91,11 +93,11 @@ def _join(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
     content = dict(pairs)
     if len(content) != len(pairs):
         names = [name for name, _ in pairs]
-        doubled = next(name for name in names if names.count(name) > 1)
-        raise MessageError(f"doubled: {short_repr(doubled)} is given twice")
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise MessageError(f"key {short_repr(repeated)} is given twice")
     return content
 
 
 def as_json(value: Any) -> Any:
-    """Return plain data in which arrays are lists, and numbers that are not finite None."""
+    """Return plain data for JSON: arrays become lists, non-finite numbers None."""
     return to_jsonable_python(value, inf_nan_mode="null", fallback=lambda array: array.tolist())

@@ -1,4 +1,4 @@
-"""What a server is asked for: the options of `rlctl serve` as data. Imports nothing heavy."""
+"""The options of `rlctl serve` as data. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ class ServeRequest:
     """The options of `rlctl serve` that are about the server; paths are of files."""
 
     host: Annotated[str, Option("Address to listen on; others than loopback need a key.")] = "127.0.0.1"
-    port: Annotated[int, Option("Port to listen on; 0: any that is free.", min=0, max=65535)] = 8000
+    port: Annotated[int, Option("Port to listen on; 0: any free port.", min=0, max=65535)] = 8000
     limits: Annotated[Path | None, Option("Safety limits (YAML).", metavar="FILE")] = None
     log: Annotated[Path | None, Option("Log of events, as JSON lines, rotated at 10 MB.", metavar="FILE")] = None
     rerun: Annotated[Path | None, Option("Record actions and observations for Rerun (.rrd).", metavar="FILE")] = None
-    key_file: Annotated[Path | None, Option("Key that clients must send; or RLCTL_API_KEY.", metavar="FILE")] = None
+    key_file: Annotated[
+        Path | None,
+        Option("File with the key that clients must send; default: the variable RLCTL_API_KEY.", metavar="FILE"),
+    ] = None
     max_clients: Annotated[int, Option("Clients that may be connected at once.", min=1)] = 64
     watchdog: bool = True
-    """Whether clients that send nothing are stopped: off for a simulation, which does not keep real time."""
+    """Whether silent clients are stopped: off for a simulation, which does not run in real time."""

@@ -1,4 +1,4 @@
-"""What a server answers over HTTP, and to whom: actions as JSON, orders, another policy, metrics, and the live page."""
+"""The server's HTTP routes: actions as JSON, orders, another policy, metrics, the live page; and the access check."""
 
 from __future__ import annotations
 
@@ -92,18 +92,18 @@ class _Routes:
         return web.json_response({"order": order, "clients": clients})
 
     async def _serve_override(self, request: web.Request) -> web.Response:
-        """Take an action by hand for all clients, `{"action": [...]}`; null gives them back to the policy."""
+        """Override the actions of all clients, `{"action": [...]}`; null ends the override."""
         try:
             content = messages.parse_json(await _read_body(request, 64 * 1024))
             if not isinstance(content, dict) or list(content) != ["action"]:
-                raise ValueError('write {"action": [numbers]}, or null to end it')
+                raise ValueError('send {"action": [numbers]}, or {"action": null} to end the override')
             self.server.override(content["action"])
         except (ValueError, TypeError) as error:
             return _refuse(400, str(error))
         return web.json_response({"overridden": content["action"] is not None})
 
     async def _serve_policy(self, request: web.Request) -> web.Response:
-        """Take another policy, whose file is the body."""
+        """Replace the policy by the file in the body."""
         content = await _read_body(request, _LARGEST_POLICY)
         name = Path(request.query.get("name", "")).name
         # The format of safetensors begins with the length of its header, in JSON.
@@ -167,11 +167,11 @@ def _find_problem(request: web.Request, is_local: bool, key: str | None) -> tupl
         name, page_host = urlsplit(f"//{host}").hostname, urlsplit(origin or "").netloc
     except ValueError:  # `[::1`
         return 400, "Host or Origin is not an address"
-    # A name that somebody lets point to this machine would open it to the pages of that name.
+    # Another site's domain can resolve to this machine (DNS rebinding); its pages could then send requests.
     if is_local and name not in LOOPBACK:
         return 403, "this server answers to localhost only"
     if origin is not None and page_host != host:
-        return 403, "requests of other sites are refused"
+        return 403, "requests from other sites are refused"
     page = request.path == "/" and request.headers.get("Upgrade", "").lower() != "websocket"
     if key is None or request.path == "/healthz" or page:
         return None

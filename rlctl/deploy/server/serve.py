@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def make_server(file: Path, request: ServeRequest) -> PolicyServer:
-    """Load a policy and make its server; raises `RlctlError` for whatever would be wrong with it."""
+    """Load a policy and make its server. Raises `RlctlError` for an invalid policy, limits file, key or option."""
     try:
         import uvloop  # noqa: F401
 
@@ -50,12 +50,12 @@ def _read_key(file: Path | None) -> str | None:
     except (OSError, UnicodeDecodeError) as error:
         raise ArtifactError(f"{file}: the key cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if not key or not key.isprintable():
-        raise UsageError(f"--key-file {file}: a key is a line of text, this file has none")
+        raise UsageError(f"--key-file {file}: the file contains no key; write the key as one line of text")
     return key
 
 
 def run_server(server: PolicyServer, on_start: Callable[[str], None]) -> None:
-    """Serve until SIGINT or SIGTERM; SIGHUP reads the policy file again. `on_start` is given the address."""
+    """Serve until SIGINT or SIGTERM; SIGHUP reads the policy file again. Calls `on_start` with the address."""
     with asyncio.Runner(loop_factory=make_loop) as runner:
         runner.run(serve_until(server, on_start, asyncio.Event(), handle_signals=True))
 

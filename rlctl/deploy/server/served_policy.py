@@ -1,4 +1,4 @@
-"""Policy files as a server uses them: loaded and tried once, acting for many clients, each with a state of its own."""
+"""A policy that is loaded once and acts for many clients, each with its own recurrent state."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from rlctl.policy.policy import Policy
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ServedPolicy:
-    """A policy that a server acts with."""
+    """The policy of a server."""
 
     file: Path
     info: PolicyInfo
     make_actor: Callable[[], Policy]
-    """Returns what acts for one client: a recurrent policy remembers."""
+    """Returns the policy of one client, with its own recurrent state."""
     network: Network | None = None
-    """None of an ONNX file, which has nothing but the action."""
+    """None for an ONNX file, which outputs only the action."""
 
     def measure_spread(self, observation: Any) -> float | None:
-        """Return the mean standard deviation of the actions that were trained with; None where there is none."""
+        """Return the mean standard deviation of the stochastic policy's actions; None if the policy has none."""
         network, algo = self.network, self.info.algo
         if network is None or algo in (*DETERMINISTIC, "dqn") or self.info.policy_kwargs.get("use_sde"):
             return None
@@ -40,19 +40,19 @@ class ServedPolicy:
         return float(network.compute_std(network.compute_latent(observation)).mean())
 
     def check_replaces(self, other: EnvInfo) -> None:
-        """Raise `ArtifactError` if this policy cannot take the place of one for another environment."""
+        """Raise `ArtifactError` if this policy cannot replace a policy for the environment `other`."""
         own = self.info.env
         difference = own.find_difference(other, "the served policy's")
         if difference is None and list(own.observation_sizes.items()) != list(other.observation_sizes.items()):
-            difference = "its observation has other names, or another order"
+            difference = "its observation has different names or a different order"
         if difference is None and own.control_dt != other.control_dt:
             difference = f"its control_dt is {own.control_dt} s, the served policy's {other.control_dt} s"
         if difference is not None:
-            raise ArtifactError(f"{self.file.name}: this policy cannot replace the one that is served: {difference}")
+            raise ArtifactError(f"{self.file.name}: this policy cannot replace the served one: {difference}")
 
 
 def load_served_policy(file: Path) -> ServedPolicy:
-    """Load a `.safetensors` or `.onnx` file and act once; raises `ArtifactError` for what is not a sound policy."""
+    """Load a `.safetensors` or `.onnx` file and act once; raises `ArtifactError` for an invalid policy."""
     if file.suffix == ".onnx":
         from rlctl.policy.onnx_policy import OnnxPolicy  # only here: it imports onnxruntime
 

@@ -28,8 +28,8 @@ from rlctl.errors import RlctlError, short_repr
 from rlctl.version import __version__
 
 _HEARTBEAT_S = 30.0
-_AT_ONCE_S = 20e-6
-_SHORTEST_TICK_S = 0.01
+_NO_WAIT_S = 20e-6
+_MIN_TICK_S = 0.01
 
 
 class PolicyServer:
@@ -45,19 +45,19 @@ class PolicyServer:
         self._sessions: dict[int, Session] = {}
         self._earlier_counts: collections.Counter[str] = collections.Counter()
         self._manual: Any | None = None
-        """The action by hand."""
+        """The action of an override; None: the policy acts."""
         self._order: str | None = None
-        """What an operator ordered, for clients that come later too; None: to act."""
+        """The operator's last order, which later clients get too; None: no order."""
         self._limits = limits
         numbers = sum(map(math.prod, ObservationLayout(policy.info.env).shapes.values()))
-        self.largest_message = 64 * numbers + 64 * 1024  # as text, and with names
-        """Size of a request beyond which it is not read [bytes]."""
+        self.largest_message = 64 * numbers + 64 * 1024  # text with names
+        """Largest size of a request [bytes]."""
         self.posting = self._open_session()
         """The session of clients that post."""
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What a client is told first: names, sizes, units and bounds of observations and actions, timing."""
+        """The first message to a client: names, sizes, units and bounds of observations and actions, timing."""
         info = self.policy.info
         layout = self.posting.safety.layout
         return {
@@ -91,7 +91,7 @@ class PolicyServer:
         self._log.write("disconnected", session.number, name=session.safety.state, steps=session.safety.steps)
 
     def count_interventions(self) -> collections.Counter[str]:
-        """Return how often each limit acted and each fault occurred, of all clients so far."""
+        """Return the number of interventions per limit and of faults, over all clients so far."""
         return sum((session.safety.counts for session in self._sessions.values()), self._earlier_counts)
 
     def _write_fault(self, session: Session, name: str, value: float | str, limit: float | None = None) -> None:
@@ -104,14 +104,14 @@ class PolicyServer:
             self._recording.close()
 
     async def write_recording(self) -> None:
-        """Write what was recorded, once a second; runs until it is cancelled."""
+        """Write the recorded rows once per second; runs until cancelled."""
         while self._recording is not None:
             await asyncio.sleep(1.0)
             await asyncio.to_thread(self._recording.flush)
 
     async def check_watchdogs(self) -> None:
-        """Stop clients that no longer send observations; runs until it is cancelled."""
-        period = max(self.posting.safety.control_dt or 1.0, _SHORTEST_TICK_S)
+        """Stop clients that no longer send observations; runs until cancelled."""
+        period = max(self.posting.safety.control_dt or 1.0, _MIN_TICK_S)
         while True:
             await asyncio.sleep(period)
             now = time.monotonic()
@@ -124,7 +124,7 @@ class PolicyServer:
             self.measurements.refused += 1
             return web.Response(
                 status=503,
-                text=f"{self.request.max_clients} clients are connected, which is the most that --max-clients allows\n",
+                text=f"{self.request.max_clients} clients are connected; --max-clients allows no more\n",
             )
         session = self._open_session()
         self.measurements.connections += 1
@@ -136,7 +136,7 @@ class PolicyServer:
             await socket.send_bytes(messages.pack(self.metadata))
             try:
                 await self._answer_all(socket, session)
-            except ConnectionError:  # it died, or read nothing for as long as it may leave a heartbeat unanswered
+            except ConnectionError:  # the client disconnected, or did not answer a heartbeat in time
                 if request.transport is not None:
                     request.transport.abort()
             return socket
@@ -148,11 +148,11 @@ class PolicyServer:
         ready = time.perf_counter()
         async for message in socket:
             begin = time.perf_counter()
-            if begin - ready < _AT_ONCE_S:  # it was waiting, as the messages of a flood are: other clients come first
+            if begin - ready < _NO_WAIT_S:  # the message had already arrived: serve other clients before a flood
                 await asyncio.sleep(0)
             try:
                 if message.type is not aiohttp.WSMsgType.BINARY:
-                    raise messages.MessageError("a text frame; requests are binary frames of msgpack")
+                    raise messages.MessageError("text frame received; send binary frames of msgpack")
                 answer = session.answer(messages.unpack(message.data))
             except messages.MessageError as error:
                 await self._send_error(socket, session, str(error))
@@ -171,7 +171,7 @@ class PolicyServer:
         await socket.send_str(text)
 
     def measure(self, session: Session, answer: dict[str, Any], seconds: float) -> None:
-        """Count an answer that was given after so long."""
+        """Record the duration [s] and the outcome of an answer."""
         measured = self.measurements
         measured.request.add(seconds)
         if (infer_ms := answer["server_timing"]["infer_ms"]) > 0.0:
@@ -197,7 +197,7 @@ class PolicyServer:
     def give_order(self, order: str) -> int:
         """Order all clients, present and future, to stop, home, hold or resume; return how many there are.
 
-        Raises `UsageError` for home where none is known.
+        Raises `UsageError` for home if the limits define none.
         """
         for session in self._sessions.values():
             session.order(order)
@@ -206,9 +206,9 @@ class PolicyServer:
         return len(self._sessions)
 
     def override(self, action: Any | None) -> None:
-        """Give all clients, also later ones, an action by hand; None: the policy acts again.
+        """Override the actions of all present and later clients; None ends the override.
 
-        Raises `ValueError` for what is not an action of this policy.
+        Raises `ValueError` for an invalid action.
         """
         for session in self._sessions.values():
             session.safety.override(action)
@@ -216,9 +216,9 @@ class PolicyServer:
         self._log.write("order", name="policy" if action is None else "override")
 
     async def replace_policy(self, file: Path) -> None:
-        """Act with another policy file from the next step of each client on.
+        """Replace the policy from each client's next step on.
 
-        Raises `RlctlError` for a file that is not a sound policy for the same robot; the old one keeps acting then.
+        Raises `RlctlError` for an invalid policy or one for another robot; the old policy then keeps acting.
         """
         try:
             policy = await asyncio.to_thread(load_served_policy, file)
@@ -242,7 +242,7 @@ class PolicyServer:
                 return
 
     def describe(self) -> dict[str, Any]:
-        """Return what the live page shows."""
+        """Return the content of the live page."""
         measured = self.measurements
         self.measure_spread()
         return {

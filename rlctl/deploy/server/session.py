@@ -15,13 +15,13 @@ from rlctl.deploy.filter.safety_filter import SafetyFilter
 from rlctl.deploy.server.served_policy import ServedPolicy
 from rlctl.errors import RlctlError, short_repr
 
-_LONGEST_AGE_S = 1e9
+_MAX_AGE_S = 1e9
 
 
 class Session:
-    """The episodes of one client, one after the other.
+    """The successive episodes of one client.
 
-    `policy` returns what is to act; a new policy acts from the next step on, blended in.
+    `policy` returns the policy to act with; a new one takes over at the next step, with a blend.
     """
 
     def __init__(self, number: int, policy: Callable[[], ServedPolicy], limits: Limits | None) -> None:
@@ -31,30 +31,30 @@ class Session:
         self._actor = self._served.make_actor()
         self.safety = SafetyFilter(self._served.info.env, limits)
         periods, dt = self.safety.limits.watchdog_periods, self.safety.control_dt
-        self._patience_s = periods * dt if periods and dt else None
+        self._watchdog_s = periods * dt if periods and dt else None
         self._last_s: float | None = None
         self._by_watchdog = False
         self.action: NDArray[Any] | None = None
         """The last action."""
         self.observation: Any = None
-        """The last observation, as the policy takes it."""
+        """The last observation, in the policy's form."""
 
     def check_watchdog(self, now_s: float) -> None:
-        """Stop if no observation came for too long while running; `now_s` is of `time.monotonic`."""
-        if self._patience_s is None or self._last_s is None or self.safety.state != "running":
+        """Stop if no observation arrived for too long while running; `now_s` is a `time.monotonic()`."""
+        if self._watchdog_s is None or self._last_s is None or self.safety.state != "running":
             return
-        if (waited := now_s - self._last_s) > self._patience_s:
+        if (waited := now_s - self._last_s) > self._watchdog_s:
             self._by_watchdog = True
             self.safety.stop(f"watchdog: no observation for {waited:.3g} s; POST /resume, or send reset: true")
 
     def answer(self, request: Any) -> dict[str, Any]:
-        """Return the answer to a request: the action, always within limits, the state, and what was wrong."""
+        """Return the answer to a request: an action within the limits, the state, and any error."""
         now = time.monotonic()
         self.check_watchdog(now)
         self._last_s = now
         self._adopt_policy()
         error = ""
-        wanted = None
+        policy_action = None
         infer_s = 0.0
         try:
             observation, age_s = self._read(request)
@@ -66,11 +66,11 @@ class Session:
             if self.safety.observe(observation, age_s):
                 begin = time.perf_counter()
                 try:
-                    wanted = self._actor.predict(observation)
+                    policy_action = self._actor.predict(observation)
                 except (RlctlError, ValueError, ArithmeticError) as problem:
                     error = f"the policy cannot act: {short_repr(str(problem), 200)}"
                 infer_s = time.perf_counter() - begin
-        self.action = action = self.safety.limit(wanted)
+        self.action = action = self.safety.limit(policy_action)
         answer: dict[str, Any] = {
             "actions": action.reshape(1, -1) if action.ndim < 2 else action[None],
             "server_timing": {"infer_ms": infer_s * 1000.0},
@@ -83,7 +83,7 @@ class Session:
         return answer
 
     def _read(self, request: Any) -> tuple[Any, float]:
-        """Return the observation of a request and its age; begin an episode where it says so."""
+        """Return the observation of a request and its age [s]; reset if it asks for that."""
         if not isinstance(request, dict):
             raise ObservationError("a request is a map: observations by name, or observation: the flat vector")
         fields = dict(request)
@@ -93,12 +93,14 @@ class Session:
         if reset:
             self.reset()
         is_number = isinstance(age_s, int | float | np.number) and not isinstance(age_s, bool)
-        if not is_number or abs(age_s) > _LONGEST_AGE_S:
+        if not is_number or abs(age_s) > _MAX_AGE_S:
             raise ObservationError(f"age_s is {short_repr(age_s)}, not a number of seconds")
         layout = self.safety.layout
         if WHOLE in fields and WHOLE not in layout.shapes:
             if others := [short_repr(name) for name in fields if name != WHOLE]:
-                raise ObservationError(f"doubled: {WHOLE} and {', '.join(others[:8])}; send names or the flat vector")
+                raise ObservationError(
+                    f"{WHOLE} and {', '.join(others[:8])} exclude each other; send names or the flat vector"
+                )
             return layout.read(fields[WHOLE]), float(age_s)
         return layout.read(fields), float(age_s)
 
@@ -117,7 +119,7 @@ class Session:
 
     def order(self, what: str) -> None:
         """Follow an operator: stop, home, hold or resume."""
-        self._by_watchdog = False  # only a person ends what a person ordered
+        self._by_watchdog = False  # only the operator ends an operator's order
         {
             "stop": lambda: self.safety.stop("stopped by hand"),
             "home": lambda: self.safety.home("sent home by hand"),

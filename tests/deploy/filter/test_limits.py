@@ -78,8 +78,8 @@ def test_what_is_wrong_in_a_file(write, text, message):
         (("position: positions", "position: goal"), "measured.position: goal has 3 elements, the action has 2"),
         (("measured: {position: positions}\n", ""), "write measured: {position: NAME}"),
         (("home: [0, 0]", "home: [0]"), "home: 1 numbers, the action has 2 elements"),
-        (("home: [0, 0]", "home: [0, 2]"), "home: it is outside the limits of position"),
-        (("home: [0, 0]", "on_fault: home"), "on_fault: home: write where home is"),
+        (("home: [0, 0]", "home: [0, 2]"), "home: outside the position limits"),
+        (("home: [0, 0]", "on_fault: home"), "on_fault: home: it needs the home position"),
         (("joints: [shoulder, elbow]", "joints: [elbow, elbow]"), "1 different names, the action has 2 elements"),
         (("command: position", "command: torque"), "with command: torque only torque, rate, action can be limited"),
         (("[-1, 1]", "[20, 30]"), "elbow: no action keeps these limits and the policy's own action bounds"),
@@ -132,7 +132,9 @@ def test_a_joint_without_limits_of_its_own(write, arm):
 
 def test_actions_from_minus_1_to_1_need_a_scale(write, arm):
     normalised = arm.model_copy(update={"action_space": space_to_json(spaces.Box(-1, 1, (2,)))})
-    with pytest.raises(RecipeError, match=r"^limits: scale: how much torque is 1 of the action\? "):
+    with pytest.raises(
+        RecipeError, match=r"^limits: scale: required when actions range from -1 to 1; .* the torque of action 1 "
+    ):
         SafetyFilter(normalised, write("command: torque\nlimits: {all: {torque: 8}}"))  # 1 of it may be 10 N m
     safety = SafetyFilter(normalised, write("command: torque\nscale: 10\nlimits: {all: {torque: 8}}"))
     safety.observe(observe_at(0, 0))

@@ -179,7 +179,7 @@ def test_a_hand_takes_over_gradually_and_within_limits(arm):
     assert [run_filter(safety, REST, [0.5, 0.5])[0] for _ in range(2)] == pytest.approx([0.75, 0.5])
     with pytest.raises(ValueError, match="2 finite numbers"):
         safety.override([1.0])
-    with pytest.raises(UsageError, match="there is no home"):
+    with pytest.raises(UsageError, match="the limits define no home"):
         safety.home()
 
 

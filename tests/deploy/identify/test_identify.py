@@ -75,7 +75,7 @@ def test_trajectory_stays_in_the_limits(excitation):
 
 
 def test_trajectories_that_cannot_be(tmp_path, monkeypatch):
-    with pytest.raises(UsageError, match=r"--seconds 0\.3: 15 actions of .*; a log has 20 or more"):
+    with pytest.raises(UsageError, match=r"--seconds 0\.3: 15 actions of .*; a log needs at least 20"):
         write_excitation(SPEC, tmp_path / "log.csv", seconds=0.3, seed=0)
     monkeypatch.setattr(registry.load(ARM), "action_space", Box(-np.inf, np.inf, (2,), np.float32))
     with pytest.raises(UsageError, match="its actions have no bounds"):
@@ -136,7 +136,7 @@ def test_a_log_that_tells_nothing_is_told_so(real, tmp_path):
     ("task", "events", "message"),
     [
         (ARM, ["mas"], r"no event 'mas'\. Did you mean 'mass'\?"),
-        (ARM, ["noise"], "noise is not a physical value that holds for an episode"),
+        (ARM, ["noise"], "noise has no physical value that holds for an episode"),
         ("quadruped", [], "the base of 'robot' is free"),
         ("Pendulum-v1", [], "plain Gymnasium environment"),
     ],
@@ -187,13 +187,13 @@ def slow_down(rows):
     ("change", "message"),
     [
         (remove_rows, r"line 11: a gap of 0\.12 s"),
-        (turn_back, r"line 11: time does not go forward: 0\.16 s, then 0\.001 s"),
+        (turn_back, r"line 11: time does not increase: 0\.16 s, then 0\.001 s"),
         (write_degrees, r"position_shoulder reaches .*is that degrees\? Multiply by pi / 180"),
         (drop_column, "no column 'velocity_shoulder'"),
         (rename_joint, r"no joint 'sholder'\. Did you mean 'shoulder'\?|no column 'position_shoulder'"),
         (write_text, "line 8: position_elbow is 'off', not a finite number"),
         (slow_down, r"a row every 0\.002 s, but the task acts every 0\.02 s"),
-        (lambda rows: rows.__delitem__(slice(5, None)), "4 rows; a recording of a few seconds"),
+        (lambda rows: rows.__delitem__(slice(5, None)), "4 rows; a log needs at least 20"),
         (lambda rows: rows.__delitem__(0), "its first line must name the columns"),
         (lambda rows: rows[3].pop(), "line 4: 6 values for 7 columns"),
     ],

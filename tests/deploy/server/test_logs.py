@@ -25,7 +25,7 @@ def test_what_repeats_is_counted(tmp_path):
 
 
 def test_files_are_rotated(tmp_path):
-    log = EventLog(tmp_path / "log.jsonl", largest=2000)
+    log = EventLog(tmp_path / "log.jsonl", max_file_size=2000)
     for number in range(500):
         log.write("state", number, name="running")
     log.close()

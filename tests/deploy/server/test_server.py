@@ -60,7 +60,10 @@ def test_the_protocol(serve):
     [
         ({"positions": [0, 0]}, "observation names missing: goal"),
         ({**OBSERVATION, "gaol": 1}, "observation names unknown: gaol (Did you mean 'goal'?)"),
-        ({**OBSERVATION, "observation": FLAT}, "doubled: observation and positions, goal; send names or the flat"),
+        (
+            {**OBSERVATION, "observation": FLAT},
+            "observation and positions, goal exclude each other; send names or the flat",
+        ),
         ({"observation": FLAT[:3]}, "observation 'observation' has shape (3,), the policy takes (5,)"),
         ({**OBSERVATION, "goal": "near"}, "observation 'goal' is <U4, not numbers"),
         ({**OBSERVATION, "goal": [[1], [2, 3]]}, "observation 'goal' is not an array of numbers"),
@@ -89,12 +92,12 @@ def pack_array(dtype="<f8", shape=(1,)):
     [
         (b"\xc1", "not msgpack"),
         (b"", "not msgpack"),
-        (b"\x82\xa1a\x01\xa1a\x02", "doubled: a is given twice"),
-        (pack_array("|O"), "an array of dtype |O"),
-        (pack_array("|V8"), "an array of dtype |V8"),
-        (pack_array("<c8"), "an array of dtype <c8"),
-        (pack_array(shape=[2**60]), "is not as large as its data"),
-        (pack_array(shape=[-1]), "an array of shape [-1]"),
+        (b"\x82\xa1a\x01\xa1a\x02", "key a is given twice"),
+        (pack_array("|O"), "unsupported array dtype |O"),
+        (pack_array("|V8"), "unsupported array dtype |V8"),
+        (pack_array("<c8"), "unsupported array dtype <c8"),
+        (pack_array(shape=[2**60]), "the data of an array has another size than shape "),
+        (pack_array(shape=[-1]), "invalid array shape [-1]"),
     ],
 )
 def test_what_is_not_a_message_gets_a_text_frame(serve, content, error):
@@ -110,7 +113,7 @@ def test_json_for_curl(serve):
     status, text = server.post("/act", OBSERVATION)
     assert (status, json.loads(text)["actions"]) == (200, [[6.0, 1.0]])
     status, text = server.post("/act", b'{"goal": [1, 2, 3], "goal": [1, 2, 3]}')
-    assert (status, json.loads(text)["error"]) == (400, "doubled: goal is given twice")
+    assert (status, json.loads(text)["error"]) == (400, "key goal is given twice")
     status, text = server.post("/act", {"goal": [1, 2, float("nan")], "positions": [0, 0]})
     assert (status, json.loads(text)["state"], json.loads(text)["reason"]) == (200, "holding", "finite goal[2]")
     assert server.post("/act", b"{")[0] == 400
@@ -216,7 +219,7 @@ def test_orders_are_for_all_clients_also_later_ones(serve):
 
 def test_actions_by_hand(serve):
     server = serve()
-    assert json.loads(server.post("/home")[1])["error"].startswith("there is no home")
+    assert json.loads(server.post("/home")[1])["error"].startswith("the limits define no home")
     with server.client() as client:
         client.act(OBSERVATION)
         assert server.post("/override", {"action": [1, -1]})[0] == 200
@@ -256,7 +259,7 @@ def test_another_policy_without_a_gap(serve, tmp_path):
         end.set()
         thread.join()
     assert [code for code, _ in refused] == [422, 422, 422]
-    assert "names, or another order" in refused[2][1]
+    assert "different names or a different order" in refused[2][1]
     assert (status, json.loads(text)["policy"]) == (200, "other.safetensors")
     changes = [index for index in range(1, len(seen)) if seen[index] != seen[index - 1]]
     assert len(changes) == 1  # never a mixture, and never back
