@@ -1,4 +1,4 @@
-"""The verbs from Python: `rlctl.check_env`, `train`, `evaluate` and `load_policy`."""
+"""The Python API: `rlctl.check_env`, `train`, `evaluate` and `load_policy`."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def check_env(
     env_timeout_s: float = 10.0,
     **parameters: Any,
 ) -> list[RuleFinding]:
-    """Check an environment as `rlctl check-env` does, in processes of its own, and return the findings, worst first.
+    """Check an environment as `rlctl check-env` does, in child processes, and return the findings, worst first.
 
-    Keywords are parameters of the task. `select` and `ignore` are beginnings of rule ids: `ignore=["RL5"]`. A finding
+    Keywords are parameters of the task. `select` and `ignore` are prefixes of rule ids: `ignore=["RL5"]`. A finding
     has `rule`, `severity` ("error", "warning", "info"), `message`, `fix` and `evidence`; `str(finding)` is one line.
-    Raises `UsageError` for a task or a parameter that does not exist, and `TaskError` where no instance can be built
-    and `select` leaves out the rules that say why.
+    Raises `UsageError` for an unknown task or parameter, and `TaskError` if no instance can be built and `select`
+    excludes the rules that explain why.
     """
     from rlctl.checking.check import check
     from rlctl.checking.finding import choose_rules
@@ -42,7 +42,7 @@ def check_env(
         names, details = ", ".join(report.verdict.crashed), "\n".join(report.verdict.crashed.values())
         raise RlctlError(f"check_env: a bug in rlctl: {names} crashed on {task}; please report it", details=details)
     if report.records.built is None and not report.verdict.findings:
-        raise TaskError(f"{task}: no instance could be built, so nothing was judged; rlctl check-env {task} says why")
+        raise TaskError(f"{task}: no instance could be built, so nothing was checked; rlctl check-env {task} shows why")
     return sorted(report.verdict.findings, key=lambda finding: (finding.severity.rank, finding.rule))
 
 
@@ -57,11 +57,12 @@ def train(
     initial_policy: str | os.PathLike[str] | None = None,
     **recipe: Any,
 ) -> TrainResult:
-    """Train as `rlctl train` does, and return what was reached; `load_policy` and `evaluate` take its `run`.
+    """Train as `rlctl train` does; `load_policy` and `evaluate` accept the result's `run`.
 
-    Keywords are the keys of a recipe, `docs/recipe.md`: `train("reach", seed=1, algo_kwargs={"gamma": 0.97})`. They go
-    over `config`, a recipe file. `initial_policy` is a run, a policy file or a task's name, as `--from` takes it. Call
-    it from a script's `if __name__ == "__main__":`, which processes may import. Raises what `rlctl.errors` has.
+    Keywords are the keys of a recipe (`docs/recipe.md`): `train("reach", seed=1, algo_kwargs={"gamma": 0.97})`. They
+    override those of `config`, a recipe file. `initial_policy` is a run, a policy file or a task's name, like `--from`.
+    In a script, call it below `if __name__ == "__main__":`, because worker processes may import the script. Raises the
+    exceptions of `rlctl.errors`.
     """
     from rlctl.run.train_request import TrainRequest
     from rlctl.training.request import run_training
@@ -90,12 +91,11 @@ def evaluate(
     deterministic: bool = True,
     **recipe: Any,
 ) -> Evaluation:
-    """Evaluate as `rlctl eval` does, and return the numbers with every episode.
+    """Evaluate as `rlctl eval` does, and return the statistics and every episode.
 
-    `run` is a run's folder, a policy file, a task's name or None for the latest run; `task` a task to evaluate on
-    instead of the one it was trained on; `parameters` are those of its constructor. Further keywords are the other
-    keys of a recipe that are about the environment: `reward_weights`, `randomize`, `events`.
-    `pandas.DataFrame(result.episodes)` is a table of the episodes.
+    `run` is a run's folder, a policy file, a task's name, or None for the latest run. `task` replaces the task of the
+    training, and `parameters` are changes of the task's parameters. The other keywords are the recipe's keys for the
+    environment: `reward_weights`, `randomize`, `events`. `pandas.DataFrame(result.episodes)` is a table of them.
     """
     from rlctl.errors import UsageError
     from rlctl.evaluation.evaluate import Gates, run_evaluation
@@ -103,9 +103,11 @@ def evaluate(
     from rlctl.recipe.sources import check_changes
 
     if task is not None and not isinstance(task, str):
-        raise UsageError(f"evaluate: task is the name of a task, got {task!r}; its parameters are parameters={{...}}")
+        raise UsageError(
+            f"evaluate: task must be the name of a task, got {task!r}; pass its parameters as parameters={{...}}"
+        )
     if episodes < 1 or seed < 0:
-        raise UsageError(f"evaluate: episodes={episodes}, seed={seed}: one episode or more, and a seed from 0 on")
+        raise UsageError(f"evaluate: episodes={episodes}, seed={seed}: episodes must be 1 or more, seed 0 or more")
     request = EvalRequest(
         run=None if run is None else os.fspath(run),
         task=task,
@@ -121,9 +123,8 @@ def evaluate(
 def load_policy(path: str | os.PathLike[str], /) -> Policy:
     """Load a `.safetensors` file, an exported `.onnx` file, or the best policy of a run's folder; without torch.
 
-    `load_policy(path).predict(observation)` returns the action. `path` may be an address, `hf://ORG/NAME`. The name
-    of an installed task, `load_policy("ant")`, loads the policy that ships with it, never that of a run. Raises
-    `ArtifactError` for a file that is not a policy.
+    `load_policy(path).predict(observation)` returns the action. The name of an installed task, `load_policy("ant")`,
+    means the policy that ships with the task, never that of a run. Raises `ArtifactError` if it is not a policy.
     """
     from rlctl.environments import installed
     from rlctl.hub import store

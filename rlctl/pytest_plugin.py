@@ -1,4 +1,4 @@
-"""A pytest plugin: `check_env(task)` in a test fails with what `rlctl check-env` finds. Imports pytest alone.
+"""A pytest plugin: `check_env(task)` fails a test with the findings of `rlctl check-env`. It imports pytest only.
 
 def test_my_robot(check_env):
     check_env("my_robots.arm:Arm", ignore=["RL106"])
@@ -26,7 +26,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Give a marked test the tasks of the distributions."""
+    """Parametrize a marked test with the tasks of its distributions."""
     names = [name for marker in metafunc.definition.iter_markers("rlctl_tasks") for name in marker.args]
     if not names:
         return
@@ -34,7 +34,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
     tasks = [entry.name for entry in installed.list_installed() if entry.distribution in names]
     if not tasks:
-        raise pytest.UsageError(f"rlctl_tasks: {', '.join(map(str, names))} installs no task; see `rlctl tasks`")
+        raise pytest.UsageError(
+            f"rlctl_tasks: {', '.join(map(str, names))} installs no tasks; `rlctl tasks` lists the installed ones"
+        )
     metafunc.parametrize("task", tasks)
 
 
@@ -57,7 +59,10 @@ def check_env() -> CheckEnv:
         failures = [finding for finding in findings if finding.severity in wrong]
         if failures:
             lines = [f"{finding}\n  fix: {finding.fix}" for finding in failures]
-            explain = f"rlctl check-env --explain {failures[0].rule} says more"
-            pytest.fail("\n".join([f"{task}: {len(failures)} of rlctl's rules broken", *lines, explain]), pytrace=False)
+            explain = f"rlctl check-env --explain {failures[0].rule} explains the rule"
+            pytest.fail(
+                "\n".join([f"{task}: {len(failures)} finding{'' if len(failures) == 1 else 's'}", *lines, explain]),
+                pytrace=False,
+            )
 
     return check

@@ -66,7 +66,7 @@ def test_check_env_returns_findings(write_module):
 
 
 def test_a_policy_is_evaluated_on_another_task():
-    with pytest.raises(UsageError, match=r"^evaluate: task is the name of a task, got {'tolerance': 0.1}; "):
+    with pytest.raises(UsageError, match=r"^evaluate: task must be the name of a task, got {'tolerance': 0.1}; "):
         rlctl.evaluate("reach", task={"tolerance": 0.1})
     easy = rlctl.evaluate("reach", checkpoint="pretrained", episodes=2, parameters={"tolerance": 0.2})
     assert easy.spec.parameters["tolerance"] == 0.2

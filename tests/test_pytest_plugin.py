@@ -55,7 +55,7 @@ def test_findings_fail_a_test(robots):
         """,
     )
     result.assert_outcomes(passed=1, failed=2)
-    result.stdout.fnmatch_lines(["*robots.py:NotFinite: 1 of rlctl's rules broken", "*RL601*", "*fix: *"])
+    result.stdout.fnmatch_lines(["*robots.py:NotFinite: 1 finding", "*RL601*", "*fix: *"])
     result.stdout.fnmatch_lines(["*no instance could be built*"])
 
 
@@ -83,4 +83,4 @@ def test_a_distribution_without_tasks(pytester):
         def test_names(task): ...
         """,
     )
-    result.stdout.fnmatch_lines(["*rlctl_tasks: numpy installs no task; see `rlctl tasks`"])
+    result.stdout.fnmatch_lines(["*rlctl_tasks: numpy installs no tasks; `rlctl tasks` lists the installed ones"])

@@ -1,6 +1,6 @@
-"""The command line: a module per command parses, calls one function and prints.
+"""The command line. A module per command parses the arguments, calls one function and prints the result.
 
-What a verb needs is imported inside its command, so that help, lists and completion load nothing heavy.
+Each command imports what it needs when it runs, so that help, lists and completion start fast.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
 
 
 def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
-    """Return the command line with some of the commands."""
+    """Return the Typer app with the named commands."""
     app = typer.Typer(
         name="rlctl",
         help="Robot learning in simulation, end to end: check an environment, train, evaluate, export, replay.",
@@ -57,7 +57,7 @@ def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
         pretty_exceptions_enable=False,
         context_settings={
             "help_option_names": ["-h", "--help"],
-            # Typer hands over names without their dashes in front.
+            # Typer passes names without the leading dashes.
             "token_normalize_func": lambda name: {"num-envs": "n-envs"}.get(
                 name.replace("_", "-"), name.replace("_", "-")
             ),
@@ -87,17 +87,17 @@ def run(arguments: list[str]) -> int:
 
 
 def _call(arguments: list[str]) -> int:
-    # Typer reads the options of every command it is given, which takes longer than most commands need to begin.
+    # Typer inspects the options of every command, which takes longer than most commands need to start.
     app = build_app(arguments[:1] if arguments and arguments[0] in COMMANDS else COMMANDS)
     try:
         code = app(arguments, standalone_mode=False)
-    except typer.Abort:  # at a question
+    except typer.Abort:  # the user cancelled a question
         raise KeyboardInterrupt from None
     except Exception as error:
         option = getattr(error, "option_name", None)  # of Typer's error for an option that does not exist
         if option is not None and arguments[0] in ("train", "tune") and (setting := suggest_setting(option)):
-            raise UsageError(f"no option {option}; it is a key of the recipe: {setting}VALUE") from None
+            raise UsageError(f"no option {option}; set the recipe's key instead: {setting}VALUE") from None
         raise
     if code == error_boundary.INTERRUPTED:
-        raise KeyboardInterrupt  # which Typer has caught
+        raise KeyboardInterrupt  # Typer has caught it
     return code if isinstance(code, int) else 0

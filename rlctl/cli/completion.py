@@ -1,4 +1,4 @@
-"""What the shell offers after TAB: tasks, algorithms, runs. Imports no plugin and no library."""
+"""Shell completion of tasks, algorithms and runs. Imports no plugin and no library."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ _MOST = 50
 
 
 def complete_task(incomplete: str) -> list[str]:
-    """Return the installed tasks that begin so, and the Python files here."""
-    from rlctl.environments import installed  # only here: every command's help imports this module
+    """Return the installed tasks and the Python files here that begin with `incomplete`."""
+    from rlctl.environments import installed  # here, because the help of every command imports this module
 
     names = [entry.name for entry in installed.list_installed() if entry.problem is None]
     return [name for name in (*dict.fromkeys(names), *_list_paths(incomplete, "*.py")) if name.startswith(incomplete)]
 
 
 def complete_algorithm(incomplete: str) -> list[str]:
-    """Return the algorithms that begin so."""
+    """Return the algorithms that begin with `incomplete`."""
     known = ("ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo")
     return [name for name in known if name.startswith(incomplete)]
 
 
 def complete_run(incomplete: str) -> list[str]:
-    """Return `latest`, the tasks with a run, the runs, newest first, and policy files here."""
+    """Return `latest`, tasks with runs, runs (newest first) and policy files here that begin with `incomplete`."""
     runs = sorted((file.parent for file in _RUNS.glob("*/*/run.json")), key=lambda run: run.name, reverse=True)
     tasks = dict.fromkeys(run.parent.name for run in runs)
     latest = ["latest"] if runs else []

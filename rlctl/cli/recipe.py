@@ -1,4 +1,4 @@
-"""`rlctl recipe`: the recipe of a task as it would be trained, and the JSON schema of recipes."""
+"""`rlctl recipe`: the complete recipe of a task, and the JSON schema of recipes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def recipe(
     ] = None,
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of recipes, for editors.")] = False,
 ) -> None:
-    """Print the recipe that a task is trained with, or the JSON schema of recipes."""
+    """Print the complete recipe of a task, or the JSON schema of recipes."""
     claim_stdout()
     from rlctl import output
 
@@ -27,7 +27,7 @@ def recipe(
         output.results().write(render_json_schema())
         return
     if task is None:
-        raise UsageError("give a task, e.g. rlctl recipe reach; --schema needs none")
+        raise UsageError("give a task, such as rlctl recipe reach, or --schema")
     from rlctl.recipe.sources import resolve
 
     output.results().write(resolve(task, None, {}).to_yaml())

@@ -1,4 +1,4 @@
-"""`rlctl tasks` and what comes after it."""
+"""`rlctl tasks`, `rlctl tasks show` and `rlctl tasks new`."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ app = typer.Typer()
 @app.callback(invoke_without_command=True)
 def tasks(
     context: typer.Context,
-    check: Annotated[bool, typer.Option("--check", help="Import each task, in a process of its own.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Import each task in a child process.")] = False,
     json: Json = None,
 ) -> None:
-    """List the installed tasks; show one of them, or begin one of your own."""
+    """List the installed tasks; show one, or create your own."""
     if context.invoked_subcommand is not None:
         if check or json is not None:
-            raise UsageError(f"options of `rlctl tasks {context.invoked_subcommand}` come after its name")
+            raise UsageError(f"put the options after `rlctl tasks {context.invoked_subcommand}`")
         return
     from rlctl.tasks.listing import list_tasks, show
 
@@ -34,7 +34,7 @@ def show_task(
     task: Annotated[str, typer.Argument(metavar="TASK", help=TASK_FORMS, autocompletion=completion.complete_task)],
     json: Json = None,
 ) -> None:
-    """Show what a task observes, does and rewards, what can be set, and how it is trained."""
+    """Show a task's observations, actions, rewards, events, parameters and recipe."""
     claim_stdout()
     from rlctl.tasks.description import describe
     from rlctl.tasks.show import show
@@ -47,7 +47,7 @@ def new_task(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the task: letters, digits, - and _.")],
     json: Json = None,
 ) -> None:
-    """Write a plugin to begin with, in a folder of its name: a task that learns at once, its recipe and tests."""
+    """Create a starter plugin in a folder NAME: a task that trains in seconds, its recipe and tests."""
     from rlctl.tasks.new import create, show
 
     show(create(name), json)

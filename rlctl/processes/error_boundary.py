@@ -1,4 +1,4 @@
-"""From an exception to what the user reads and an exit code; streams that are closed or not UTF-8."""
+"""Turns exceptions into messages and exit codes; handles streams that are closed or not UTF-8."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from rlctl.version import __version__
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 EXIT_S = 10.0
-"""How long exit handlers may take [s]."""
+"""Time limit of exit handlers [s]."""
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "can't allocate memory", "not enough memory")
 
 
 def run(main: Callable[[], int]) -> int:
-    """Return the exit code that `main` returns, or that of the exception that ends it, which is printed."""
+    """Call `main` and return its exit code; print an exception and return the exit code that belongs to it."""
     try:
         code = main()
         flush()
@@ -32,7 +32,7 @@ def run(main: Callable[[], int]) -> int:
         close_stdout()
         return 141
     except SystemExit as end:
-        if isinstance(end.__context__, BrokenPipeError):  # what Typer and Rich make of it
+        if isinstance(end.__context__, BrokenPipeError):  # Typer and Rich convert it
             close_stdout()
             return 141
         raise
@@ -41,7 +41,7 @@ def run(main: Callable[[], int]) -> int:
 
 
 def prepare_streams() -> None:
-    """Make sure that there is a stderr, and that no text fails because a stream has another encoding than UTF-8."""
+    """Open a stderr if there is none; let streams that are not UTF-8 replace characters instead of raising."""
     if sys.stderr is None:
         descriptor = os.open(os.devnull, os.O_WRONLY)
         if descriptor != 2:
@@ -49,12 +49,12 @@ def prepare_streams() -> None:
         sys.stderr = os.fdopen(2, "w", encoding="utf-8", errors="replace")
     for stream in (sys.stdout, sys.stderr):
         if stream is not None and not (stream.encoding or "").lower().startswith("utf"):
-            with contextlib.suppress(AttributeError, ValueError):  # a stream of somebody's test
+            with contextlib.suppress(AttributeError, ValueError):  # a replacement of a test
                 stream.reconfigure(errors="replace")  # type: ignore[union-attr]
 
 
 def flush() -> None:
-    """Write what is buffered for stdout; raises `BrokenPipeError` if nobody reads it."""
+    """Flush stdout; raises `BrokenPipeError` if its reader has closed it."""
     from rlctl import output
 
     if sys.stdout is not None and not sys.stdout.closed:  # a plugin may have closed it
@@ -64,7 +64,7 @@ def flush() -> None:
 
 
 def close_stdout() -> None:
-    """Discard what is buffered for a stdout that was closed: it must not raise when the interpreter ends."""
+    """Discard the buffer of a closed stdout, so that the interpreter does not raise when it exits."""
     from rlctl import output
 
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -74,21 +74,21 @@ def close_stdout() -> None:
 
 
 def limit_exit_handlers(code: int) -> None:
-    """End the process with `code` after `EXIT_S`, whatever an exit handler of a plugin or a library still does."""
+    """End the process with `code` after `EXIT_S`, even if exit handlers of plugins or libraries still run."""
     import threading
 
     def leave() -> None:
-        print(f"warning: an exit handler did not end within {EXIT_S:g} s; leaving without it", file=sys.stderr)
+        print(f"warning: an exit handler did not finish within {EXIT_S:g} s; exiting without it", file=sys.stderr)
         sys.stderr.flush()
         os._exit(code)
 
     timer = threading.Timer(EXIT_S, leave)
-    timer.daemon = True  # Python waits for other threads before it calls the handlers
+    timer.daemon = True  # Python joins other threads before the exit handlers run
     timer.start()
 
 
 def report(error: RlctlError) -> int:
-    """Print one of our own errors; return its exit code."""
+    """Print an error of rlctl; return its exit code."""
     from rlctl.output import escape_controls
 
     if error.details:
@@ -99,7 +99,7 @@ def report(error: RlctlError) -> int:
 
 
 def report_unexpected(error: Exception) -> int:
-    """Print an exception that no part of rlctl has explained; return the exit code."""
+    """Print any other exception; return the exit code."""
     usage, show = getattr(error, "exit_code", None), getattr(error, "show", None)
     if usage is not None and show is not None:  # Typer's own usage errors
         show()
@@ -121,7 +121,7 @@ def report_unexpected(error: Exception) -> int:
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:
-    """Say whether memory was refused: by Python, by the loader of libraries, or by torch."""
+    """Return whether an allocation failed: in Python, the library loader, or torch."""
     while error is not None:
         text = str(error).lower()
         refused = isinstance(error, ImportError | OSError | RuntimeError) and any(words in text for words in _NO_MEMORY)

@@ -1,4 +1,4 @@
-"""What a task is, read off its class, one instance of its environment, and its recipe."""
+"""Describes a task from its class, one instance of its environment, and its recipe."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """Everything that is known of a task."""
+    """Everything known about a task."""
 
     content: dict[str, Any]
-    """What is written as JSON: plain data."""
+    """The JSON output, as plain data."""
     recipe: recipes.Recipe
     policy: PolicyInfo | None
-    """Of the policy that ships with it."""
+    """Metadata of the policy that ships with the task."""
 
 
 def describe(task: str) -> Description:
-    """Describe what `task` names, with the parameters of its recipe; its environment is built and closed.
+    """Describe a task with the parameters of its recipe; its environment is built and closed.
 
     Raises `UsageError` for an unknown name, `TaskError` for a task that cannot be built.
     """
     constructor: Any = registry.load(task)
     recipe = sources.resolve_packaged(task)
-    # The last stage is what is wanted. The parts of stacked observations have no names.
+    # The last stage is the full task. Parts of stacked observations have no names.
     spec = dataclasses.replace(recipe.env_specs(task)[-1], frame_stack=1, time_feature=False)
     env = spec.make()
-    # Guarded: attributes of an environment are a plugin's code too.
+    # Reading attributes of an environment also runs the plugin's code.
     try:
         about = call_plugin(task, lambda: _describe_env(task, constructor, env))
     except TaskError:
@@ -72,7 +72,7 @@ def describe(task: str) -> Description:
 
 
 def _convert(value: Any) -> Any:
-    """Return what stands for a value that JSON does not have: an array's numbers, a function's name."""
+    """Return the JSON form of an array (its numbers) or a function (its name)."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else getattr(value, "__name__", repr(value))
 
 
@@ -87,7 +87,7 @@ def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> 
     target = f"{cls.__module__}:{cls.__qualname__}"
     distribution, version = _find_origin(task, target)
     model, simulated = describe_model(env), find_mujoco(env)
-    # Gymnasium's constructor of an id takes anything; the class behind it does not.
+    # Gymnasium's constructor of an id accepts any arguments; the class itself does not.
     called = cls if task_env or hasattr(constructor, "gymnasium_id") else constructor
     return {
         "task": task,
@@ -110,7 +110,7 @@ def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> 
 
 
 def _describe_definition(env: TaskEnv) -> dict[str, Any]:
-    """Return what only a `Task` says of itself."""
+    """Return the fields that only a `Task` has."""
     from rlctl.task.inertia import find_inertia_faults
 
     task = env.task
@@ -135,7 +135,7 @@ def _describe_definition(env: TaskEnv) -> dict[str, Any]:
 
 
 def _describe_event(name: str, offered: Event, acting: Event | None) -> dict[str, Any]:
-    event = acting or offered  # with the parameters of the recipe, where it acts
+    event = acting or offered  # `acting` has the parameters of the recipe
     settings: dict[str, Any] = {"every_s": event.every_s} if event.when == "interval" else {}
     if event.when == "observation" and event.of:
         settings = {"of": event.of}
@@ -150,10 +150,7 @@ def _describe_event(name: str, offered: Event, acting: Event | None) -> dict[str
 
 
 def _list_parameters(constructor: Callable[..., Any]) -> list[dict[str, Any]]:
-    """Return the parameters that make a task or an environment, where Python can tell.
-
-    Without `render_mode`, which is not the user's to set.
-    """
+    """Return the parameters of a constructor without `render_mode`; empty if Python cannot inspect it."""
     try:
         found = inspect.signature(constructor).parameters.values()
     except (TypeError, ValueError):  # written in C
@@ -180,7 +177,7 @@ def _find_origin(task: str, target: str) -> tuple[str | None, str | None]:
     )
     if entry is not None:
         return entry.distribution, entry.version
-    if task.rpartition(":")[0].endswith(".py"):  # any package may have a module of that name
+    if task.rpartition(":")[0].endswith(".py"):  # another package may have a module of that name
         return None, None
     names = importlib.metadata.packages_distributions().get(target.partition(":")[0].partition(".")[0])
     return (names[0], importlib.metadata.version(names[0])) if names else (None, None)
@@ -206,7 +203,7 @@ def _format_space(space: Any) -> str:
 
 
 def _list_observations(env: TaskEnv) -> list[dict[str, Any]]:
-    """Return the parts of a task's observation by the names that the task gives them."""
+    """Return the named parts of a task's observation."""
     units = env.task.observation_units
     parts = _list_quantities(env.observation_space)
     if env.task.observation_layout == "flat":
@@ -222,7 +219,7 @@ def _list_quantities(space: Any) -> list[dict[str, Any]]:
 
 
 def _describe_part(name: str, leaf: Leaf, shape: list[int], part: Any = ...) -> dict[str, Any]:
-    """Return a named part of an observation, or an action, with its lowest and highest bound."""
+    """Describe a named part of an observation or action; `low` and `high` are the bounds over its elements."""
     low = None if leaf.low is None or 0 in shape else float(np.min(leaf.low[part]))
     high = None if leaf.high is None or 0 in shape else float(np.max(leaf.high[part]))
     return {

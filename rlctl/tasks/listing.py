@@ -1,4 +1,4 @@
-"""`rlctl tasks`: what is installed, what it does, how well its policy does it, and what is broken."""
+"""`rlctl tasks`: the installed tasks, with summary, score of the shipped policy, and problems."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class ListedTask:
     """First line of the task's docstring."""
     algo: str | None
     success: float | None
-    """Success rate of the shipped policy, as it was measured when it was exported."""
+    """Success rate of the shipped policy, measured at its export."""
     mean_return: float | None
-    """Mean return of the shipped policy, measured on the same episodes."""
+    """Mean return of the shipped policy in the same episodes."""
     problem: str | None
 
 
@@ -66,7 +66,7 @@ def describe_entry(entry: installed.TaskEntry, *, check: bool) -> ListedTask:
 
 
 def read_summary(entry: installed.TaskEntry) -> str:
-    """Read the first line of a task's docstring off its source; to import the task would take seconds."""
+    """Read the first line of a task's docstring from its source; importing the task would take seconds."""
     file = entry.module_file
     return _read_class_summaries(file).get(entry.target.partition(":")[2], "") if file else ""
 
@@ -82,7 +82,7 @@ def _read_class_summaries(file: Path) -> dict[str, str]:
 
 
 def _read_algorithm(entry: installed.TaskEntry) -> str | None:
-    """Read the algorithm off the packaged recipe; the full check of a recipe would cost its imports."""
+    """Read the algorithm from the packaged recipe, without the slow imports of a full check."""
     file = entry.recipe_file
     if file is None:
         return None
@@ -94,7 +94,7 @@ def _read_algorithm(entry: installed.TaskEntry) -> str | None:
 
 
 def _read_score(entry: installed.TaskEntry) -> dict[str, Any]:
-    """Read the measured score off the header of the shipped policy; safetensors' own reader would load NumPy."""
+    """Read the score from the header of the shipped policy; safetensors' own reader would import NumPy."""
     if (path := entry.policy_file) is None:
         return {}
     try:
@@ -104,11 +104,11 @@ def _read_score(entry: installed.TaskEntry) -> dict[str, Any]:
         score = json.loads(header["__metadata__"]["rlctl"])["provenance"]["score"]
         return {name: value for name, value in score.items() if isinstance(value, int | float)}
     except (RlctlError, ValueError, KeyError, TypeError, AttributeError, OSError):
-        return {}  # whoever uses the policy is told what is wrong with it
+        return {}  # loading the policy reports the error
 
 
 def show(listed: list[ListedTask], json: str | None) -> None:
-    """Print the table, or JSON alone for `-`."""
+    """Print the table, or only JSON for `-`."""
     if output.present({"tasks": listed}, json):
         return
     if not listed:

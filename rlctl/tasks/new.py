@@ -1,4 +1,4 @@
-"""`rlctl tasks new`: a plugin to begin with, which passes every check and learns at once."""
+"""`rlctl tasks new`: writes a starter plugin that passes every check and trains in seconds."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rlctl.recipe import json_schema
 from rlctl.storage import files as storage_files
 
 TEMPLATE = Path(__file__).with_name("template")
-"""The files of the plugin, with `$name`, `$package` and `$cls` to be filled in; `package/` takes the package's name."""
+"""Templates of the files. `$name`, `$package` and `$cls` are substituted; `package/` is renamed to the package."""
 _SUFFIX = ".tmpl"
 _NAME = re.compile(r"[A-Za-z](?:[A-Za-z0-9_-]*[A-Za-z0-9])?")
 _TAKEN = {
-    "tests": "the plugin's tests are in a folder of that name",
+    "tests": "the plugin's folder of tests has that name",
     "latest": "`rlctl eval latest` means the newest run",
 }
 
@@ -39,17 +39,17 @@ class NewPlugin:
 
     @property
     def target(self) -> str:
-        """How to name the task without installing it."""
+        """The task's name while it is not installed."""
         return f"{self.folder / self.package / 'task.py'}:{self.cls}"
 
 
 def create(name: str) -> NewPlugin:
-    """Write the plugin `name` into the current folder, whole or not at all; raises `UsageError` for a name in use."""
+    """Write the plugin `name` atomically into the current folder; raises `UsageError` for a name in use."""
     package = name.replace("-", "_").lower()
     _check(name, package)
     folder = Path(name)
     if os.path.lexists(folder):
-        raise UsageError(f"{folder} exists already; choose another name, or go to another folder")
+        raise UsageError(f"{folder} already exists; choose another name or another folder")
     sources = _read_sources()
     cls = _make_class_name(name, "".join(sources.values()))
     content = {
@@ -58,14 +58,14 @@ def create(name: str) -> NewPlugin:
         )
         for path, text in sources.items()
     }
-    # The editor's schema lies next to the recipe: a path into this machine's packages would mean nothing elsewhere.
+    # The recipe's schema is copied next to it, since a path to this machine's packages is wrong on other machines.
     content[Path(package, json_schema.FILE.name)] = json_schema.FILE.read_text(encoding="utf-8")
     write_files(folder, content)
     return NewPlugin(name, folder, package, cls, list(content))
 
 
 def show(plugin: NewPlugin, json: str | None) -> None:
-    """Print what was written and what to type next, or JSON alone for `-`."""
+    """Print the files and the next commands, or only JSON for `-`."""
     from rlctl import output
 
     files = [str(plugin.folder / file) for file in plugin.files]
@@ -75,7 +75,9 @@ def show(plugin: NewPlugin, json: str | None) -> None:
     out = output.out()
     for file in plugin.files:
         out.print(f"wrote {plugin.folder / file}")
-    out.print("A planar arm that brings its tip to a goal. Every CHANGE in task.py marks a place to make it your own.")
+    out.print(
+        "A planar arm moves its tip to a goal. Comments with CHANGE in task.py mark what to replace by your own task."
+    )
     out.print("next:")
     for command in (
         f"rlctl check-env {plugin.target}",
@@ -90,40 +92,38 @@ def _check(name: str, package: str) -> None:
     if not _NAME.fullmatch(name):
         near = re.sub(r"[^A-Za-z0-9_]+", "-", name).strip("-_0123456789")
         raise UsageError(
-            f"name {name!r}: use letters, digits, - and _, with a letter first and no sign last"
+            f"name {name!r}: use letters, digits, - and _; begin with a letter, end with a letter or digit"
             f"{f', such as {near!r}' if _NAME.fullmatch(near) else ''}"
         )
     if entry := installed.find(name):
         raise UsageError(
-            f"a task {name!r} is installed already, by {entry.distribution} {entry.version}; choose another name"
+            f"task {name!r} of {entry.distribution} {entry.version} is already installed; choose another name"
         )
     if reason := _TAKEN.get(package):
         raise UsageError(f"name {name!r}: {reason}; choose another name")
     if keyword.iskeyword(package):
-        raise UsageError(
-            f"name {name!r}: {package} is a word of Python, so no package can have it; choose another name"
-        )
-    # Installing the plugin would hide the module for everything else here.
+        raise UsageError(f"name {name!r}: {package} is a Python keyword; choose another name")
+    # The installed plugin would hide that module.
     spec = importlib.util.find_spec(package)
-    if spec is not None and spec.origin is not None:  # without an origin it is just a folder on the path
-        raise UsageError(f"name {name!r}: there is a module {package!r} already ({spec.origin}); choose another name")
+    if spec is not None and spec.origin is not None:  # without an origin it is only a folder on the path
+        raise UsageError(f"name {name!r}: module {package!r} already exists ({spec.origin}); choose another name")
 
 
 def _read_sources() -> dict[Path, str]:
     files = sorted(TEMPLATE.rglob(f"*{_SUFFIX}"))
     if not files:
-        raise ArtifactError(f"{TEMPLATE}: the template is missing; install rlctl again")
+        raise ArtifactError(f"{TEMPLATE}: the template is missing; reinstall rlctl")
     return {file.relative_to(TEMPLATE).with_suffix(""): file.read_text(encoding="utf-8") for file in files}
 
 
 def _make_class_name(name: str, used: str) -> str:
-    """`my-arm` -> `MyArm`; with `Task` behind it where the template itself uses the word, or Python does."""
+    """`my-arm` -> `MyArm`; `MyArmTask` if the template or Python already uses that word."""
     cls = "".join(part[:1].upper() + part[1:] for part in re.split("[-_]+", name))
     return f"{cls}Task" if keyword.iskeyword(cls) or re.search(rf"\b{cls}\b", used) else cls
 
 
 def write_files(folder: Path, content: dict[Path, str]) -> None:
-    """Write files into a new folder, all or none; raise `OSError` if the folder exists or one cannot be written."""
+    """Write files into a new folder atomically; raises `OSError` if the folder exists or a write fails."""
     beside = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     try:
         with storage_files.name_in_errors(folder):
@@ -131,6 +131,6 @@ def write_files(folder: Path, content: dict[Path, str]) -> None:
                 file = beside / path
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_text(text, encoding="utf-8")
-            beside.rename(folder)  # fails, and removes nothing, if somebody has put files there meanwhile
+            beside.rename(folder)  # fails if the folder now exists and has files
     finally:
         shutil.rmtree(beside, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""What `rlctl tasks show` prints."""
+"""Prints `rlctl tasks show`."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from rlctl.tasks.description import Description
 Row = tuple[str, ...]
 Json = Mapping[str, Any]
 
-_LONGEST_SPACE = 100  # [characters]; JSON has all of it
+_LONGEST_SPACE = 100  # [characters]; the JSON has the full text
 
 
 def show(description: Description, json: str | None) -> None:
-    """Print a description, or JSON alone for `-`."""
+    """Print a description, or only JSON for `-`."""
     content = description.content
     if output.present(content, json):
         return
@@ -41,14 +41,14 @@ def show(description: Description, json: str | None) -> None:
             _print_section("model files", [(fault,) for fault in definition["model_faults"]])
     if recipe.stages:
         _print_section("stages", [_format_stage(number, stage) for number, stage in enumerate(recipe.stages, 1)])
-    _print_section(f"recipe  {content['recipe_file'] or 'none packaged; the defaults'}", ())
+    _print_section(f"recipe  {content['recipe_file'] or 'none packaged; defaults'}", ())
     for line in recipe.to_yaml().splitlines():
         out.print(Text(f"  {line}"))
     _print_section(f"shipped policy  {content['policy_file'] or 'none'}", _list_scores(description.policy))
 
 
 def _list_scores(info: PolicyInfo | None) -> list[Row]:
-    """Return the measured scores: of the shipped policy, of zero and of random actions."""
+    """Return the measured scores of the shipped policy, of zero actions and of random actions."""
     if info is None:
         return []
     steps = f"{info.algo}, {info.training_steps:,} steps"
@@ -81,7 +81,7 @@ def _list_facts(content: Json) -> list[Row]:
         facts.append(("file", content["file"]))
     definition, steps = content["definition"], content["max_steps"]
     if definition is None:
-        limit = f"truncated after {steps:,} steps" if steps else "no time limit that Gymnasium knows of"
+        limit = f"truncated after {steps:,} steps" if steps else "no known time limit"
         model = [("mass", f"{content['mass']:.4g} kg")] if content["mass"] is not None else []
         control = [("control", f"{content['control_dt']:.6g} s per action")] if content["control_dt"] else []
         return [*facts, *model, *control, ("episode", limit)]
@@ -97,7 +97,7 @@ def _list_facts(content: Json) -> list[Row]:
 
 
 def _shorten(space: str) -> str:
-    """Leave out the bounds of a large space, or the parts, which the rows below it have."""
+    """Leave out the bounds or parts of a large space; the rows below show them."""
     return space if len(space) <= _LONGEST_SPACE else f"{space.partition('(')[0]}(...)"
 
 
@@ -110,7 +110,7 @@ def _list_quantities(quantities: list[Json]) -> list[Row]:
             _format_bounds(quantity["low"], quantity["high"]),
         )
         for quantity in quantities
-        if quantity["name"]  # without one it is the whole space, which the title has
+        if quantity["name"]  # an unnamed part is the whole space, which is in the title
     ]
 
 
@@ -176,11 +176,11 @@ def _format_event(event: Json) -> Row:
 def _format_stage(number: int, stage: Stage) -> Row:
     rule = stage.promote.model_dump(by_alias=True, exclude_none=True, exclude_defaults=True) if stage.promote else {}
     until = ", ".join(f"{name} {_format_value(value)}" for name, value in rule.items())
-    return str(number), str(stage), f"until {until}" if until else "the last, which is evaluated"
+    return str(number), str(stage), f"until {until}" if until else "last stage, used for evaluation"
 
 
 def _format_range(value: Any) -> str:
-    """Write what an event draws from: `0.8..1.2`, or `0.9..1.1 -> 0.8..1.2` for a range that widens."""
+    """Format an event's range: `0.8..1.2`, or `0.9..1.1 -> 0.8..1.2` if it widens."""
     if isinstance(value, Mapping) and value.keys() == {"from", "to"}:
         return f"{_format_range(value['from'])} -> {_format_range(value['to'])}"
     if isinstance(value, list) and len(value) == 2 and all(isinstance(bound, int | float) for bound in value):

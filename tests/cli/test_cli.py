@@ -274,7 +274,7 @@ def test_an_exit_handler_that_hangs_does_not_keep_the_process(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=250)
     assert done.returncode == 2
-    assert done.stderr.endswith("warning: an exit handler did not end within 0.2 s; leaving without it\n")
+    assert done.stderr.endswith("warning: an exit handler did not finish within 0.2 s; exiting without it\n")
 
 
 @pytest.mark.parametrize(
@@ -284,7 +284,7 @@ def test_an_exit_handler_that_hangs_does_not_keep_the_process(tmp_path):
 def test_an_option_that_is_a_key_of_the_recipe(rlctl, option, setting):
     result = rlctl("train", "reach", option, "0.1")
     assert result.returncode == 2
-    assert f"error: no option {option}; it is a key of the recipe: --set {setting}=VALUE" in result.stderr
+    assert f"error: no option {option}; set the recipe's key instead: --set {setting}=VALUE" in result.stderr
 
 
 def test_resuming_a_task_without_a_run(rlctl):

@@ -44,7 +44,7 @@ def test_what_each_algorithm_has():
 def test_the_command(rlctl):
     assert json.loads(rlctl("recipe", "--schema").stdout) == VALIDATOR.schema
     assert yaml_text.load(rlctl("recipe", "reach").stdout, "recipe")["algo"] == "ppo"
-    assert rlctl("recipe").stderr == "error: give a task, e.g. rlctl recipe reach; --schema needs none\n"
+    assert rlctl("recipe").stderr == "error: give a task, such as rlctl recipe reach, or --schema\n"
 
 
 def test_recipes_name_their_schema(tmp_path):

@@ -93,19 +93,20 @@ def test_its_recipe_is_found_installed_or_not(rlctl, plugin, install, tmp_path):
     [
         (
             "my arm",
-            "name 'my arm': use letters, digits, - and _, with a letter first and no sign last, such as 'my-arm'",
+            "name 'my arm': use letters, digits, - and _; begin with a letter, "
+            "end with a letter or digit, such as 'my-arm'",
         ),
-        ("3d", "use letters, digits, - and _, with a letter first and no sign last, such as 'd'"),
+        ("3d", "use letters, digits, - and _; begin with a letter, end with a letter or digit, such as 'd'"),
         ("arm-", "such as 'arm'"),
         ("../arm", "such as 'arm'"),
         ("", "name '': use letters"),
-        ("reach", "a task 'reach' is installed already, by rlctl "),
-        ("tests", "the plugin's tests are in a folder of that name"),
+        ("reach", "task 'reach' of rlctl "),
+        ("tests", "the plugin's folder of tests has that name"),
         ("latest", "means the newest run"),
-        ("class", "class is a word of Python"),
-        ("numpy", "there is a module 'numpy' already"),
-        ("stable-baselines3", "there is a module 'stable_baselines3' already"),
-        ("sb3-contrib", "there is a module 'sb3_contrib' already"),
+        ("class", "class is a Python keyword"),
+        ("numpy", "module 'numpy' already exists"),
+        ("stable-baselines3", "module 'stable_baselines3' already exists"),
+        ("sb3-contrib", "module 'sb3_contrib' already exists"),
     ],
 )
 def test_names_that_cannot_be(tmp_path, monkeypatch, name, message):
@@ -138,7 +139,7 @@ def test_an_existing_folder_is_left_alone(rlctl, tmp_path):
     (tmp_path / "my-arm").mkdir()
     result = rlctl("tasks", "new", "my-arm")
     assert result.returncode == 2
-    assert result.stderr == "error: my-arm exists already; choose another name, or go to another folder\n"
+    assert result.stderr == "error: my-arm already exists; choose another name or another folder\n"
     assert written(tmp_path) == set()
 
 

@@ -107,7 +107,7 @@ def test_everything_that_a_task_says(rlctl, everything):
         "wind every 0.5 s shift_gravity change -1..1 always",
         "sensor observation noise std 0.02, of angle with this recipe",
         "1 tolerance 0.5 until return 1.5",
-        "2 the recipe's own task the last, which is evaluated",
+        "2 the recipe's own task last stage, used for evaluation",
         "frame_stack: 3",
     ):
         assert line in shown
@@ -218,7 +218,7 @@ def test_what_fails_at_its_end(write_module, monkeypatch, tmp_path):
 def test_options_of_the_list_are_not_lost(rlctl):
     result = rlctl("tasks", "--check", "show", "reach")
     assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr == "error: options of `rlctl tasks show` come after its name\n"
+    assert result.stderr == "error: put the options after `rlctl tasks show`\n"
     assert "Did you mean 'show'?" in rlctl("tasks", "sho").stderr
 
 
