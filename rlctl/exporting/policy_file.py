@@ -74,10 +74,18 @@ def _find_origin(source: FoundPolicy) -> dict[str, Any]:
 
 
 def show(report: PolicyFileReport, json: str | None) -> None:
-    """Print a report, or JSON alone for `-`."""
-    if output.present(as_json(report), json):
-        return
+    """Print a report, or only JSON for `-`."""
     out, info, provenance = output.out(), report.info, report.provenance
+    content = {
+        "path": report.path,
+        "bytes": report.size,
+        "task": info.spec.task,
+        "algo": info.algo,
+        "training_steps": info.training_steps,
+        **provenance.model_dump(),
+    }
+    if output.present(content, json):
+        return
     out.print(f"exported {report.path} ({format_bytes(report.size)}): the actor of {provenance.run}")
     out.print(f"{info.algo} for {info.spec.task}, step {info.training_steps:,}")
     for name, score in {"policy": provenance.score, **provenance.baselines}.items():
@@ -85,15 +93,3 @@ def show(report: PolicyFileReport, json: str | None) -> None:
     out.print(
         f"{output.format_count(provenance.score.episodes, 'episode')}, seed {provenance.score.seed}; 95 % intervals"
     )
-
-
-def as_json(report: PolicyFileReport) -> dict[str, Any]:
-    """Return a report as plain data."""
-    return {
-        "path": report.path,
-        "bytes": report.size,
-        "task": report.info.spec.task,
-        "algo": report.info.algo,
-        "training_steps": report.info.training_steps,
-        **report.provenance.model_dump(),
-    }

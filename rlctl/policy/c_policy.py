@@ -67,7 +67,7 @@ class CPolicy(Policy):
         """Return the action for one observation; a recurrent state is kept until `reset`."""
         if not deterministic:
             raise UsageError("an exported policy cannot sample: only its deterministic action is in the C file")
-        self._fill(split(observation))
+        self._fill(observation)
         self._act(*self._pointers)
         return self._action.reshape(self._shape).astype(self._dtype)
 
@@ -77,10 +77,11 @@ class CPolicy(Policy):
 
     def repeat(self, observation: Any, count: int) -> None:
         """Compute the action for one observation `count` times in a C loop, to measure its time."""
-        self._fill(split(observation))
+        self._fill(observation)
         self.library.rlctl_repeat(*self._pointers, count)
 
-    def _fill(self, parts: dict[str, Any]) -> None:
+    def _fill(self, observation: Any) -> None:
+        parts = split(observation)
         if self._frames > 1:
             value = np.reshape(parts[SINGLE], (self._frames, -1))[-1]
         elif len(parts) > 1:

@@ -122,7 +122,7 @@ class _Reader:
 
     def __init__(self, policy: PolicyFile) -> None:
         info = self.info = policy.info
-        self.policy_tensors = policy.tensors
+        self.policy = policy
         self.normalize = read_normalization(policy)
         self.tensors = {name.removeprefix("policy/"): values for name, values in policy.tensors.items()}
         name = info.policy_kwargs.get("activation_fn", "relu" if info.algo in _RELU_BY_DEFAULT else "tanh")
@@ -139,7 +139,7 @@ class _Reader:
             return None
         from rlctl.policy.own_graph import OwnGraph  # only here: it imports onnxruntime
 
-        return OwnGraph(self.policy_tensors, self.normalize)
+        return OwnGraph(self.policy.tensors, self.normalize)
 
     def features(self, key: str, space: spaces.Space[object], extractor: str) -> list[Layer]:
         """Return the layers from a part of a raw observation to its features."""

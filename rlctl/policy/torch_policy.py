@@ -90,11 +90,6 @@ def is_own_extractor(cls: type) -> bool:
     return cls.__module__.partition(".")[0] not in ("stable_baselines3", "sb3_contrib")
 
 
-def find_activation(name: Any) -> type[torch.nn.Module]:
-    """Return an activation function by its name, or by the description of a user's class."""
-    return own_modules.find_class(name) if isinstance(name, dict) else ACTIVATIONS[name]
-
-
 def describe_network(policy: BasePolicy) -> dict[str, Any]:
     """Return the constructor arguments of a network as plain data, for `build_network`."""
     described = {}
@@ -136,7 +131,8 @@ def build_network(info: PolicyInfo) -> BasePolicy:
         raise ArtifactError(f"policy of an unknown kind {info.policy!r} for {info.algo}")
     kwargs = dict(info.policy_kwargs)
     if "activation_fn" in kwargs:
-        kwargs["activation_fn"] = find_activation(kwargs["activation_fn"])
+        name = kwargs["activation_fn"]
+        kwargs["activation_fn"] = own_modules.find_class(name) if isinstance(name, dict) else ACTIVATIONS[name]
     if "features_extractor_class" in kwargs:
         kwargs["features_extractor_class"] = own_modules.find_class(kwargs["features_extractor_class"])
     return cls(

@@ -82,8 +82,8 @@ def odd_statistics():
         assert isinstance(env, VecNormalize)
         env.training = False
         rms = env.obs_rms
-        for each in rms.values() if isinstance(rms, dict) else [rms]:
-            each.mean = np.array([0.3, -50.0, 0.1])
-            each.var = np.array([1e-12, 2000.0, 1.7])
+        for statistics in rms.values() if isinstance(rms, dict) else [rms]:
+            statistics.mean = np.array([0.3, -50.0, 0.1])
+            statistics.var = np.array([1e-12, 2000.0, 1.7])
 
     return set_statistics

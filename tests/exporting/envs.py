@@ -60,7 +60,7 @@ class Small(gymnasium.Env):
     def _observe(self, space):
         level = int(abs(self.place[0]) * 10)
         if isinstance(space, spaces.Dict):
-            return {key: self._observe(each) for key, each in space.spaces.items()}
+            return {key: self._observe(part) for key, part in space.spaces.items()}
         if isinstance(space, spaces.Discrete):
             return level % int(space.n)
         if isinstance(space, spaces.MultiDiscrete):

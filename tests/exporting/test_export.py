@@ -57,7 +57,7 @@ def test_export_is_verified(algo, observation, action, small, train, write):
     assert report.path == path.with_suffix(".onnx")
     assert report.size == report.path.stat().st_size
     assert_verified(report)
-    assert sorted(each.name for each in path.parent.iterdir()) == ["policy.onnx", "policy.safetensors"]
+    assert sorted(file.name for file in path.parent.iterdir()) == ["policy.onnx", "policy.safetensors"]
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_not_verified_is_not_kept(small, train, write, tmp_path):
     assert "all actions agree, but the episodes differ" in first
     assert agreement.startswith("max |difference| ")
     assert "20 episodes: same length in 20, return within " in loop
-    assert [each.name for each in target.parent.iterdir()] == ["policy.onnx"]
+    assert [file.name for file in target.parent.iterdir()] == ["policy.onnx"]
     assert target.read_bytes() == b"former"
 
 

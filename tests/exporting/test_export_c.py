@@ -80,7 +80,10 @@ SLOW_CASES = [
     ("ddpg", "vector", "box", {}),
     ("tqc", "vector", "box", {}),
     ("recurrent_ppo", "vector", "discrete", {"policy_kwargs": {"lstm_hidden_size": 8}}),
-    *(("ppo", "vector", "box", {"policy_kwargs": {"activation_fn": each}}) for each in ACTIVATIONS.values()),
+    *(
+        ("ppo", "vector", "box", {"policy_kwargs": {"activation_fn": activation}})
+        for activation in ACTIVATIONS.values()
+    ),
 ]
 
 
@@ -148,7 +151,7 @@ def test_what_c_cannot_carry_is_refused_on_the_command_line(rlctl, small, train,
     done = rlctl("export", path.name, "--c", "--onnx", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr == "error: export --c: networks for images cannot be written as C; use export --onnx\n"
-    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
 def test_name_of_the_output(small, train, write, tmp_path):

@@ -27,7 +27,7 @@ def session_of(path):
 
 def random_observations(space, rows=ROWS):
     if isinstance(space, spaces.Dict):
-        return {key: random_observations(each, rows) for key, each in space.spaces.items()}
+        return {key: random_observations(part, rows) for key, part in space.spaces.items()}
     space.seed(0)
     values = np.stack([space.sample() for _ in range(rows)])
     if values.dtype.kind == "f":
@@ -42,8 +42,8 @@ def difference(model, path, observations):
     state = None
     feeds = dict(observations) if isinstance(observations, dict) else {"obs": observations}
     session = session_of(path)
-    outputs = [each.name for each in session.get_outputs()]
-    if "state_h" in (each.name for each in session.get_inputs()):
+    outputs = [port.name for port in session.get_outputs()]
+    if "state_h" in (port.name for port in session.get_inputs()):
         layers, _, hidden = session.get_inputs()[-1].shape
         state = tuple(np.random.default_rng(0).normal(size=(2, layers, ROWS, hidden)).astype(np.float32))
         feeds |= {"state_h": state[0], "state_c": state[1]}
@@ -195,8 +195,8 @@ def test_file_says_what_it_is(train, tmp_path):
     info = policy.info
     proto = build(policy)
     assert proto.ir_version == 8
-    assert [(each.domain, each.version) for each in proto.opset_import] == [("", 17)]
-    metadata = {each.key: each.value for each in proto.metadata_props}
+    assert [(entry.domain, entry.version) for entry in proto.opset_import] == [("", 17)]
+    metadata = {entry.key: entry.value for entry in proto.metadata_props}
     names = metadata["observation_names"].split(",")
     assert names[0] == "joint_positions"
     assert len(names) == len(metadata["observation_sizes"].split(",")) == len(metadata["observation_units"].split(","))
@@ -215,16 +215,16 @@ def test_file_says_what_it_is(train, tmp_path):
 
 def test_batch_is_the_only_free_dimension(small, train, write):
     session = session_of(write(train("ppo", small(), steps=0), "ppo", small()))
-    assert [(each.name, each.shape) for each in session.get_inputs()] == [("obs", ["batch", 3])]
-    assert [(each.name, each.shape) for each in session.get_outputs()] == [("action", ["batch", 2])]
+    assert [(port.name, port.shape) for port in session.get_inputs()] == [("obs", ["batch", 3])]
+    assert [(port.name, port.shape) for port in session.get_outputs()] == [("action", ["batch", 2])]
 
 
 def test_recurrent_state_goes_in_and_out_after_the_action(small, train, write):
     model = train("recurrent_ppo", small(), steps=0, policy_kwargs={"lstm_hidden_size": 8, "n_lstm_layers": 2})
     session = session_of(write(model, "recurrent_ppo", small()))
     state = [2, "batch", 8]
-    assert [(each.name, each.shape) for each in session.get_inputs()[1:]] == [("state_h", state), ("state_c", state)]
-    assert [each.name for each in session.get_outputs()] == ["action", "state_h_out", "state_c_out"]
+    assert [(port.name, port.shape) for port in session.get_inputs()[1:]] == [("state_h", state), ("state_c", state)]
+    assert [port.name for port in session.get_outputs()] == ["action", "state_h_out", "state_c_out"]
     assert session.get_outputs()[1].shape == state
 
 

@@ -26,11 +26,11 @@ def write(tmp_path):
     def written(nodes, initializers=(), description=None, **model):
         ports = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", 4]) for name in ("obs", "action")]
         graph = helper.make_graph(nodes, "policy", ports[:1], ports[1:], list(initializers))
-        made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8, **model)
-        entry = made.metadata_props.add()
+        proto = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8, **model)
+        entry = proto.metadata_props.add()
         entry.key, entry.value = "rlctl", description or INFO.model_dump_json()
         path = tmp_path / "policy.onnx"
-        path.write_bytes(onnx_file.encode(made))
+        path.write_bytes(onnx_file.encode(proto))
         return path
 
     return written
@@ -151,9 +151,9 @@ def test_changed_weights_are_named_as_such(write):
 def test_an_export_without_a_digest(write):
     path = write([node("Tanh", "obs")])
     model = onnx.load(path)
-    kept = [each for each in model.metadata_props if each.key == "rlctl"]
+    description = [prop for prop in model.metadata_props if prop.key == "rlctl"]
     del model.metadata_props[:]
-    model.metadata_props.extend(kept)
+    model.metadata_props.extend(description)
     onnx.save(model, path)
     assert refused(path).endswith("its metadata has no sha256; rlctl writes one into every export; export it again")
 
@@ -174,4 +174,4 @@ def test_any_cut_and_any_flipped_byte(write):
         except ArtifactError as error:
             lines.append(str(error))
     assert len(lines) > 75
-    assert all(len(each.splitlines()) == 1 for each in lines)
+    assert all(len(line.splitlines()) == 1 for line in lines)

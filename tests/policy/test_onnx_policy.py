@@ -55,7 +55,7 @@ def test_one_observation_gets_the_action_that_it_gets_beside_others(pendulum, ob
     actions = policy.start_episodes(observations)
     assert actions.shape == (50, 1)
     assert actions.dtype == np.float32
-    alone = np.stack([policy.predict(each) for each in observations])
+    alone = np.stack([policy.predict(observation) for observation in observations])
     assert alone.shape == actions.shape
     assert np.abs(alone - actions).max() <= 1e-6
     assert len(np.unique(actions)) > 10
@@ -63,11 +63,11 @@ def test_one_observation_gets_the_action_that_it_gets_beside_others(pendulum, ob
 
 def test_recurrent_policy_remembers_until_reset(recurrent, observations):
     policy = load_policy(recurrent)
-    first = [policy.predict(each) for each in observations[:3]]
-    again = [policy.predict(each) for each in observations[:3]]
+    first = [policy.predict(observation) for observation in observations[:3]]
+    again = [policy.predict(observation) for observation in observations[:3]]
     assert not np.array_equal(first[0], again[0])
     policy.reset()
-    afresh = [policy.predict(each) for each in observations[:3]]
+    afresh = [policy.predict(observation) for observation in observations[:3]]
     assert np.array_equal(first, afresh)
 
 
@@ -115,7 +115,7 @@ def test_foreign_file(tmp_path):
 
 def with_description(path, target, change):
     model = onnx.load(path)
-    entry = next(each for each in model.metadata_props if each.key == "rlctl")
+    entry = next(candidate for candidate in model.metadata_props if candidate.key == "rlctl")
     description = json.loads(entry.value)
     change(description)
     entry.value = json.dumps(description)
