@@ -1,4 +1,4 @@
-"""`rlctl runs` and what comes after it."""
+"""`rlctl runs` and its commands."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def report_runs(
     ] = None,
     format: Annotated[Literal["html", "md"], typer.Option(help="A page, or text for pull requests.")] = "html",
     pictures: Annotated[
-        bool, typer.Option("--pictures/--no-pictures", help="Play episodes again, to draw them.")
+        bool, typer.Option("--pictures/--no-pictures", help="Replay episodes to draw pictures.")
     ] = True,
     episodes: Annotated[
         int, typer.Option(help="Episodes that each run plays to compare recipes; 0: do not compare.", min=0)
@@ -84,13 +84,13 @@ def compare_runs(
     task: Annotated[str | None, typer.Option(help="Evaluate all on this task.")] = None,
     settings: Set = [],
     threshold: Annotated[
-        float | None, typer.Option(help="Success rate (or return) to be reached soon; 0.9 where success is known.")
+        float | None, typer.Option(help="Report the steps to this success rate (or return); 0.9 if success is known.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Compare although the task has changed.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Compare even if the task has changed.")] = False,
     gate: Annotated[Literal["not-worse"] | None, typer.Option(help="Exit 1 if one is worse than the first.")] = None,
     json: Json = None,
 ) -> None:
-    """Say whether a policy, or a recipe trained with several seeds, is better than another."""
+    """Test whether a policy, or a recipe trained with several seeds, is better than another."""
     claim_stdout()
     from rlctl.evaluation.request import EvalRequest
     from rlctl.runs.comparison import compare
@@ -108,11 +108,11 @@ def compare_runs(
 @app.command("import")
 def import_run(
     model: Annotated[Path, typer.Argument(metavar="MODEL.zip", help="Model of Stable-Baselines3 or rl-zoo3.")],
-    task: Annotated[str, typer.Option(metavar="TASK", help=f"What it was trained on. {TASK_FORMS}")],
+    task: Annotated[str, typer.Option(metavar="TASK", help=f"The task it was trained on. {TASK_FORMS}")],
     vecnormalize: Annotated[
         Path | None, typer.Option(metavar="FILE.pkl", help="Its normalisation, if it has one.")
     ] = None,
-    algo: Annotated[str | None, typer.Option(help="Its algorithm, where the file does not say it.")] = None,
+    algo: Annotated[str | None, typer.Option(help="Its algorithm, if the file does not name it.")] = None,
     settings: Set = [],
     output: Annotated[
         Path | None,
@@ -120,7 +120,7 @@ def import_run(
     ] = None,
     json: Json = None,
 ) -> None:
-    """Turn a model of Stable-Baselines3 into a policy file. Nothing in the model is unpickled."""
+    """Convert a model of Stable-Baselines3 to a policy file. Nothing in the model is unpickled."""
     claim_stdout()
     from rlctl.importing.import_model import import_model, show
 
@@ -135,7 +135,7 @@ def remove_runs(
         int | None,
         typer.Option(
             metavar="N",
-            help="Remove all finished or failed runs but the N best of each task; groups stay whole.",
+            help="Keep the N best runs of each task, remove the other finished or failed ones; groups stay.",
             min=0,
         ),
     ] = None,
@@ -157,7 +157,7 @@ def prune_runs(
     yes: Yes = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Remove the checkpoints of finished runs, which are needed only to make these longer."""
+    """Remove the checkpoints of finished runs, which are needed only to train longer."""
     from rlctl.runs.removal import plan_prune, remove_with_report
 
     remove_with_report(plan_prune(runs or []), yes=yes, dry_run=dry_run)

@@ -21,12 +21,12 @@ from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference, find_mixed
 from rlctl.run.directory import RunDirectory
 from rlctl.run.lookup import describe_source_change
-from rlctl.runs.selection import find_runs_of
+from rlctl.runs.listing import find_runs_of
 from rlctl.runs.significance import MeanDifference, Quantity, Verdict, compare_episodes, compare_seeds
 from rlctl.runs.summary import read_table, summarize
 
 THRESHOLD = 0.9
-"""Success rate whose first evaluation is looked for, where no other is asked for."""
+"""The default threshold, a success rate."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Side:
     name: str
     runs: list[EvaluatedRun]
     mixed: list[str]
-    """Keys in which the recipes of its own runs differ: it should have none."""
+    """Recipe keys in which its own runs differ; there should be none."""
 
     @property
     def has_success(self) -> bool:
@@ -67,7 +67,7 @@ class Side:
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """A side beside the baseline: by how much it differs, and in what."""
+    """A side that is compared with the baseline, and the differences in scores and recipe."""
 
     side: Side
     differences: Mapping[Quantity, MeanDifference]
@@ -77,14 +77,14 @@ class Candidate:
 
     @property
     def verdict(self) -> Verdict:
-        """Success decides; where it cannot tell, the return does. The p-values allow for both."""
+        """Success decides; if it cannot tell, the return decides. The p-values are adjusted for both tests."""
         verdicts = (difference.verdict for difference in self.differences.values())
         return next((verdict for verdict in verdicts if verdict is not Verdict.CANNOT_TELL), Verdict.CANNOT_TELL)
 
 
 @dataclasses.dataclass(frozen=True)
 class RunComparison:
-    """The baseline and what was compared with it."""
+    """The baseline and the candidates that were compared with it."""
 
     of_recipes: bool
     """Whether recipes are compared, seed by seed; else two policies, episode by episode."""
@@ -96,7 +96,7 @@ class RunComparison:
 
     @property
     def world_differences(self) -> list[str]:
-        """The recipe keys of the world in which a candidate differs from the first; all play in the first's."""
+        """Recipe keys of the environment in which a candidate differs from the baseline; all play in the baseline's."""
         keys = dict.fromkeys(key for candidate in self.candidates for key in candidate.recipe_changes)
         return [key for key in keys if key.partition(".")[0] in ("task", "reward_weights", "randomize", "events")]
 
@@ -115,14 +115,14 @@ class RunComparison:
 def compare(
     texts: Sequence[str], request: EvalRequest, threshold: float | None = None, *, force: bool = False
 ) -> RunComparison:
-    """Evaluate every run as `request` says, without its `run`, and compare each side with the first.
+    """Evaluate every run with the other fields of `request` than `run`, and compare each side with the first.
 
     `texts` are runs, groups, globs, or folders of runs; the first is the baseline. `threshold` is a success rate, or a
-    return where a task has no success, whose first evaluation is looked for. `force` compares although the task has
-    changed since a training.
+    return if the task reports no success; the result has the steps until an evaluation reached it. `force` compares
+    even if the task has changed since a training.
 
     Raises `UsageError` for less than two sides, a run compared with itself, runs of different tasks without `task`,
-    a task that has changed, and groups beside single runs; `ArtifactError` for runs that are missing, damaged or
+    a task that has changed, and a mix of groups and single runs; `ArtifactError` for runs that are missing, damaged or
     without a policy.
     """
     if len(texts) < 2:
@@ -149,7 +149,7 @@ def compare_runs(
         _refuse_changed([run for group in groups for run in group])
     recipes = [[run.recipe() for run in group] for group in groups]
     first = _evaluate(groups[0][0], request, threshold)
-    # All in the same world: a tolerance that is easier to keep makes no policy better.
+    # All play in the same environment: an easier tolerance does not make a policy better.
     request = dataclasses.replace(request, spec=first.evaluation.spec)
     sides = [
         Side(
@@ -200,8 +200,8 @@ def _refuse_unequal(names: Sequence[str], groups: Sequence[Sequence[RunDirectory
     if len(sizes) > 1:
         alone = next(name for name, group in zip(names, groups, strict=True) if len(group) == 1)
         raise UsageError(
-            f"{alone}: one run beside a group of seeds. A recipe is judged by several seeds: "
-            "train more, or compare two single runs as policies"
+            f"{alone}: a single run cannot be compared with a group of seeds; "
+            "train more seeds, or compare two single runs as policies"
         )
     paths = [run.path.resolve() for group in groups for run in group]
     twice = next((path for path in paths if paths.count(path) > 1), None)
@@ -214,7 +214,7 @@ def _common_task(runs: list[RunDirectory], task: str | None) -> str:
     if task is not None:
         return task
     if len(tasks) > 1:
-        raise UsageError(f"these runs are of different tasks ({', '.join(tasks)}); --task TASK evaluates all on one")
+        raise UsageError(f"runs of different tasks ({', '.join(tasks)}); --task TASK evaluates all on one task")
     return tasks[0]
 
 
@@ -222,7 +222,7 @@ def _refuse_changed(runs: list[RunDirectory]) -> None:
     for run in runs:
         if change := describe_source_change(run):
             raise UsageError(
-                f"{run.path}: {change}\nwhat this run learned was another task, so no comparison is fair; "
+                f"{run.path}: {change}\nit was trained on another version of the task, so the comparison is not fair; "
                 "--force compares anyway"
             )
 

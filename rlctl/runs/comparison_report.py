@@ -1,4 +1,4 @@
-"""What a comparison prints."""
+"""Prints a comparison."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def show(result: RunComparison, json: str | None) -> None:
         rows = [(side.name, *_format_scores(side.runs[0])) for side in result.sides]
         output.print_table(("policy", "success", "return"), rows, left=("policy",))
     if result.world_differences:
-        out.print(f"all played with the first's {', '.join(result.world_differences)}")
+        out.print(f"all played with the baseline's {', '.join(result.world_differences)}")
     out.print(describe_tests(result))
     for candidate in result.candidates:
         _show_candidate(result, candidate)
@@ -93,7 +93,7 @@ def _show_candidate(result: RunComparison, candidate: Candidate) -> None:
 
 
 def describe_candidate(result: RunComparison, candidate: Candidate) -> list[str]:
-    """Return a line per difference, and how much data would decide where these cannot tell."""
+    """Return a line per difference, and if the verdict is `cannot tell`, how much data would decide."""
     lines = [
         f"{quantity}: {format_difference(difference, as_percent=quantity == 'success')}"
         for quantity, difference in candidate.differences.items()
@@ -120,7 +120,7 @@ def format_difference(difference: MeanDifference, *, as_percent: bool) -> str:
 
 
 def format_needed(candidate: Candidate, comparisons: int) -> str:
-    """Return how much data would decide, where a baseline is compared with so many candidates."""
+    """Return how much data would decide; `comparisons` is the number of candidates."""
     first, *_ = candidate.differences.values()
     unit, parts = "episodes", []
     if isinstance(first, SeedDifference):
@@ -128,7 +128,7 @@ def format_needed(candidate: Candidate, comparisons: int) -> str:
         if first.smallest_p >= ALPHA:
             seeds, smallest = find_least_seeds(comparisons)
             parts.append(
-                f"so few seeds cannot decide: the smallest p-value that they can reach is {first.smallest_p:.2g}; "
+                f"too few seeds to decide: their smallest possible p-value is {first.smallest_p:.2g}; "
                 f"{seeds} seeds for each recipe reach {smallest:.2g}"
             )
     needed = [
@@ -138,17 +138,17 @@ def format_needed(candidate: Candidate, comparisons: int) -> str:
     ]
     if needed:
         count, quantity = min(needed)
-        parts.append(f"if the difference in {quantity} is as it seems, about {count:,} {unit} would decide")
-    return "; ".join(parts) or "no difference at all: more of the same would not decide"
+        parts.append(f"about {count:,} {unit} would decide, if the true difference in {quantity} is the measured one")
+    return "; ".join(parts) or "no difference at all: more data would not decide"
 
 
 def describe_tests(result: RunComparison) -> str:
-    """Return what is tested, and how often equals are called different."""
+    """Return what is tested, and how often equal candidates are reported as different."""
     quantities = " and ".join(result.candidates[0].differences)
     count = len(result.candidates)
     of = "" if count == 1 else f" of {count} candidates"
     together = "" if count == 1 and " and " not in quantities else ", p-values adjusted for all tests together"
-    return f"tested: {quantities}{of}{together}; where all are equal, {ALPHA:.0%} of comparisons report a difference"
+    return f"tested: {quantities}{of}{together}; if all are equal, {ALPHA:.0%} of comparisons report a difference"
 
 
 def as_json(result: RunComparison) -> dict[str, Any]:

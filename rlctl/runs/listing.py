@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import glob
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from rlctl import output
 from rlctl.environments import registry
-from rlctl.errors import UsageError, did_you_mean, short_repr
-from rlctl.run.directory import ROOT, RunDirectory
-from rlctl.run.lookup import describe_source_change
+from rlctl.errors import ArtifactError, UsageError, did_you_mean, short_repr
+from rlctl.run.directory import ROOT, RunDirectory, is_group
+from rlctl.run.group import find_group, read_group
+from rlctl.run.lookup import describe_source_change, find_run
 from rlctl.runs.summary import RunSummary, find_runs, list_waiting, summarize
 
 _SORT_KEYS = {
@@ -23,7 +25,7 @@ _SORT_KEYS = {
 _COLUMNS = ("run", "algo", "seed", "state", "steps", "minutes", "success", "return", "differs from the recipe")
 _LEFT = ("run", "algo", "state", "differs from the recipe")
 _DROP = ("minutes", "differs from the recipe", "algo", "seed", "return", "steps")
-"""The columns that a narrow terminal does without, in this order."""
+"""Columns that a narrow terminal omits, in this order."""
 _CHANGES_SHOWN = 4
 _STATE_SHOWN = 44  # characters; `rlctl runs show` has the whole error
 
@@ -38,18 +40,37 @@ def list_runs(
 ) -> list[RunSummary]:
     """Return the runs of a task, or all, best or newest first; with `waiting` also those a cluster has not begun.
 
-    Raises `UsageError` for a task without runs, which may be one of `commands` misspelt.
+    Raises `UsageError` for a task without runs; the error suggests similar tasks and `commands`.
     """
     runs = [*(summarize(path) for path in find_runs(root)), *(list_waiting(root) if waiting else ())]
     if task is not None:
-        every = runs
         slug = registry.make_slug(task)
-        runs = [run for run in every if run.task == task or run.name.partition("/")[0] == slug]
-        if not runs:
-            names = sorted({run.task for run in every})
+        named = [run for run in runs if run.task == task or run.name.partition("/")[0] == slug]
+        if not named:
+            names = sorted({run.task for run in runs})
             close = did_you_mean(task, [*names, *commands])
-            raise UsageError(f"no run of {task!r} under {root.resolve()}, and no such command of rlctl runs.{close}")
+            raise UsageError(f"no run of {task!r} under {root.resolve()}, and rlctl runs has no such command.{close}")
+        runs = named
     return sorted(runs, key=_SORT_KEYS[sort], reverse=True)
+
+
+def find_runs_of(text: str) -> list[RunDirectory]:
+    """Return the runs that an argument names: those of a glob, a group or a folder of runs, or one run."""
+    if any(character in text for character in "*?[") and not Path(text).exists():
+        runs = [RunDirectory(path) for path in map(Path, sorted(glob.glob(text))) if (path / "run.json").is_file()]
+        if not runs:
+            raise ArtifactError(f"{text}: no run matches")
+        return runs
+    path = Path(text)
+    if not is_group(path) and (runs := [RunDirectory(file.parent) for file in sorted(path.glob("*/run.json"))]):
+        return runs
+    if (folder := find_group(text)) is None:
+        return [find_run(text)]
+    group = read_group(folder)
+    runs = [run for seed in group.seeds if (run := group.find_run(seed)) is not None]
+    if not runs:
+        raise ArtifactError(f"{text}: none of its seeds has started")
+    return runs
 
 
 def show(runs: list[RunSummary], json: str | None) -> None:

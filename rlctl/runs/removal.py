@@ -1,4 +1,4 @@
-"""`rlctl runs rm` and `prune`: free the disk without losing what is still wanted."""
+"""`rlctl runs rm` and `prune`: remove runs, or the checkpoints of finished runs."""
 
 from __future__ import annotations
 
@@ -12,40 +12,39 @@ from rich.filesize import decimal as format_bytes
 from rlctl import output
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
-from rlctl.runs.listing import list_runs
-from rlctl.runs.selection import find_runs_of
+from rlctl.runs.listing import find_runs_of, list_runs
 from rlctl.runs.summary import RunSummary, summarize
 
 
 @dataclasses.dataclass(frozen=True)
 class Removal:
-    """Folders that are to go, and their size."""
+    """Folders to remove, and their size."""
 
     paths: list[Path]
     bytes: int
 
 
 def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Path = ROOT) -> Removal:
-    """Find the runs to remove: those given, or per task all but the `keep_best` best that are finished or failed.
+    """Find the runs to remove: those named, or of each task all finished or failed runs except the `keep_best` best.
 
-    The seeds of a group are left out of `keep_best`.
+    `keep_best` never removes the runs of a group.
 
-    Raises `UsageError` where nothing or both is asked for, or a run is being trained; `ArtifactError` for a folder that
-    is not a run.
+    Raises `UsageError` unless exactly one of both is given, or if a run is being trained; `ArtifactError` for a folder
+    that is not a run.
     """
-    if bool(runs) == (keep_best is not None) or "" in runs:  # a variable of the shell that is not set
+    if bool(runs) == (keep_best is not None) or "" in runs:  # an unset variable of the shell
         raise UsageError("say what to remove: RUN..., or --keep-best N for all but the N best of each task")
     if keep_best is not None:
-        return _measured([run.path for run in _all_but_best(list_runs(root=root), keep_best)])
-    paths = [_checked(Path(text), root) for text in runs]
+        return _measure([run.path for run in _all_but_best(list_runs(root=root), keep_best)])
+    paths = [_resolve_run_folder(Path(text), root) for text in runs]
     for path in paths:
         if any(is_being_written(folder) for folder in (path, *(lock.parent for lock in path.glob("*/.lock")))):
             raise UsageError(f"{path}: this run is being trained; nothing was removed")
-    return _measured(list(dict.fromkeys(paths)))
+    return _measure(list(dict.fromkeys(paths)))
 
 
-def _checked(path: Path, root: Path) -> Path:
-    """Return a run's folder; only a folder with a run.json of ours, or a damaged one where runs are, is one."""
+def _resolve_run_folder(path: Path, root: Path) -> Path:
+    """Return the folder of a run: one with a run.json of rlctl, or a damaged one at the place of a run."""
     below = root / path
     folder = path if path.is_dir() else below
     is_run = (folder / "run.json").is_file()
@@ -58,7 +57,7 @@ def _checked(path: Path, root: Path) -> Path:
 
 
 def _all_but_best(runs: list[RunSummary], count: int) -> list[RunSummary]:
-    # The seeds of a group stay together: without those that did worse it would say of its recipe what is not true.
+    # A group stays whole: without its worse seeds its recipe would look better than it is.
     alone = [run for run in runs if not is_group(run.path.parent)]
     ended = [run for run in alone if run.state in ("done", "failed") and not is_being_written(run.path)]
     by_task: dict[str, list[RunSummary]] = {}
@@ -68,7 +67,7 @@ def _all_but_best(runs: list[RunSummary], count: int) -> list[RunSummary]:
 
 
 def plan_prune(runs: Sequence[str] = (), root: Path = ROOT) -> Removal:
-    """Find the checkpoints, replay buffers included, of finished runs; they are needed only to train on.
+    """Find the checkpoints, replay buffers included, of finished runs; they are needed only to train longer.
 
     `runs` are runs, groups, globs or folders of runs; by default all. Raises `UsageError` for one of these that has not
     finished.
@@ -76,21 +75,21 @@ def plan_prune(runs: Sequence[str] = (), root: Path = ROOT) -> Removal:
     named = [summarize(run.path) for text in runs for run in find_runs_of(text)]
     for run in named:
         if run.state != "done":
-            raise UsageError(f"{run.path}: {run.state}; only a finished run can do without its checkpoints")
+            raise UsageError(f"{run.path}: {run.state}; only the checkpoints of finished runs can be removed")
     candidates = named if runs else [run for run in list_runs(root=root) if run.state == "done"]
     folders = [RunDirectory(run.path).checkpoint(0).parent for run in candidates if not is_being_written(run.path)]
-    return _measured([folder for folder in folders if folder.is_dir()])
+    return _measure([folder for folder in folders if folder.is_dir()])
 
 
-def _measured(paths: list[Path]) -> Removal:
+def _measure(paths: list[Path]) -> Removal:
     size = sum(file.lstat().st_size for path in paths for file in path.rglob("*") if not file.is_dir())
     return Removal(paths, size)
 
 
 def remove_with_report(removal: Removal, *, yes: bool, dry_run: bool = False) -> None:
-    """List what is to go and its size, ask, remove, and say what came free; `dry_run` only lists.
+    """List the folders and their size, ask, and remove them; `dry_run` only lists.
 
-    Raises `UsageError` where nobody can be asked and `yes` is not set.
+    Raises `UsageError` without a terminal, if `yes` is not set.
     """
     out = output.out()
     for path in removal.paths:
@@ -106,20 +105,20 @@ def remove_with_report(removal: Removal, *, yes: bool, dry_run: bool = False) ->
     if not yes and not output.confirm(f"remove {what}, {format_bytes(removal.bytes)}?", refusal):
         return
     remove(removal)
-    out.print(f"removed {what}: {format_bytes(removal.bytes)} came free")
+    out.print(f"removed {what}: {format_bytes(removal.bytes)} freed")
 
 
 def remove(removal: Removal) -> None:
-    """Remove the folders; each under another name first, so that a half-removed one is not taken for a run.
+    """Remove the folders. Each is renamed first, so that a partly removed one is not listed as a run.
 
-    Raises `UsageError` for a run that is being trained by now: the question may have waited long for its answer.
+    Raises `UsageError` for a run whose training has started since it was listed.
     """
     for path in removal.paths:
         if is_being_written(path if (path / ".lock").exists() else path.parent):
             raise UsageError(f"{path}: this run is being trained; it was not removed")
-        beside = path.with_name(f".{path.name}.removed")
+        renamed = path.with_name(f".{path.name}.removed")
         try:
-            path.rename(beside)
-            shutil.rmtree(beside)
+            path.rename(renamed)
+            shutil.rmtree(renamed)
         except OSError as error:
             raise ArtifactError(f"{path}: cannot be removed: {error.strerror}") from None

@@ -28,14 +28,14 @@ _PLOT_SIZE = (90, 13)
 
 
 class RunDescription(History):
-    """Everything that is shown of a run: its records and what they show."""
+    """Everything that `rlctl runs show` prints about a run."""
 
     def __init__(self, run: RunDirectory) -> None:
         """Read a run; raises `ArtifactError` if its `run.json` is damaged."""
         super().__init__(run)
         self.warnings = list(_list_warnings(run.status()))
         if change := describe_source_change(run):
-            self.warnings.append(f"{change}: what it learned was another task")
+            self.warnings.append(f"{change}: it was trained on another version of the task")
         self.summary = summarize(run.path)
         self.findings = diagnose(self)
         self.robustness: Robustness | None = None
@@ -52,19 +52,19 @@ def _list_warnings(status: Mapping[str, Any]) -> Iterator[str]:
         "observations_outside": "observations outside their space",
         "failed_evaluations": "evaluations that failed",
     }
-    for key, what in counted.items():
+    for key, noun in counted.items():
         if isinstance(count := status.get(key), int) and count:
-            yield f"{count:,} {what}"
+            yield f"{count:,} {noun}"
     if status.get("error"):
         yield str(status["error"])
 
 
 def describe_robustness(result: Robustness) -> Iterator[str]:
-    """Yield the worst cell of all maps, what a push does, and how both were measured."""
+    """Yield lines about the worst cell of all maps, the push test, and the command that measured them."""
     if (worst := result.find_worst()) is not None:
         where, cell = worst[0].name_cell(worst[1]), worst[1]
         rate = "" if cell.success_rate is None else f"success {cell.success_rate:.1%}, "
-        yield f"worst of {result.episodes} episodes each at {where}: {rate}return {cell.mean_return:.4g}"
+        yield f"worst cell, {result.episodes} episodes at {where}: {rate}return {cell.mean_return:.4g}"
     if result.push is not None:
         yield result.push.verdict
     if result.command:
@@ -90,15 +90,15 @@ def show(run: RunDescription, json: str | None) -> None:
         measured = None if run.robustness is None else run.robustness.model_dump(mode="json")
         if output.present({**content, **notes, "robustness": measured, "bytes": sizes}, json):
             return
-    what = f": {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}"
-    out.print(Text.assemble((summary.name, "bold"), what))
+    title = f": {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}"
+    out.print(Text.assemble((summary.name, "bold"), title))
     duration = output.format_duration(summary.seconds or 0.0)
     out.print(f"{summary.steps or 0:,} steps in {duration}, started {summary.started}")
     if summary.best_return is not None:
         success = "" if summary.best_success is None else f"success {summary.best_success:.1%}, "
         out.print(f"best evaluation at step {summary.best_step:,}: {success}return {summary.best_return:.4g}")
     if isinstance(source, dict):
-        out.print(f"began with {source.get('policy')}, step {source.get('training_steps')}")
+        out.print(f"started from {source.get('policy')}, step {source.get('training_steps')}")
     for key, value in summary.changes.items():
         out.print(f"differs from the task's recipe: {key} = {format_value(key, value)}")
     for warning in run.warnings:
@@ -127,7 +127,7 @@ def plot(run: RunDescription, name: str) -> str:
     plotext.plotsize(*_PLOT_SIZE)
     plotext.title(f"{name} over steps")
     if name == "success":
-        plotext.ylim(0, 1)  # a point far outside would take all memory
+        plotext.ylim(0, 1)  # plotext would need too much memory for a point far outside
         lines = [[(step, min(max(value, 0.0), 1.0)) for step, value in points] for points in lines]
     for points, label, marker in zip(
         lines, ("training", "evaluations"), (("braille", "●") if is_utf8 else (".", "o")), strict=True

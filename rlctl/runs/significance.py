@@ -1,10 +1,10 @@
-"""Is one policy, or one recipe, really better than another? Tests, intervals, and how much data would decide.
+"""Tests whether one policy or recipe is better than another: p-values, intervals, and how much data would decide.
 
 Two policies are compared on the same episodes, so the unit is the episode and the test is paired. Two recipes are
 compared by training each several times, so the unit is the training seed.
 
 Success and return are tested together, and each candidate against the baseline. The p-values are adjusted for that:
-where all are equal, at most `ALPHA` of the comparisons report any difference.
+if all are equal, at most `ALPHA` of the comparisons report a difference.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ Quantity = Literal["success", "return"]
 Array = NDArray[np.float64]
 
 ALPHA = 0.05
-"""Below this p-value a difference is called one; intervals are of 1 - ALPHA."""
+"""A difference is significant below this p-value; intervals have the level 1 - ALPHA."""
 POWER = 0.8
 _RESAMPLES = 9999
 _LEAST_PAIRS, _LEAST_SEEDS = 6, 4
-"""Pairs that differ, and seeds for each of two recipes, of which an exact test's p-value can be below `ALPHA`."""
+"""The fewest pairs that differ, and seeds per recipe, with which an exact test can reach `ALPHA`."""
 
 
 class Verdict(enum.StrEnum):
-    """What the data say of a candidate against the baseline."""
+    """The result of comparing a candidate with the baseline."""
 
     BETTER = "better"
     WORSE = "worse"
@@ -48,9 +48,9 @@ class MeanDifference:
     """Lower end of the 95 % interval; equal to `mean` where there is nothing to resample."""
     high: float
     p: float
-    """Two-sided p-value, adjusted for all that is tested; 1 where all pairs are equal."""
+    """Two-sided p-value, adjusted for all tests; 1 if all pairs are equal."""
     needed: int | None
-    """About how many episodes, or seeds per recipe, would decide, if the difference is as it seems; None if it is 0."""
+    """About how many episodes, or seeds per recipe, would decide if this is the true difference; None if it is 0."""
 
     @property
     def verdict(self) -> Verdict:
@@ -62,12 +62,12 @@ class MeanDifference:
 
 @dataclasses.dataclass(frozen=True)
 class SeedDifference(MeanDifference):
-    """The same between two recipes, over training seeds."""
+    """The mean difference between two recipes, over training seeds."""
 
     probability_of_improvement: float
     """How often a training of the candidate beats one of the baseline; ties count half (Agarwal et al., 2021)."""
     smallest_p: float
-    """The smallest p-value that so many seeds can reach at all."""
+    """The smallest p-value that this number of seeds can reach."""
 
 
 _Kind = TypeVar("_Kind", bound=MeanDifference)
@@ -113,8 +113,8 @@ def _adjust(differences: Mapping[Quantity, _Kind], p_values: Array, comparisons:
 def flip_signs(differences: Array) -> Array:
     """Return the p-values, shape (quantities,), of paired differences, shape (quantities, episodes), tested together.
 
-    Under the null hypothesis an episode's differences may as well have the other sign, all at once. Step-down maximum
-    of Westfall and Young (1993), which takes into account that success and return go together.
+    Under the null hypothesis all differences of an episode can change their sign together. Step-down maximum of
+    Westfall and Young (1993), which allows for the correlation of success and return.
     """
     moving = differences[:, differences.any(axis=0)]
     episodes = moving.shape[1]
@@ -130,23 +130,23 @@ def flip_signs(differences: Array) -> Array:
 def exchange_seeds(baseline: Array, candidate: Array) -> Array:
     """Return the p-values, shape (quantities,), of scores, shapes (quantities, seeds), of two recipes tested together.
 
-    Under the null hypothesis a seed may as well be the other recipe's; else as `flip_signs`.
+    Under the null hypothesis seeds can be exchanged between the recipes; otherwise as `flip_signs`.
     """
     scores = np.concatenate([candidate, baseline], axis=1)
-    count, every = candidate.shape[1], scores.shape[1]
+    count, total = candidate.shape[1], scores.shape[1]
     scores = scores - scores.mean(axis=1, keepdims=True)
     scale = scores.std(axis=1, keepdims=True)
     scaled = np.divide(scores, scale, out=np.zeros_like(scores), where=scale > 1e-12)
-    if exact := math.comb(every, count) <= _RESAMPLES:
-        chosen = np.array(list(itertools.combinations(range(every), count)))
+    if exact := math.comb(total, count) <= _RESAMPLES:
+        chosen = np.array(list(itertools.combinations(range(total), count)))
     else:
-        chosen = _rng().permuted(np.tile(np.arange(every), (_RESAMPLES, 1)), axis=1)[:, :count]
+        chosen = _rng().permuted(np.tile(np.arange(total), (_RESAMPLES, 1)), axis=1)[:, :count]
     # Of centred scores the sum over one recipe's seeds is proportional to the difference of means.
     return _step_down(np.abs(scaled[:, :count].sum(axis=1)), np.abs(scaled[:, chosen].sum(axis=2)).T, exact)
 
 
 def _step_down(observed: Array, resampled: Array, exact: bool) -> Array:
-    """Return p-values, shape (quantities,), of statistics, of which `resampled` is the null, shape (n, quantities)."""
+    """Return p-values, shape (quantities,); `resampled`, shape (n, quantities), is the null distribution."""
     order = np.argsort(-observed)
     largest = np.maximum.accumulate(resampled[:, order[::-1]], axis=1)[:, ::-1]
     extreme = (largest >= observed[order] - 1e-9).sum(axis=0)
@@ -156,7 +156,7 @@ def _step_down(observed: Array, resampled: Array, exact: bool) -> Array:
 
 
 def find_least_seeds(comparisons: int) -> tuple[int, float]:
-    """Return with how many seeds for each recipe a difference can be found at all, and their smallest p-value."""
+    """Return the fewest seeds per recipe that can show a difference, and their smallest p-value."""
     for seeds in itertools.count(2):
         if (smallest := comparisons * 2 / math.comb(2 * seeds, seeds)) < ALPHA:
             return seeds, smallest
@@ -166,7 +166,7 @@ def find_least_seeds(comparisons: int) -> tuple[int, float]:
 def success_difference(baseline: Array, candidate: Array) -> MeanDifference:
     """Compare two policies' successes, 0 or 1, on the same episodes: McNemar's exact test (McNemar, 1947).
 
-    Both of shape (episodes,). The interval is that of Agresti and Min (2005), which is not empty where no episode
+    Both of shape (episodes,). The interval is that of Agresti and Min (2005), which is not empty if no episode
     differs: half an episode is added to each of the four outcomes of a pair.
     """
     from scipy.stats import binomtest
@@ -200,7 +200,7 @@ def return_difference(baseline: Array, candidate: Array) -> MeanDifference:
 
 
 def seed_difference(baseline: Array, candidate: Array) -> SeedDifference:
-    """Compare two recipes by the final scores of their training seeds: an exact permutation test where it is small.
+    """Compare two recipes by the final scores of their training seeds: a permutation test, exact for few seeds.
 
     Shapes (seeds,), two seeds or more each. The interval of the difference of means is a bootstrap over seeds.
     """
@@ -234,7 +234,7 @@ def _difference_of_means(one: Array, two: Array, axis: int = -1) -> Any:
 
 
 def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]:
-    """Return a percentile bootstrap interval; the statistic itself, twice, where no sample varies."""
+    """Return a percentile bootstrap interval; if no sample varies, both ends are the statistic."""
     from scipy.stats import bootstrap
 
     if all(np.ptp(sample) == 0 for sample in samples):
@@ -247,7 +247,7 @@ def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]
 
 
 def _rng() -> np.random.Generator:
-    return np.random.default_rng(0)  # the same data give the same figures
+    return np.random.default_rng(0)  # the same data give the same result
 
 
 def _sample_size(difference: float, std: float, least: int) -> int | None:

@@ -1,4 +1,4 @@
-"""A run in a few numbers, read from the small files of its folder; a damaged folder is a summary too."""
+"""The summary of a run, read from the small files of its folder; a damaged folder has a summary too."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from rlctl.run.job import list_jobs, read_job
 Rows = list[dict[str, float | None]]
 """Of a table, oldest first; an empty field is None."""
 _LARGEST = 1e100
-"""No training has larger numbers; what draws and adds them would overflow."""
+"""Larger numbers are ignored: plots and sums would overflow."""
 _STANDARD_ERRORS = 1.645
 """A success rate is lower beyond this many standard errors: 5 % of equal policies count as lower (one-sided)."""
 _TAIL_BYTES = 4096
-"""The last row of a table is looked for here; a row has at most some hundred bytes."""
+"""The last row of a table is read from this many bytes; a row has a few hundred."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RunSummary:
-    """What `rlctl runs` shows of a run. Numbers are None where the run does not have them yet."""
+    """A line of `rlctl runs`. Numbers are None until the run has them."""
 
     path: Path
     task: str = ""
@@ -51,14 +51,14 @@ class RunSummary:
     """Recipe keys, dotted, that differ from the task's own recipe, and their values."""
     versions: dict[str, str] = dataclasses.field(default_factory=dict)
     folder: str = ""
-    """Where it was trained: a task named by a path is found from there."""
+    """The working folder of the training; a relative path of a task starts there."""
     source_sha256: str = ""
     """Of the task's file when the training began."""
 
     @property
     def name(self) -> str:
         """Return the path below the folder of all runs: `reach/2026-11-21_10-30-00_s0`."""
-        path = self.path.resolve()  # it may have been called "." or "latest"
+        path = self.path.resolve()  # the path may be "." or "latest"
         return "/".join(path.parts[-3 if is_group(path.parent) else -2 :])
 
     @property
@@ -112,7 +112,7 @@ def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
     last = last_row(run.metrics_file) or {}
     evaluations = read_table(run.evals_file)
     best = find_best_row(evaluations)
-    if status.get("status") == "finished":  # new episodes may have decided for the last policy
+    if status.get("status") == "finished":  # new episodes may have selected the last policy
         best = next((row for row in evaluations if row["steps"] == status.get("best_step")), best)
     state, reason = _state(run, status)
     steps = _first_number(last.get("steps", status.get("steps")))
@@ -141,7 +141,7 @@ def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
 
 
 def _first_number(*values: object) -> float | None:
-    """Return the first value that is a number, or the text of one, and not absurdly large."""
+    """Return the first value that is a number, or the text of one, and below `_LARGEST`."""
     for value in values:
         if isinstance(value, str | int | float) and not isinstance(value, bool):
             with contextlib.suppress(ValueError, OverflowError):
@@ -159,7 +159,7 @@ def _state(run: RunDirectory, status: dict[str, Any]) -> tuple[str, str]:
     if state == "finished":
         return "done", ""
     if state == "running":
-        # A killed training could not write that it stopped; its lock went with it.
+        # A killed training could not write that it stopped, but its lock is free.
         if is_being_written(run.path):
             return "running", ""
         return _remote_state(run, status) or ("stopped", "")

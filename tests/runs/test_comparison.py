@@ -13,8 +13,8 @@ from rlctl.recipe.sources import resolve
 from rlctl.run.train_request import TrainRequest
 from rlctl.runs.comparison import Candidate, RunComparison, Side, compare, find_recipe_changes
 from rlctl.runs.comparison_report import as_json, format_needed
+from rlctl.runs.listing import find_runs_of
 from rlctl.runs.report.write import write_report
-from rlctl.runs.selection import find_runs_of
 from rlctl.runs.significance import Verdict
 from rlctl.training.request import run_training
 from tests.training.conftest import ENVS, TINY
@@ -73,8 +73,8 @@ def test_recipes_are_compared_seed_by_seed(root):
     assert candidate.recipe_changes == {"algo_kwargs.gamma": (0.99, 0.9)}
     assert candidate.verdict is Verdict.CANNOT_TELL
     needed = format_needed(candidate, comparisons=1)
-    assert "smallest p-value that they can reach is 0.33" in needed
-    assert "if the difference in return is as it seems, about " in needed
+    assert "smallest possible p-value is 0.33" in needed
+    assert "would decide, if the true difference in return is the measured one" in needed
     content = json.loads(json.dumps(as_json(result)))
     baseline = content["baseline"]
     assert baseline["over_seeds"]["return"]["mean"] == pytest.approx(
@@ -99,7 +99,7 @@ def test_refusals(root, write_run):
         compare([str(one)], EvalRequest(None))
     with pytest.raises(UsageError, match="cannot be compared with itself"):
         compare([str(one), str(one)], EvalRequest(None))
-    with pytest.raises(UsageError, match="one run beside a group"):
+    with pytest.raises(UsageError, match="a single run cannot be compared with a group"):
         compare([str(one), str(root / "0.99/Line")], EvalRequest(None))
     with pytest.raises(ArtifactError, match="no run matches"):
         compare([str(one), f"{root}/0.5*"], EvalRequest(None))
@@ -133,5 +133,5 @@ def test_a_parameter_that_is_not_set_has_its_default():
 def test_a_report_of_two_recipes_begins_with_the_verdict(root):
     text = write_report([f"{root}/0.9*/Line/*"], "md", root / "report.md", episodes=2).read_text()
     assert "\n**gamma 0.99 against gamma 0.9: cannot tell**\n" in text
-    assert text.index("cannot tell") < text.index("In the evaluations that chose them")
-    assert "- tested: success and return, p-values adjusted for all tests together; where all are equal, 5% of" in text
+    assert text.index("cannot tell") < text.index("In the evaluations that selected them")
+    assert "- tested: success and return, p-values adjusted for all tests together; if all are equal, 5% of" in text

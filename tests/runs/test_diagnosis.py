@@ -274,7 +274,7 @@ def test_show_has_findings_with_advice(write_training, rlctl):
     run = write_training({**FLAT, "explained_variance": 0.01})
     shown = rlctl("runs", "show", run.path)
     assert "warning: Q9 observations do not suffice: training return" in shown.stdout
-    assert "try: Observe what the reward is made of" in shown.stdout
+    assert "try: Observe what the reward depends on" in shown.stdout
     assert "gamma is 0.99: usually 0.9 to 0.9999" in shown.stdout
     (finding,) = json.loads(rlctl("runs", "show", run.path, "--json", "-").stdout)["findings"]
     assert finding["id"] == "Q9"
@@ -285,7 +285,7 @@ def test_training_ends_with_warnings_in_full_and_the_rest_in_a_line(write_traini
     findings = diagnose(write_training({**FLAT, "explained_variance": 0.01, "playing": 0.1}))
     lines = format_end(findings, "runs/x")
     assert lines[0].startswith("warning: Q9 ")
-    assert lines[-1] == "noted: Q13 slow updates or a slow policy; more: rlctl runs show runs/x"
+    assert lines[-1] == "also noted: Q13 slow updates or a slow policy; details: rlctl runs show runs/x"
     assert format_end([], "runs/x") == []
 
 

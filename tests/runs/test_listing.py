@@ -87,7 +87,7 @@ def test_order_and_selection(write_run):
     assert [run.task for run in list_runs("reach")] == ["reach"]
     with pytest.raises(UsageError, match=r"no run of 'reech'.*Did you mean 'reach'"):
         list_runs("reech")
-    with pytest.raises(UsageError, match=r"no such command of rlctl runs\. Did you mean 'show'"):
+    with pytest.raises(UsageError, match=r"rlctl runs has no such command\. Did you mean 'show'"):
         list_runs("shwo", commands=["list", "show", "compare"])
 
 

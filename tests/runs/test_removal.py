@@ -137,4 +137,4 @@ def test_only_what_is_named_is_pruned_and_a_dry_run_removes_nothing(write_run, r
     assert [(run / "checkpoints").exists() for run in (one, two)] == [True, False]
     done = rlctl("runs", "prune", stopped, "--yes")
     assert done.returncode == 2
-    assert "only a finished run can do without its checkpoints" in done.stderr
+    assert "only the checkpoints of finished runs can be removed" in done.stderr

@@ -51,7 +51,7 @@ def write(*runs, **options):
 
 def test_page_has_everything_and_needs_nothing_else(group):
     page = write(group[2])
-    assert "In the evaluation that chose it the best policy succeeds in 100.0% of 100 episodes, with" in page
+    assert "In the evaluation that selected it, the best policy succeeds in 100.0% of 100 episodes, with" in page
     for plot in ("Return over training steps", "Success rate over training steps", "Reward terms over training steps"):
         assert f'aria-label="{plot}"' in page
         assert f">{plot}</text>" in page
@@ -105,16 +105,16 @@ def test_a_band_per_recipe(group):
     ]
     page = write(*group, episodes=0)
     assert page.count(">learning_rate 0.001</text>") == 3  # legends of return and success, title of its terms
-    assert "learning_rate 0.002: In the evaluation that chose it" in page
+    assert "learning_rate 0.002: In the evaluation that selected it" in page
     assert "Mean of 1 to 2 trainings each, from the lowest to the highest." in page
-    assert "not compared: learning_rate 0.002: one run beside a group of seeds" in write(*group)
+    assert "not compared: learning_rate 0.002: a single run cannot be compared" in write(*group)
 
 
 def test_a_bad_result_is_not_called_usual(write_run):
     run = write_run("reach/2026-11-21_10-00-00_s0", evals=((1000, 0.088, 1.0),))
     page = write(run)
     assert "Nothing unusual" not in page
-    assert "No known mistake shows in the records of this training, but the best policy succeeds in only 8.8%" in page
+    assert "The records of this training show no known mistake, but the best policy succeeds in only 8.8%" in page
 
 
 def test_curves_of_seeds_are_averaged_at_common_steps():
@@ -143,7 +143,7 @@ def test_robustness_is_in_it_where_it_was_measured(group):
     )  # fmt: skip
     robustness.write(group[0] / "robustness.json", result)
     page = write(group[0])
-    assert "worst of 20 episodes each at mass 0.6: success 30.0%, return 1" in page
+    assert "worst cell, 20 episodes at mass 0.6: success 30.0%, return 1" in page
     (group[1] / "robustness.json").write_text("{")
     assert "robustness.json: damaged: " in write(group[1])
     assert 'aria-label="Success rate by mass"' in page

@@ -1,7 +1,7 @@
-"""What is wrong with a training, as far as its run folder shows it: Q1 to Q13, each with its evidence and what to try.
+"""The diagnosis of a training from its run folder: findings Q1 to Q13, each with its evidence and what to try.
 
-One sign alone means little: in a perfect training of `reach`, `approx_kl > 0.03` holds for three of four updates. So a
-finding needs several signs together; which ones, and all texts, are data in `findings.yaml`.
+A single sign proves little: in a perfect training of `reach`, three of four updates have `approx_kl > 0.03`. So a
+finding is a combination of signs; `findings.yaml` has the combinations and all texts.
 """
 
 from rlctl.runs.diagnosis.findings import Finding, Grade, diagnose, explain, format_end, format_finding

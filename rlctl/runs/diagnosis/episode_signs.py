@@ -1,4 +1,4 @@
-"""Signs in the recorded episodes of the last evaluations, in which the policy acts as it does in use."""
+"""Signs in the recorded episodes of the last evaluations, which are played without exploration."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MOST_OVERLAP = 0.05
 
 
 def _actions(run: History) -> list[Array]:
-    """Return the actions of each episode, shape (T, elements), in half ranges; none where they have no limits."""
+    """Return each episode's actions, shape (T, elements), as fractions of half their range; empty without limits."""
     if run.env is None:
         return []
     space = run.env.spaces()[1]
@@ -33,7 +33,7 @@ def _actions(run: History) -> list[Array]:
 
 
 def shakes(run: History) -> str | None:
-    """Actions jump to and fro from step to step by a large part of their range."""
+    """Actions reverse from step to step by a large part of their range."""
     changes = []
     for actions in _actions(run):
         change = np.diff(actions, axis=0)
@@ -43,24 +43,24 @@ def shakes(run: History) -> str | None:
     reversals, size = np.median(changes, axis=0)
     if reversals < 0.6 or size < 0.4:
         return None
-    return f"actions reverse in {reversals:.0%} of the steps, by {size:.2g} half ranges on average"
+    return f"actions reverse in {reversals:.0%} of the steps, on average by {size:.2g} of half their range"
 
 
 def stands_still(run: History) -> str | None:
-    """The policy does next to nothing."""
+    """The actions are nearly zero."""
     sizes = [float(np.abs(actions).mean()) for actions in _actions(run)]
     if not sizes or run.progress < 0.5 or (largest := max(sizes)) > 0.05:
         return None
-    return f"actions are {largest:.1%} of their half range on average"
+    return f"actions are on average {largest:.1%} of half their range"
 
 
 def mostly_constant_reward(run: History) -> str | None:
-    """Most of the positive reward is paid alike in every step, whatever is done."""
+    """Most of the positive reward is the same in every step, whatever the policy does."""
     return _describe_constant_reward(run, 0.7)
 
 
 def only_constant_reward(run: History) -> str | None:
-    """Next to all of the positive reward is paid alike in every step."""
+    """Nearly all of the positive reward is the same in every step."""
     return _describe_constant_reward(run, 0.9)
 
 
@@ -76,7 +76,7 @@ def _constant_share(episode: RecordedEpisode, weights: dict[str, float]) -> floa
     if len(episode.rewards) < _LEAST_STEPS or not episode.info.term_names:
         return None
     weighted = episode.terms * np.array([weights.get(name, 1.0) for name in episode.info.term_names])
-    inner = weighted[:-1]  # what the last step pays is for the end
+    inner = weighted[:-1]  # the last step may have a reward for the end
     positive = np.maximum(inner, 0).sum(axis=0)
     constant = inner.std(axis=0) <= 0.05 * np.abs(inner.mean(axis=0))
     total = float(positive.sum())
@@ -84,7 +84,7 @@ def _constant_share(episode: RecordedEpisode, weights: dict[str, float]) -> floa
 
 
 def impossible_motion(run: History) -> str | None:
-    """Speeds, or jumps of positions, that no robot has."""
+    """Speeds, or jumps of positions, that no real robot reaches."""
     if run.env is None:
         return None
     motions = []
@@ -95,7 +95,7 @@ def impossible_motion(run: History) -> str | None:
 
 
 def _fast(name: str, unit: str, rows: Array, control_dt: float | None) -> list[tuple[float, str]]:
-    """Return how many times too fast an observation is, in words too; nothing where it is so in less than two steps."""
+    """Return by which factor an observation is too fast, with a sentence; empty if in fewer than two steps."""
     speeds, limit = np.abs(rows).max(axis=1), _MOST_SPEED.get(unit)
     if unit == "m" and control_dt and len(rows) > 1:
         speeds, limit = np.abs(np.diff(rows, axis=0)).max(axis=1) / control_dt, _MOST_POSITION_SPEED
@@ -106,7 +106,7 @@ def _fast(name: str, unit: str, rows: Array, control_dt: float | None) -> list[t
 
 
 def bodies_overlap(run: History) -> str | None:
-    """Bodies are far inside each other in half of the episodes that the last evaluations measured."""
+    """Bodies overlap far in half of the episodes of the last evaluations."""
     depths = run.evaluation_curve("overlap").values[-2:]
     if not len(depths) or (depth := float(depths.min())) < _MOST_OVERLAP:
         return None
@@ -114,7 +114,7 @@ def bodies_overlap(run: History) -> str | None:
 
 
 def badly_scaled_observations(run: History) -> str | None:
-    """Observations that are not normalised differ a thousand times in size."""
+    """Observations are not normalised, and their scales differ by a factor of 1,000."""
     settings = run.recipe.get("normalize")
     if (isinstance(settings, dict) and settings.get("observation", True)) or not run.episodes:
         return None

@@ -1,4 +1,4 @@
-"""What signs mean together, and findings as lines; which signs make one, and its texts, are data in `findings.yaml`."""
+"""Findings of a training; `findings.yaml` has the combinations of signs that make a finding, and its texts."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ class Grade(enum.StrEnum):
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """A parameter to try another value of."""
+    """A hyperparameter that may need another value."""
 
     name: str
     value: Any
-    """What the recipe has, or SB3's default."""
+    """The value in the recipe, or SB3's default."""
     advice: str
     """Its usual range and value, and what raising and lowering it does."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Something that a training's records show."""
+    """A problem that the records of a training show."""
 
     id: str
     """Q1 to Q13."""
     name: str
     grade: Grade
     evidence: list[str]
-    """What was seen, in numbers."""
+    """The numbers that show it."""
     meaning: str
     advice: list[str]
     settings: list[Setting]
@@ -85,31 +85,31 @@ def diagnose(run: RunDirectory | History) -> list[Finding]:
     functions = list_signs()
 
     @functools.cache
-    def look(name: str) -> str | None:
+    def read_sign(name: str) -> str | None:
         return functions[name](history)
 
-    findings = [finding for text in _texts()["findings"] if (finding := _check(text, look, history)) is not None]
+    findings = [finding for text in _texts()["findings"] if (finding := _check(text, read_sign, history)) is not None]
     return sorted(findings, key=lambda finding: list(Grade).index(finding.grade))
 
 
-def _check(text: dict[str, Any], look: Callable[[str], str | None], history: History) -> Finding | None:
-    holding = [signs for signs in text["when"] if all(_holds(name, look) for name in signs)]
-    if not holding:
+def _check(text: dict[str, Any], read_sign: Callable[[str], str | None], history: History) -> Finding | None:
+    matches = [signs for signs in text["when"] if all(_holds(name, read_sign) for name in signs)]
+    if not matches:
         return None
-    names = dict.fromkeys(name for signs in holding for name in signs if not name.startswith(_NOT))
+    names = dict.fromkeys(name for signs in matches for name in signs if not name.startswith(_NOT))
     return Finding(
         id=text["id"],
         name=text["name"],
         grade=Grade(text["grade"]),
-        evidence=list(dict.fromkeys(evidence for name in names if (evidence := look(name)) is not None)),
+        evidence=list(dict.fromkeys(evidence for name in names if (evidence := read_sign(name)) is not None)),
         meaning=text["meaning"],
         advice=[history.name_run(advice) for advice in text["try"]],
         settings=list(_settings(text["settings"], history)),
     )
 
 
-def _holds(name: str, look: Callable[[str], str | None]) -> bool:
-    return look(name.removeprefix(_NOT)) is None if name.startswith(_NOT) else look(name) is not None
+def _holds(name: str, read_sign: Callable[[str], str | None]) -> bool:
+    return read_sign(name.removeprefix(_NOT)) is None if name.startswith(_NOT) else read_sign(name) is not None
 
 
 def _settings(names: Iterable[str], history: History) -> Iterable[Setting]:
@@ -122,7 +122,7 @@ def _settings(names: Iterable[str], history: History) -> Iterable[Setting]:
 
 
 def explain(code: str) -> list[str]:
-    """Return what the findings of an id, as Q10, mean, and what to try; raises `UsageError` for another id."""
+    """Return what the findings of an id (`Q10`) mean, and what to try; raises `UsageError` for an unknown id."""
     texts = [text for text in _texts()["findings"] if text["id"] == code.upper()]
     if not texts:
         known = list(dict.fromkeys(text["id"] for text in _texts()["findings"]))
@@ -146,8 +146,8 @@ def format_finding(finding: Finding) -> list[str]:
 
 
 def format_end(findings: Sequence[Finding], run: str) -> list[str]:
-    """Return what a training says at its end: warnings in full, the rest in one line; nothing where all is well."""
+    """Return the lines at the end of a training: warnings in full, other findings in one line."""
     warnings = [finding for finding in findings if finding.grade == Grade.WARNING]
     others = [f"{finding.id} {finding.name}" for finding in findings if finding.grade != Grade.WARNING]
     lines = [line for finding in warnings for line in format_finding(finding)]
-    return [*lines, f"noted: {', '.join(others)}; more: rlctl runs show {run}"] if others else lines
+    return [*lines, f"also noted: {', '.join(others)}; details: rlctl runs show {run}"] if others else lines

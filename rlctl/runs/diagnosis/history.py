@@ -1,4 +1,4 @@
-"""What a run folder holds of a training, as curves."""
+"""The records of a training, read from its run folder, as curves."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from rlctl.runs.summary import Rows, list_points, read_table
 Array = NDArray[np.float64]
 
 LEAST_ROWS = 10
-"""Of `metrics.csv`; of a shorter training most signs say nothing."""
+"""Rows of `metrics.csv`; with fewer rows most signs are not checked."""
 _GOOD = 0.8
-"""From this success rate on a training has succeeded, whatever its records look like."""
+"""A training with this success rate has succeeded, whatever its other records are."""
 EPISODES = 4
-"""Recorded episodes that are looked at: of the last two evaluations, as each keeps its first and its worst."""
+"""Recorded episodes that are checked: the first and the worst of the last two evaluations."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Curve:
         return float(self.values[:size].mean()), float(self.values[-size:].mean())
 
     def noise(self) -> float:
-        """Return the standard deviation from point to point, a slow change left out; for a normal distribution."""
+        """Return the standard deviation of normal noise from point to point, without slow changes."""
         if len(self) < 3:
             return 0.0
         return float(np.median(np.abs(np.diff(self.values))) / 0.954)
@@ -61,7 +61,7 @@ class Curve:
 
 
 class History:
-    """Reads a run when it is asked; what is missing or damaged is empty."""
+    """Reads the records of a run on demand; a missing or damaged record is empty."""
 
     def __init__(self, run: RunDirectory) -> None:
         self.run = run
@@ -75,7 +75,7 @@ class History:
             return {}
 
     def name_run(self, text: str) -> str:
-        """Put the run and its task into a command."""
+        """Replace RUN and TASK in a command by the run and its task."""
         return text.replace("RUN", str(self.run.path)).replace("TASK", str(self.status.get("task", "TASK")))
 
     @functools.cached_property
@@ -115,8 +115,8 @@ class History:
         curve, reached = self.curve(name), self.curve("stage")
         if not self.stage_count or not len(reached):
             return curve
-        kept = np.isin(curve.steps, reached.steps[reached.values == self.stage_count])
-        return Curve(curve.steps[kept], curve.values[kept])
+        in_last = np.isin(curve.steps, reached.steps[reached.values == self.stage_count])
+        return Curve(curve.steps[in_last], curve.values[in_last])
 
     @property
     def successes(self) -> tuple[Curve, Curve]:
@@ -125,12 +125,12 @@ class History:
 
     @property
     def is_good(self) -> bool:
-        """Whether nearly all episodes succeeded once."""
+        """Whether the success rate reached `_GOOD` at least once."""
         return any(len(curve) and curve.values.max() >= _GOOD for curve in self.successes)
 
     @functools.cached_property
     def progress(self) -> float:
-        """How much of the planned training is done, in [0, 1]; 1 for one that ended as planned."""
+        """The finished fraction of the planned training, in [0, 1]; 1 if it ended as planned."""
         if self.status.get("status") == "finished":
             return 1.0
         total, steps = self.recipe.get("total_timesteps"), self.curve("steps").values
@@ -149,7 +149,7 @@ class History:
 
     @functools.cached_property
     def env(self) -> EnvInfo | None:
-        """What the policy was trained in."""
+        """The environment that the policy was trained in."""
         for file in (self.run.last_policy, self.run.best_policy):
             try:
                 return PolicyFile.read(file).info.env

@@ -1,4 +1,4 @@
-"""Signs in where the time went, and in how a run ended. Functions as in `signs`."""
+"""Signs in the use of time and in the end of a run. Functions as in `signs`."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
 
 
 def learner_slow(run: History) -> str | None:
-    """Most of the time goes into updates."""
+    """Updates take most of the time."""
     shares = _read_shares(run)
     return shares.describe() if shares and shares.learner >= 0.75 else None
 
 
 def policy_slow(run: History) -> str | None:
-    """The environments' own time goes into choosing actions."""
+    """Choosing actions takes more time than stepping the environments."""
     shares = _read_shares(run)
     return shares.describe() if shares and shares.policy > max(0.4, shares.environments) else None
 
 
 def environments_slow(run: History) -> str | None:
-    """Most of the time goes into slow environments."""
+    """Slow environments take most of the time."""
     shares = _read_shares(run)
     if shares is None or shares.environments < 0.5 or shares.learner > 0.2 or shares.steps_per_s > 300:
         return None
@@ -32,7 +32,7 @@ def environments_slow(run: History) -> str | None:
 
 @dataclasses.dataclass(frozen=True)
 class _Shares:
-    """Parts of the learner's time; what plays beside its updates is no part."""
+    """Fractions of the learner's time; environments that step during updates do not count."""
 
     environments: float
     policy: float
@@ -88,7 +88,7 @@ def last_stage_never_begun(run: History) -> str | None:
 
 
 def stage_never_succeeds(run: History) -> str | None:
-    """A large part of all steps went into a stage before the last, and no episode of it has succeeded."""
+    """A stage before the last took a large part of all steps, and none of its episodes succeeded."""
     reached, success = run.curve("stage"), run.curve("success")
     if not len(reached) or not len(success) or reached.values[-1] >= run.stage_count:
         return None

@@ -1,4 +1,4 @@
-"""Signs in returns, lengths and successes. Each function returns its evidence, or None where the sign is not there."""
+"""Signs in returns, lengths and successes. Each function returns the evidence of a sign, or None without it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def flat(run: History) -> str | None:
 
 
 def no_longer_rises(run: History) -> str | None:
-    """Evaluations last as long as they can, and their return is hardly above that of the middle of the training."""
+    """Evaluations reach the time limit, but their return hardly rises after the middle of the training."""
     returns, lengths = run.evaluation_curve("return"), run.evaluation_curve("length")
     if len(returns) < _LEAST_EVALUATIONS or run.progress < 0.5 or run.is_good:
         return None
@@ -61,7 +61,7 @@ def _rises(success: Curve) -> bool:
 
 
 def success_rises(run: History) -> str | None:
-    """The success rate of the evaluations rises, so the policy does more than collect what every step pays."""
+    """The success rate of the evaluations rises, so the policy does more than collect a constant reward."""
     success = run.evaluation_curve("success")
     if len(success) < 2 or not _rises(success):
         return None
@@ -69,7 +69,7 @@ def success_rises(run: History) -> str | None:
 
 
 def never_succeeds(run: History) -> str | None:
-    """Success is reported, and there is hardly any."""
+    """Success is reported, but hardly any episode succeeds."""
     curves = [curve for curve in run.successes if len(curve)]
     if not curves or run.progress < 0.5 or (best := max(float(curve.values.max()) for curve in curves)) > _NEVER:
         return None
@@ -77,7 +77,7 @@ def never_succeeds(run: History) -> str | None:
 
 
 def succeeds_by_exploring(run: History) -> str | None:
-    """Training episodes succeed, by what exploration adds, and not one evaluation does, to the end."""
+    """Training episodes succeed with exploration noise, but evaluations never do, up to the end."""
     evaluated, trained = run.evaluation_curve("success"), run.last_stage_curve("success")
     if run.progress < 1 or len(evaluated) < _LEAST_EVALUATIONS or not len(trained):
         return None
@@ -126,7 +126,7 @@ def _count_drops(curve: Curve, least: float) -> int:
 
 
 def collapsed(run: History) -> str | None:
-    """The return rose and has fallen for good, in training and in evaluations."""
+    """The return rose, then fell and did not recover, in training and in evaluations."""
     parts = []
     for curve, what, least in (
         (run.curve("return"), "training return", LEAST_ROWS),
@@ -140,7 +140,7 @@ def collapsed(run: History) -> str | None:
 
 
 def _find_fall(curve: Curve) -> tuple[float, float, float, float] | None:
-    """Return start, peak, end and step of the peak, of a curve that lost more than half of what it had gained."""
+    """Return start, peak, end and step of the peak, if the curve lost more than half of its gain."""
     window = max(2, len(curve) // 8) if len(curve) >= LEAST_ROWS else 1
     smooth = np.convolve(curve.values, np.ones(window) / window, "valid")
     at = int(smooth.argmax())
@@ -173,7 +173,7 @@ def early_peak(run: History) -> str | None:
 
 
 def penalties_dominate(run: History) -> str | None:
-    """Of the weighted reward terms at the end, the negative ones weigh three times the positive ones."""
+    """At the end the negative reward terms sum to more than three times the positive ones."""
     means = {name: curve.thirds()[1] for name, curve in run.terms().items() if len(curve) >= 3}
     negative = -sum(value for value in means.values() if value < 0)
     positive = sum(value for value in means.values() if value > 0)
@@ -206,7 +206,7 @@ def return_rises(run: History) -> str | None:
 
 
 def distance_grows(run: History) -> str | None:
-    """Episodes end ever farther from the goal."""
+    """Episodes end farther and farther from the goal."""
     curve = run.curve("distance")
     if len(curve) < _LEAST_RETURNS or run.progress < 0.5 or curve.rise() < 3:
         return None
@@ -215,7 +215,7 @@ def distance_grows(run: History) -> str | None:
 
 
 def time_limit_terminates(run: History) -> str | None:
-    """Every episode ends at the same step, and is said to be terminated: a time limit that is not truncation."""
+    """Every episode ends at the same step as terminated: a time limit that should truncate."""
     lengths, terminated = run.curve("length"), run.curve("terminated")
     if len(lengths) < 5 or len(terminated) < 5 or np.ptp(lengths.values) > 0 or terminated.values.min() < 1:
         return None

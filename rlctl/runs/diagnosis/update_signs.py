@@ -1,4 +1,4 @@
-"""Signs in what SB3 logs of updates, and in what is measured after them. Functions as in `signs`."""
+"""Signs in the values that are logged and measured after updates. Functions as in `signs`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def critic_explains_nothing(run: History) -> str | None:
 
 
 def values_explode(run: History) -> str | None:
-    """The critic expects far more than rewards can add up to."""
+    """The critic predicts more than rewards can add up to."""
     value, most = run.curve("value"), _largest_value(run)
     if len(value) < LEAST_ROWS or most is None:
         return None
@@ -34,7 +34,7 @@ def values_explode(run: History) -> str | None:
 
 
 def gradients_explode(run: History) -> str | None:
-    """Gradients are far larger than errors of a value could make them."""
+    """Gradients are far larger than errors of the value function can explain."""
     norm, most = run.curve("gradient_norm"), _largest_value(run)
     if len(norm) < LEAST_ROWS or most is None or (peak := float(norm.values.max())) < 1000 * max(most, 1.0):
         return None
@@ -60,13 +60,13 @@ def policy_hardly_changes(run: History) -> str | None:
 
 
 def policy_jumps(run: History) -> str | None:
-    """Updates change the policy several times as much as PPO is made for."""
+    """Updates change the policy several times more than PPO intends."""
     change = _read_change(run)
     return change.describe() if change and (change.kl >= 0.2 or change.clipped >= 0.55) else None
 
 
 def policy_is_replaced(run: History) -> str | None:
-    """Each update makes another policy of it, and none of them is good."""
+    """Each update replaces the policy by a very different one, and none of them is good."""
     change = _read_change(run)
     return change.describe() if change and not run.is_good and change.kl >= 1 and change.clipped >= 0.7 else None
 
@@ -89,14 +89,14 @@ def _read_change(run: History) -> _Change | None:
 
 
 def exploration_vanishes(run: History) -> str | None:
-    """The policy has become all but deterministic with half of the training to go, or was so from the beginning."""
+    """The policy is almost deterministic halfway through the training, or from the beginning."""
     curve = _exploration(run)
     if len(curve) < LEAST_ROWS:
         return None
     half = curve.values[max(0, len(curve) // 2 - 2) : len(curve) // 2 + 1].mean()
     if half > 0.1 * curve.values[0] and not (curve.values[0] < 0.02 and half < 0.02):
         return None
-    return f"exploration {curve.values[0]:.2g} at first, {half:.2g} half-way (1 is the half range of an action)"
+    return f"exploration {curve.values[0]:.2g} at first, {half:.2g} halfway (1 is half the range of an action)"
 
 
 def _exploration(run: History) -> Curve:
@@ -119,11 +119,15 @@ def exploration_explodes(run: History) -> str | None:
     if len(curve) < LEAST_ROWS:
         return None
     first, last = curve.thirds()
-    return f"exploration grows from {first:.2g} to {last:.2g} half ranges" if last > max(2 * first, 2.0) else None
+    return (
+        f"exploration grows from {first:.2g} to {last:.2g} of half the action range"
+        if last > max(2 * first, 2.0)
+        else None
+    )
 
 
 def saturated(run: History) -> str | None:
-    """Nearly all actions are at a limit, in the training and where the best of them is taken."""
+    """Nearly all actions are at a limit of their range."""
     curve = run.curve("action_saturation")
     if len(curve) < LEAST_ROWS or (last := curve.thirds()[1]) < 0.8:
         return None

@@ -1,1 +1,1 @@
-"""`rlctl runs report`: what came of a training, or of one recipe with several seeds, as one file to read or to send."""
+"""`rlctl runs report`: the results of trainings as one file."""

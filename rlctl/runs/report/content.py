@@ -1,4 +1,4 @@
-"""What a report says, before it has a format."""
+"""The content of a report, before it is formatted."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rlctl.recipe.stages import format_value
 from rlctl.run.episode import RecordedEpisode
 from rlctl.runs.comparison import RunComparison, compare_runs, find_recipe_changes
 from rlctl.runs.diagnosis import Finding
-from rlctl.runs.selection import find_runs_of
+from rlctl.runs.listing import find_runs_of
 from rlctl.runs.show import RunDescription
 from rlctl.runs.summary import Rows, list_points
 from rlctl.tasks.listing import read_summary
@@ -43,7 +43,7 @@ class RunReport:
 
     recipes: list[RecipeRuns]
     notes: list[str]
-    """What a reader must know of the runs themselves."""
+    """Warnings about the runs."""
 
     @property
     def runs(self) -> list[RunDescription]:
@@ -60,9 +60,9 @@ class RunReport:
 
 
 def collect(texts: Sequence[str]) -> RunReport:
-    """Read the runs that some words name.
+    """Read the runs that arguments name.
 
-    Raises `ArtifactError` for a damaged run and one that has nothing yet, `UsageError` for runs of several tasks.
+    Raises `ArtifactError` for a damaged run and one without records, `UsageError` for runs of several tasks.
     """
     folders = {run.path.resolve(): run for text in texts for run in find_runs_of(text)}
     runs = [RunDescription(run) for run in folders.values()]
@@ -70,9 +70,9 @@ def collect(texts: Sequence[str]) -> RunReport:
         if run.summary.state == "damaged":
             raise ArtifactError(f"{run.run.path}: damaged: {run.summary.reason}")
     if len(tasks := {run.summary.task for run in runs}) > 1:
-        raise UsageError(f"runs of several tasks, {', '.join(sorted(tasks))}: a report is of one")
+        raise UsageError(f"runs of several tasks, {', '.join(sorted(tasks))}: a report is about one")
     if not any(run.metrics or run.evaluations for run in runs):
-        raise ArtifactError(f"{runs[0].run.path}: nothing to report yet: not one update is done")
+        raise ArtifactError(f"{runs[0].run.path}: nothing to report yet: no update is finished")
     notes = [note for run in runs for note in _find_notes(run)]
     try:
         return RunReport(_group_by_recipe(runs), notes)
@@ -90,7 +90,7 @@ def _find_notes(run: RunDescription) -> list[str]:
 
 
 def _group_by_recipe(runs: Sequence[RunDescription]) -> list[RecipeRuns]:
-    """Put runs together that differ in nothing but the seed; raises `RlctlError` for a recipe that cannot be read."""
+    """Group runs that differ only in the seed; raises `RlctlError` for a recipe that cannot be read."""
     groups: list[tuple[Recipe, list[RunDescription]]] = []
     for run in runs:
         recipe = run.run.recipe()
@@ -129,7 +129,7 @@ def compare_recipes(report: RunReport, episodes: int) -> RunComparison | None:
 
 
 def list_facts(report: RunReport) -> list[tuple[str, str]]:
-    """Return what, when, how long and where was trained, with names."""
+    """Return names and texts: task, start, duration, machine and versions."""
     summaries = [run.summary for run in report.runs]
     task = summaries[0].task
     entry = installed.find(task)
@@ -156,7 +156,7 @@ def list_facts(report: RunReport) -> list[tuple[str, str]]:
 def summarize_result(runs: Sequence[RunDescription]) -> str:
     """Return the result of the runs of a recipe as a sentence.
 
-    It says where its figures come from: the best of several evaluations is better than new episodes will be.
+    It names the source of its numbers: the best of several evaluations overestimates new episodes.
     """
     scored = [run for run in runs if run.summary.best_return is not None]
     if not scored:
@@ -169,11 +169,11 @@ def summarize_result(runs: Sequence[RunDescription]) -> str:
         if summary.best_success is not None:
             verb = f"succeeds in {summary.best_success:.1%} of {count} episodes, with"
         of_return = f"a mean return of {summary.best_return:.4g}, at step {summary.best_step or 0:,}"
-        return f"In the evaluation that chose it the best policy {verb} {of_return}."
+        return f"In the evaluation that selected it, the best policy {verb} {of_return}."
     successes = [run.summary.best_success for run in scored if run.summary.best_success is not None]
     returns = [run.summary.best_return for run in scored if run.summary.best_return is not None]
     of_returns = f"a mean return of {np.mean(returns):.4g} ({min(returns):.4g} to {max(returns):.4g})"
-    start = f"In the evaluations that chose them the best policies of {len(scored)} trainings"
+    start = f"In the evaluations that selected them, the best policies of {len(scored)} trainings"
     if len(successes) < len(scored):
         return f"{start} have {of_returns}."
     rates = f"{np.mean(successes):.1%} of the episodes ({min(successes):.1%} to {max(successes):.1%})"
@@ -181,19 +181,19 @@ def summarize_result(runs: Sequence[RunDescription]) -> str:
 
 
 def describe_absence(report: RunReport) -> str:
-    """Return what a report without findings says: that nothing is known to be wrong, but not that a result is good."""
+    """Return the diagnosis without findings: no known problem, which does not mean a good result."""
     which = "this training" if len(report.runs) == 1 else "these trainings"
     rates = [run.summary.best_success for run in report.runs if run.summary.best_success is not None]
     if not rates or (best := max(rates)) >= _GOOD_SUCCESS:
         return f"Nothing unusual in the records of {which}."
     return (
-        f"No known mistake shows in the records of {which}, but the best policy succeeds in only {best:.1%} of the "
+        f"The records of {which} show no known mistake, but the best policy succeeds in only {best:.1%} of the "
         "episodes: train longer, make the task easier first (stages), or look at an episode with rlctl replay."
     )
 
 
 def collect_findings(report: RunReport) -> list[tuple[Finding, list[str]]]:
-    """Return what the runs' records show, each finding once, with its evidence; of several runs with their seeds."""
+    """Return the findings of all runs, each once, with the evidence of every run."""
     findings: dict[str, tuple[Finding, list[str]]] = {}
     for run in report.runs:
         for finding in run.findings:
@@ -210,7 +210,7 @@ def list_commands(report: RunReport) -> list[str]:
         changes = [
             f"{key}={value if isinstance(value, str) else json.dumps(value)}"
             for key, value in run.summary.changes.items()
-            if value != NOT_SET  # another algorithm's, which its own `algo` leaves out
+            if value != NOT_SET  # a key of another algorithm, which `algo` removes
         ]
         source = run.status.get("from")
         start = ["--from", str(source.get("policy"))] if isinstance(source, dict) else []
@@ -226,7 +226,7 @@ def list_commands(report: RunReport) -> list[str]:
 
 
 def choose_episodes(report: RunReport) -> list[tuple[str, RecordedEpisode]]:
-    """Return the best and the worst recorded episode of the best evaluation there are episodes of, with their names."""
+    """Return the best and the worst recorded episode of the best run's last evaluation, with captions."""
     episodes = max(report.runs, key=lambda run: run.summary.score).episodes
     steps = max((_trained_steps(episode) for episode in episodes), default=-1)
     last = [episode for episode in episodes if _trained_steps(episode) == steps]
@@ -252,7 +252,7 @@ def _outcome(episode: RecordedEpisode) -> str:
 def mean_curve(tables: Sequence[Rows], column: str, points: int = 200) -> dict[str, Any] | None:
     """Return steps, mean, lowest and highest over several tables at common steps; None without a value.
 
-    All of one shape, at most (points,); a single table gives its own rows, averaged where there are more.
+    All of one shape, at most (points,); the rows of a single table are averaged down to `points`.
     """
     curves = [np.array(curve) for rows in tables if (curve := list_points(rows, column))]
     if not curves:

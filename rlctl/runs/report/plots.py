@@ -1,4 +1,4 @@
-"""The plots of a report, as SVG texts that stand in an HTML page."""
+"""The plots of a report, as SVG texts for an HTML page."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def plot_learning(report: RunReport, column: str) -> str | None:
     for number, recipe in enumerate(report.recipes):
         training = mean_curve([run.metrics for run in recipe.runs], column)
         evaluated = mean_curve([run.evaluations for run in recipe.runs], column)
-        color = {"color": f"C{number}"} if recipe.name else {}  # a colour is a recipe
+        color = {"color": f"C{number}"} if recipe.name else {}  # a colour per recipe
         if training is not None:
             _draw_curve(axes, training, recipe.name or "training", color)
         if evaluated is not None:
@@ -121,7 +121,7 @@ def _plot_varied(result: RobustnessMap, quantity: str) -> str:
 
 
 def plot_push(test: PushTest) -> str:
-    """Return how many episodes go well by the push."""
+    """Return the fraction of episodes that go well over the impulse of the push."""
     figure, axes = _make_figure()
     axes.plot([level.impulse for level in test.levels], [level.held for level in test.levels], marker="o", ms=3)
     if test.threshold is not None:
@@ -155,11 +155,9 @@ def _finish(figure: Figure, axes: Axes, x: str, y: str, title: str) -> str:
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     file = io.StringIO()
     with matplotlib.rc_context(_STYLE):
-        figure.savefig(
-            file, format="svg", transparent=True, metadata={"Date": None, "Creator": None, "Format": None, "Type": None}
-        )
-    svg = file.getvalue()[file.getvalue().index("<svg") :].replace("#000000", "currentColor")  # which is of the page
-    # The page scales it; a name is for those who cannot see it.
+        figure.savefig(file, format="svg", transparent=True, metadata=_NO_METADATA)
+    svg = file.getvalue()[file.getvalue().index("<svg") :].replace("#000000", "currentColor")  # the page's text colour
+    # The page scales the plot; screen readers read its name.
     name = title.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     return re.sub(
         r'^<svg ([^>]*?)width="[^"]*"',

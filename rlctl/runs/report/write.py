@@ -32,9 +32,9 @@ def write_report(
 ) -> Path | None:
     """Write a report and return its file, by default report.html; None for Markdown that was printed.
 
-    Runs of several recipes are compared first, for which each plays `episodes`; with 0 they are not.
+    Runs of several recipes are compared first, each plays `episodes` for it; 0 leaves it out.
 
-    Raises `UsageError` for runs of several tasks, `ArtifactError` for a damaged run or one that has nothing yet.
+    Raises `UsageError` for runs of several tasks, `ArtifactError` for a damaged run or one without records.
     """
     report = content.collect(runs)
     is_html = form == "html"
@@ -58,7 +58,7 @@ def _render(template: str, escape: bool, values: dict[str, Any]) -> str:
 
 
 def _escape_html(value: Any) -> Any:
-    """Return a text for Markdown, in which HTML would act; a block of code is marked as safe and stays as it is."""
+    """Escape HTML in a text for Markdown; code blocks are marked as safe and stay unchanged."""
     if hasattr(value, "__html__") or not isinstance(value, str):
         return value
     return value.replace("&", "&amp;").replace("<", "&lt;")
@@ -99,7 +99,7 @@ def _values(report: RunReport, is_html: bool, pictures: bool, episodes: int) -> 
 
 
 def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, list[str]]], list[str]]:
-    """Return per candidate the question, the verdict and what speaks for it; and notes, as why none was compared."""
+    """Return question, verdict and evidence per candidate, and notes, such as why nothing was compared."""
     if not episodes:
         return [], []
     try:
@@ -117,7 +117,7 @@ def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, lis
         for candidate in result.candidates
     ]
     worlds = result.world_differences
-    return verdicts, [f"all were compared with the first's {', '.join(worlds)}"] if worlds else []
+    return verdicts, [f"all were compared with the baseline's {', '.join(worlds)}"] if worlds else []
 
 
 def _split_terms(rows: Rows) -> list[tuple[list[str], list[list[str]]]]:
@@ -153,7 +153,7 @@ def _describe_bands(report: RunReport) -> str:
     counts = [len(recipe.runs) for recipe in report.recipes]
     of_recipes = ""
     if len(counts) > 1:
-        of_recipes = "A colour is a recipe: lines are training episodes, points are evaluations. "
+        of_recipes = "Each colour is a recipe: lines are training episodes, points are evaluations. "
     if max(counts) == 1:
         return of_recipes
     count = str(counts[0]) if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
@@ -166,7 +166,7 @@ def _take_pictures(report: RunReport) -> Iterator[tuple[str, list[tuple[int, str
     for name, episode in content.choose_episodes(report):
         try:
             strip = take_pictures(episode, _PICTURES)
-        except RlctlError as error:  # another task by now, or one that cannot draw
+        except RlctlError as error:  # the task has changed, or cannot draw
             output.print_notes([f"no pictures: {str(error).splitlines()[0]}"])
             return
         depth = 1000 * strip.deepest_contact  # [mm]
