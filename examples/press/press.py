@@ -12,15 +12,15 @@ DOWN = (0.0, 1.0, 0.0, 0.0)  # quaternion: the hand's z axis points to the floor
 PLACE = np.array([0.55, 0.0])  # [m], x and y
 TABLE = 0.2  # [m], height of its top
 PAD = 0.05  # [m], edge of the cube under the hand
-FLANGE = 0.05  # [m], from the frame of the hand to where its shape ends, and a little air
-STEP = 0.001  # [m], of the hand's target at action 1
+FLANGE = 0.05  # [m], from the hand's frame to the end of its shape, with a small gap
+STEP = 0.001  # [m], motion of the hand's target per control step at action 1
 LIMIT = 60.0  # [N], more would break the table
 CAMERA_STEPS = 6  # control steps between two pictures: 10 Hz
 
 
 @dataclass
 class Press(Task):
-    """Press on the table with `force`, and never with more than 60 N."""
+    """Press on the table with `force` [N]; more than 60 N is penalised."""
 
     force: float = 20.0  # [N]
 
@@ -40,7 +40,7 @@ class Press(Task):
         for _ in range(5):  # each search starts where the last one ended
             self.arm.set_joints(self.solve(self.start))
         self.home = self.arm.joint_positions.copy()
-        # The pad is a body of its own that is held under the hand. Its file's inertia is that of a body of tons.
+        # The pad is a body of its own that is held under the hand. The inertia in its file is far too large.
         height = self.arm.link_position(HAND)[2] - FLANGE - PAD / 2
         self.pad = sim.load("pad", "cube_small.urdf", position=(*PLACE, height), inertia="shape")
         under = Attachment(self.arm, HAND, (0.0, 0.0, FLANGE + PAD / 2), DOWN)
@@ -65,7 +65,7 @@ class Press(Task):
         if self.steps % CAMERA_STEPS == 0:
             eye = (PLACE[0] + 0.5, PLACE[1] + 0.5, TABLE + 0.2)
             self.picture = self.sim.render(64, 48, eye=eye, target=(*PLACE, TABLE))
-        # At a reset no step has measured anything yet.
+        # After a reset there is no measurement yet.
         force = self.arm.joint_reaction(WRIST)[:3] if self.steps else np.zeros(3)
         height = np.array([self.target, self.arm.link_position(HAND)[2]])
         return {"height": height, "wrist_force": force, "camera": self.picture}

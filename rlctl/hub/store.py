@@ -59,15 +59,15 @@ def is_cached(path: Path) -> bool:
 def fetch(address: str) -> Path:
     """Download the run or the file at an address, unless it is cached, and return its path in the cache.
 
-    A file is checked against `#sha256=HEX` after its address. Raises `ArtifactError` if it is missing, incomplete or
-    differs from its checksum, `UsageError` if the package for its scheme is not installed.
+    A file, or the manifest of a run, is checked against `#sha256=HEX` after the address. Raises `ArtifactError` if it
+    is missing, incomplete or differs from its checksum, `UsageError` if the package for its scheme is not installed.
     """
     base, _, expected = address.partition("#sha256=")
     with _open_store(base) as (store, path):
         if PurePosixPath(path).suffix in _SUFFIXES:
             return _fetch_file(store, path, base, expected)
         content = _read_manifest(store, path, base)
-        folder = _cache() / hashlib.sha256(content).hexdigest()
+        folder = _cache() / _check_digest(base, hashlib.sha256(content).hexdigest(), expected)
         if not folder.exists():
             manifest = _parse_manifest(content, base)
             with _temporary_folder() as new:
@@ -149,13 +149,16 @@ def _fetch_file(store: Any, path: str, address: str, expected: str) -> Path:
     if expected and (cached := _cache() / expected / name).is_file():
         return cached
     with _temporary_folder() as new:
-        sha256 = _download(store, path, address, new / name, None)
-        if expected and sha256 != expected:
-            raise ArtifactError(f"{address}: its SHA-256 is {sha256}, not {short_repr(expected, 80)}")
-        folder = _cache() / sha256
+        folder = _cache() / _check_digest(address, _download(store, path, address, new / name, None), expected)
         if not folder.exists():
             _move_to_cache(new, folder)
     return folder / name
+
+
+def _check_digest(address: str, sha256: str, expected: str) -> str:
+    if expected and sha256 != expected:
+        raise ArtifactError(f"{address}: its SHA-256 is {sha256}, not {short_repr(expected, 80)}")
+    return sha256
 
 
 def _download(store: Any, path: str, address: str, target: Path, entry: StoredFile | None) -> str:

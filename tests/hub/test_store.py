@@ -90,6 +90,10 @@ def test_one_file_and_its_checksum(run, pushed):
     assert PolicyFile.read_info(find_policy(f"{address}#sha256={digest}").file).algo == "ppo"
     with pytest.raises(ArtifactError, match=r"its SHA-256 is .*, not 0000"):
         find_policy(f"{address}#sha256={'0' * 64}")
+    manifest = hashlib.sha256(pushed.cat("/lab/reach/rlctl.json")).hexdigest()
+    assert store.fetch(f"{ADDRESS}#sha256={manifest}") == store.fetch(ADDRESS)
+    with pytest.raises(ArtifactError, match=r"its SHA-256 is .*, not 0000"):
+        store.fetch(f"{ADDRESS}#sha256={'0' * 64}")
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ def write_excitation(spec: EnvSpec, path: Path, *, seconds: float, seed: int) ->
         shape = _draw_sines(env, steps, seed)
         reason = ""
         for amplitude in _AMPLITUDES:
-            reason, log, share = _try(env, amplitude * shape, expected.driven)
+            reason, log, share = _play(env, amplitude * shape, expected.driven)
             if not reason:
                 write_log(path, log, expected)
                 return Excitation(path, spec.task, seconds, amplitude, share)
@@ -81,35 +81,35 @@ def _draw_sines(env: TaskEnv, steps: int, seed: int) -> Array:
     return result
 
 
-def _try(env: TaskEnv, shape: Array, driven: tuple[str, ...]) -> tuple[str, Log, float]:
+def _play(env: TaskEnv, trajectory: Array, driven: tuple[str, ...]) -> tuple[str, Log, float]:
     """Play a trajectory; return why it is unsafe (or empty), the log, and the largest fraction of a range."""
-    joints = find_joints(env)
-    names = driven or tuple(joints)
+    found = find_joints(env)
+    joints = {name: found[name] for name in driven or found}
     low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
     middle = np.clip(np.zeros_like(low), low, high)
     env.reset(seed=0)
-    actions, measured, share = [], [], 0.0
-    for row in shape:
+    actions, measured, share, reason = [], [], 0.0, ""
+    for row in trajectory:
         side = row.reshape(low.shape)
         action = (middle + np.where(side > 0, side * (high - middle), side * (middle - low))).astype(low.dtype)
-        states = [
-            (float(body.joint_positions[i]), float(body.joint_velocities[i])) for body, i in (joints[n] for n in names)
-        ]
         actions.append(action.ravel())
-        measured.append(states)
+        measured.append(
+            [(body.joint_positions[index], body.joint_velocities[index]) for body, index in joints.values()]
+        )
         env.task.act(action)
         env.sim.step()
-        reason, reached = _find_danger(env, [joints[name] for name in names], names)
-        if reason:
-            return reason, Log(names, np.array(actions), np.zeros(0), np.zeros(0)), share
+        reason, reached = _find_danger(env, joints)
         share = max(share, float(reached))
-    arrays = np.array(measured)
-    return "", Log(names, np.array(actions), arrays[:, :, 0], arrays[:, :, 1]), share
+        if reason:
+            break
+    arrays = np.array(measured, np.float64)
+    return reason, Log(tuple(joints), np.array(actions), arrays[:, :, 0], arrays[:, :, 1]), share
 
 
-def _find_danger(env: TaskEnv, joints: list[tuple[Any, int]], names: tuple[str, ...]) -> tuple[str, float]:
+def _find_danger(env: TaskEnv, joints: dict[str, tuple[Any, int]]) -> tuple[str, float]:
+    """Return why the present state is unsafe (or empty), and the largest used fraction of a joint's range."""
     largest = 0.0
-    for (body, index), name in zip(joints, names, strict=True):
+    for name, (body, index) in joints.items():
         low, high, limit = body.joint_low[index], body.joint_high[index], body.joint_max_speed[index]
         position, speed = body.joint_positions[index], abs(body.joint_velocities[index])
         if low < high and np.isfinite(high - low):
@@ -121,7 +121,7 @@ def _find_danger(env: TaskEnv, joints: list[tuple[Any, int]], names: tuple[str, 
             return f"{name} turns faster than its {limit:.3g} rad/s", largest
     if env.task.is_terminated():
         return "the episode ends", largest
-    bodies = {id(body): body for body, _ in joints if body.fixed}.values()
+    bodies = {id(body): body for body, _ in joints.values() if body.fixed}.values()
     for body in bodies:
         for other in env.sim.bodies.values():
             if other is not body and (touching := body.links_touching(other)):

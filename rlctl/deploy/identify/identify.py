@@ -11,7 +11,7 @@ import numpy as np
 
 from rlctl.deploy.identify.follow import Follower, describe_expected, open_world
 from rlctl.deploy.identify.log import Array, Log, check_actions, read_log
-from rlctl.deploy.identify.parameters import Parameter, Unknowns, find_unknowns
+from rlctl.deploy.identify.parameters import Unknowns, find_unknowns
 from rlctl.deploy.identify.search import Fit, SearchWorkers, search
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo
@@ -130,12 +130,8 @@ def _summarise(
 ) -> Identification:
     before, after = follower.compare(None, 0), follower.compare(best.at, best.delay)
     count = len(log.joints)
-
-    def sizes(errors: Array) -> tuple[float, float]:
-        return _root_mean_square(errors[:, :count]), _root_mean_square(errors[:, count:])
-
-    errors = list(zip(sizes(before), sizes(after), strict=True))
-    worst = int(np.square(before[:, :count]).mean(axis=0).argmax())
+    positions, velocities = np.s_[:, :count], np.s_[:, count:]
+    worst = int(np.square(before[positions]).mean(axis=0).argmax())
     measured = np.concatenate([log.positions[start + 1 :][: follower.steps] for start in follower.starts])[:, worst]
     return Identification(
         task=task,
@@ -146,8 +142,8 @@ def _summarise(
         delay_event=follower.unknowns.delay,
         delay=best.delay,
         delay_known=delay_known,
-        position_error=errors[0],
-        velocity_error=errors[1],
+        position_error=(_root_mean_square(before[positions]), _root_mean_square(after[positions])),
+        velocity_error=(_root_mean_square(before[velocities]), _root_mean_square(after[velocities])),
         curves={
             "joint": log.joints[worst],
             "measured": measured.tolist(),
@@ -188,18 +184,15 @@ def _estimate_value(
     value, half = parameter.value(position), CONFIDENCE * deviation
     if parameter.is_logarithmic:
         low, high = value * np.exp(-min(half, 5.0)), value * np.exp(min(half, 5.0))
-        known, known_alone = half <= WIDEST, CONFIDENCE * alone <= WIDEST
+        limit = WIDEST
     else:
         low, high = value - half, value + half
         limit = WIDEST * max(abs(value), 0.1 * parameter.relative_span)
-        known, known_alone = half <= limit, CONFIDENCE * alone <= limit
-    note = ""
-    if not known:
-        note = (
-            _explain_unknown(unknowns, index, information)
-            if known_alone
-            else f"this log contains no information about {parameter.name}"
-        )
+    known, note = half <= limit, ""
+    if not known and CONFIDENCE * alone <= limit:
+        note = _explain_unknown(unknowns, index, information)
+    elif not known:
+        note = f"this log contains no information about {parameter.name}"
     elif min(position, 1 - position) < 0.005:
         end = parameter.low if position < 0.5 else parameter.high
         note = f"at the end of its search range, {end:.3g}: something else may differ"
@@ -214,11 +207,6 @@ def _explain_unknown(unknowns: Unknowns, index: int, information: Array) -> str:
     sizes, directions = np.linalg.eigh(information)
     shares = np.abs(directions[index]) / np.sqrt(np.maximum(sizes, 1e-12 * sizes[-1]))
     direction = directions[:, int(shares.argmax())]
-    names = [
-        parameter.name
-        for parameter, part in zip(unknowns.parameters, direction, strict=True)
-        if abs(part) >= _MIN_COMPONENT
-    ]
-    own: Parameter = unknowns.parameters[index]
-    others = [name for name in names if name != own.name] or ["the others"]
+    own, large = unknowns.parameters[index], np.flatnonzero(np.abs(direction) >= _MIN_COMPONENT)
+    others = [unknowns.parameters[other].name for other in large if other != index] or ["the others"]
     return f"this log cannot tell {own.name} from {' and '.join(others)}"

@@ -6,13 +6,11 @@ import asyncio
 import hmac
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from aiohttp import web
-from aiohttp.typedefs import Middleware
 
 from rlctl.deploy.server import messages
 from rlctl.deploy.server.connections import Connections, Handler
@@ -20,7 +18,7 @@ from rlctl.deploy.server.request import LOOPBACK
 from rlctl.deploy.server.server import PolicyServer
 from rlctl.errors import RlctlError
 
-_LARGEST_POLICY = 64 * 2**20  # [bytes]
+_MAX_POLICY_SIZE = 64 * 2**20  # [bytes]
 _BODY_TIMEOUT_S = 10.0
 _ORDERS = ("stop", "home", "hold", "resume")
 
@@ -36,8 +34,8 @@ class _Routes:
         self.page = (Path(__file__).parent / "page.html").read_text("utf-8")
 
     def make_app(self) -> web.Application:
-        check = make_access_check(self.server.request.host, self.server.api_key, self._note_refused)
-        app = web.Application(middlewares=[self.connections.follow, check], client_max_size=_LARGEST_POLICY)
+        middlewares = [self.connections.follow, self._check_access]
+        app = web.Application(middlewares=middlewares, client_max_size=_MAX_POLICY_SIZE)
         app.add_routes(
             [
                 web.get("/", self._serve_root),
@@ -54,8 +52,14 @@ class _Routes:
         app.cleanup_ctx.append(self._watch)
         return app
 
-    def _note_refused(self) -> None:
+    @web.middleware
+    async def _check_access(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Refuse requests without the key (`Authorization: Api-Key KEY`) and requests from other sites' pages."""
+        problem = _find_problem(request, self.server.request.host in LOOPBACK, self.server.api_key)
+        if problem is None:
+            return await handler(request)
         self.server.measurements.refused += 1
+        return web.Response(status=problem[0], text=f"{problem[1]}\n")
 
     async def _watch(self, app: web.Application) -> Any:
         work = (self.server.check_watchdogs(), self.server.write_recording(), self.connections.close_slow())
@@ -104,7 +108,7 @@ class _Routes:
 
     async def _serve_policy(self, request: web.Request) -> web.Response:
         """Replace the policy by the file in the body."""
-        content = await _read_body(request, _LARGEST_POLICY)
+        content = await _read_body(request, _MAX_POLICY_SIZE)
         name = Path(request.query.get("name", "")).name
         # The format of safetensors begins with the length of its header, in JSON.
         suffix = ".safetensors" if content[8:9] == b"{" else ".onnx"
@@ -135,30 +139,17 @@ async def _answer_health(request: web.Request) -> web.Response:
     return web.Response(text="OK\n")
 
 
-async def _read_body(request: web.Request, largest: int) -> bytes:
-    """Read a body of at most `largest` bytes that arrives in time."""
+async def _read_body(request: web.Request, max_size: int) -> bytes:
+    """Read a body of at most `max_size` bytes that arrives in time."""
     try:
         async with asyncio.timeout(_BODY_TIMEOUT_S):
-            return await request.clone(client_max_size=largest).read()
+            return await request.clone(client_max_size=max_size).read()
     except TimeoutError:
         raise web.HTTPRequestTimeout from None
 
 
 def _refuse(status: int, text: str) -> web.Response:
     return web.json_response({"error": text}, status=status)
-
-
-def make_access_check(host: str, key: str | None, on_refused: Callable[[], None]) -> Middleware:
-    """Return what refuses requests without the key (`Authorization: Api-Key KEY`), and those of other sites' pages."""
-
-    @web.middleware
-    async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
-        if (problem := _find_problem(request, host in LOOPBACK, key)) is None:
-            return await handler(request)
-        on_refused()
-        return web.Response(status=problem[0], text=f"{problem[1]}\n")
-
-    return check
 
 
 def _find_problem(request: web.Request, is_local: bool, key: str | None) -> tuple[int, str] | None:

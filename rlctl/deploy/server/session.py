@@ -117,16 +117,16 @@ class Session:
         self._actor.reset()
         self.safety.reset()
 
-    def order(self, what: str) -> None:
-        """Follow an operator: stop, home, hold or resume."""
+    def order(self, order: str) -> None:
+        """Obey an operator's order: stop, home, hold or resume."""
         self._by_watchdog = False  # only the operator ends an operator's order
-        {
-            "stop": lambda: self.safety.stop("stopped by hand"),
-            "home": lambda: self.safety.home("sent home by hand"),
-            "hold": lambda: self.safety.hold("held by hand"),
-            "resume": self._resume,
-        }[what]()
-
-    def _resume(self) -> None:
-        self._last_s = None
-        self.safety.resume()
+        match order:
+            case "stop":
+                self.safety.stop("stopped by hand")
+            case "home":
+                self.safety.home("sent home by hand")
+            case "hold":
+                self.safety.hold("held by hand")
+            case "resume":
+                self._last_s = None
+                self.safety.resume()
