@@ -219,10 +219,10 @@ def _find_measured(limits: Limits, layout: ObservationLayout, count: int) -> sli
     if name is None:
         return None
     check_name(name, layout.slices, "limits: measured.position: no observation", RecipeError, listed="Known")
-    place = layout.slices[name]
-    if (size := place.stop - place.start) != count:
+    part = layout.slices[name]
+    if (size := part.stop - part.start) != count:
         raise RecipeError(f"limits: measured.position: {name} has {size} elements, the action has {count}")
-    return place
+    return part
 
 
 def _read_list(limits: Limits, key: str, count: int) -> Array | None:
@@ -267,8 +267,8 @@ def _make_safe_command(limits: Limits, bounds: Bounds | None, count: int) -> Arr
         )
     if bounds is None:
         return np.zeros(count)
-    wanted = bounds.offset + (np.zeros(count) if safe is None else safe) * bounds.factor
-    clipped: Array = np.clip(wanted, bounds.low, bounds.high)
-    if safe is not None and not np.allclose(clipped, wanted):
+    command = bounds.offset + (np.zeros(count) if safe is None else safe) * bounds.factor
+    clipped: Array = np.clip(command, bounds.low, bounds.high)
+    if safe is not None and not np.allclose(clipped, command):
         raise RecipeError("limits: safe_action: outside the action's limits")
     return clipped

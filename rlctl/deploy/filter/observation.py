@@ -126,15 +126,15 @@ class SensorChecks:
         self._low, self._high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
         self._frozen: list[tuple[str, slice, int]] = []
         for name, sensor in limits.sensors.items():
-            place = layout.slices[name]
+            part = layout.slices[name]
             if sensor.range is not None:
-                self._low[place], self._high[place] = sensor.range
+                self._low[part], self._high[part] = sensor.range
             if sensor.frozen_s is not None:
                 if control_dt is None:
                     raise RecipeError(
                         f"limits: sensors.{name}.frozen_s: this policy has no control_dt; write control_dt: SECONDS"
                     )
-                self._frozen.append((name, place, max(2, round(min(sensor.frozen_s / control_dt, 1e9)))))
+                self._frozen.append((name, part, max(2, round(min(sensor.frozen_s / control_dt, 1e9)))))
         self._all_finite = b"\x01" * layout.size
         self._has_range = bool(np.isfinite(self._low).any())
         self.reset()
@@ -168,8 +168,8 @@ class SensorChecks:
 
     def _check_frozen(self, values: Array) -> Fault | None:
         fault: Fault | None = None
-        for number, (name, place, steps) in enumerate(self._frozen):
-            same = self._last is not None and bool((values[place] == self._last[place]).all())
+        for number, (name, part, steps) in enumerate(self._frozen):
+            same = self._last is not None and bool((values[part] == self._last[part]).all())
             self._same[number] = self._same[number] + 1 if same else 0
             if self._same[number] >= steps:
                 fault = ("frozen", name, float(self._same[number]), float(steps))
@@ -177,7 +177,7 @@ class SensorChecks:
         return fault
 
     def _name(self, index: int) -> str:
-        for name, place in self._layout.slices.items():
-            if place.start <= index < place.stop:
-                return name if place.stop - place.start == 1 else f"{name}[{index - place.start}]"
+        for name, part in self._layout.slices.items():
+            if part.start <= index < part.stop:
+                return name if part.stop - part.start == 1 else f"{name}[{index - part.start}]"
         return str(index)

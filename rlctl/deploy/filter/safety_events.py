@@ -44,17 +44,17 @@ class Intervention:
     time_s: float
     bounds: Bounds
     limit: str
-    wanted: Array
-    """Motion, and what the limit left of it."""
+    requested: Array
+    """Motion before and after the limit."""
     allowed: Array
     ends: tuple[Array, Array]
-    """Between which the motion had to be."""
+    """Lower and upper bound of the motion."""
     before: Array
     """Motion of the step before."""
     reference: Array | None
     """Where the motion began."""
     acted: NDArray[np.bool_]
-    """On which joints."""
+    """Whether the limit changed the motion, per joint."""
 
     @property
     def names(self) -> Sequence[str]:
@@ -73,7 +73,7 @@ class Intervention:
 
     def _convert(self) -> tuple[Array, Array]:
         bounds, dt = self.bounds, self.bounds.dt
-        x, allowed = self.wanted, self.allowed
+        x, allowed = self.requested, self.allowed
         end = np.where(x > allowed, self.ends[1], self.ends[0])
         if self.limit in ("speed", "rate"):
             return x / dt, end / dt

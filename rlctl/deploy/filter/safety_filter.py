@@ -192,15 +192,15 @@ class SafetyFilter:
     def limit(self, action: Any | None) -> Array:
         """Return the robot's action for the policy's action; None: the policy could not act."""
         self.steps += 1
-        wanted, problem = (self._manual, "") if self._manual is not None else self._read_action(action)
-        fault = self._fault or self._find_fault(wanted, problem)
+        requested, problem = (self._manual, "") if self._manual is not None else self._read_action(action)
+        fault = self._fault or self._find_fault(requested, problem)
         if self.state != "stopped" and not self._ordered:
             self._update_state(fault)
         if self._command is None:
-            return self._choose(wanted if self.state == "running" else None)
+            return self._choose(requested if self.state == "running" else None)
         try:
-            if self.state == "running" and wanted is not None:
-                return self._command.follow(wanted)
+            if self.state == "running" and requested is not None:
+                return self._command.follow(requested)
             return self._command.rest(self._goes_home and self.state == "holding")
         except UnsafeCommand as unsafe:
             self._record("limit", unsafe.limit, unsafe.value, unsafe.bound)
@@ -227,12 +227,12 @@ class SafetyFilter:
                 return None, f"{short_repr(numbers.tolist())}"
         return numbers, ""
 
-    def _find_fault(self, wanted: Array | None, problem: str) -> str:
+    def _find_fault(self, requested: Array | None, problem: str) -> str:
         """Return and record why an action cannot be used; empty if it can."""
         fault = ""
         if problem:
             fault = "action"
-        elif wanted is None:
+        elif requested is None:
             fault = "" if self.state == "stopped" or self._ordered else "no action"
         elif self._measured is not None and self._command is not None and self._command.position is None:
             fault = "no position"

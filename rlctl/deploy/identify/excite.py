@@ -83,8 +83,8 @@ def _draw_sines(env: TaskEnv, steps: int, seed: int) -> Array:
 
 def _play(env: TaskEnv, trajectory: Array, driven: tuple[str, ...]) -> tuple[str, Log, float]:
     """Play a trajectory; return why it is unsafe (or empty), the log, and the largest fraction of a range."""
-    found = find_joints(env)
-    joints = {name: found[name] for name in driven or found}
+    all_joints = find_joints(env)
+    joints = {name: all_joints[name] for name in driven or all_joints}
     low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
     middle = np.clip(np.zeros_like(low), low, high)
     env.reset(seed=0)

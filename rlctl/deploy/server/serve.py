@@ -94,8 +94,8 @@ async def serve_until(
             if error.errno == errno.EADDRINUSE:
                 hint = "choose another one, or --port 0 for any free port"
                 raise UsageError(f"port {request.port} is in use; {hint}") from None
-            place = f"--host {request.host} --port {request.port}"
-            raise UsageError(f"{place}: {error.strerror or error}") from None
+            option = f"--host {request.host} --port {request.port}"
+            raise UsageError(f"{option}: {error.strerror or error}") from None
         if handle_signals:
             _handle_signals(server, end)
         gc.collect()

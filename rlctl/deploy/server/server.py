@@ -191,8 +191,8 @@ class PolicyServer:
         recording.add(f"{root}/infer_ms", infer_ms)
         if session.observation is not None:
             flat = layout.flatten(session.observation)
-            for name, place in layout.slices.items():
-                recording.add(f"{root}/observation/{name}", flat[place].copy())
+            for name, part in layout.slices.items():
+                recording.add(f"{root}/observation/{name}", flat[part].copy())
 
     def give_order(self, order: str) -> int:
         """Order all clients, present and future, to stop, home, hold or resume; return how many there are.
@@ -272,7 +272,7 @@ def _describe(session: Session) -> dict[str, Any]:
         "control_error": safety.control_error,
         "action": None if session.action is None else session.action.ravel()[:32],
         "observation": {
-            name: [] if flat is None else flat[place][:32] for name, place in list(safety.layout.slices.items())[:16]
+            name: [] if flat is None else flat[part][:32] for name, part in list(safety.layout.slices.items())[:16]
         },
         "events": [dataclasses.asdict(event) for event in safety.find_last_events(8)],
     }
