@@ -21,8 +21,7 @@ Frame = NDArray[np.float64]
 """What one call of reset or step returned: the observation's numbers, flat, the reward, and the two flags."""
 
 REPEATED_STEPS = 20
-REWARD = -3
-"""Where the reward is in a frame."""
+REWARD = -3  # Where the reward is in a frame
 
 
 class OutOfTime(Exception):
@@ -34,10 +33,8 @@ class ActionNumber:
     """One number of the action."""
 
     leaf: Leaf
-    index: int
-    """Flat, in the leaf."""
-    column: int
-    """Flat, in the whole action."""
+    index: int  # Flat, in the leaf
+    column: int  # Flat, in the whole action
 
     @property
     def name(self) -> str:
@@ -122,7 +119,7 @@ class Trials:
         episode = EpisodePlayer(self.instance, seed, given=chosen, max_steps=len(chosen), deadline=self.deadline)
         frames = []
         for moment in episode:
-            frames.append(to_frame(moment))
+            frames.append(_to_frame(moment))
             if moment.step == 0:
                 after_reset()
         if episode.ended == "time":
@@ -146,8 +143,7 @@ class Trials:
         return (np.flatnonzero(is_copy) + REWARD - len(is_copy)).tolist()
 
 
-def to_frame(moment: Moment) -> Frame:
-    """Return the numbers of what a call returned."""
+def _to_frame(moment: Moment) -> Frame:
     try:
         reward = float(moment.reward)
     except Exception:  # its type is another rule's matter
@@ -171,10 +167,8 @@ def find_differences(one: Sequence[Frame], two: Sequence[Frame]) -> dict[int, ND
 
 def observations_differ(one: Sequence[Frame], two: Sequence[Frame], besides: Sequence[int] = ()) -> bool:
     """Say whether observations or flags differ, with some columns left out."""
-    return any(
-        not {REWARD, *besides}.issuperset(find_difference.tolist())
-        for find_difference in find_differences(one, two).values()
-    )
+    differing = {column for columns in find_differences(one, two).values() for column in columns.tolist()}
+    return bool(differing - {REWARD, *besides})
 
 
 def find_other_rewards(one: Sequence[Frame], two: Sequence[Frame]) -> list[int]:

@@ -18,14 +18,11 @@ from numpy.typing import NDArray
 from rlctl.checking.bullet_calls import LIBRARIES
 from rlctl.checking.leaves import NUMBERS
 
-MOST_NUMBERS = 64
-"""Arrays with more numbers are left out: buffers, images and tables are no single quantity."""
+MOST_NUMBERS = 64  # larger arrays are buffers, images or tables, no single quantity
 MOST_ATTRIBUTES = 500
-DEEPEST = 2
-"""Attributes of attributes are read, but no deeper."""
+DEEPEST = 2  # Attributes of attributes are read, but no deeper
 Generator = np.random.Generator | np.random.RandomState | random.Random
-NO_GENERATORS = {id(np.random.mtrand._rand), id(random._inst)}
-"""The generators of the whole process, which RL309 watches."""
+NO_GENERATORS = {id(np.random.mtrand._rand), id(random._inst)}  # of the whole process: RL309 watches them
 
 
 def find_author(env: Any) -> Any:
@@ -44,13 +41,10 @@ def is_task(env: Any) -> bool:
 class Attribute:
     """A number, an array of numbers, or a random generator that an object of the environment holds."""
 
-    name: str
-    """`self.goal`."""
-    owner: Any
-    """The object, or the dictionary, that holds it."""
+    name: str  # `self.goal`
+    owner: Any  # The object, or the dictionary, that holds it
     key: str
-    value: Any
-    """A copy; of a generator the generator itself."""
+    value: Any  # A copy; of a generator the generator itself
 
     @property
     def numbers(self) -> NDArray[np.float64]:
@@ -98,7 +92,6 @@ def _is_quantity(value: Any) -> bool:
 
 
 def _is_own(value: Any) -> bool:
-    """Say whether it is a dictionary, or an object whose class is not a library's."""
     if isinstance(value, dict):
         return True
     is_object = hasattr(value, "__dict__") and not inspect.isroutine(value) and not inspect.isclass(value)
@@ -113,10 +106,8 @@ def find_unequal(one: Mapping[str, Attribute], two: Mapping[str, Attribute]) -> 
 
 def read_generators(env: Any) -> dict[str, str]:
     """Return the state of each random generator, as text, by name."""
-    attributes = read_attributes(env).values()
-    return {
-        attribute.name: _state(attribute.value) for attribute in attributes if isinstance(attribute.value, Generator)
-    }
+    values = {name: attribute.value for name, attribute in read_attributes(env).items()}
+    return {name: _state(value) for name, value in values.items() if isinstance(value, Generator)}
 
 
 def _state(generator: Any) -> str:
@@ -143,10 +134,8 @@ class GeneratorWatch:
     """Watches the random generators of the instance that a process keeps."""
 
     def __init__(self) -> None:
-        self.calls: set[tuple[str, int]] = set()
-        """File and line where reset or step made a generator by `default_rng()` without a seed."""
-        self.before: dict[str, str] | None = None
-        """The states of all generators after the first reset that was watched."""
+        self.calls: set[tuple[str, int]] = set()  # file and line of default_rng() without a seed in reset or step
+        self.before: dict[str, str] | None = None  # generator states after the first watched reset
 
     @contextlib.contextmanager
     def watch(self) -> Iterator[None]:

@@ -26,8 +26,7 @@ FIRST_IS_CLIENT = {
     "disconnect", "getConnectionInfo", "getNumBodies", "getNumConstraints", "isConnected", "performCollisionDetection",
     "getKeyboardEvents", "getMouseEvents", "getPhysicsEngineParameters", "removeAllUserDebugItems", "saveState",
     "stepSimulation",
-}  # fmt: skip
-"""Functions whose only positional argument is the client."""
+}  # fmt: skip  # with the client as only positional argument
 CLIENT_WORDS = re.compile(r"client|\bcid\b|_cid\b|server", re.IGNORECASE)
 """Names of a client that is passed by position."""
 
@@ -49,8 +48,7 @@ class BulletCall:
 MOTORS = ("setJointMotorControl2", "setJointMotorControlArray", "resetJointState")
 """Functions that set a joint's position, or the target of its motor."""
 RECORDED = (*MOTORS, "getContactPoints")
-POSITION = 2
-"""PyBullet's POSITION_CONTROL."""
+POSITION = 2  # PyBullet's POSITION_CONTROL
 FULL_TURN = 2 * math.pi
 MOST_FAR = 1_000
 
@@ -71,8 +69,7 @@ class ContactQuery:
 
     call: BulletCall
     client: int
-    bodies: tuple[int, int]
-    """Of both sides; -1 where the call leaves it out."""
+    bodies: tuple[int, int]  # Of both sides; -1 where the call leaves it out
     links: tuple[int | None, int | None]
     calls: int = 0
     contacts: int = 0
@@ -83,10 +80,8 @@ class BulletCalls:
 
     def __init__(self) -> None:
         self.without_client: set[BulletCall] = set()
-        self.targets: dict[tuple[int, int, int], Target] = {}
-        """The last motor target per client, body and joint."""
-        self.far_targets: list[Target] = []
-        """Positions of more than a full turn."""
+        self.targets: dict[tuple[int, int, int], Target] = {}  # last motor target by client, body and joint
+        self.far_targets: list[Target] = []  # Positions of more than a full turn
         self.queries: dict[tuple[Any, ...], ContactQuery] = {}
         self._known: set[tuple[CodeType, int]] = set()
 
@@ -139,7 +134,6 @@ def _read_positions(name: str, arguments: Sequence[Any], keywords: dict[str, Any
 
 
 def _read_arguments(frame: FrameType) -> str:
-    """Return how the arguments of the call that a frame is making are written."""
     positions = inspect.getframeinfo(frame).positions
     if positions is None or positions.lineno is None:
         return ""
@@ -175,11 +169,9 @@ class _RecordedFunction(_Replacement):
 
 @contextlib.contextmanager
 def _replace_functions(replace: Callable[[str, Any], Any]) -> Iterator[None]:
-    """Replace each function of PyBullet, if it is loaded, inside the `with` block."""
     pybullet = sys.modules.get("pybullet")
-    functions = (
-        {name: function for name, function in vars(pybullet).items() if inspect.isbuiltin(function)} if pybullet else {}
-    )
+    members = vars(pybullet) if pybullet else {}
+    functions = {name: function for name, function in members.items() if inspect.isbuiltin(function)}
     for name, function in functions.items():
         setattr(pybullet, name, replace(name, function))
     try:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
+import inspect
 import math
 import sys
 from collections import Counter
@@ -15,26 +17,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_CLIENTS = 1024
-"""So many physics clients a process may have, in the wheels of PyBullet 3.2."""
-MOST_BODIES = 20
-"""So many bodies of a world are read, robots and free ones first."""
+MOST_CLIENTS = 1024  # So many physics clients a process may have, in the wheels of PyBullet 3.2
+MOST_BODIES = 20  # So many bodies of a world are read, robots and free ones first
 MOST_JOINTS = 60
-MOST_LINKS = 30
-"""So many links of a robot are read for their orientation."""
-WIDEST_RANGE = 1e3
-"""Limits farther apart are none: some models write 1e16 for a joint without limits."""
+MOST_LINKS = 30  # So many links of a robot are read for their orientation
+WIDEST_RANGE = 1e3  # wider limits are none: some models write 1e16
 
 GRAVITY = -9.81  # [m/s^2]
 WEIGHT_STEPS = 20
-UNMOVED = 1e-3
-"""Gravity changes nothing where no position or speed differs by more [m, rad, m/s, rad/s]."""
-LONGEST_S = 0.1
-"""How long a world is simulated without its environment [s]: what was put inside something is thrown out by then."""
+UNMOVED = 1e-3  # smaller differences are no effect of gravity [m, rad, m/s, rad/s]
+LONGEST_S = 0.1  # simulated without the environment [s]: overlapping bodies are thrown out by then
 MOST_STEPS = 100
 
-Link = tuple[int, int]
-"""Body id and link index; the base is link -1."""
+Link = tuple[int, int]  # Body id and link index; the base is link -1
 Pair = tuple[Link, Link]
 VELOCITY, ANGULAR, JOINTS = slice(3, 6), slice(6, 9), 9
 """Where in a body's state its base's velocity [m/s] and angular velocity [rad/s] are, after its position, and where its
@@ -46,13 +41,21 @@ def bullet() -> Any:
     return sys.modules["pybullet"]
 
 
+class ClientCalls:
+    """PyBullet's functions, bound to one client; its constants too."""
+
+    def __init__(self, client: int) -> None:
+        self._client = client
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(bullet(), name)
+        return functools.partial(value, physicsClientId=self._client) if inspect.isbuiltin(value) else value
+
+
 def find_clients() -> list[int]:
     """Return the ids of the clients that are connected, whoever did it; empty where PyBullet is not loaded."""
-    if "pybullet" not in sys.modules:
-        return []
-    return [
-        client for client in range(MOST_CLIENTS) if bullet().getConnectionInfo(physicsClientId=client)["isConnected"]
-    ]
+    ids = range(MOST_CLIENTS if "pybullet" in sys.modules else 0)
+    return [client for client in ids if ClientCalls(client).getConnectionInfo()["isConnected"]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,13 +80,10 @@ class WorldBody:
 
     id: int
     name: str
-    links: tuple[str, ...]
-    """The base first: link `i` of PyBullet is `links[i + 1]`."""
+    links: tuple[str, ...]  # The base first: link `i` of PyBullet is `links[i + 1]`
     joints: tuple[Joint, ...]
-    is_free: bool
-    """Whether its base is not fixed to the world."""
-    has_heavy_links: bool
-    """Whether it has joints, and anything beside its base has a mass."""
+    is_free: bool  # Whether its base is not fixed to the world
+    has_heavy_links: bool  # Whether it has joints, and anything beside its base has a mass
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,8 +110,8 @@ class World:
 
 def read_world(client: int) -> World:
     """Return what a client holds now."""
-    p = bullet()
-    ids = [p.getBodyUniqueId(i, physicsClientId=client) for i in range(p.getNumBodies(physicsClientId=client))]
+    p = ClientCalls(client)
+    ids = [p.getBodyUniqueId(i) for i in range(p.getNumBodies())]
     bodies = []
     for id in ids:
         with contextlib.suppress(p.error):  # a soft body, which has neither links nor a mass
@@ -121,14 +121,12 @@ def read_world(client: int) -> World:
 
 
 def _body(client: int, body: int) -> WorldBody:
-    p = bullet()
-    base, name = (text.decode(errors="replace") for text in p.getBodyInfo(body, physicsClientId=client))
-    infos = [
-        p.getJointInfo(body, i, physicsClientId=client) for i in range(p.getNumJoints(body, physicsClientId=client))
-    ]
+    p = ClientCalls(client)
+    base, name = (text.decode(errors="replace") for text in p.getBodyInfo(body))
+    infos = [p.getJointInfo(body, i) for i in range(p.getNumJoints(body))]
     joints = [_joint(info) for info in infos if info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)]
     links = [base, *(info[12].decode(errors="replace") for info in infos)]
-    base_mass, *masses = (p.getDynamicsInfo(body, i, physicsClientId=client)[0] for i in range(-1, len(infos)))
+    base_mass, *masses = (p.getDynamicsInfo(body, i)[0] for i in range(-1, len(infos)))
     has_heavy_links = bool(joints) and any(mass > 0 for mass in masses)
     return WorldBody(
         body, name or base or "a body", tuple(links), tuple(joints[:MOST_JOINTS]), base_mass > 0, has_heavy_links
@@ -148,28 +146,28 @@ def _number_names(bodies: list[WorldBody]) -> list[WorldBody]:
 
 def read_states(world: World) -> list[NDArray[np.float64]]:
     """Return the state of each body. Shape (9 + 2 * joints,) each."""
-    p, client = bullet(), world.client
+    p = ClientCalls(world.client)
     states = []
     for body in world.bodies:
-        position, _ = p.getBasePositionAndOrientation(body.id, physicsClientId=client)
-        joints = p.getJointStates(body.id, [j.index for j in body.joints], physicsClientId=client) or ()
+        position, _ = p.getBasePositionAndOrientation(body.id)
+        joints = p.getJointStates(body.id, [j.index for j in body.joints]) or ()
         numbers = np.ravel([joint[:2] for joint in joints], "F")  # all positions, then all speeds
-        parts = [position, *p.getBaseVelocity(body.id, physicsClientId=client), numbers]
+        parts = [position, *p.getBaseVelocity(body.id), numbers]
         states.append(np.concatenate(parts))
     return states
 
 
 def read_orientations(world: World) -> dict[Link, list[float]]:
     """Return the quaternion (x, y, z, w) of each base that is free, and of each link of a robot."""
-    p, client = bullet(), world.client
+    p = ClientCalls(world.client)
     orientations = {}
     for body in world.bodies:
         if body.is_free:
-            orientations[body.id, -1] = list(p.getBasePositionAndOrientation(body.id, physicsClientId=client)[1])
+            orientations[body.id, -1] = list(p.getBasePositionAndOrientation(body.id)[1])
         links = range(min(MOST_LINKS, len(body.links) - 1)) if body.joints else ()
         for link, state in zip(
             links,
-            p.getLinkStates(body.id, links, computeForwardKinematics=1, physicsClientId=client) or (),
+            p.getLinkStates(body.id, links, computeForwardKinematics=1) or (),
             strict=False,
         ):
             orientations[body.id, link] = list(state[5])
@@ -178,9 +176,9 @@ def read_orientations(world: World) -> dict[Link, list[float]]:
 
 def find_joint(client: int, body: int, index: int) -> Joint | None:
     """Return a joint that a client holds now; None where there is none of one degree of freedom."""
-    p = bullet()
+    p = ClientCalls(client)
     try:
-        info = p.getJointInfo(body, index, physicsClientId=client)
+        info = p.getJointInfo(body, index)
     except p.error:
         return None
     is_single = info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)
@@ -193,14 +191,14 @@ def _joint(info: Any) -> Joint:
 
 def read_gravity(client: int) -> list[float]:
     """Return the gravity of a client [m/s^2]."""
-    parameters = bullet().getPhysicsEngineParameters(physicsClientId=client)
+    parameters = ClientCalls(client).getPhysicsEngineParameters()
     return [float(parameters[f"gravityAcceleration{axis}"]) for axis in "XYZ"]
 
 
 def read_contacts(client: int) -> dict[Pair, float]:
     """Return the deepest distance per pair of links that touch [m]; below zero they are inside each other."""
     deepest: dict[Pair, float] = {}
-    for contact in bullet().getContactPoints(physicsClientId=client) or ():
+    for contact in ClientCalls(client).getContactPoints() or ():
         pair = (contact[1], contact[3]), (contact[2], contact[4])
         deepest[pair] = min(deepest.get(pair, math.inf), contact[8])
     return deepest
@@ -208,24 +206,24 @@ def read_contacts(client: int) -> dict[Pair, float]:
 
 def measure_thickness(client: int, link: Link) -> float:
     """Return the smallest extent of the box around a link [m]."""
-    low, high = bullet().getAABB(*link, physicsClientId=client)
+    low, high = ClientCalls(client).getAABB(*link)
     return float(min(b - a for a, b in zip(low, high, strict=True)))
 
 
 def weight_matters(world: World) -> bool:
     """Say whether gravity would change the motion of a world without it: not where all that moves moves level."""
-    p, client = bullet(), world.client
-    state = p.saveState(physicsClientId=client)
+    p = ClientCalls(world.client)
+    state = p.saveState()
     ends = []
     for gravity in (0.0, GRAVITY):
-        p.restoreState(state, physicsClientId=client)
-        p.setGravity(0.0, 0.0, gravity, physicsClientId=client)
+        p.restoreState(state)
+        p.setGravity(0.0, 0.0, gravity)
         for _ in range(WEIGHT_STEPS):
-            p.stepSimulation(physicsClientId=client)
+            p.stepSimulation()
         ends.append(np.concatenate(read_states(world)))
-    p.restoreState(state, physicsClientId=client)
-    p.setGravity(0.0, 0.0, 0.0, physicsClientId=client)
-    p.removeState(state, physicsClientId=client)
+    p.restoreState(state)
+    p.setGravity(0.0, 0.0, 0.0)
+    p.removeState(state)
     return bool(np.abs(ends[0] - ends[1]).max(initial=0.0) > UNMOVED)
 
 
@@ -234,22 +232,20 @@ class Jump:
     """How fast a free body became right after a reset, with nothing done to it."""
 
     body: str
-    speed: float
-    """[m/s]."""
-    explained: float
-    """The speed that it had, and that falling adds [m/s]."""
+    speed: float  # [m/s]
+    explained: float  # The speed that it had, and that falling adds [m/s]
     after_s: float
     seed: int
 
 
 def find_jumps(world: World, seed: int) -> list[Jump]:
     """Simulate a world without its environment, and return how fast each free body became."""
-    p, client = bullet(), world.client
-    dt = float(p.getPhysicsEngineParameters(physicsClientId=client)["fixedTimeStep"])
-    gravity = float(np.linalg.norm(read_gravity(client)))
+    p = ClientCalls(world.client)
+    dt = float(p.getPhysicsEngineParameters()["fixedTimeStep"])
+    gravity = float(np.linalg.norm(read_gravity(world.client)))
     speeds = [_free_speeds(world)]
     for _ in range(min(MOST_STEPS, max(1, round(LONGEST_S / dt))) if dt > 0 else 0):
-        p.stepSimulation(physicsClientId=client)
+        p.stepSimulation()
         speeds.append(_free_speeds(world))
     jumps = []
     for name, before in speeds[0].items():

@@ -10,12 +10,11 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from rlctl.checking import families
-from rlctl.checking.experiments import Experiment
 from rlctl.checking.finding import RULES, NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.leaves import name_leaf
 from rlctl.checking.messages import ChildMessage, Mistake
 from rlctl.checking.progress import Position
-from rlctl.checking.records import Records
+from rlctl.checking.records import Experiment, Records
 from rlctl.checking.supervisor import Supervisor
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
@@ -24,8 +23,7 @@ from rlctl.recipe import sources
 
 METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6": "step", "RL7": "step"}
 """The method that the findings of a family are about, where nothing more is known."""
-LOADING = ("RL0", "RL216")
-"""What is judged even where no instance could be built: loading, and windows that end it."""
+LOADING = ("RL0", "RL216")  # judged even if no instance could be built
 
 
 @dataclasses.dataclass
@@ -33,17 +31,12 @@ class CheckVerdict:
     """What the rules say."""
 
     findings: list[RuleFinding] = dataclasses.field(default_factory=list)
-    waived: list[RuleFinding] = dataclasses.field(default_factory=list)
-    """What the environment's class says is meant."""
+    waived: list[RuleFinding] = dataclasses.field(default_factory=list)  # rlctl_ignore of the class
     judged: list[str] = dataclasses.field(default_factory=list)
-    not_judged: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Rule id, or the part of the environment that no rule could look into, and why."""
-    not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Rule id, and what this kind of environment does not have."""
-    known: list[RuleFinding] = dataclasses.field(default_factory=list)
-    """What an earlier report, the baseline, has too."""
-    crashed: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Rule id or name of an experiment, and traceback."""
+    not_judged: dict[str, str] = dataclasses.field(default_factory=dict)  # rule or part of the environment -> reason
+    not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)  # rule -> reason
+    known: list[RuleFinding] = dataclasses.field(default_factory=list)  # also in the baseline
+    crashed: dict[str, str] = dataclasses.field(default_factory=dict)  # rule or experiment -> traceback
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,12 +46,9 @@ class CheckReport:
     task: str
     verdict: CheckVerdict
     records: Records
-    seconds: float
-    """How long the check took."""
-    budget_s: float
-    """How long the experiments of one process might take."""
-    strict: bool = False
-    """Whether warnings count as errors."""
+    seconds: float  # How long the check took
+    budget_s: float  # How long the experiments of one process might take
+    strict: bool = False  # Whether warnings count as errors
 
     @property
     def exit_code(self) -> int:
@@ -75,10 +65,11 @@ class CheckReport:
         if finding.where is not None:
             return Path(finding.where[0]), finding.where[1]
         built = self.records.built
+        if built is None or built.file is None:
+            file = registry.find_source_file(self.task)
+            return (file, 1) if file else None
         method = finding.evidence.get("call") or METHODS.get(finding.rule[:3], "")
-        if built is not None and built.file is not None and method in built.lines:
-            return Path(built.file), built.lines[method]
-        return self.place
+        return Path(built.file), built.lines.get(method) or built.line or 1
 
     def fingerprint(self, finding: RuleFinding) -> str:
         """Return what identifies a finding in every run: no number of a message, which differ from run to run."""
@@ -89,15 +80,6 @@ class CheckReport:
         verdict = self.verdict
         verdict.known += [finding for finding in verdict.findings if self.fingerprint(finding) in baseline]
         verdict.findings = [finding for finding in verdict.findings if self.fingerprint(finding) not in baseline]
-
-    @property
-    def place(self) -> tuple[Path, int] | None:
-        """File and line of the environment's class; line 1 where only the file is known."""
-        built = self.records.built
-        if built is not None and built.file is not None:
-            return Path(built.file), built.line or 1
-        file = registry.find_source_file(self.task)
-        return (file, 1) if file else None
 
 
 def check(
@@ -152,7 +134,6 @@ def _normalizes(task: str, what: str) -> bool:
 
 @contextlib.contextmanager
 def _status(task: str, wanted: bool) -> Iterator[Callable[[Position], None]]:
-    """Show a line about what is going on, on a terminal only."""
     from rlctl import output
 
     console = output.err()
@@ -194,7 +175,6 @@ def _apply(rule: str, records: Records, verdict: CheckVerdict) -> None:
 
 
 def _findings(rule: str, records: Records) -> list[RuleFinding]:
-    """Return what the experiment that decides a rule and the rule's check have found."""
     check, experiment = families.CHECKS.get(rule), families.DECIDED_BY.get(rule)
     findings = [finding for finding in records.findings if finding.rule == rule]
     if findings and records.built is None:

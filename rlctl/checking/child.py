@@ -9,13 +9,12 @@ from collections.abc import Collection, Iterator, Sequence
 from multiprocessing.connection import Connection
 
 from rlctl.checking import families
-from rlctl.checking.clock import read_clock
-from rlctl.checking.experiments import Experiment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.instance import Budget, Context
 from rlctl.checking.messages import CallFailure, ChildMessage, End, Finished, Mistake, Skipped
-from rlctl.checking.progress import CallProgress
+from rlctl.checking.progress import CallProgress, read_clock
+from rlctl.checking.records import Experiment
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.processes.messages import send
@@ -39,7 +38,8 @@ def run(
 ) -> Iterator[ChildMessage]:
     """Yield the messages of one process; all its experiments by default, within so many seconds together."""
     context = Context(spec, progress)
-    chosen = [each for each in families.PROCESSES[process].experiments if names is None or each.name in names]
+    experiments = families.PROCESSES[process].experiments
+    chosen = [experiment for experiment in experiments if names is None or experiment.name in names]
     try:
         for message in _run_all(context, chosen, seconds):
             yield dataclasses.replace(message, process=process) if isinstance(message, CallFailure) else message
@@ -48,48 +48,45 @@ def run(
 
 
 def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> Iterator[ChildMessage]:
-    """Run the experiments; each has its share of the time that those before it have left."""
     end = read_clock() + seconds
-    shares = sum(each.share for each in chosen)
-    for each in chosen:
+    shares = sum(experiment.share for experiment in chosen)
+    for experiment in chosen:
         started = read_clock()
-        if each.name == "build":
-            yield from _run(each, context)
+        if experiment.name == "build":
+            yield from _run(experiment, context)
             if not context.is_built:
                 return
             end += read_clock() - started  # importing and building comes on top
         elif context.is_built and not context.instance.can_act:
-            yield Skipped(each.name, "its action space is not a Gymnasium space")
+            yield Skipped(experiment.name, "its action space is not a Gymnasium space")
         elif started > end:
-            yield Skipped(each.name, f"the experiments before it took the {seconds:g} s there are")
+            yield Skipped(experiment.name, f"the experiments before it took the {seconds:g} s there are")
         else:
-            context.budget = Budget(started + (end - started) * each.share / shares)
-            yield from _run(each, context)
-        shares -= each.share
+            context.budget = Budget(started + (end - started) * experiment.share / shares)
+            yield from _run(experiment, context)
+        shares -= experiment.share
     yield from context.close()
 
 
 def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
     started = time.monotonic()
     context.progress.phase(experiment.name)
-    is_complete, crash = False, ""
-    found: set[str] = set()
+    is_complete, crash = True, ""
+    with_finding: set[str] = set()
     try:
         for message in experiment.run(context):
             if isinstance(message, RuleFinding):
-                found.add(message.rule)
+                with_finding.add(message.rule)
             yield message
-        is_complete = True
     except (NotJudged, NotApplicable) as reason:
         for name in (*experiment.rules, experiment.name):
-            if name not in found:
+            if name not in with_finding:
                 yield Skipped(name, str(reason), applies=isinstance(reason, NotJudged))
-        is_complete = True
     except EnvironmentRaised as error:
+        is_complete = False
         yield describe_failure(error, context.progress)
     except UsageError:
         raise
-    except Exception:
-        # The environment's own exceptions were caught where it was called, so this one is ours.
-        crash = traceback.format_exc()
+    except Exception:  # what the environment raises was caught at the call, so this is a bug of rlctl
+        is_complete, crash = False, traceback.format_exc()
     yield Finished(experiment.name, time.monotonic() - started, is_complete, crash)

@@ -13,36 +13,31 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.clock import read_clock
 from rlctl.checking.failures import EnvironmentRaised
 from rlctl.checking.instance import Instance
 from rlctl.checking.leaves import Leaf, Path, find_leaves, name_type, read_flag
+from rlctl.checking.progress import read_clock
 
 if TYPE_CHECKING:
     from gymnasium import spaces
 
-HOLD_STEPS = 10
-"""How long an extreme action is held."""
-RARE = 0.1
-"""How often a rare action is not zero."""
+HOLD_STEPS = 10  # How long an extreme action is held
+RARE = 0.1  # How often a rare action is not zero
 
 
 @dataclasses.dataclass(frozen=True)
 class Moment:
     """What one call of reset or step was given and returned."""
 
-    step: int
-    """0 is the reset."""
+    step: int  # 0 is the reset
     action: Any
     observation: Any
     reward: Any = 0.0
     terminated: Any = False
     truncated: Any = False
     info: Any = dataclasses.field(default_factory=dict)
-    form: str = ""
-    """What was returned where it is not what Gymnasium's interface says: `tuple of 4`, `NoneType`."""
-    is_readable: bool = True
-    """False where step returned something that cannot be taken apart: nothing above it is known."""
+    form: str = ""  # of a wrong return value: `tuple of 4`, `NoneType`
+    is_readable: bool = True  # False if step returned something that cannot be unpacked
 
     @property
     def flags(self) -> tuple[bool, bool]:

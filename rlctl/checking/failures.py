@@ -45,20 +45,10 @@ class EnvironmentRaised(Exception):
 
 def describe_failure(error: EnvironmentRaised, progress: CallProgress) -> CallFailure:
     """Describe what a call into the environment raised, and when."""
-    where = progress.read()
-    cause = error.__cause__ or error
-    return CallFailure(
-        kind="raised",
-        call=error.call,
-        phase=where.phase,
-        episode=where.episode,
-        seed=where.seed,
-        step=where.step,
-        error=describe(cause),
-        details="".join(traceback.format_exception(cause)),
-        file=find_missing_file(cause),
-        where=find_line(cause),
-    )
+    at, cause = progress.read(), error.__cause__ or error
+    place = (error.call, at.phase, at.episode, at.seed, at.step)
+    trace, file = "".join(traceback.format_exception(cause)), find_missing_file(cause)
+    return CallFailure("raised", *place, describe(cause), trace, file, find_line(cause))
 
 
 def describe(error: BaseException) -> str:
@@ -73,11 +63,8 @@ def describe(error: BaseException) -> str:
 
 def find_line(error: BaseException) -> tuple[str, int] | None:
     """Return file and line of the environment's own code that an exception went through last, not a library's."""
-    frames = [
-        frame
-        for frame in traceback.extract_tb(error.__traceback__)
-        if PACKAGE_FOLDER not in Path(frame.filename).parents
-    ]
+    trace = traceback.extract_tb(error.__traceback__)
+    frames = [frame for frame in trace if PACKAGE_FOLDER not in Path(frame.filename).parents]
     own = [frame for frame in frames if not _LIBRARY.search(frame.filename)] or frames
     return (own[-1].filename, own[-1].lineno or 1) if own else None
 

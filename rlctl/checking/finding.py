@@ -16,12 +16,9 @@ from rlctl.errors import UsageError, did_you_mean
 class Severity(enum.StrEnum):
     """How bad a finding is."""
 
-    ERROR = "error"
-    """Training on this is wrong, or fails."""
-    WARNING = "warning"
-    """Likely wrong."""
-    INFO = "info"
-    """Worth knowing."""
+    ERROR = "error"  # Training on this is wrong, or fails
+    WARNING = "warning"  # Likely wrong
+    INFO = "info"  # Worth knowing
 
     @property
     def rank(self) -> int:
@@ -35,10 +32,8 @@ class Rule:
 
     id: str
     name: str
-    severity: Severity
-    """Of a finding, unless the check gives it another one."""
-    meaning: str
-    """What it means and why it matters."""
+    severity: Severity  # Of a finding, unless the check gives it another one
+    meaning: str  # What it means and why it matters
     fix: str
 
 
@@ -46,15 +41,14 @@ def _load() -> tuple[dict[str, str], dict[str, Rule]]:
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where PyYAML has it
     content = yaml.load(Path(__file__).with_name("rules.yaml").read_text(encoding="utf-8"), loader)  # noqa: S506
     rules = {}
-    for key, texts in content["rules"].items():
-        head, _, name = key.partition(": ")
-        rule_id, severity = head.split()
-        rules[rule_id] = Rule(rule_id, name, Severity(severity), **texts)
+    for key, text in content["rules"].items():
+        (rule_id, severity), name = key.partition(": ")[0].split(), key.partition(": ")[2]
+        meaning, fix = (" ".join(part.split()) for part in text.split("\nfix: "))
+        rules[rule_id] = Rule(rule_id, name, Severity(severity), meaning, fix)
     return content["families"], rules
 
 
-FAMILIES, RULES = _load()
-"""The families' titles by the beginning of their ids, and the rules by id."""
+FAMILIES, RULES = _load()  # The families' titles by the beginning of their ids, and the rules by id
 
 
 @dataclasses.dataclass(init=False)
@@ -63,12 +57,10 @@ class RuleFinding:
 
     rule: str
     message: str
-    evidence: Mapping[str, Any]
-    """Numbers and names that JSON can hold: seed, episode, step, value, expected."""
+    evidence: Mapping[str, Any]  # plain data: seed, episode, step, value, expected
     severity: Severity
     fix: str
-    where: tuple[str, int] | None
-    """File and line of the code that causes it, where they are known."""
+    where: tuple[str, int] | None  # File and line of the code that causes it, where they are known
 
     def __init__(
         self,

@@ -9,28 +9,24 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
 from rlctl.checking.attributes import GeneratorWatch, find_author, is_task
-from rlctl.checking.clock import read_clock
 from rlctl.checking.failures import EnvironmentRaised, describe, describe_failure
 from rlctl.checking.leaves import find_leaves
 from rlctl.checking.messages import CallFailure
-from rlctl.checking.progress import CallProgress
+from rlctl.checking.progress import CallProgress, read_clock
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 
-Timer = Callable[..., Any]
-"""Calls a function, its first argument, with the other arguments, and returns what it returns."""
+Timer = Callable[..., Any]  # calls its first argument with the others
 
-MOST_FAILURES = 3
-"""After so many episodes that raise no other is played for the same purpose."""
+MOST_FAILURES = 3  # After so many episodes that raise no other is played for the same purpose
 
 
 @dataclasses.dataclass
 class Budget:
     """What the episodes of an experiment may use together."""
 
-    deadline: float
-    """On `read_clock`'s clock [s]."""
+    deadline: float  # On `read_clock`'s clock [s]
     bytes_left: int = 48 * 2**20
     failures: int = 0
 
@@ -64,8 +60,7 @@ class Instance:
         self.action_leaves = find_leaves(getattr(env, "action_space", None))
         self.accepts_seed, self.accepts_options = (_accepts(env, name) for name in ("seed", "options"))
         self.progress = progress
-        self.timers: Mapping[str, Timer] = {}
-        """What calls the environment's functions, by their names, while they are timed."""
+        self.timers: Mapping[str, Timer] = {}  # by the name of the call they time
 
     @property
     def is_env(self) -> bool:
@@ -110,8 +105,7 @@ class Context:
     def __init__(self, spec: EnvSpec, progress: CallProgress | None = None) -> None:
         self.spec = spec
         self.progress = progress or CallProgress()
-        self.budget = Budget(read_clock())
-        """What the experiment that is running may use."""
+        self.budget = Budget(read_clock())  # What the experiment that is running may use
         self.generators = GeneratorWatch()
         self._instance: Instance | None = None
 
@@ -163,7 +157,6 @@ class Context:
 
 
 def _accepts(env: Any, name: str) -> bool:
-    """Say whether reset has a parameter of that name."""
     try:
         parameters = inspect.signature(env.reset).parameters.values()
     except ValueError:  # not written in Python

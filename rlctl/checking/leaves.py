@@ -21,14 +21,11 @@ NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)
 class Leaf:
     """One array of a space. Every supported kind has bounds: Discrete(n) is the integers from 0 to n - 1."""
 
-    path: Path
-    """Keys and places from the whole value to this array."""
-    kind: str
-    """`Box`, `Discrete`, `MultiDiscrete`, `MultiBinary`, or the name of a class that cannot be judged."""
+    path: Path  # Keys and places from the whole value to this array
+    kind: str  # `Box`, `Discrete`, `MultiDiscrete`, `MultiBinary`, or another class
     shape: tuple[int, ...] = ()
     dtype: str = ""
-    low: NDArray[Any] | None = None
-    """Shape `shape`; None for a kind that cannot be judged."""
+    low: NDArray[Any] | None = None  # Shape `shape`; None for a kind that cannot be judged
     high: NDArray[Any] | None = None
 
     @property
@@ -115,9 +112,8 @@ def find_numbers(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:
         inner = value.items() if isinstance(value, dict) else [("", value)]
         for name, number in inner:
             # Some libraries make an array without axes of a comparison.
-            if isinstance(number, NUMBERS) or (
-                isinstance(number, np.ndarray) and number.shape == () and number.dtype.kind in "biuf"
-            ):
+            is_scalar = isinstance(number, np.ndarray) and number.shape == () and number.dtype.kind in "biuf"
+            if isinstance(number, NUMBERS) or is_scalar:
                 with contextlib.suppress(OverflowError):  # a whole number of hundreds of digits
                     yield f"{key}/{name}" if isinstance(value, dict) else str(key), float(number)
 

@@ -16,10 +16,8 @@ from rlctl.checking.leaves import Leaf, name_element
 FIRST_SEED = 1000
 SECOND_SEED = 1001
 
-MOST_INFOS = 100
-"""So many numbers of info are recorded per episode, by name."""
-SUCCESS = "is_success"
-"""The name of success in info."""
+MOST_INFOS = 100  # So many numbers of info are recorded per episode, by name
+SUCCESS = "is_success"  # The name of success in info
 ENDS = ("terminated", "truncated", "both")
 
 
@@ -27,33 +25,22 @@ ENDS = ("terminated", "truncated", "both")
 class Built:
     """The environment that was built: its spaces and what it says about itself."""
 
-    leaves: list[Leaf]
-    """The observation space, taken apart into arrays."""
+    leaves: list[Leaf]  # The observation space, taken apart into arrays
     action_leaves: list[Leaf]
     observation_space: str
     action_space: str
-    names: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """Size per observation name in the order of a flat observation; empty where names are not known."""
-    events: Mapping[str, bool] = dataclasses.field(default_factory=dict)
-    """Per event of a task, whether it acts."""
-    max_steps: int | None = None
-    """The time limit it declares [steps]."""
-    nondeterministic: bool = False
-    """Whether its Gymnasium registration says that equal seeds may give unequal episodes."""
-    truncation: str = "unknown"
-    """What the code of `step` says of `truncated`: `never` (always False), `computed`, or `unknown`."""
-    counter: str = ""
-    """The comparison by which the code of `step` sets `terminated` when a counter of steps reaches a number."""
-    lines: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """The first lines of its methods in `file`, by name."""
+    names: Mapping[str, int] = dataclasses.field(default_factory=dict)  # observation name -> size
+    events: Mapping[str, bool] = dataclasses.field(default_factory=dict)  # event -> whether it acts
+    max_steps: int | None = None  # The time limit it declares [steps]
+    nondeterministic: bool = False  # its registration says that it is not repeatable
+    truncation: str = "unknown"  # `truncated` in the code of step: `never`, `computed`, `unknown`
+    counter: str = ""  # comparison in step that sets terminated by a counter
+    lines: Mapping[str, int] = dataclasses.field(default_factory=dict)  # method -> line in `file`
     accepts_seed: bool = True
     accepts_options: bool = True
-    uses_pybullet: bool = False
-    """Whether a PyBullet client was connected once it was built."""
-    waivers: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Per rule that its class waives, the reason."""
-    file: str | None = None
-    """Where its class is written."""
+    uses_pybullet: bool = False  # Whether a PyBullet client was connected once it was built
+    waivers: Mapping[str, str] = dataclasses.field(default_factory=dict)  # rule -> reason
+    file: str | None = None  # Where its class is written
     line: int | None = None
 
     @property
@@ -76,18 +63,15 @@ class Built:
 class Series:
     """The values of one leaf of the observation: those that have the leaf's shape."""
 
-    steps: NDArray[np.int64]
-    """Which observation each row is; 0 is the one of `reset`. Shape (n,)."""
-    values: NDArray[Any]
-    """Shape (n, *leaf.shape)."""
+    steps: NDArray[np.int64]  # Which observation each row is; 0 is the one of `reset`. Shape (n,).
+    values: NDArray[Any]  # Shape (n, *leaf.shape)
 
 
 @dataclasses.dataclass(frozen=True)
 class Form:
     """A type that something had: where it came first, and how often."""
 
-    what: str
-    """`observation`, `memory`, `keys`, `reward`, `terminated`, `truncated`, `info`, `reset` or `step`."""
+    what: str  # `observation`, `memory`, `keys`, `info`, a flag, `reward`, `reset` or `step`
     type: str
     step: int
     count: int
@@ -100,23 +84,17 @@ class Form:
 class CheckedEpisode:
     """One episode of T steps, or the part of it that was played."""
 
-    role: str
-    """What it was recorded for: `episodes`, or the name of a comparison."""
+    role: str  # What it was recorded for: `episodes`, or the name of a comparison
     episode: int
     seed: int
-    actions: str
-    """How actions were chosen: `random`, `zero` or `extreme`."""
-    ended: str
-    """`terminated`, `truncated`, `both`, `raised`, or what cut it: `steps`, `time`, `memory`."""
-    observations: dict[int, Series]
-    """Per leaf."""
-    rewards: NDArray[np.float64]
-    """Shape (T,); NaN where it was no number."""
+    actions: str  # How actions were chosen: `random`, `zero` or `extreme`
+    ended: str  # `terminated`, `truncated`, `both`, `raised`, `steps`, `time`, `memory`
+    observations: dict[int, Series]  # Per leaf
+    rewards: NDArray[np.float64]  # Shape (T,); NaN where it was no number
     reward_is_number: NDArray[np.bool_]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
-    infos: Mapping[str, Series]
-    """Numbers in info, by name; those in a dictionary of info as `reward_terms/distance`. Values have shape (n,)."""
+    infos: Mapping[str, Series]  # number in info -> values; `reward_terms/distance` if nested
     forms: list[Form]
 
     @property
@@ -138,37 +116,24 @@ class CheckedEpisode:
 class CallFailure:
     """A call into the environment that raised, never came back, or ended the process."""
 
-    kind: str
-    """`raised`, `hung` or `died`."""
-    call: str
-    """`load`, `build`, `reset`, `step`, `close`, `sample`, `render` or `compute_reward`."""
-    phase: str
-    """The experiment, or the part of one."""
+    kind: str  # `raised`, `hung` or `died`
+    call: str  # `load`, `build`, `reset`, `step`, `close`, `sample`, `render` or `compute_reward`
+    phase: str  # The experiment, or the part of one
     episode: int
     seed: int
     step: int
     error: str
-    details: str | None = None
-    """A traceback, or the last lines that a dying process printed."""
-    file: Mapping[str, Any] | None = None
-    """A file that was not found: its name, and the folders that were searched."""
-    where: tuple[str, int] | None = None
-    """File and line of the environment's own code that it went through last."""
-    process: str = ""
-    """Which child process: `probe` or `instances`."""
-
-    @property
-    def in_call(self) -> str:
-        """The call, in words for a message: `step 7`, `reset`, `the constructor`."""
-        names = {"step": f"step {self.step}", "load": "the import", "build": "the constructor"}
-        return names.get(self.call, self.call)
+    details: str | None = None  # A traceback, or the last lines that a dying process printed
+    file: Mapping[str, Any] | None = None  # one that was not found, and the searched folders
+    where: tuple[str, int] | None = None  # last line of the environment's own code
+    process: str = ""  # Which child process: `probe` or `instances`
 
     @property
     def message(self) -> str:
-        """What happened, in words."""
-        if self.kind == "raised":
-            return f"{self.in_call} raised {self.error}"
-        return f"{self.in_call} {self.error}" if self.kind == "hung" else f"the process {self.error} in {self.in_call}"
+        """What happened, in words: `step 7 raised ValueError: ...`."""
+        names = {"step": f"step {self.step}", "load": "the import", "build": "the constructor"}
+        call, verb = names.get(self.call, self.call), " raised" if self.kind == "raised" else ""
+        return f"the process {self.error} in {call}" if self.kind == "died" else f"{call}{verb} {self.error}"
 
     @property
     def place(self) -> dict[str, Any]:
@@ -184,8 +149,7 @@ class Fact:
     """What an experiment has found out for checks of the parent."""
 
     experiment: str
-    value: Any
-    """Plain data."""
+    value: Any  # Plain data
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,8 +158,7 @@ class Skipped:
 
     name: str
     reason: str
-    applies: bool = True
-    """False where this kind of environment does not have what the rule is about."""
+    applies: bool = True  # False if the environment has nothing to judge
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,8 +168,7 @@ class Finished:
     experiment: str
     seconds: float
     is_complete: bool
-    crash: str = ""
-    """The traceback of a bug of the experiment."""
+    crash: str = ""  # The traceback of a bug of the experiment
 
 
 @dataclasses.dataclass(frozen=True)

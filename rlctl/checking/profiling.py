@@ -15,7 +15,7 @@ from typing import Any
 
 from rlctl.checking import bullet_calls
 from rlctl.checking.attributes import find_author
-from rlctl.checking.clock import read_waited_s
+from rlctl.checking.progress import read_waited_s
 from rlctl.version import PACKAGE_FOLDER
 
 _BUILTIN = re.compile(
@@ -56,18 +56,13 @@ class Stopwatch:
 class TimedCall:
     """The calls of one function in all steps, or in all resets."""
 
-    name: str
-    """`pybullet.stepSimulation`."""
-    place: str
-    """The function of the environment that most of its time is spent for, `file.py:12`; empty if there is none."""
-    share: float
-    """Its part of the time of all steps, or of all resets."""
-    kind: str = ""
-    """`rendering`, `sleeping`, `loading` or `connecting`, for what is suspicious."""
+    name: str  # `pybullet.stepSimulation`
+    place: str  # `file.py:12` in the environment; empty if not known
+    share: float  # Its part of the time of all steps, or of all resets
+    kind: str = ""  # `rendering`, `sleeping`, `loading` or `connecting`, for what is suspicious
 
 
-Function = tuple[str, int, str]
-"""File, line and name, as Python's profiler has them; the file of what is not written in Python is `~`."""
+Function = tuple[str, int, str]  # file, line, name, as in cProfile
 
 
 class Profile:
@@ -82,9 +77,7 @@ class Profile:
         """Per function the number of calls, twice, the time in itself and with all it calls [s], the same by caller."""
         self._own = {function for function in self._stats if function[0] != "~" and is_own(function[0])}
         modules = {getattr(module, "__dict__", {}).get("__file__"): name for name, module in list(sys.modules.items())}
-        self._names = {
-            function: function[2] if function in self._own else _name_of(function, modules) for function in self._stats
-        }
+        self._names = {key: key[2] if key in self._own else _name_of(key, modules) for key in self._stats}
         self._kinds = {function: _kind_of(name, function in self._own) for function, name in self._names.items()}
 
     def slowest(self) -> list[TimedCall]:
@@ -112,7 +105,6 @@ class Profile:
         return "" if function is None else f"{Path(function[0]).name}:{function[1]}"
 
     def _sum_up(self, calls: Sequence[tuple[Function, str, float]]) -> list[TimedCall]:
-        """Return one call per name, with the place where most of its time goes, the slowest first."""
         total = sum(stats[2] for stats in self._stats.values()) or 1.0
         by_name: dict[str, TimedCall] = {}
         for function, place, spent in sorted(calls, key=lambda call: -call[2]):
@@ -123,7 +115,6 @@ class Profile:
 
 
 def _name_of(function: Function, modules: dict[Any, str]) -> str:
-    """Return a library's function without private modules: `numpy.linalg.norm`, `open`."""
     file, _, name = function
     if file == bullet_calls.__file__:
         name = f"pybullet.{name}"
@@ -156,7 +147,6 @@ def find_own_code(env: Any) -> Callable[[str], bool]:
 
 
 def _kind_of(name: str, own: bool) -> str:
-    """Return what is suspicious about a function: a key of `KINDS`, or nothing."""
     if own:
         return "rendering" if name.rpartition(".")[2] in ("render", "_render") else ""
     return next((kind for kind, pattern in KINDS.items() if re.match(pattern, name)), "")

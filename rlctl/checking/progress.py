@@ -1,4 +1,8 @@
-"""Where a child process is, in memory that its parent reads too: so a hang or a crash can be placed."""
+"""Where a child process is, in memory that its parent reads too, so that a hang or crash can be placed; and its clock.
+
+Time limits run on this clock, so a busy machine judges what an idle one does, and only takes longer: it stands still
+while a process waits for a processor. Linux counts that in `schedstat`; elsewhere it is the ordinary time.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,8 @@ import ctypes
 import dataclasses
 import mmap
 import os
+import time
+from pathlib import Path
 
 
 class _Memory(ctypes.Structure):
@@ -25,15 +31,12 @@ class Position:
     """A moment of a child process."""
 
     counter: int
-    call: str
-    """What of the environment is being called; empty between calls."""
-    phase: str
-    """The experiment, or the part of one."""
+    call: str  # What of the environment is being called; empty between calls
+    phase: str  # The experiment, or the part of one
     episode: int
     seed: int
     step: int
-    is_first: bool
-    """Whether it is the first call of its kind in the process, which may compile or load something."""
+    is_first: bool  # the process's first call of its kind, which may compile or load
 
 
 class CallProgress:
@@ -72,3 +75,35 @@ class CallProgress:
         now = self._now
         call, phase = now.call.decode(), now.phase.decode() or "build"
         return Position(now.counter, call, phase, now.episode, now.seed, now.step, now.is_first)
+
+
+INTERVAL_S = 0.01  # reading the count takes longer than many an episode's step
+
+
+def read_clock() -> float:
+    """Return the time of this process [s]; only differences have a meaning."""
+    now = time.monotonic()
+    if now - _last.read_at > INTERVAL_S:
+        _last.read_at, _last.waited_s = now, read_waited_s("self")
+    return now - _last.waited_s
+
+
+def read_clock_of(pid: int) -> float:
+    """Return the time of another process [s]; only differences have a meaning."""
+    return time.monotonic() - read_waited_s(str(pid))
+
+
+def read_waited_s(process: str = "self") -> float:
+    """Return for how long a process, given by its id, has waited for a processor [s]; 0 where that is not counted."""
+    try:
+        return int(Path(f"/proc/{process}/schedstat").read_text().split()[1]) / 1e9
+    except (OSError, IndexError):
+        return 0.0
+
+
+class _Last:
+    read_at = float("-inf")
+    waited_s = 0.0
+
+
+_last = _Last()

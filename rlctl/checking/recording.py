@@ -139,7 +139,6 @@ class Recording:
         return array.nbytes + 100
 
     def _compare_memory(self, index: int, value: Any, copy: NDArray[Any]) -> None:
-        """Note an observation that a later step has changed: both are one memory."""
         if not isinstance(value, np.ndarray) or not value.shape:
             return
         earlier = self._previous.get(index)

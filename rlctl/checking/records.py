@@ -1,26 +1,16 @@
-"""Everything that is known about one environment: what the child processes have sent. No environment code runs here."""
+"""What the child processes have sent about one environment; and what judges rules: experiments and checks of this."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from rlctl.checking.finding import NotJudged, RuleFinding
-from rlctl.checking.messages import (
-    Built,
-    CallFailure,
-    CheckedEpisode,
-    ChildMessage,
-    Fact,
-    Finished,
-    Form,
-    Series,
-    Skipped,
-)
+from rlctl.checking import messages
+from rlctl.checking.finding import RULES, NotJudged, RuleFinding
+from rlctl.checking.instance import Context
 
-OTHERS_MATTER = ("interleaved", "interleaved second", "after close")
-"""Roles of episodes beside another instance: rules of their own judge them."""
+OTHERS_MATTER = ("interleaved", "interleaved second", "after close")  # judged by RL401 and RL402
 
 
 @dataclasses.dataclass
@@ -28,81 +18,73 @@ class Records:
     """Everything known about one environment; what the checks of the parent process read."""
 
     task: str
-    built: Built | None = None
-    trajectories: list[CheckedEpisode] = dataclasses.field(default_factory=list)
-    failures: list[CallFailure] = dataclasses.field(default_factory=list)
-    findings: list[RuleFinding] = dataclasses.field(default_factory=list)
-    """Those of the experiments."""
-    facts: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """By the name of the experiment that found it out."""
-    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Experiments, roles and rules that were left out, and why."""
-    not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Rules that an experiment found nothing to look at for, and why."""
-    finished: dict[str, Finished] = dataclasses.field(default_factory=dict)
-    """Per experiment that was run and did not end its process."""
-    normalizes: Callable[[str], bool] = lambda _: False
-    """Says whether there is a packaged recipe, and it normalises the `reward`, or the `observation`."""
-    printed_lines: int = 0
-    """Lines that the environment of the first process wrote to stdout."""
+    built: messages.Built | None = None
+    trajectories: list[messages.CheckedEpisode] = dataclasses.field(default_factory=list)
+    failures: list[messages.CallFailure] = dataclasses.field(default_factory=list)
+    findings: list[RuleFinding] = dataclasses.field(default_factory=list)  # of the experiments
+    facts: dict[str, Any] = dataclasses.field(default_factory=dict)  # by experiment
+    skipped: dict[str, str] = dataclasses.field(default_factory=dict)  # experiment, role or rule -> reason
+    not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)  # rule -> reason
+    finished: dict[str, messages.Finished] = dataclasses.field(default_factory=dict)  # by experiment
+    normalizes: Callable[[str], bool] = lambda _: False  # says whether the recipe normalises `reward` or `observation`
+    printed_lines: int = 0  # Lines that the environment of the first process wrote to stdout
     printed_first: str = ""
 
-    def add(self, message: ChildMessage) -> None:
+    def add(self, message: messages.ChildMessage) -> None:
         """Take in one message of a child process."""
         match message:
-            case Built():
+            case messages.Built():
                 self.built = message
-            case CheckedEpisode():
+            case messages.CheckedEpisode():
                 self.trajectories.append(message)
-            case CallFailure():
+            case messages.CallFailure():
                 self.failures.append(message)
             case RuleFinding():
                 self.findings.append(message)
-            case Fact():
+            case messages.Fact():
                 self.facts[message.experiment] = message.value
-            case Skipped():
+            case messages.Skipped():
                 (self.skipped if message.applies else self.not_applicable)[message.name] = message.reason
-            case Finished():
+            case messages.Finished():
                 self.finished[message.experiment] = message
 
-    def role(self, role: str) -> list[CheckedEpisode]:
+    def role(self, role: str) -> list[messages.CheckedEpisode]:
         """Return what was recorded for one purpose."""
         return [trajectory for trajectory in self.trajectories if trajectory.role == role]
 
     @property
-    def episodes(self) -> list[CheckedEpisode]:
+    def episodes(self) -> list[messages.CheckedEpisode]:
         """Return the whole episodes of the first process."""
         return self.role("episodes")
 
-    def require_built(self) -> Built:
+    def require_built(self) -> messages.Built:
         """Return the environment that was built; raises `NotJudged` if there is none."""
         if self.built is None:
             raise NotJudged("no instance could be built")
         return self.built
 
     @property
-    def alone(self) -> list[CheckedEpisode]:
+    def alone(self) -> list[messages.CheckedEpisode]:
         """Return all episodes of instances that were alone in their process and used as a learner uses them."""
         return [trajectory for trajectory in self.trajectories if trajectory.role not in OTHERS_MATTER]
 
-    def require_alone(self) -> list[CheckedEpisode]:
+    def require_alone(self) -> list[messages.CheckedEpisode]:
         """Return the same; raises `NotJudged` if there is none."""
         episodes = self.alone
         if not any(episode.steps or episode.observations for episode in episodes):
             raise NotJudged("no episode was recorded")
         return episodes
 
-    def forms(self, what: str) -> list[tuple[CheckedEpisode, Form]]:
+    def forms(self, what: str) -> list[tuple[messages.CheckedEpisode, messages.Form]]:
         """Return every type that something had in the same episodes."""
         return [(episode, form) for episode in self.require_alone() for form in episode.forms if form.what == what]
 
-    def series(self, leaf: int) -> list[tuple[CheckedEpisode, Series]]:
+    def series(self, leaf: int) -> list[tuple[messages.CheckedEpisode, messages.Series]]:
         """Return the values of a leaf of the observation in the same episodes, where there are any."""
-        return [
-            (episode, episode.observations[leaf]) for episode in self.require_alone() if leaf in episode.observations
-        ]
+        episodes = [episode for episode in self.require_alone() if leaf in episode.observations]
+        return [(episode, episode.observations[leaf]) for episode in episodes]
 
-    def require_role(self, role: str) -> CheckedEpisode:
+    def require_role(self, role: str) -> messages.CheckedEpisode:
         """Return the episode of a comparison; raises `NotJudged` if there is none."""
         episodes = self.role(role)
         if not episodes:
@@ -123,3 +105,48 @@ class Records:
         if failed:
             return f"the environment failed in {failed[0].call} during this experiment: {failed[0].error}"
         return f"the process ended before the experiment {experiment!r}"
+
+
+RECORDING = ("comparisons", "episodes", "instances")
+"""The experiments that record episodes for all rules: with random and other actions, alone and beside another."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """One thing to do with an environment in a child process."""
+
+    name: str
+    run: Callable[[Context], Iterator[messages.ChildMessage]]  # yields findings at once, so that a crash loses none
+    rules: tuple[str, ...]  # those it decides if it completes; may be empty
+    share: float  # of the time of its process, relative to the others
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """How the parent process judges a rule from what was recorded."""
+
+    rule: str
+    run: Callable[[Records], Iterable[RuleFinding]]
+    needs: tuple[str, ...]  # The experiments that record what it reads
+
+
+def experiment(
+    name: str, *rules: str, share: float = 1.0
+) -> Callable[[Callable[[Context], Iterator[messages.ChildMessage]]], Experiment]:
+    """Make an experiment of a function. It decides `rules`; see the package `families` for how."""
+
+    def decorate(run: Callable[[Context], Iterator[messages.ChildMessage]]) -> Experiment:
+        assert all(rule in RULES for rule in rules)
+        return Experiment(name, run, rules, share)
+
+    return decorate
+
+
+def check(rule: str, *needs: str) -> Callable[[Callable[[Records], Iterable[RuleFinding]]], Check]:
+    """Make the check of a rule of a function; by default it reads the recorded episodes."""
+
+    def decorate(run: Callable[[Records], Iterable[RuleFinding]]) -> Check:
+        assert rule in RULES
+        return Check(rule, run, needs or RECORDING)
+
+    return decorate

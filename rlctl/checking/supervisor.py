@@ -5,30 +5,26 @@ What a process had left to do when it died or hung is done in another one, so th
 
 from __future__ import annotations
 
+import functools
 import os
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 
 from rlctl.checking import families
-from rlctl.checking.clock import read_clock_of
 from rlctl.checking.messages import Built, CallFailure, ChildMessage, End, Finished, Mistake
-from rlctl.checking.progress import CallProgress, Position
+from rlctl.checking.progress import CallProgress, Position, read_clock_of
 from rlctl.environments.spec import EnvSpec
 from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill, anonymous_file
 from rlctl.processes.printed_lines import LineReader
 
 AT_ONCE = 2
-BUILD_TIMEOUT_S = 60.0
-"""How long importing and building may take, unless a step may take longer."""
-FIRST_CALL_TIMEOUT_S = 30.0
-"""How long the first reset and the first step of a process may take, where much is compiled or loaded [s]."""
-IDLE_TIMEOUT_S = 300.0
-"""How long a child may do nothing with the environment: loading libraries on a busy machine, at the worst."""
+BUILD_TIMEOUT_S = 60.0  # How long importing and building may take, unless a step may take longer
+FIRST_CALL_TIMEOUT_S = 30.0  # first reset or step, which may compile or load [s]
+IDLE_TIMEOUT_S = 300.0  # outside of the environment: loading libraries [s]
 _POLL_S = 0.1
 _KEPT_LINES = 8
-_PYBULLETS = ("pybullet build time", "argv[")
-"""Lines that PyBullet prints when it is imported and when it connects."""
+_PYBULLETS = ("pybullet build time", "argv[")  # printed at import and connection
 
 
 class Child:
@@ -36,16 +32,14 @@ class Child:
 
     def __init__(self, name: str, spec: EnvSpec, experiments: Sequence[str], seconds: float) -> None:
         self.name = name
-        self.experiments = list(experiments)
-        """Those that it has not finished; the first is running."""
+        self.experiments = list(experiments)  # Those that it has not finished; the first is running
         self.has_finished_one = False
-        self.printed = 0
-        """Lines that were written to stdout."""
+        self.printed = 0  # Lines that were written to stdout
         self.first_line = ""
         self.last_lines: deque[str] = deque(maxlen=_KEPT_LINES)
         self._memory = anonymous_file()
         self._progress = CallProgress(self._memory)
-        self._readers = LineReader(self._count), LineReader(self._keep)
+        self._readers = LineReader(functools.partial(self._keep, counts=True)), LineReader(self._keep)
         arguments = {"process": name, "spec": spec, "seconds": seconds, "memory": self._memory}
         self.process = ChildProcess(
             "rlctl.checking.child:main",
@@ -57,18 +51,13 @@ class Child:
         )
         for reader in self._readers:
             reader.close_descriptor()
-        self._standstill = Standstill(
-            lambda: self.position.counter, clock=lambda: read_clock_of(self.process.process.pid)
-        )
+        pid = self.process.process.pid
+        self._standstill = Standstill(lambda: self.position.counter, clock=lambda: read_clock_of(pid))
 
-    def _count(self, line: str) -> None:
+    def _keep(self, line: str, *, counts: bool = False) -> None:
         if line and not line.startswith(_PYBULLETS):
-            self.printed += 1
-            self.first_line = self.first_line or line
-        self._keep(line)
-
-    def _keep(self, line: str) -> None:
-        if line and not line.startswith(_PYBULLETS):
+            self.printed += counts
+            self.first_line = self.first_line or (line if counts else "")
             self.last_lines.append(line)
 
     @property
@@ -83,11 +72,9 @@ class Child:
 
     def fail(self, kind: str, error: str) -> CallFailure:
         """Return the failure that ends it, with the last lines that it has printed."""
-        at, details = self.position, "\n".join(self.last_lines)
+        at, details = self.position, "\n".join(self.last_lines) or None
         call = at.call or "between calls"
-        return CallFailure(
-            kind, call, at.phase, at.episode, at.seed, at.step, error, details or None, process=self.name
-        )
+        return CallFailure(kind, call, at.phase, at.episode, at.seed, at.step, error, details, process=self.name)
 
     def wait_for_lines(self) -> None:
         """Wait until all that an ended process has printed was read."""
@@ -127,8 +114,7 @@ class Supervisor:
         self._active: dict[Connection, Child] = {}
         self._has_built = False
         self._started_again: set[str] = set()
-        self.children: list[Child] = []
-        """Those that were started, the first process first."""
+        self.children: list[Child] = []  # Those that were started, the first process first
 
     def run(self, experiments: Mapping[str, Sequence[str]], on_poll: Callable[[Position], None]) -> None:
         """Run each process with some experiments, and come back when all are done, dead or ended."""
@@ -138,8 +124,9 @@ class Supervisor:
             for ready in wait(list(self._active), timeout=_POLL_S):
                 self._read(self._active[ready])  # type: ignore[index]
             for child in list(self._active.values()):
-                if child.process.connection in self._active:  # not ended because of another
-                    self._check(child)
+                is_active = child.process.connection in self._active  # not ended because of another
+                if is_active and (why := child.hangs(self._env_timeout_s)):
+                    self._end(child, child.fail("hung", why))
             self._start()
             if self._active:
                 on_poll(next(iter(self._active.values())).position)
@@ -163,21 +150,18 @@ class Supervisor:
             child.wait_for_lines()
             self._end(child, child.fail("died", str(end)))
             return
-        if isinstance(message, End):
-            self._end(child, grace_s=1.0)
-            return
-        if isinstance(message, Built):
-            self._has_built = True
-        if isinstance(message, Mistake):
-            self._waiting.clear()
-        if isinstance(message, Finished):
-            child.experiments.remove(message.experiment)
-            child.has_finished_one = True
+        match message:
+            case End():
+                self._end(child, grace_s=1.0)
+                return
+            case Built():
+                self._has_built = True
+            case Mistake():
+                self._waiting.clear()
+            case Finished():
+                child.experiments.remove(message.experiment)
+                child.has_finished_one = True
         self._receive(message)
-
-    def _check(self, child: Child) -> None:
-        if why := child.hangs(self._env_timeout_s):
-            self._end(child, child.fail("hung", why))
 
     def _end(self, child: Child, failure: CallFailure | None = None, grace_s: float = 0.0) -> None:
         if failure is not None:
@@ -189,7 +173,6 @@ class Supervisor:
         child.close(grace_s)
 
     def _start_again(self, child: Child) -> None:
-        """Have a new process do what is left of one that died or hung, once, if the environment worked before."""
         rest = child.experiments[1:]
         if rest and child.has_finished_one and child.name not in self._started_again:
             self._started_again.add(child.name)

@@ -10,27 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking import bullet_worlds
 from rlctl.checking.bullet_calls import BulletCalls, Target
-from rlctl.checking.bullet_worlds import (
-    ANGULAR,
-    JOINTS,
-    VELOCITY,
-    Jump,
-    Link,
-    Pair,
-    World,
-    WorldBody,
-    bullet,
-    find_clients,
-    find_jumps,
-    measure_thickness,
-    read_contacts,
-    read_gravity,
-    read_orientations,
-    read_states,
-    read_world,
-    weight_matters,
-)
+from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Jump, Link, Pair, World, WorldBody
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.finding import NotApplicable
 from rlctl.checking.instance import Instance
@@ -38,13 +20,9 @@ from rlctl.checking.leaves import flatten_numbers
 from rlctl.checking.messages import FIRST_SEED
 
 MOST_WORLDS = 4
-DEEPEST_FINE = 0.02
-"""Links of ordinary size may be so far inside each other [m]: Bullet pushes them apart over several steps, and 2 cm
-are more than a stiff contact leaves even for a heavy robot that falls."""
-LEAST_LIMIT = 0.005
-"""The same for the smallest things [m]: collision margins alone are 1 to 4 mm."""
-PART_OF_LINK = 0.25
-"""Between those two it is this part of the thinner link."""
+DEEPEST_FINE = 0.02  # [m]; Bullet pushes links apart over several steps, heavy robots leave up to 2 cm
+LEAST_LIMIT = 0.005  # The same for the smallest things [m]: collision margins alone are 1 to 4 mm
+PART_OF_LINK = 0.25  # Between those two it is this part of the thinner link
 Place = dict[str, Any]
 """`seed`, `episode`, `actions` and `step` of a look at a world, as a finding's evidence; step 0 is the reset."""
 
@@ -55,16 +33,11 @@ class WorldLog:
 
     world: World
     places: list[Place] = dataclasses.field(default_factory=list)
-    states: list[list[NDArray[np.float64]]] = dataclasses.field(default_factory=list)
-    """Per look, per body, as `read_states` returns them."""
-    deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)
-    """Depth and limit of what is too far inside each other [m]."""
-    touching: list[set[Pair]] = dataclasses.field(default_factory=list)
-    """Links that touch."""
-    orientations: list[dict[Link, list[float]]] = dataclasses.field(default_factory=list)
-    """Quaternions of links, as `read_orientations` returns them."""
-    observed: list[NDArray[np.float64]] = dataclasses.field(default_factory=list)
-    """The numbers of the observation, flat."""
+    states: list[list[NDArray[np.float64]]] = dataclasses.field(default_factory=list)  # by look and body
+    deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)  # depth and limit [m]
+    touching: list[set[Pair]] = dataclasses.field(default_factory=list)  # Links that touch
+    orientations: list[dict[Link, list[float]]] = dataclasses.field(default_factory=list)  # quaternions, x y z w
+    observed: list[NDArray[np.float64]] = dataclasses.field(default_factory=list)  # flat observations
     first_targets: dict[tuple[int, int, int], Target] = dataclasses.field(default_factory=dict)
     """Motor targets that the first step sets, with the zero action only."""
 
@@ -72,10 +45,10 @@ class WorldLog:
         """Add what is there now; False where the world has gone, or has other bodies."""
         client = self.world.client
         try:
-            states, contacts = read_states(self.world), read_contacts(client)
-            orientations = read_orientations(self.world)
+            states, contacts = bullet_worlds.read_states(self.world), bullet_worlds.read_contacts(client)
+            orientations = bullet_worlds.read_orientations(self.world)
             deep = {pair: (-d, _limit(client, pair)) for pair, d in contacts.items() if d < -LEAST_LIMIT}
-        except bullet().error:
+        except bullet_worlds.bullet().error:
             return False
         self.places.append(place)
         self.states.append(states)
@@ -106,7 +79,7 @@ class WorldLog:
 
 
 def _limit(client: int, pair: Pair) -> float:
-    thinner = min(measure_thickness(client, link) for link in pair)
+    thinner = min(bullet_worlds.measure_thickness(client, link) for link in pair)
     return min(DEEPEST_FINE, max(LEAST_LIMIT, PART_OF_LINK * thinner))
 
 
@@ -115,12 +88,10 @@ class LoggedWorld:
     """Everything about one world."""
 
     world: World
-    gravity: list[float]
-    """The strongest [m/s^2]."""
+    gravity: list[float]  # The strongest [m/s^2]
     logs: list[WorldLog] = dataclasses.field(default_factory=list)
     jumps: list[Jump] = dataclasses.field(default_factory=list)
-    weight_matters: bool | None = None
-    """Whether anything would move otherwise with gravity; tested only where there is none."""
+    weight_matters: bool | None = None  # tested if gravity is zero
 
 
 class WorldLogger:
@@ -134,8 +105,7 @@ class WorldLogger:
         self.calls = calls
         self.resets = 0
         self._older = older
-        self._worlds: dict[int, LoggedWorld] = {}
-        """By their index in the list of worlds: an environment that connects anew may get another client."""
+        self._worlds: dict[int, LoggedWorld] = {}  # by index: ids of clients may change
 
     @property
     def worlds(self) -> list[LoggedWorld]:
@@ -163,7 +133,7 @@ class WorldLogger:
         self.resets += 1
         logs = []
         for i, world in enumerate(self._read()):
-            gravity = read_gravity(world.client)
+            gravity = bullet_worlds.read_gravity(world.client)
             logged = self._worlds.setdefault(i, LoggedWorld(world, gravity))
             logged.gravity = max(logged.gravity, gravity, key=np.linalg.norm)
             if world.key == logged.world.key:
@@ -173,18 +143,17 @@ class WorldLogger:
         return logs
 
     def _read(self) -> list[World]:
-        """Return the worlds of the clients that came with the instance, or of all where it shares older ones."""
-        ids = find_clients()
-        own = [read_world(id) for id in ids if id not in self._older]
+        ids = bullet_worlds.find_clients()
+        own = [bullet_worlds.read_world(id) for id in ids if id not in self._older]
         if not any(world.bodies for world in own):
-            own = [read_world(id) for id in ids]
+            own = [bullet_worlds.read_world(id) for id in ids]
         return [world for world in own if world.bodies][:MOST_WORLDS]
 
     def simulate_alone(self, number: int, deadline: float) -> None:
         """Reset, and simulate every world without the environment, which leaves them unusable."""
         self.play(number, "none", 0, deadline)
         for logged in self._worlds.values():
-            with contextlib.suppress(bullet().error):
+            with contextlib.suppress(bullet_worlds.bullet().error):
                 if not any(logged.gravity):
-                    logged.weight_matters = weight_matters(logged.world)
-                logged.jumps += find_jumps(logged.world, FIRST_SEED + number)
+                    logged.weight_matters = bullet_worlds.weight_matters(logged.world)
+                logged.jumps += bullet_worlds.find_jumps(logged.world, FIRST_SEED + number)

@@ -41,7 +41,7 @@ def check_env(
     from rlctl.checking import formats
     from rlctl.checking.check import check
     from rlctl.checking.finding import choose_rules
-    from rlctl.checking.formats import rules, structured
+    from rlctl.checking.formats import plain, structured
     from rlctl.environments.spec import EnvSpec
 
     if explain is not None and explain.upper().startswith("Q"):
@@ -51,7 +51,7 @@ def check_env(
         streams.out().print("\n".join(diagnosis.explain(explain)))
         return
     if list_rules or explain is not None:
-        rules.show_list() if explain is None else rules.explain(explain)
+        plain.show_list() if explain is None else plain.explain(explain)
         return
     if task is None:
         raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rlctl.checking.clock import INTERVAL_S, read_clock, read_clock_of
+from rlctl.checking.progress import INTERVAL_S, read_clock, read_clock_of
 
 LINUX = pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="only Linux counts it")
 

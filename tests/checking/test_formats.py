@@ -154,7 +154,7 @@ def test_outside_the_repository_there_is_no_place_to_annotate(broken, monkeypatc
 def test_text_has_the_finding_its_numbers_and_its_fix(broken):
     text = plain.text(broken)
     assert text.startswith("error RL601  reward not finite\n  the reward is nan at step 13\n  seed 1000, episode 0, ")
-    assert "\n  fix: Find the division, logarithm or diverging simulation behind it.\n" in text
+    assert "\n  fix: Find the division, logarithm or diverging simulation that causes it.\n" in text
     assert "\x1b" not in text
 
 

@@ -10,9 +10,8 @@ import pytest
 
 from rlctl.checking import families
 from rlctl.checking.check import check, judge
-from rlctl.checking.experiments import Check
 from rlctl.checking.finding import choose_rules
-from rlctl.checking.records import Records
+from rlctl.checking.records import Check, Records
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from tests import fork_server
@@ -166,7 +165,7 @@ def test_command_shows_the_worst_first_with_numbers_and_fix():
         "  the reward is a numpy.ndarray at step 1",
         "  seed 1000, episode 0, actions random, step 1, type numpy.ndarray, expected float",
         "  fix: Return bool(...) for both flags (a comparison of numpy numbers gives numpy.bool), float(reward), and a "
-        "dict, empty if there is nothing to say.",
+        "dict, which may be empty.",
     ]
 
 

@@ -42,8 +42,8 @@ def test_what_is_wrong_is_named(name, rule, message):
 
 def test_names_that_have_no_effect_are_found():
     assert {finding.message for finding in findings("broken_variants.py:Misspelled", "RL013")} == {
-        "Misspelled.episode_seconds is used by nothing. Did you mean 'episode_s'?",
-        "Misspelled.is_terminate is used by nothing. Did you mean 'is_terminated'?",
+        "nothing uses Misspelled.episode_seconds. Did you mean 'episode_s'?",
+        "nothing uses Misspelled.is_terminate. Did you mean 'is_terminated'?",
     }
 
 

@@ -9,11 +9,10 @@
             if not isinstance(picture := instance.call("render", instance.env.render), np.ndarray):
                 yield RuleFinding("RL215", "render returns no array", {"value": str(picture)})
 
-It decides the rules that it names: they are judged when it comes to its end. `raise NotJudged(why)` or
-`NotApplicable(why)` says so of all its rules without a finding, `yield Skipped("RL404", why)` of one of them. It calls
-the environment through `Instance.call`, `Instance.reset` and `EpisodePlayer` only, so that what the environment raises
-is an `EnvironmentRaised`, which need not be caught, and a hang or a crash can be placed. `context.budget` is what there
-is of time and memory.
+It decides the rules that it names, if it completes. `raise NotJudged(why)` or `NotApplicable(why)` ends it, and applies
+to all its rules without a finding; `yield Skipped("RL404", why)` applies to one. It calls the environment through
+`Instance.call`, `Instance.reset` and `EpisodePlayer` only: what the environment raises is then an `EnvironmentRaised`,
+which need not be caught, and hangs and crashes can be located. `context.budget` limits time and memory.
 
 **A check** judges one rule in the parent process, from recorded episodes, which many rules share:
 
@@ -21,13 +20,12 @@ is of time and memory.
     def find_both_flags(records: Records) -> Iterator[RuleFinding]:
         for episode in records.episodes: ...
 
-It names the experiments that it needs (by default those that record the common episodes, `RECORDING`) and raises
-`NotJudged` or `NotApplicable`. A rule may have both, and then has the findings of both. A recording experiment yields
-what `Recording.run()` returns.
+It names the experiments that it needs (by default `RECORDING`, which record the common episodes) and may raise
+`NotJudged` or `NotApplicable`. A rule may have an experiment and a check. A recording experiment yields what
+`Recording.run()` returns.
 
-**Texts** (name, severity, meaning, fix) are in `rules.yaml`, not here. A finding gives its own severity or fix only
-where they differ from the rule's. Every check and experiment of a module in `MODULES` counts; the order of experiments
-is that of `PROCESSES`.
+**Texts** (name, severity, meaning, fix) are in `rules.yaml`. A finding has its own severity or fix only if they differ
+from the rule's. All checks of a module in `MODULES` count; `PROCESSES` orders the experiments.
 """
 
 from __future__ import annotations
@@ -35,7 +33,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Collection, Iterable
 
-from rlctl.checking.experiments import Check, Experiment
 from rlctl.checking.families import (
     actions,
     determinism,
@@ -55,62 +52,51 @@ from rlctl.checking.families import (
     variants,
 )
 from rlctl.checking.finding import RULES
+from rlctl.checking.records import Check, Experiment
 
-PROCESS_S = 18.0
-"""How long the experiments of one process may take together [s]; importing and building comes on top."""
+PROCESS_S = 18.0  # for the experiments of one process [s], besides importing and building
+
+
+MODULES = (
+    *(loading, observations, features, interface, determinism, seeding, isolation, episodes),
+    *(rewards, incentives, search, actions, physics, speed, state, variants),
+)
+_MEMBERS = [value for module in MODULES for value in vars(module).values()]
+
+CHECKS = {check.rule: check for check in _MEMBERS if isinstance(check, Check)}
+
+_BY_NAME = {experiment.name: experiment for experiment in _MEMBERS if isinstance(experiment, Experiment)}
 
 
 @dataclasses.dataclass(frozen=True)
 class Process:
     """A child process and what runs in it, in this order: what may crash the environment comes last."""
 
-    experiments: tuple[Experiment, ...]
+    names: tuple[str, ...]
     hash_seed: int = 0
+
+    @property
+    def experiments(self) -> list[Experiment]:
+        """The experiments."""
+        return [_BY_NAME[name] for name in self.names]
 
 
 PROCESSES = {
     "probe": Process(
         (
-            loading.build,
-            determinism.compare_repetitions,
-            seeding.compare_generators,
-            speed.measure_speed,
-            episodes.record_episodes,
-            incentives.record_starts,
-            search.search,
-            episodes.find_unseeded,
-            rewards.recompute_rewards,
-            isolation.count_after_resets,
+            *("build", "comparisons", "global random", "speed", "episodes", "starts", "search", "unseeded generators"),
+            *("hindsight", "leaks"),
         )
     ),
     "instances": Process(
-        (
-            isolation.compare_instances,
-            seeding.compare_unseeded,
-            physics.watch_worlds,
-            actions.compare_actions,
-            state.change_attributes,
-            actions.give_nan,
-            variants.play_variants,
-            interface.render,
-        ),
-        hash_seed=1,  # another one, so that hash order shows
+        ("instances", "unseeded", "worlds", "action effects", "hidden state", "nan action", "variants", "rendering"),
+        hash_seed=1,  # differs, so that a dependence on hash order shows
     ),
 }
-"""The child processes."""
-
-MODULES = (
-    *(loading, observations, features, interface, determinism, seeding, isolation, episodes),
-    *(rewards, incentives, actions, physics, speed, state, variants),
-)
-
-CHECKS = {var.rule: var for module in MODULES for var in vars(module).values() if isinstance(var, Check)}
-"""The check of a rule, for those that have one."""
 
 EXPERIMENTS = {experiment.name: experiment for process in PROCESSES.values() for experiment in process.experiments}
 
 DECIDED_BY = {rule: experiment for experiment in EXPERIMENTS.values() for rule in experiment.rules}
-"""The experiment that decides a rule, for those that one does."""
 
 
 def find_needs(rules: Iterable[str]) -> set[str]:

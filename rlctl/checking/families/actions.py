@@ -9,44 +9,28 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rlctl.checking.action_trials import (
-    REPEATED_STEPS,
-    REWARD,
-    ActionNumber,
-    OutOfTime,
-    Trials,
-    find_differences,
-    find_dimensions,
-    find_other_rewards,
-    observations_differ,
-)
-from rlctl.checking.experiments import experiment
+from rlctl.checking import action_trials
+from rlctl.checking.action_trials import REWARD, ActionNumber, Trials
 from rlctl.checking.failures import EnvironmentRaised
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.instance import Context
 from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage
+from rlctl.checking.records import experiment
 
 MOST_DIMENSIONS = 64
-STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))
-"""Seeds and steps that are compared until a difference shows: most show at once, some need time or another start."""
-DELAY_STEPS = 4
-"""Over so many steps the effect of the first action is looked for."""
-NAN_STEPS = 4
-"""Of an episode whose first action is NaN."""
-LONGEST_DELAY = 4
-"""Observations may hold so many earlier actions; a penalty on changes of the action reaches as far [steps]."""
-MOST_NAMES = 8
-"""So many dimensions are named in a message."""
-Effect = Literal["lasting", "cost", "copy", "none"]
-"""What a number of the action does; `cost`: in the reward of its own step only; `copy`: beside that, only as a copy of
-itself in the observation."""
+STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows
+DELAY_STEPS = 4  # Over so many steps the effect of the first action is looked for
+NAN_STEPS = 4  # Of an episode whose first action is NaN
+LONGEST_DELAY = 4  # steps; for earlier actions in observations and for penalties on changes
+MOST_NAMES = 8  # So many dimensions are named in a message
+Effect = Literal["lasting", "cost", "copy", "none"]  # cost: in its own reward; copy: in the observation
 
 
 @experiment("action effects", "RL701", "RL115", "RL616", share=4.0)
 def compare_actions(context: Context) -> Iterator[ChildMessage]:
     """Play the same episode with each number of the action at other values."""
     with context.fresh() as instance:
-        every = find_dimensions(instance.action_leaves)
+        every = action_trials.find_dimensions(instance.action_leaves)
         if not every:
             raise NotJudged("no number of the action can be varied")
         trials = Trials(context, instance)
@@ -57,7 +41,7 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
             yield from _late_effects(trials, every)
             for dimension in every[:MOST_DIMENSIONS]:
                 effects[dimension.name] = _find_effect(trials, dimension)
-        except OutOfTime:
+        except action_trials.OutOfTime:
             why = "there was no time for more"
         if not effects:
             raise NotJudged("there was no time to compare a single action")
@@ -75,25 +59,31 @@ def give_nan(context: Context) -> Iterator[ChildMessage]:
         # A simulator may write a log about it to the working directory: MuJoCo does.
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.suppress(EnvironmentRaised):
             try:
-                returned = _play_nan(trials)
-            except OutOfTime:
+                nan_in, lasts = _play_nan(trials)
+            except action_trials.OutOfTime:
                 raise NotJudged("time ran out before an action of NaN could be judged") from None
-            if returned:
+            if nan_in:
                 evidence = {"seed": FIRST_SEED, "step": 1, "value": "NaN", "expected": "an exception"}
-                severity = Severity.WARNING if "later" in returned else None
-                message = f"an action of NaN is accepted, and NaN comes back in {returned}"
-                yield RuleFinding("RL704", message, evidence, severity)
+                until = "also in later episodes" if lasts else "until the next reset"
+                message = f"step accepts an action of NaN: {nan_in} NaN {until}"
+                yield RuleFinding("RL704", message, evidence, Severity.WARNING if lasts else None)
 
 
-def _play_nan(trials: Trials) -> str:
-    """Return where NaN comes back after a first action of NaN; empty where it does not."""
-    numbers = [number for number in find_dimensions(trials.instance.action_leaves) if "float" in number.leaf.dtype]
-    frames = trials.with_values(FIRST_SEED, NAN_STEPS, dict.fromkeys(numbers, np.nan), at=0)
-    if all(np.isfinite(frame).all() for frame in frames[1:]):
-        return ""
+def _play_nan(trials: Trials) -> tuple[str, bool]:
+    """Return what is NaN after a first action of NaN, and whether anything is in the next episode."""
+    dimensions = action_trials.find_dimensions(trials.instance.action_leaves)
+    values = {dimension: np.nan for dimension in dimensions if "float" in dimension.leaf.dtype}
+    frames = [~np.isfinite(frame) for frame in trials.with_values(FIRST_SEED, NAN_STEPS, values, at=0)[1:]]
+    parts = {
+        "observation": any(frame[:REWARD].any() for frame in frames),
+        "reward": any(frame[REWARD] for frame in frames),
+    }
+    names = [name for name, is_nan in parts.items() if is_nan]
+    if not names:
+        return "", False
     later = trials.play(FIRST_SEED, trials.actions(FIRST_SEED, NAN_STEPS))
-    lasts = not all(np.isfinite(frame).all() for frame in later)
-    return "the observation or the reward" + (", in later episodes too" if lasts else "")
+    verb = "are" if len(names) > 1 else "is"
+    return f"the {' and the '.join(names)} {verb}", not all(np.isfinite(frame).all() for frame in later)
 
 
 def _late_effects(trials: Trials, dimensions: Sequence[ActionNumber]) -> Iterator[RuleFinding]:
@@ -103,59 +93,53 @@ def _late_effects(trials: Trials, dimensions: Sequence[ActionNumber]) -> Iterato
         plain = trials.plain(seed, DELAY_STEPS)
         for end in (0, 1):
             values = {dimension: dimension.ends[end] for dimension in dimensions}
-            pairs.append(find_differences(plain, trials.with_values(seed, DELAY_STEPS, values, at=0)))
+            pairs.append(action_trials.find_differences(plain, trials.with_values(seed, DELAY_STEPS, values, at=0)))
     rewarded = [{step for step, columns in pair.items() if REWARD in columns} for pair in pairs]
     observed = [{step for step, columns in pair.items() if columns.min() < REWARD} for pair in pairs]
     evidence: dict[str, Any] = {"seed": FIRST_SEED, "value": 2, "expected": 1}
     if all(min(steps, default=0) == 2 for steps in observed):
-        message = (
-            "the observation of step 1 does not depend on the first action, that of step 2 does: it is one step old"
-        )
+        message = "the first action changes the observation only at step 2: the observation is one step old"
         yield RuleFinding("RL115", message, {**evidence, "step": 1})
     elif all(min(steps, default=0) == 1 for steps in observed) and all(min(s, default=0) == 2 for s in rewarded):
-        message = "the first action changes the observation of step 1, and the reward from step 2 on only"
+        message = "the first action changes the observation at step 1, but the reward only from step 2 on"
         yield RuleFinding("RL616", message, {**evidence, "step": 1})
 
 
 def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:
-    copies = trials.copies(dimension, FIRST_SEED, REPEATED_STEPS, LONGEST_DELAY)
+    copies = trials.copies(dimension, FIRST_SEED, action_trials.REPEATED_STEPS, LONGEST_DELAY)
     effect: Effect = "none"
     for seed, steps in STAGES:
         plain = trials.plain(seed, steps)
         for end in dimension.ends:
             played = trials.with_values(seed, steps, {dimension: end})
-            if observations_differ(plain, played, copies):
+            if action_trials.observations_differ(plain, played, copies):
                 return "lasting"
-            if find_other_rewards(plain, played):
+            if action_trials.find_other_rewards(plain, played):
                 effect = "cost"
-            elif effect == "none" and observations_differ(plain, played):
+            elif effect == "none" and action_trials.observations_differ(plain, played):
                 effect = "copy"
     return "lasting" if effect == "cost" and _lasts(trials, dimension) else effect
 
 
 def _lasts(trials: Trials, dimension: ActionNumber) -> bool:
-    """Say whether a single changed action changes rewards long after it: by a state that is not observed."""
     for seed, steps in STAGES[1:]:
         plain = trials.plain(seed, steps)
         at = (len(plain) - 1) // 4
         for end in dimension.ends:
             played = trials.with_values(seed, steps, {dimension: end}, at)
             # The action of index `at` gives frame `at + 1`.
-            if any(step > at + 1 + LONGEST_DELAY for step in find_other_rewards(plain, played)):
+            if any(step > at + 1 + LONGEST_DELAY for step in action_trials.find_other_rewards(plain, played)):
                 return True
     return False
 
 
 def _without_effect(effects: Mapping[str, Effect], total: int, left_out: str) -> Iterator[RuleFinding]:
-    dead, costly, copied = (
-        [name for name, effect in effects.items() if effect == kind] for kind in ("none", "cost", "copy")
-    )
+    kinds = ("none", "cost", "copy")
+    dead, costly, copied = ([name for name, effect in effects.items() if effect == kind] for kind in kinds)
     if dead:
-        what = (
-            "no action has any effect" if len(dead) == total else f"{list_names(dead, MOST_NAMES)} without any effect"
-        )
+        what = "no action has" if len(dead) == total else f"{list_names(dead, MOST_NAMES)} without"
         how = f"at its lowest and highest value, over {STAGES[-1][1]} steps from two seeds"
-        message = f"{what}: {how}, no observation, reward or end changes{left_out}"
+        message = f"{what} any effect: {how}, no observation, reward or end changes{left_out}"
         yield _finding(dead, message, Severity.ERROR if len(dead) == total else Severity.WARNING)
     if costly:
         # If no action moves anything, it is a bandit, or a series that is only watched.

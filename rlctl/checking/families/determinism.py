@@ -15,78 +15,59 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking import messages
 from rlctl.checking.attributes import find_unequal, read_attributes
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
 from rlctl.checking.finding import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.instance import Context, Instance
-from rlctl.checking.messages import (
-    FIRST_SEED,
-    SECOND_SEED,
-    SUCCESS,
-    Built,
-    CheckedEpisode,
-    ChildMessage,
-    Fact,
-    Skipped,
-)
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import Records
+from rlctl.checking.records import Check, Records, check, experiment
 
-COMPARED_STEPS = 300
-"""How far comparisons go."""
-DIRTY_STEPS = 37
-"""How far the other episode goes, at most, that is left unfinished before a repetition."""
-KEPT_STEPS = 10
-"""So many steps are between two resets whose attributes are compared."""
-LATE = 20
-"""What an unfinished episode changes only after so many steps is a residue, not the episode's start [steps]."""
-LAST_BITS = 1e-12
-"""Up to this the last bits of a float differ, by the order of additions, and nothing grows out of it."""
+COMPARED_STEPS = 300  # How far comparisons go
+DIRTY_STEPS = 37  # longest unfinished episode before a repetition
+KEPT_STEPS = 10  # So many steps are between two resets whose attributes are compared
+LATE = 20  # a later difference is a residue, not the episode's start [steps]
+LAST_BITS = 1e-12  # largest difference that the order of additions explains
 MOST_KEPT = 3
-NEARLY = 1e-5
-"""Up to this a first difference is a numerical residue, such as a simulation's that was not reset in full; chaos may
-make it large later. Relative to the larger value or to 1; it is also what Gymnasium's checker tolerates."""
+NEARLY = 1e-5  # relative to the value or to 1: a smaller first difference is a numerical residue
 
 
 @experiment("comparisons", share=6.0)
-def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
+def compare_repetitions(context: Context) -> Iterator[messages.ChildMessage]:
     """Play the first episode again: at once, after an unfinished other one, and with another seed."""
     instance, budget = context.instance, context.budget
     longest_s = budget.seconds_left / 4
-    steps = COMPARED_STEPS
+    steps, first = COMPARED_STEPS, messages.FIRST_SEED
     for number, role in enumerate(("alone", "reused", "dirty", "seeds")):
         instance.progress.phase(role)
         if role == "dirty":
             unfinished = min(DIRTY_STEPS, max(1, steps // 2))
-            other = EpisodePlayer(
-                instance, SECOND_SEED, "extreme", max_steps=unfinished, deadline=budget.end_within(1.0)
-            )
+            deadline = budget.end_within(1.0)
+            other = EpisodePlayer(instance, messages.SECOND_SEED, "extreme", max_steps=unfinished, deadline=deadline)
             Recording(role, other, budget).run()
         if budget.seconds_left < 0:
-            yield Skipped(role, "the first comparisons took all the time there is for them")
+            yield messages.Skipped(role, "the first comparisons took all the time there is for them")
             continue
-        seed = SECOND_SEED if role == "seeds" else FIRST_SEED
-        episode = EpisodePlayer(instance, seed, number=number, action_seed=FIRST_SEED, max_steps=COMPARED_STEPS)
+        seed = messages.SECOND_SEED if role == "seeds" else first
+        episode = EpisodePlayer(instance, seed, number=number, action_seed=first, max_steps=COMPARED_STEPS)
         episode.deadline = budget.end_within(longest_s)
         recording = Recording(role, episode, budget)
         yield from recording.run()
         steps = min(steps, recording.steps)
-    yield Fact("kept", _find_kept(instance))
+    yield messages.Fact("kept", _find_kept(instance))
 
 
 def _find_kept(instance: Instance) -> list[str]:
-    """Return the attributes that differ after two resets with one seed, with some steps between them."""
     read = []
     for _ in range(2):
-        instance.reset(FIRST_SEED)
+        instance.reset(messages.FIRST_SEED)
         read.append(read_attributes(instance.env))
-        for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=KEPT_STEPS):
+        for _ in EpisodePlayer(instance, messages.SECOND_SEED, max_steps=KEPT_STEPS):
             pass
     return find_unequal(*read)
 
 
-def compare(records: Records, first: str, second: str) -> tuple[CheckedEpisode, FirstDifference | None]:
+def compare(records: Records, first: str, second: str) -> tuple[messages.CheckedEpisode, FirstDifference | None]:
     """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised."""
     built = records.require_built()
     if not built.accepts_seed:
@@ -114,7 +95,7 @@ def require_independent(records: Records) -> None:
 def report(
     rule: str,
     records: Records,
-    trajectory: CheckedEpisode,
+    trajectory: messages.CheckedEpisode,
     difference: FirstDifference,
     what: str,
     cause: str = "",
@@ -130,7 +111,6 @@ def report(
 
 
 def _find_cause(records: Records) -> tuple[str, str]:
-    """Return what explains that an instance differs from itself, for a message, and what to do about it."""
     fresh = records.role("fresh process")
     names: list[str] = records.facts.get("kept", [])
     if not fresh or find_difference(records.require_built(), records.require_role("alone"), fresh[0]) is not None:
@@ -140,64 +120,51 @@ def _find_cause(records: Records) -> tuple[str, str]:
     return f"; a new process repeats it, so reset keeps state{shown}", f"Set back in reset: {what}."
 
 
-@check("RL301", "comparisons", "instances")
-def compare_starts(records: Records) -> Iterator[RuleFinding]:
-    """Compare the resets of an episode and its repetition."""
-    trajectory, difference = compare(records, "alone", "reused")
-    if difference is not None and difference.step == 0:
-        yield report("RL301", records, trajectory, difference, "reset twice with one seed", *_find_cause(records))
+def _compare_itself(rule: str, what: str, *, at_reset: bool) -> Check:
+    """Return the check that compares the resets, or the steps, of an episode and its repetition."""
+
+    @check(rule, "comparisons", "instances")
+    def compare_itself(records: Records) -> Iterator[RuleFinding]:
+        episode, difference = compare(records, "alone", "reused")
+        if difference is not None and (difference.step == 0) is at_reset:
+            yield report(rule, records, episode, difference, what, *_find_cause(records))
+
+    return compare_itself
 
 
-@check("RL302", "comparisons", "instances")
-def compare_trajectories(records: Records) -> Iterator[RuleFinding]:
-    """Compare the steps of an episode and its repetition."""
-    trajectory, difference = compare(records, "alone", "reused")
-    if difference is not None and difference.step > 0:
-        yield report("RL302", records, trajectory, difference, "played twice by one instance", *_find_cause(records))
+def _compare_other(rule: str, first: str, second: str, what: str, *needs: str) -> Check:
+    """Return the check that compares two recordings of an episode, if an instance repeats its own."""
+
+    @check(rule, "comparisons", *needs)
+    def compare_other(records: Records) -> Iterator[RuleFinding]:
+        episode, difference = compare(records, first, second)
+        if difference is not None:
+            require_repeatable(records)
+            is_late = second == "dirty" and difference.step > LATE
+            yield report(rule, records, episode, difference, what, is_mild=is_late)
+
+    return compare_other
 
 
-@check("RL303", "comparisons")
-def compare_after_other_episode(records: Records) -> Iterator[RuleFinding]:
-    """Compare an episode with its repetition after an unfinished other one."""
-    require_repeatable(records)
-    trajectory, difference = compare(records, "alone", "dirty")
-    if difference is not None:
-        what = "played again after an unfinished other episode"
-        yield report("RL303", records, trajectory, difference, what, is_mild=difference.step > LATE)
-
-
-@check("RL304", "comparisons", "instances")
-def compare_instances(records: Records) -> Iterator[RuleFinding]:
-    """Compare the first and a second instance of one process."""
-    trajectory, difference = compare(records, "fresh process", "fresh instance")
-    if difference is not None:
-        require_repeatable(records)
-        yield report("RL304", records, trajectory, difference, "played by a second instance in one process")
-
-
-@check("RL305", "comparisons", "instances")
-def compare_processes(records: Records) -> Iterator[RuleFinding]:
-    """Compare two processes."""
-    trajectory, difference = compare(records, "alone", "fresh process")
-    if difference is not None:
-        require_repeatable(records)
-        yield report("RL305", records, trajectory, difference, "played by a new process")
+compare_resets = _compare_itself("RL301", "reset twice with one seed", at_reset=True)
+compare_repetition = _compare_itself("RL302", "played twice by one instance", at_reset=False)
+compare_after_other = _compare_other("RL303", "alone", "dirty", "played again after an unfinished other episode")
+compare_instances = _compare_other(
+    "RL304", "fresh process", "fresh instance", "played by a second instance in one process", "instances"
+)
+compare_processes = _compare_other("RL305", "alone", "fresh process", "played by a new process", "instances")
 
 
 @dataclasses.dataclass(frozen=True)
 class FirstDifference:
     """Where two trajectories begin to differ."""
 
-    step: int
-    """0 is the observation of reset."""
-    element: str
-    """What differs most at that step: an element of the observation, the reward, a flag, or the length."""
+    step: int  # 0 is the observation of reset
+    element: str  # what differs most there: an element, the reward, a flag, or the length
     first: float
     second: float
-    size: float
-    """The largest difference at that step, relative to the larger value or to 1."""
-    largest: float
-    """The same over all steps that were compared."""
+    size: float  # The largest difference at that step, relative to the larger value or to 1
+    largest: float  # The same over all steps that were compared
 
     @property
     def is_small(self) -> bool:
@@ -210,24 +177,22 @@ class FirstDifference:
         at = "at reset" if self.step == 0 else f"at step {self.step}"
         return f"first difference {at}: {self.element} is {self.first:.9g}, then {self.second:.9g}{size}"
 
-    def evidence(self, trajectory: CheckedEpisode) -> dict[str, Any]:
+    def evidence(self, trajectory: messages.CheckedEpisode) -> dict[str, Any]:
         """Return it with the trajectory's seed, as a finding's evidence."""
         return {
             "seed": trajectory.seed,
             "step": self.step,
             "element": self.element,
-            "value": _plain(self.second),
-            "expected": _plain(self.first),
-            "relative_difference": _plain(self.size),
-            "largest_relative_difference": _plain(self.largest),
+            "value": self.second,
+            "expected": self.first,
+            "relative_difference": self.size,
+            "largest_relative_difference": self.largest,
         }
 
 
-def _plain(value: float) -> float | str:
-    return value if np.isfinite(value) else str(value)
-
-
-def find_difference(built: Built, one: CheckedEpisode, two: CheckedEpisode) -> FirstDifference | None:
+def find_difference(
+    built: messages.Built, one: messages.CheckedEpisode, two: messages.CheckedEpisode
+) -> FirstDifference | None:
     """Compare two trajectories bit for bit as far as both go; NaN equals NaN."""
     differences: list[FirstDifference] = []
     for index in sorted(one.observations.keys() & two.observations.keys()):
@@ -237,9 +202,9 @@ def find_difference(built: Built, one: CheckedEpisode, two: CheckedEpisode) -> F
     differences += _compare(one.rewards, two.rewards, after, lambda _: "reward")
     differences += _compare(one.terminated, two.terminated, after, lambda _: "terminated")
     differences += _compare(one.truncated, two.truncated, after, lambda _: "truncated")
-    if SUCCESS in one.infos and SUCCESS in two.infos:
-        a, b = one.infos[SUCCESS], two.infos[SUCCESS]
-        differences += _compare(a.values, b.values, a.steps, lambda _: SUCCESS)
+    if messages.SUCCESS in one.infos and messages.SUCCESS in two.infos:
+        a, b = one.infos[messages.SUCCESS], two.infos[messages.SUCCESS]
+        differences += _compare(a.values, b.values, a.steps, lambda _: messages.SUCCESS)
     if one.has_ended and two.has_ended and one.steps != two.steps:
         differences.append(FirstDifference(min(one.steps, two.steps), "length", one.steps, two.steps, 1.0, 1.0))
     if not differences:

@@ -7,12 +7,11 @@ from collections.abc import Iterator
 
 from rlctl.checking.attributes import find_assignment, read_generators
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
 from rlctl.checking.finding import NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Budget, Context, Instance
 from rlctl.checking.messages import ENDS, FIRST_SEED, CheckedEpisode, ChildMessage
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import Records
+from rlctl.checking.records import Records, check, experiment
 
 EPISODES = (
     *("random", "zero", "extreme", "random", "random", "random"),
@@ -20,20 +19,14 @@ EPISODES = (
     *("repeated", "repeated"),
 )
 """How the actions of each episode are chosen; the first three come first, in case time runs out."""
-ENDLESS_STEPS = 10_000
-"""After so many steps an episode without an end is cut."""
-LATER_ENDLESS_STEPS = 1_000
-"""The same, once every kind of action was tried."""
+ENDLESS_STEPS = 10_000  # After so many steps an episode without an end is cut
+LATER_ENDLESS_STEPS = 1_000  # The same, once every kind of action was tried
 FEWEST_EPISODES = 6
-SHORTEST_LIMIT = 5
-"""Games of fewer steps that always end together are games, not time limits [steps]."""
+SHORTEST_LIMIT = 5  # shorter games with one length have no time limit [steps]
 FEWEST_TIES = 4
-FEWEST_LENGTHS = 2
-"""With fewer different lengths it may be one that is unlike the others."""
-SHORTEST_TIE = 20
-"""The same, where only some episodes end together [steps]."""
-ENOUGH_STEPS = 1_000
-"""An episode that was cut earlier says nothing about whether it would end [steps]."""
+FEWEST_LENGTHS = 2  # With fewer different lengths it may be one that is unlike the others
+SHORTEST_TIE = 20  # The same, where only some episodes end together [steps]
+ENOUGH_STEPS = 1_000  # shorter cut episodes tell nothing about an end
 
 
 @experiment("episodes", share=6.0)
@@ -82,7 +75,6 @@ def find_unseeded(context: Context) -> Iterator[ChildMessage]:
 
 
 def _require_episodes(records: Records) -> list[CheckedEpisode]:
-    """Return the whole episodes that can be judged: those that did not raise."""
     episodes = [episode for episode in records.episodes if episode.ended != "raised"]
     if not episodes:
         raise NotJudged(records.skipped.get("episodes", "no episode could be played"))
@@ -127,7 +119,6 @@ def _find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
 
 
 def _ends_with_odd_reward(episode: CheckedEpisode) -> bool:
-    """Say whether the last reward is outside of what all others are: an obstacle that was hit, not a clock."""
     before, last = episode.rewards[:-1], episode.rewards[-1]
     return bool(before.size and (last < before.min() or last > before.max()))
 
@@ -149,11 +140,9 @@ def _find_failure_as_truncated(records: Records) -> Iterator[RuleFinding]:
     early = [steps for steps in lengths if steps < limit]
     if any(episode.terminated.any() for episode in episodes) or len(set(early)) < FEWEST_LENGTHS:
         return
-    message = (
-        f"{len(early)} of {len(episodes)} episodes are truncated before step {limit}, at {len(set(early))} different"
-    )
-    evidence = {"value": sorted(set(early)), "expected": limit}
-    yield RuleFinding("RL507", f"{message} steps, and none is terminated", evidence)
+    steps = sorted(set(early))
+    message = f"{len(early)} of {len(episodes)} episodes are truncated before step {limit}, at {len(steps)} different "
+    yield RuleFinding("RL507", f"{message}steps, and none is terminated", {"value": steps, "expected": limit})
 
 
 @check("RL503", "episodes")

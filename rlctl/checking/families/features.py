@@ -7,26 +7,22 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiments import check
 from rlctl.checking.families.rewards import WITH_SEARCH
 from rlctl.checking.finding import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.leaves import Leaf
-from rlctl.checking.records import Records
+from rlctl.checking.records import Records, check
 
 Numbers = NDArray[np.float64]
 
 FEWEST_ROWS = 50
 FEWEST_SEEDS = 3
 MOST_NAMED = 8
-NEAR_TURN, SMALL_TURN = 1.0, 1.5
-"""A step of an angle that wraps is 2 pi, give or take the first [rad], or below the second [rad]."""
+NEAR_TURN, SMALL_TURN = 1.0, 1.5  # a step of an angle is 2 pi +- NEAR_TURN, or small [rad]
 FEWEST_JUMPS = 2
-LARGE_SIZE = 100.0
-"""Root mean square from which an element is large: networks begin with inputs around 1."""
+LARGE_SIZE = 100.0  # root mean square; networks expect inputs around 1
 
 
 def _rows(records: Records, index: int) -> Numbers:
-    """Return the observations of one leaf, flat. Shape (n, elements)."""
     recorded = records.series(index)
     if not recorded:
         raise NotJudged("no observation of the declared shape was recorded")
@@ -37,24 +33,26 @@ def _rows(records: Records, index: int) -> Numbers:
     return rows.reshape(len(rows), -1)
 
 
-def _is_image(leaf: Leaf) -> bool:
-    return len(leaf.shape) == 3 and (leaf.dtype == "uint8" or min(leaf.shape[0], leaf.shape[-1]) in (1, 3, 4))
+def _leaves(records: Records, kinds: str = "f") -> Iterator[tuple[int, Leaf]]:
+    """Yield index and leaf of the observation's arrays of some kinds of numbers, images left out."""
+    for index, leaf in enumerate(records.require_built().leaves):
+        smallest = min(leaf.shape[0], leaf.shape[-1]) if leaf.shape else 0
+        is_image = len(leaf.shape) == 3 and (leaf.dtype == "uint8" or smallest in (1, 3, 4))
+        if leaf.supported and 0 not in leaf.shape and np.dtype(leaf.dtype).kind in kinds and not is_image:
+            yield index, leaf
 
 
 @check("RL110", *WITH_SEARCH)
 def _find_constant_elements(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     names: list[str] = []
-    total = 0
-    has_constant_leaf = False
-    for index, leaf in enumerate(built.leaves):
-        size = int(np.prod(leaf.shape))
-        if leaf.supported and size and not _is_image(leaf):
-            rows = _rows(records, index)
-            constant = _constant(rows, leaf)
-            total += size
-            has_constant_leaf |= len(constant) == size
-            names += [f"{built.element(index, int(column))} ({float(rows[0, column]):.4g})" for column in constant]
+    total, has_constant_leaf = 0, False
+    for index, leaf in _leaves(records, "biuf"):
+        rows = _rows(records, index)
+        constant = _constant(rows, leaf)
+        total += rows.shape[1]
+        has_constant_leaf |= len(constant) == rows.shape[1]
+        names += [f"{built.element(index, int(column))} ({float(rows[0, column]):.4g})" for column in constant]
     if names:
         yield RuleFinding(
             "RL110",
@@ -75,21 +73,16 @@ def _constant(rows: Numbers, leaf: Leaf) -> NDArray[np.intp]:
 
 @check("RL117", *WITH_SEARCH)
 def _find_wrapped_angles(records: Records) -> Iterator[RuleFinding]:
-    for index, leaf in enumerate(records.require_built().leaves):
-        if not leaf.supported or np.dtype(leaf.dtype).kind != "f" or _is_image(leaf):
-            continue
-        steps, rows = [np.zeros((0, int(np.prod(leaf.shape))))], _rows(records, index)
-        for _, series in records.series(index):
-            values = series.values.reshape(len(series.values), -1).astype(np.float64)
-            steps.append(np.abs(np.diff(values, axis=0)))
-        changes = np.concatenate(steps)
+    for index, _ in _leaves(records):
+        rows = _rows(records, index)
+        values = [series.values.reshape(len(series.values), -1) for _, series in records.series(index)]
+        changes = np.concatenate([np.abs(np.diff(value.astype(np.float64), axis=0)) for value in values])
         jumps = np.abs(changes - 2 * np.pi) < NEAR_TURN
         is_angle = (np.abs(rows) <= 2 * np.pi).all(axis=0) & (jumps | (changes < SMALL_TURN)).all(axis=0)
         for column in np.flatnonzero(is_angle & (jumps.sum(axis=0) >= FEWEST_JUMPS))[:1]:
             name = records.require_built().element(index, int(column))
-            message = (
-                f"{name} jumps by 2 pi in {int(jumps[:, column].sum())} of {len(changes)} steps: an angle that wraps"
-            )
+            count = f"{int(jumps[:, column].sum())} of {len(changes)} steps"
+            message = f"{name} jumps by 2 pi in {count}: an angle that wraps"
             yield RuleFinding("RL117", message, {"element": name, "expected": "sin and cos"})
 
 
@@ -97,16 +90,11 @@ def _find_wrapped_angles(records: Records) -> Iterator[RuleFinding]:
 def _find_large_elements(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     large: dict[str, float] = {}
-    for index, leaf in enumerate(built.leaves):
-        if leaf.supported and np.dtype(leaf.dtype).kind == "f" and not _is_image(leaf):
-            sizes = np.sqrt(np.mean(np.square(np.nan_to_num(_rows(records, index).astype(np.float64))), axis=0))
-            large |= {built.element(index, int(i)): float(sizes[i]) for i in np.flatnonzero(sizes > LARGE_SIZE)}
+    for index, _ in _leaves(records):
+        sizes = np.sqrt(np.mean(np.square(np.nan_to_num(_rows(records, index).astype(np.float64))), axis=0))
+        large |= {built.element(index, int(i)): float(sizes[i]) for i in np.flatnonzero(sizes > LARGE_SIZE)}
     if large and not records.normalizes("observation"):
         names = [f"{name} ({size:.3g})" for name, size in sorted(large.items(), key=lambda pair: -pair[1])]
         message = f"elements of the observation are large (root mean square): {list_names(names, MOST_NAMED)}"
-        evidence = {
-            "value": max(large.values()),
-            "expected": f"up to {LARGE_SIZE:g}",
-            "elements": list(large)[:MOST_NAMED],
-        }
-        yield RuleFinding("RL118", message, evidence)
+        evidence = {"value": max(large.values()), "expected": f"up to {LARGE_SIZE:g}"}
+        yield RuleFinding("RL118", message, {**evidence, "elements": list(large)[:MOST_NAMED]})

@@ -8,71 +8,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
-from rlctl.checking.families.rewards import (
-    DISCOUNT,
-    WITH_SEARCH,
-    discounted_steps,
-    discounted_sum,
-    ends_in_success,
-    find_constant_terms,
-    find_terms,
-    has_succeeded,
-    has_terms,
-    longest_episode,
-    reports_success,
-    require_readable,
-    require_rewarded,
-    summarize,
-)
+from rlctl.checking.families import rewards
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
 from rlctl.checking.messages import FIRST_SEED, SUCCESS, CheckedEpisode, ChildMessage, Skipped
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import Records
+from rlctl.checking.records import Records, check, experiment
 
-LIKE_A_GOAL, LIKE_ANY = 0.9, 0.5
-"""Part of all rewards that the last one of an episode is as good as, from which its end looks like a goal, or like
-nothing in particular. Below, it looks like a failure."""
-NEARLY = 0.05
-"""How much better than doing nothing something has to be, to be better."""
+LIKE_A_GOAL, LIKE_ANY = 0.9, 0.5  # of all rewards up to the last one: like a goal, like any; less: a failure
+NEARLY = 0.05  # How much better than doing nothing something has to be, to be better
 FEWEST_COMPARED = 10
-COMPARED_STEPS = 200
-"""How much of the episodes is compared at most: the search's are no longer."""
+COMPARED_STEPS = 200  # How much of the episodes is compared at most: the search's are no longer
 SHORTEST_COMPARED = 10
 MOST_OF = 0.5
 STARTS = 30
-START_STEPS = 3
-"""More than one, to tell what belongs to the episode from chance in each step."""
-FIRST = FIRST_SEED + 100
-"""The first of their seeds; none of the whole episodes has them."""
-MANY_AT_START = 0.2
-"""Part of the starts that may be successes by chance: a goal that is drawn near the robot now and then."""
+START_STEPS = 3  # More than one, to tell what belongs to the episode from chance in each step
+FIRST = FIRST_SEED + 100  # The first of their seeds; none of the whole episodes has them
+MANY_AT_START = 0.2  # part of the starts: a goal may be near the robot by chance
 FEWEST_STARTS = 10
-FEWEST_EPISODES = 20
-"""Fewer episodes say little about whether one can succeed."""
-FEWEST_STEPS = 500
-"""Steps of them: less is what raises, or ends, at once."""
+FEWEST_EPISODES = 20  # Fewer episodes say little about whether one can succeed
+FEWEST_STEPS = 500  # Steps of them: less is what raises, or ends, at once
 OTHER_NAMES = ("success", "succeeded", "goal_reached", "is_goal")
 
 
-@check("RL604", *WITH_SEARCH)
+@check("RL604", *rewards.WITH_SEARCH)
 def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
-    episodes = require_rewarded(records)
+    episodes = rewards.require_rewarded(records)
     if not any(episode.terminated.any() for episode in episodes):
         raise NotApplicable("nothing ended an episode early")
-    longest = longest_episode(records, episodes)
+    longest = rewards.longest_episode(records, episodes)
     inner = np.concatenate([episode.rewards[: episode.steps - episode.has_ended] for episode in episodes])
     early = [
         episode
         for episode in episodes
-        if episode.ended == "terminated" and episode.steps < longest and not ends_in_success(episode)
+        if episode.ended == "terminated" and episode.steps < longest and not rewards.ends_in_success(episode)
     ]
     if not early or not inner.size or inner.max() > 0 or inner.mean() == 0:
         return
     mean = float(inner.mean())
     gains = [
-        float(episode.rewards[-1]) - mean - DISCOUNT * discounted_steps(mean, longest - episode.steps)
+        float(episode.rewards[-1]) - mean - rewards.DISCOUNT * rewards.discounted_steps(mean, longest - episode.steps)
         for episode in early
     ]
     gain = float(np.median(gains))
@@ -81,12 +56,12 @@ def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
         return
     example = early[int(np.argmax(gains))]
     last = float(example.rewards[-1])
+    saved = -rewards.DISCOUNT * rewards.discounted_steps(mean, longest - example.steps)
     yield RuleFinding(
         "RL604",
         f"{len(early)} of {len(episodes)} episodes ended early without success. The mean reward is {mean:.3g} and none "
-        f"but the last is above 0, so ending at step {example.steps} with {last:.3g} saves "
-        f"{-DISCOUNT * discounted_steps(mean, longest - example.steps):.3g} (discounted by {DISCOUNT} up to step "
-        f"{longest})",
+        f"but the last is above 0, so ending at step {example.steps} with {last:.3g} saves {saved:.3g} (discounted by "
+        f"{rewards.DISCOUNT} up to step {longest})",
         example.at(example.steps, value=last, mean_reward=mean, gain=gain),
         severity,
     )
@@ -95,7 +70,7 @@ def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
 def _severity_of_end(
     episodes: Sequence[CheckedEpisode], early: Sequence[CheckedEpisode], inner: NDArray[np.float64]
 ) -> Severity | None:
-    if reports_success(episodes):
+    if rewards.reports_success(episodes):
         return Severity.WARNING
     as_good_as = float(np.median([np.mean(inner <= episode.rewards[-1]) for episode in early]))
     if as_good_as >= LIKE_A_GOAL:
@@ -103,19 +78,21 @@ def _severity_of_end(
     return Severity.INFO if as_good_as >= LIKE_ANY else Severity.WARNING
 
 
-@check("RL606", *WITH_SEARCH)
+@check("RL606", *rewards.WITH_SEARCH)
 def _find_paid_idleness(records: Records) -> Iterator[RuleFinding]:
-    compared = [episode for episode in require_rewarded(records) if episode.role in ("episodes", "search")]
+    compared = [episode for episode in rewards.require_rewarded(records) if episode.role in ("episodes", "search")]
     idle = [episode for episode in compared if episode.actions == "zero"]
     others = [episode for episode in compared if episode.actions != "zero"]
     if not idle or len(others) < FEWEST_COMPARED:
         raise NotJudged(f"{len(idle)} episodes with zero actions and {len(others)} others were recorded")
     steps = min(COMPARED_STEPS, *(episode.steps for episode in idle))
-    if any(episode.terminated.any() or has_succeeded(episode) for episode in idle) or steps < SHORTEST_COMPARED:
+    if any(episode.terminated.any() or rewards.has_succeeded(episode) for episode in idle) or steps < SHORTEST_COMPARED:
         return
-    nothing = [discounted_sum(episode.rewards[:steps]) for episode in idle]
+    nothing = [rewards.discounted_sum(episode.rewards[:steps]) for episode in idle]
     something = [
-        discounted_sum(episode.rewards[:steps]) for episode in others if episode.steps >= steps or episode.has_ended
+        rewards.discounted_sum(episode.rewards[:steps])
+        for episode in others
+        if episode.steps >= steps or episode.has_ended
     ]
     if not something or len({float(reward) for episode in compared for reward in episode.rewards[:steps]}) == 1:
         return  # a reward that never changes is RL602's
@@ -126,7 +103,7 @@ def _find_paid_idleness(records: Records) -> Iterator[RuleFinding]:
     because = f"; {100 * share:.0f} % of it is the term {bonus!r}, which never changes" if bonus else ""
     yield RuleFinding(
         "RL606",
-        f"doing nothing earns {mean:.4g} over {steps} steps (discounted by {DISCOUNT}), the best of "
+        f"doing nothing earns {mean:.4g} over {steps} steps (discounted by {rewards.DISCOUNT}), the best of "
         f"{len(something)} other episodes {best:.4g}{because}",
         idle[0].at(steps, value=mean, best=best, term=bonus, share=share),
         Severity.WARNING if bonus else Severity.INFO,
@@ -134,12 +111,11 @@ def _find_paid_idleness(records: Records) -> Iterator[RuleFinding]:
 
 
 def _bonus(idle: Sequence[CheckedEpisode]) -> tuple[str | None, float]:
-    """Return the constant positive term that is most of the reward, if there is one, and its share."""
-    total = sum(float(np.nansum(np.abs(values))) for episode in idle for values in find_terms(episode).values())
-    if total <= 0 or not all(has_terms(episode) for episode in idle):
+    total = sum(float(np.nansum(np.abs(values))) for episode in idle for values in rewards.find_terms(episode).values())
+    if total <= 0 or not all(rewards.has_terms(episode) for episode in idle):
         return None, 0.0
     steps = sum(episode.steps for episode in idle)
-    shares = {name: value * steps / total for name, value in find_constant_terms(idle).items() if value > 0}
+    shares = {name: value * steps / total for name, value in rewards.find_constant_terms(idle).items() if value > 0}
     largest = max(shares, key=lambda name: shares[name], default=None)
     return (largest, shares[largest]) if largest is not None and shares[largest] >= MOST_OF else (None, 0.0)
 
@@ -155,10 +131,10 @@ def record_starts(context: Context) -> Iterator[ChildMessage]:
         yield from Recording("starts", episode, context.budget).run()
 
 
-@check("RL609", *WITH_SEARCH)
+@check("RL609", *rewards.WITH_SEARCH)
 def _find_unreported_success(records: Records) -> Iterator[RuleFinding]:
-    episodes = require_readable(records)
-    if reports_success(episodes):
+    episodes = rewards.require_readable(records)
+    if rewards.reports_success(episodes):
         return
     if not any(episode.has_ended for episode in episodes):
         raise NotJudged("no episode ended, and success may be reported at the end only")
@@ -183,12 +159,12 @@ def _find_success_at_start(records: Records) -> Iterator[RuleFinding]:
         yield RuleFinding("RL610", message, at_once[0].at(1, value=share, expected=f"up to {MANY_AT_START}"))
 
 
-@check("RL611", *WITH_SEARCH)
+@check("RL611", *rewards.WITH_SEARCH)
 def _find_no_success(records: Records) -> Iterator[RuleFinding]:
-    episodes = require_readable(records)
-    if not reports_success(episodes):
+    episodes = rewards.require_readable(records)
+    if not rewards.reports_success(episodes):
         raise NotApplicable("is_success is not in info")
-    if any(has_succeeded(episode) for episode in episodes):
+    if any(rewards.has_succeeded(episode) for episode in episodes):
         return
     steps = sum(episode.steps for episode in episodes)
     if len(episodes) < FEWEST_EPISODES or steps < FEWEST_STEPS or not records.role("search"):
@@ -199,6 +175,6 @@ def _find_no_success(records: Records) -> Iterator[RuleFinding]:
     reward = float(best.rewards[step])
     yield RuleFinding(
         "RL611",
-        f"is_success was not true once in {summarize(episodes)}; the best reward was {reward:.4g}, at step {step + 1}",
+        f"is_success was never true in {rewards.summarize(episodes)}; best reward {reward:.4g} at step {step + 1}",
         best.at(step + 1, value=reward, episodes=len(episodes)),
     )

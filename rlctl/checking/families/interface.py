@@ -2,42 +2,28 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from rlctl.checking.experiments import RECORDING, check, experiment
-from rlctl.checking.failures import (
-    NO_DISPLAY,
-    EnvironmentRaised,
-    describe,
-    find_missing_file,
-    iterate_causes,
-    lacks_display,
-)
+from rlctl.checking import failures
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
 from rlctl.checking.messages import FIRST_SEED, CallFailure, CheckedEpisode, ChildMessage, Form
-from rlctl.checking.records import Records
+from rlctl.checking.records import RECORDING, Records, check, experiment
 from rlctl.errors import RecipeError
 
-NUMBERS = ("float", "int", "numpy.float64")
-"""Reward types that both libraries accept."""
-MANY_LINES = 0.5
-"""Lines printed per step from which printing is slow: about one each, and not a few per reset."""
-FEWEST_STEPS = 20
-"""With fewer, what is printed belongs to the start."""
+NUMBERS = ("float", "int", "numpy.float64")  # Reward types that both libraries accept
+MANY_LINES = 0.5  # lines per step; a few per reset are not slow
+FEWEST_STEPS = 20  # With fewer, what is printed belongs to the start
 MOST_FAILURES = 3
-RENDERING = "rendering"
-"""The experiment that renders."""
-OF_OTHER_RULES = ("interleaved", "after close", RENDERING)
-"""Where a failure is the matter of RL401, RL402 and RL215."""
-PICTURE = "a uint8 array of shape (height, width, 3)"
-"""What `render` returns in the mode rgb_array."""
-NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECASE)
-"""What is raised where this machine has no graphics: whether it works elsewhere is not known."""
+RENDERING = "rendering"  # The experiment that renders
+OF_OTHER_RULES = ("interleaved", "after close", RENDERING)  # failures there are RL401's, RL402's and RL215's
+PICTURE = "a uint8 array of shape (height, width, 3)"  # What `render` returns in the mode rgb_array
+NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECASE)  # raised without graphics
 
 
 @check("RL201")
@@ -77,7 +63,6 @@ def _find_wrong_types(records: Records) -> Iterator[RuleFinding]:
 
 
 def _first_forms(records: Records, what: str, *fine: str) -> Iterator[tuple[CheckedEpisode, Form]]:
-    """Yield the first place of each type of something, without those that are fine."""
     types = set(fine)
     for trajectory, form in records.forms(what):
         if form.type not in types:
@@ -108,23 +93,21 @@ def select_failures(records: Records, kind: str) -> Iterator[CallFailure]:
 
 @check("RL207")
 def _find_exceptions(records: Records) -> Iterator[RuleFinding]:
-    raised = [
-        failure for failure in select_failures(records, "raised") if failure.file is None
-    ]  # the others are RL007's
-    for failure in raised[:MOST_FAILURES]:
+    raised = (failure for failure in select_failures(records, "raised") if failure.file is None)  # the others: RL007
+    for failure in itertools.islice(raised, MOST_FAILURES):
         yield RuleFinding("RL207", failure.message, failure.place, where=failure.where)
 
 
 @check("RL208")
 def _find_ends_of_process(records: Records) -> Iterator[RuleFinding]:
     for failure in select_failures(records, "died"):
-        if not lacks_display(failure):  # RL216 says why
+        if not failures.lacks_display(failure):  # RL216 says why
             yield RuleFinding("RL208", failure.message, failure.place)
 
 
 @check("RL209")
 def _find_hangs(records: Records) -> Iterator[RuleFinding]:
-    for failure in list(select_failures(records, "hung"))[:1]:
+    for failure in itertools.islice(select_failures(records, "hung"), 1):
         yield RuleFinding("RL209", failure.message, failure.place)
 
 
@@ -150,18 +133,18 @@ def render(context: Context) -> Iterator[ChildMessage]:
         with context.fresh("rgb_array") as instance:
             instance.reset(FIRST_SEED)
             picture = instance.call("render", instance.env.render)
-    except EnvironmentRaised as error:
+    except failures.EnvironmentRaised as error:
         cause = error.__cause__ or error
-        if find_missing_file(cause) is not None:
+        if failures.find_missing_file(cause) is not None:
             raise NotJudged("a file that the environment loads is missing (RL007)") from None
         if _lacks_library(cause):
-            raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None
+            raise NotJudged(f"a library that rendering needs is not installed: {failures.describe(cause)}") from None
         call = "the constructor" if error.call == "build" else error.call
-        message = f"with render_mode='rgb_array' {call} raises {describe(cause)}"
+        message = f"with render_mode='rgb_array' {call} raises {failures.describe(cause)}"
         if isinstance(cause, RecipeError):  # the constructor was not even called
             message = f"metadata promises the render mode rgb_array, but {cause}"
-        severity = Severity.INFO if NO_GRAPHICS.search(describe(cause)) else None
-        yield RuleFinding("RL215", message, {"value": describe(cause), "expected": PICTURE}, severity)
+        severity = Severity.INFO if NO_GRAPHICS.search(failures.describe(cause)) else None
+        yield RuleFinding("RL215", message, {"value": failures.describe(cause), "expected": PICTURE}, severity)
         return
     if wrong := _describe_wrong_picture(picture):
         message = f"with render_mode='rgb_array' render returns {wrong}, not {PICTURE}"
@@ -171,10 +154,8 @@ def render(context: Context) -> Iterator[ChildMessage]:
 
 
 def _lacks_library(error: BaseException) -> bool:
-    """Say whether a library is missing: that is this machine's fault, not the environment's."""
-    return any(
-        isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in iterate_causes(error)
-    )
+    causes = list(failures.iterate_causes(error))
+    return any(isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in causes)
 
 
 def _describe_wrong_picture(picture: Any) -> str:
@@ -194,8 +175,8 @@ def _find_end_in_rendering(records: Records) -> Iterator[RuleFinding]:
 @check("RL216", *RECORDING)
 def _find_lost_display(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
-        if lacks_display(failure):
-            line = next(line for line in (failure.details or "").splitlines() if NO_DISPLAY.search(line)).strip()
-            yield RuleFinding("RL216", f"{failure.message}, because there is no display: {line!r}", failure.place)
+        if failures.lacks_display(failure):
+            lines = [line.strip() for line in (failure.details or "").splitlines() if failures.NO_DISPLAY.search(line)]
+            yield RuleFinding("RL216", f"{failure.message}, because there is no display: {lines[0]!r}", failure.place)
             return
     records.require_built()

@@ -13,7 +13,6 @@ from typing import Any
 
 from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.families.determinism import COMPARED_STEPS, compare, report, require_independent
 from rlctl.checking.families.interface import select_failures
@@ -21,24 +20,17 @@ from rlctl.checking.finding import RULES, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage, Skipped
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import Records
+from rlctl.checking.records import Records, check, experiment
 
 IN_TURNS, AFTER_CLOSE = "two instances stepped in turns", "after another instance was closed"
 MOST_RESETS = 100
-MEASURED_RESETS = 10
-"""Memory is measured after every so many resets; after the first of them caches and allocators are filled."""
-FEWEST_RESETS = 8
-"""With fewer, growth cannot be distinguished from a slow start."""
-SETTLING_RESETS = 2
-"""The first resets load what later ones keep."""
-LEAST_GROWTH = 3
-"""In each half of the resets, so that one late object is not a leak."""
+MEASURED_RESETS = 10  # between measurements of memory; the first ones fill caches
+FEWEST_RESETS = 8  # With fewer, growth cannot be distinguished from a slow start
+SETTLING_RESETS = 2  # The first resets load what later ones keep
+LEAST_GROWTH = 3  # In each half of the resets, so that one late object is not a leak
 FEWEST_MEASUREMENTS = 3
-MEMORY_GROWTH = 8 * 2**20
-"""Over the resets after the warm-up [bytes]. Allocators of clean environments move by 1 to 2 MiB; 0.1 MB per reset
-fills the memory of 16 workers in a day."""
-LATER_SHARE = 0.4
-"""Of the growth, so much must be in the second half: what fills once slows down, a leak does not."""
+MEMORY_GROWTH = 8 * 2**20  # after the warm-up [bytes]; allocators move by 1 to 2 MiB
+LATER_SHARE = 0.4  # of the growth in the second half: a leak does not slow down
 LEAKS = {
     "PyBullet clients": Severity.ERROR,
     "bodies in the PyBullet world": Severity.ERROR,
@@ -96,7 +88,6 @@ def compare_instances(context: Context) -> Iterator[ChildMessage]:
 
 
 def _close_in_between(context: Context, recording: Recording, neighbour: Instance) -> Iterator[ChildMessage]:
-    """Play an episode, after whose first step another instance is closed."""
     recording.advance()
     if recording.running:
         recording.advance()
@@ -109,14 +100,12 @@ def _close_in_between(context: Context, recording: Recording, neighbour: Instanc
 
 
 def _require_same_alone(records: Records) -> None:
-    """Raise `NotJudged` unless instances, and episodes, that follow each other do the same."""
     if compare(records, "fresh process", "fresh instance")[1] is not None:
         raise NotJudged("two instances differ already when they are alone (RL301 to RL304)")
     require_independent(records)
 
 
 def _failure(records: Records, rule: str, phase: str, doing: str) -> RuleFinding | None:
-    """Return the first failure of a phase that does not happen to an instance alone."""
     alone = {(failure.call, failure.error) for failure in select_failures(records, "raised")}
     for failure in records.failures:
         is_here = failure.process == "instances" and failure.phase == phase and failure.call != "build"
@@ -126,8 +115,7 @@ def _failure(records: Records, rule: str, phase: str, doing: str) -> RuleFinding
 
 
 @check("RL401", "comparisons", "global random", "instances")
-def find_shared_world(records: Records) -> Iterator[RuleFinding]:
-    """Compare instances that were stepped in turns with such that were alone."""
+def _find_shared_world(records: Records) -> Iterator[RuleFinding]:
     _require_same_alone(records)
     if finding := _failure(records, "RL401", "interleaved", IN_TURNS):
         yield finding
@@ -136,21 +124,18 @@ def find_shared_world(records: Records) -> Iterator[RuleFinding]:
         trajectory, difference = compare(records, alone, beside)
         if difference is not None:
             draws = any(finding.rule == "RL309" for finding in records.findings)
-            cause, fix = (
-                ("; both draw from a global random generator (RL309)", RULES["RL309"].fix) if draws else ("", "")
-            )
-            yield report("RL401", records, trajectory, difference, f"{IN_TURNS}, against one alone", cause, fix)
+            because = ("; both draw from a global random generator (RL309)", RULES["RL309"].fix) if draws else ()
+            yield report("RL401", records, trajectory, difference, f"{IN_TURNS}, against one alone", *because)
             return
 
 
 @check("RL402", "comparisons", "instances")
-def find_effect_of_closing(records: Records) -> Iterator[RuleFinding]:
-    """Compare an instance beside which another one was closed with one that was alone."""
+def _find_effect_of_closing(records: Records) -> Iterator[RuleFinding]:
     _require_same_alone(records)
     if finding := _failure(records, "RL402", "after close", AFTER_CLOSE):
         yield finding
         return
-    if list(find_shared_world.run(records)):
+    if list(_find_shared_world.run(records)):
         raise NotJudged("the instances already disturb each other while both are open (RL401)")
     trajectory, difference = compare(records, "second alone", "after close")
     if difference is not None:
@@ -189,10 +174,8 @@ class Counts:
     """What an instance holds after each of many resets."""
 
     resets: int = 0
-    series: dict[str, list[int]] = dataclasses.field(default_factory=dict)
-    """Per key of `LEAKS` that can be counted here, how many there are after each reset."""
-    memory: list[int] = dataclasses.field(default_factory=list)
-    """Resident memory [bytes] after each `MEASURED_RESETS` resets; empty where it is not known."""
+    series: dict[str, list[int]] = dataclasses.field(default_factory=dict)  # by key of LEAKS, a count per reset
+    memory: list[int] = dataclasses.field(default_factory=list)  # resident [bytes], if it is known
 
     def count(self) -> None:
         """Count what is there now."""
@@ -253,16 +236,13 @@ def find_growth(counts: Counts) -> Iterator[RuleFinding]:
         start, middle, end = (counts.memory[i] for i in (0, (len(counts.memory) - 1) // 2, -1))
         resets = MEASURED_RESETS * (len(counts.memory) - 1)
         if end - start > MEMORY_GROWTH and end - middle > LATER_SHARE * (end - start):
-            message = (
-                f"memory grows with every reset: by {(end - start) / 2**20:.1f} MiB in {resets} resets, of which "
-                f"{(end - middle) / 2**20:.1f} MiB in the second half"
-            )
+            grown, late = (f"{(end - before) / 2**20:.1f} MiB" for before in (start, middle))
+            message = f"memory grows with every reset: by {grown} in {resets} resets, by {late} in the second half"
             evidence = {"element": "memory", "value": end, "expected": start, "resets": resets}
             yield RuleFinding("RL405", message, {**evidence, "per_reset": (end - start) / resets})
 
 
 def _growth(series: list[int]) -> int:
-    """Return by how much a count grows, if it does so all the time; else 0."""
     series = series[SETTLING_RESETS:]
     first, second = series[: len(series) // 2], series[len(series) // 2 :]
     grows = all(half[-1] - half[0] >= LEAST_GROWTH for half in (first, second)) and min(second) >= max(first)

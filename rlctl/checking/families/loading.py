@@ -6,26 +6,23 @@ import ast
 import difflib
 import inspect
 import re
-import sys
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rlctl.checking.attributes import find_author, is_task
-from rlctl.checking.bullet_worlds import find_clients
-from rlctl.checking.experiments import RECORDING, check, experiment
+from rlctl.checking.bullet_worlds import ClientCalls, find_clients
 from rlctl.checking.failures import EnvironmentRaised, find_missing_file, iterate_causes, lacks_display
 from rlctl.checking.finding import RuleFinding
 from rlctl.checking.instance import Context, Instance, find_longest_episode
 from rlctl.checking.messages import Built, ChildMessage
-from rlctl.checking.records import Records
+from rlctl.checking.records import RECORDING, Records, check, experiment
 from rlctl.environments import registry
 from rlctl.environments.dict_spaces import format_space
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
 
-WAIVERS = "rlctl_ignore"
-"""The class attribute that waives rules: rule id -> reason."""
+WAIVERS = "rlctl_ignore"  # The class attribute that waives rules: rule id -> reason
 
 
 @experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", "RL013", "RL216", share=0.0)
@@ -44,14 +41,12 @@ def build(context: Context) -> Iterator[ChildMessage]:
     yield from _base_class(instance)
     if is_task(instance.env):
         yield from _find_misspelled(type(find_author(instance.env)))
-    if _count_windows():
-        yield RuleFinding(
-            "RL216", "PyBullet was connected with a window (p.GUI)", {"value": "GUI", "expected": "DIRECT"}
-        )
+    if _opens_window():
+        evidence = {"value": "GUI", "expected": "DIRECT"}
+        yield RuleFinding("RL216", "PyBullet was connected with a window (p.GUI)", evidence)
 
 
 def _explain(context: Context, error: RlctlError) -> RuleFinding:
-    """Return the finding for an exception of the import or the constructor."""
     cause = error.__cause__
     details = {"traceback": error.details} if error.details else {}
     if isinstance(error, NoSuchClassError):
@@ -97,7 +92,6 @@ def _base_class(instance: Instance) -> Iterator[RuleFinding]:
 
 
 def _find_misspelled(author: type) -> Iterator[RuleFinding]:
-    """Find names that a task's class defines and nothing uses, close to one that means something to rlctl."""
     from rlctl.task import Task  # PyBullet comes with it
 
     meant = {name for name in {*vars(Task), *Task.__annotations__} if not name.startswith("_")}
@@ -109,18 +103,13 @@ def _find_misspelled(author: type) -> Iterator[RuleFinding]:
         for name in vars(cls).keys() - meant:
             close = difflib.get_close_matches(name, meant - vars(cls).keys(), n=1, cutoff=0.7)
             if close and words[name] == 1:
-                evidence = {"value": name, "expected": close[0]}
-                yield RuleFinding(
-                    "RL013", f"{cls.__name__}.{name} is used by nothing. Did you mean {close[0]!r}?", evidence
-                )
+                message = f"nothing uses {cls.__name__}.{name}. Did you mean {close[0]!r}?"
+                yield RuleFinding("RL013", message, {"value": name, "expected": close[0]})
 
 
-def _count_windows() -> int:
-    pybullet = sys.modules.get("pybullet")
-    if pybullet is None:
-        return 0
-    methods = [pybullet.getConnectionInfo(physicsClientId=client)["connectionMethod"] for client in find_clients()]
-    return methods.count(pybullet.GUI)
+def _opens_window() -> bool:
+    clients = [ClientCalls(client) for client in find_clients()]
+    return any(client.getConnectionInfo()["connectionMethod"] == client.GUI for client in clients)
 
 
 @check("RL004", "build")
@@ -175,7 +164,6 @@ def describe_built(instance: Instance) -> Built:
 
 
 def _waivers(author: type) -> Any:
-    """Return the waivers as they are written; whether they are good is judged where they are used."""
     waivers = getattr(author, WAIVERS, {})
     if isinstance(waivers, dict):
         return {str(rule): reason if isinstance(reason, str) else "" for rule, reason in waivers.items()}
@@ -183,7 +171,6 @@ def _waivers(author: type) -> Any:
 
 
 def _place(author: type) -> tuple[str | None, int | None]:
-    """Return file and line of the class that somebody wrote."""
     try:
         return inspect.getsourcefile(author), inspect.getsourcelines(author)[1]
     except (OSError, TypeError):
@@ -191,7 +178,6 @@ def _place(author: type) -> tuple[str | None, int | None]:
 
 
 def _find_lines(author: type, file: str | None) -> dict[str, int]:
-    """Return the first lines of the methods of a class that are written in one file."""
     lines = {}
     for name in ("__init__", "reset", "step"):
         code = getattr(inspect.unwrap(getattr(author, name, None) or author), "__code__", None)

@@ -8,26 +8,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiments import RECORDING, check
 from rlctl.checking.finding import RuleFinding, Severity, list_names
 from rlctl.checking.leaves import Leaf, name_leaf
 from rlctl.checking.messages import CheckedEpisode, Form, Series
-from rlctl.checking.records import Records
+from rlctl.checking.records import RECORDING, Records, check
 
-ROUNDING = 1e-6
-"""Excess over a bound, relative to the bound, up to which it is float rounding."""
-LARGE_SHARE, SMALL_SHARE = 0.1, 0.005
-"""Part of all observations from which values outside the bounds are no rare extreme, or below which they hardly matter.
-The last one of an episode does not count: a limit that ends it has just been passed."""
-OFF_CENTRE = 0.05
-"""How far zero may be from the middle of an action's range, in parts of the range, for an info."""
+ROUNDING = 1e-6  # Excess over a bound, relative to the bound, up to which it is float rounding
+LARGE_SHARE, SMALL_SHARE = 0.1, 0.005  # of all observations but the last ones, for an error, or a warning
+OFF_CENTRE = 0.05  # part of the range that zero may be off its middle, for an info
 MOST_NAMED = 8
-SMALLEST_SIDE = 36
-"""An image with a shorter side does not fit through the default network's filters [pixels]."""
+SMALLEST_SIDE = 36  # smaller images do not fit the default network's filters [pixels]
 
 
 def _forms(records: Records) -> Iterator[tuple[Leaf, list[tuple[CheckedEpisode, Form]]]]:
-    """Yield what each leaf that can be judged looked like, in all episodes."""
     forms = records.forms("observation")
     for index, leaf in enumerate(records.require_built().leaves):
         if leaf.supported:
@@ -39,8 +32,7 @@ def _when(step: int) -> str:
 
 
 @check("RL101")
-def find_wrong_shape(records: Records) -> Iterator[RuleFinding]:
-    """Find observations of another shape, or with other keys."""
+def _find_wrong_shape(records: Records) -> Iterator[RuleFinding]:
     for leaf, forms in _forms(records):
         for trajectory, form in forms:
             if what := _wrong_shape(leaf, form):
@@ -90,8 +82,7 @@ def _has_wrong_dtype(leaf: Leaf, form: Form) -> bool:
 
 
 @check("RL103")
-def find_out_of_range(records: Records) -> Iterator[RuleFinding]:
-    """Find the observation that is farthest outside its bounds, per leaf."""
+def _find_out_of_range(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     for index, leaf in enumerate(built.leaves):
         recorded = [(*pair, _excess(leaf, pair[1].values)) for pair in records.series(index) if leaf.supported]
@@ -114,12 +105,7 @@ def find_out_of_range(records: Records) -> Iterator[RuleFinding]:
             f"{element} is {value:.9g} {_when(step)}; the space allows [{low:.9g}, {high:.9g}]"
             f"{' (float rounding)' if is_rounding else ''}; {count} of {total} observations are outside{more}",
             trajectory.at(
-                step,
-                element=element,
-                value=value,
-                expected=[low, high],
-                observations_outside=count,
-                observations=total,
+                step, element=element, value=value, expected=[low, high], observations_outside=count, observations=total
             ),
             Severity.WARNING if is_rounding else _severity_of_outside(recorded, outside),
         )
@@ -208,14 +194,11 @@ def _find_unusual_images(records: Records) -> Iterator[RuleFinding]:
         if leaf.kind == "Box" and (problem := _image_problem(leaf)):
             yield RuleFinding("RL108", f"{name} {problem}", {"element": name, "value": shape, "dtype": leaf.dtype})
         elif leaf.kind == "Box" and _is_in_image_format(leaf) and (brightest := _brightest(records, index)) in (0, 1):
-            message = (
-                f"{name} is uint8 up to 255, and no pixel of any episode is brighter than {brightest}: scaled twice?"
-            )
+            message = f"{name} is uint8 up to 255, and its brightest pixel was {brightest}: scaled twice?"
             yield RuleFinding("RL108", message, {"element": name, "value": brightest, "expected": 255})
 
 
 def _is_in_image_format(leaf: Leaf) -> bool:
-    """Say whether it is what the default networks take for an image."""
     in_range = np.all(leaf.low == 0) and np.all(leaf.high == 255)
     return len(leaf.shape) == 3 and leaf.dtype == "uint8" and bool(in_range)
 

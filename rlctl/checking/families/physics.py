@@ -15,33 +15,26 @@ from numpy.typing import NDArray
 from rlctl.checking.attributes import is_task
 from rlctl.checking.bullet_calls import BulletCall, record_calls
 from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Joint, Jump, Pair, WorldBody, find_clients
-from rlctl.checking.experiments import experiment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.families.robots import find_misuses
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, list_names
 from rlctl.checking.instance import Context
 from rlctl.checking.messages import FIRST_SEED, ChildMessage, Skipped
+from rlctl.checking.records import experiment
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
 
-EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))
-"""The actions of each episode, and how many of its steps are logged."""
-LASTING_STEPS = 3
-"""What lasts for fewer steps is a blow that the solver has not answered yet."""
+EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))  # actions and logged steps
+LASTING_STEPS = 3  # What lasts for fewer steps is a blow that the solver has not answered yet
 PART_OF_RANGE, LEAST_ANGLE, LEAST_LENGTH = 0.1, 0.05, 0.01
 """How far outside its limits a joint may be: part of the range, and at least so much [rad], [m]."""
-FASTEST_BASE = 50.0
-"""[m/s]; PyBullet itself stops at 100 along each axis, and no robot or thing that it handles is faster than a car."""
-FASTEST_JOINT = 90.0
-"""[rad/s]; PyBullet itself stops at 100. Arms and legs stay below 30, also when they fall or are thrown about."""
+FASTEST_BASE = 50.0  # [m/s]; PyBullet stops at 100 per axis, and no robot is faster than a car
+FASTEST_JOINT = 90.0  # [rad/s]; PyBullet stops at 100; arms and legs stay below 30
 FASTEST_SLIDE = 50.0  # [m/s]
-FASTEST_MEANT = 100.5
-"""Beyond its own limit of 100 somebody has raised it, as for propellers and wheels; then only nonsense counts."""
+FASTEST_MEANT = 100.5  # somebody raised the limit of 100, as for wheels: only NONSENSE counts
 NONSENSE = 5_000.0
-FASTEST_JUMP = 1.0
-"""So much faster than by falling a body may be a tenth of a second after a reset [m/s]: ten times gravity."""
+FASTEST_JUMP = 1.0  # above falling, 0.1 s after a reset: ten times gravity [m/s]
 MOST_NAMES = 3
-MOST_CALLS = 20
-"""Calls that a finding's evidence has."""
+MOST_CALLS = 20  # Calls that a finding's evidence has
 
 
 @experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, 8, 9, 10, 11, 12)), share=4.0)
@@ -122,7 +115,6 @@ def _gravity(world: LoggedWorld) -> Iterator[RuleFinding]:
 
 
 def _penetration(world: LoggedWorld) -> Iterator[RuleFinding]:
-    """Yield what is deep inside something else for several steps in a row with ordinary actions, the deepest only."""
     thrown = _thrown(world)
     worst: dict[Pair, tuple[float, WorldLog, list[int]]] = {}
     for log in world.logs:
@@ -153,7 +145,6 @@ def _longest_row(is_deep: Sequence[bool]) -> list[int]:
 
 
 def _joint_limits(world: LoggedWorld) -> Iterator[RuleFinding]:
-    """Yield the joint that is farthest outside its limits."""
     joints: list[tuple[float, str, Joint, int, Place, float]] = []
     for log in world.logs:
         for body, states in log.bodies:
@@ -188,7 +179,6 @@ def _outside(joint: Joint, values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _explosion(world: LoggedWorld) -> Iterator[RuleFinding]:
-    """Yield the worst of what is faster than any robot, or is not a number."""
     fastest = [record for log in world.logs for body, states in log.bodies for record in _fast(log, body, states)]
     fastest.sort(key=lambda record: -record[0])
     parts = {part for _, part, *_ in fastest}
@@ -219,7 +209,6 @@ def _fast(log: WorldLog, body: WorldBody, states: NDArray[np.float64]) -> Iterat
 
 
 def _thrown(world: LoggedWorld) -> dict[str, Jump]:
-    """Return the bodies that are thrown away right after a reset."""
     return {jump.body: jump for jump in reversed(world.jumps) if jump.speed > jump.explained + FASTEST_JUMP}
 
 

@@ -9,39 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
 from rlctl.checking.failures import EnvironmentRaised, describe
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
 from rlctl.checking.messages import FIRST_SEED, SUCCESS, CheckedEpisode, ChildMessage
-from rlctl.checking.records import Records
+from rlctl.checking.records import Records, check, experiment
 
-WITH_SEARCH = ("comparisons", "episodes", "starts", "search")
-"""The experiments that record episodes of the first process's instance: nearly all there are."""
-DISCOUNT = 0.99
-"""The usual discount per step: what is more than a few hundred steps away hardly counts."""
+WITH_SEARCH = ("comparisons", "episodes", "starts", "search")  # they play the first process's instance
+DISCOUNT = 0.99  # per step: what is hundreds of steps away hardly counts
 TERMS = "reward_terms/"
-SUM_TOLERANCE = 1e-3
-"""Part of the reward, or of 1, by which terms may miss it: they may be rounded for the log."""
-FEW_WRONG = 0.02
-"""Part of the steps that may be off: the last one of an episode may have a bonus of its own."""
-REST_STEPS = 3
-"""So many steps before and after a jump everything has to stand still."""
+SUM_TOLERANCE = 1e-3  # part of the reward or of 1: terms may be rounded for the log
+FEW_WRONG = 0.02  # part of the steps: the last of an episode may have a bonus
+REST_STEPS = 3  # So many steps before and after a jump everything has to stand still
 STILL = 1e-6
-ENOUGH_STEPS = 50
-"""With fewer steps nothing is said about what never happens."""
-LARGE = 10.0
-"""Root mean square per step from which a reward is large. With the usual discount a return is up to a hundred times
-as much, and value networks begin near 0. Pendulum's rewards, down to -16, are below it."""
-HUGE = 1_000.0
-"""A single reward beyond this, ten times the usual bonus for finishing, spoils the value estimate of all before it."""
-MEANT_CONSTANT = re.compile(
-    r"(^|_)(alive|aliveness|surviv\w*|time|steps?|living|life|exist\w*|constant|bias)(_|$)", re.I
-)
-"""Names of terms that are meant to be the same at every step."""
+ENOUGH_STEPS = 50  # With fewer steps nothing is said about what never happens
+LARGE = 10.0  # root mean square per step; a return is up to a hundred times as much
+HUGE = 1_000.0  # a single larger reward spoils the values before it
+MEANT_CONSTANT = re.compile(r"(?i)(^|_)(alive(ness)?|surviv\w*|time|steps?|living|life|exist\w*|constant|bias)(_|$)")
 STEPS = 50
-TOLERANCE = 1e-4
-"""Difference between two rewards, relative to the environment's or to 1, up to which it is rounding to float32."""
+TOLERANCE = 1e-4  # relative to the reward or to 1: rounding to float32
 GOALS = ("achieved_goal", "desired_goal")
 
 
@@ -226,7 +212,6 @@ def _find_wrong_sum(records: Records) -> Iterator[RuleFinding]:
 
 @check("RL615", "episodes", "search")
 def _find_jump_at_rest(records: Records) -> Iterator[RuleFinding]:
-    """Find a reward that jumps from one level to another while the observation stands still under the zero action."""
     require_rewarded(records)
     for episode in records.episodes + records.role("search"):
         size = episode.steps - episode.has_ended
@@ -244,11 +229,9 @@ def _find_jump_at_rest(records: Records) -> Iterator[RuleFinding]:
             before, after = slice(max(0, at - REST_STEPS), at), slice(at + 1, at + 1 + REST_STEPS)
             calm = level[before].all() and level[after].all() and still[before].all() and still[at : after.stop].all()
             if len(rewards[before]) == REST_STEPS == len(level[after]) and calm:
-                message = (
-                    f"the reward jumps from {rewards[at]:.4g} to {rewards[at + 1]:.4g} at step {at + 2}, and nothing"
-                )
+                jump = f"from {rewards[at]:.4g} to {rewards[at + 1]:.4g} at step {at + 2}"
                 evidence = episode.at(at + 2, value=float(rewards[at + 1]), expected=float(rewards[at]))
-                yield RuleFinding("RL615", f"{message} that is observed moves", evidence)
+                yield RuleFinding("RL615", f"the reward jumps {jump}, and no observed number changes", evidence)
                 return
 
 

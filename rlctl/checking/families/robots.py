@@ -9,32 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.bullet_calls import FULL_TURN, BulletCalls, ContactQuery
-from rlctl.checking.bullet_worlds import JOINTS, bullet, find_joint
+from rlctl.checking.bullet_worlds import JOINTS, ClientCalls, find_joint
 from rlctl.checking.finding import RuleFinding, Severity
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 
-FAR_RANGES = 3.0
-"""A target so many ranges outside of a joint's limits is no target that the joint may just not reach."""
+FAR_RANGES = 3.0  # a target farther outside the limits is not just out of reach
 FEWEST_JOINTS = 3
-NEAR = 0.05
-"""Targets are the positions in another order where both differ by no more, once sorted [rad], [m]."""
-APART = 0.2
-"""And where a motor's target differs by so much from its own joint's position [rad], [m]."""
+NEAR = 0.05  # of sorted targets and positions that are equal [rad], [m]
+APART = 0.2  # of a target and its own joint's position [rad], [m]
 FEWEST_QUERIES = 50
-MOSTLY = 0.3
-"""Part of all looks in which bodies have to touch, so that a query should have seen it."""
-SAME = 2e-4
-"""An element of the observation is an angle if it differs by no more in any look [rad]."""
-LEAST_MOTION = 0.02
-"""An angle that stays the same within this standard deviation may be equal to another by chance [rad]."""
+MOSTLY = 0.3  # Part of all looks in which bodies have to touch, so that a query should have seen it
+SAME = 2e-4  # An element of the observation is an angle if it differs by no more in any look [rad]
+LEAST_MOTION = 0.02  # standard deviation; calmer angles may be equal by chance [rad]
 FEWEST_LOOKS = 30
-ORDERS = {"w, x, y, z": (1, 2, 3, 0), "w first, passed on as x, y, z, w": (3, 0, 1, 2)}
-"""Where a wrong reader takes x, y, z and w from, by the name of the mistake."""
-ANGLES = ("roll", "pitch", "yaw")
+ORDERS = {"w, x, y, z": (1, 2, 3, 0), "w first, passed on as x, y, z, w": (3, 0, 1, 2)}  # where x, y, z, w come from
+ANGLES = (*("roll", "pitch", "yaw") * 3, "", "", "")
 
 
-def find_far_targets(calls: BulletCalls) -> Iterator[RuleFinding]:
-    """Yield the first position for a joint that can only be in degrees."""
+def _find_far_targets(calls: BulletCalls) -> Iterator[RuleFinding]:
     for target in calls.far_targets:
         joint = find_joint(target.client, target.body, target.joint)
         if joint is None or not joint.is_angle or not joint.has_limits:
@@ -50,8 +42,7 @@ def find_far_targets(calls: BulletCalls) -> Iterator[RuleFinding]:
             return
 
 
-def find_wrong_order(world: LoggedWorld) -> Iterator[RuleFinding]:
-    """Yield a body whose motor targets, with the zero action, are its joint positions at reset in another order."""
+def _find_wrong_order(world: LoggedWorld) -> Iterator[RuleFinding]:
     for log in world.logs:
         for body, states in log.bodies if log.first_targets else ():
             targets = {
@@ -77,8 +68,7 @@ def find_wrong_order(world: LoggedWorld) -> Iterator[RuleFinding]:
                 return
 
 
-def find_empty_queries(world: LoggedWorld, calls: BulletCalls) -> Iterator[RuleFinding]:
-    """Yield the first line whose contact queries never returned a contact although the bodies touched."""
+def _find_empty_queries(world: LoggedWorld, calls: BulletCalls) -> Iterator[RuleFinding]:
     key = lambda query: (query.call, query.client)  # noqa: E731
     for (call, client), group in itertools.groupby(sorted(calls.queries.values(), key=key), key):
         queries = list(group)
@@ -116,17 +106,13 @@ def _explain_empty(world: LoggedWorld, query: ContactQuery) -> tuple[str, Severi
 
 
 def _exists(client: int, body: int) -> bool:
-    p = bullet()
-    return body in {p.getBodyUniqueId(i, physicsClientId=client) for i in range(p.getNumBodies(physicsClientId=client))}
+    p = ClientCalls(client)
+    return body in {p.getBodyUniqueId(i) for i in range(p.getNumBodies())}
 
 
 def _has_shape(world: LoggedWorld, body: int, link: int) -> bool:
-    """Say whether anything can touch a link: any other body is at some distance from it."""
-    p, client = bullet(), world.world.client
-    for other in world.world.bodies:
-        if other.id != body and p.getClosestPoints(other.id, body, 1e3, linkIndexB=link, physicsClientId=client):
-            return True
-    return len(world.world.bodies) < 2
+    p, others = ClientCalls(world.world.client), [other.id for other in world.world.bodies if other.id != body]
+    return not others or any(p.getClosestPoints(other, body, 1e3, linkIndexB=link) for other in others)
 
 
 def _find_touching(log: WorldLog, query: ContactQuery) -> list[set[tuple[int, int]]]:
@@ -141,16 +127,13 @@ def _find_touching(log: WorldLog, query: ContactQuery) -> list[set[tuple[int, in
 
 
 def _are_joined(client: int, one: tuple[int, int], two: tuple[int, int]) -> bool:
-    """Say whether one of two links of a body is the other's parent."""
-    p = bullet()
+    p = ClientCalls(client)
     return any(
-        link >= 0 and p.getJointInfo(body, link, physicsClientId=client)[16] == parent
-        for (body, link), (_, parent) in ((one, two), (two, one))
+        link >= 0 and p.getJointInfo(body, link)[16] == parent for (body, link), (_, parent) in ((one, two), (two, one))
     )
 
 
-def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
-    """Yield an element of the observation that is an angle of a quaternion whose numbers are in the wrong order."""
+def _find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
     logs = [log for log in world.logs if log.observed and len({row.size for row in log.observed}) == 1]
     if sum(len(log.observed) for log in logs) < FEWEST_LOOKS or len({log.observed[0].size for log in logs}) != 1:
         return
@@ -169,13 +152,9 @@ def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
         for link, order, angles in wrong:
             is_same = (np.abs(values - angles).max(axis=0) <= SAME) & (angles.std(axis=0) > LEAST_MOTION)
             for which in np.flatnonzero(is_same)[:1]:
-                what = (
-                    f"{('', 'the sine of ', 'the cosine of ')[which // 3]}{ANGLES[which % 3]}"
-                    if which < 9
-                    else "gravity"
-                )
+                angle = f"{('', 'the sine of ', 'the cosine of ', 'gravity')[which // 3]}{ANGLES[which]}"
                 name = f"observation[{column}]"
-                message = f"{name} is {what} of {world.world.link_name(link)} with its quaternion read as {order}"
+                message = f"{name} is {angle} of {world.world.link_name(link)} with its quaternion read as {order}"
                 yield RuleFinding("RL116", message, {"element": name, "value": order, "expected": "x, y, z, w"})
                 return
 
@@ -196,8 +175,8 @@ def find_angles(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def find_misuses(worlds: Sequence[LoggedWorld], calls: BulletCalls) -> Iterator[RuleFinding]:
     """Yield what is wrong with how the robots of some worlds are driven and read; the worlds have to be there still."""
-    yield from find_far_targets(calls)
+    yield from _find_far_targets(calls)
     for world in worlds:
-        yield from find_wrong_order(world)
-        yield from find_empty_queries(world, calls)
-        yield from find_misread_quaternions(world)
+        yield from _find_wrong_order(world)
+        yield from _find_empty_queries(world, calls)
+        yield from _find_misread_quaternions(world)

@@ -1,9 +1,8 @@
 """Records a small search for good actions, so that rules see more of an environment than chance finds; and RL605.
 
-All its episodes begin with the same seed. The first does nothing. The cross-entropy method plays
-generations of sequences of a few held actions, each drawn around the best of those before. Then the best sequence is
-followed with another action from some step on; at last one that finished stops shortly before its end, to see what
-standing still beside a goal earns.
+All its episodes have the same seed. The first does nothing. The cross-entropy method plays generations of sequences of
+a few held actions, drawn around the best sequences of the generation before. Then the best sequence is repeated with
+another action from some step on; at last a finished one stops shortly before its end, next to the goal.
 """
 
 from __future__ import annotations
@@ -17,49 +16,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, action_at, zero_action
-from rlctl.checking.experiments import experiment
-from rlctl.checking.families.rewards import (
-    DISCOUNT,
-    discounted_steps,
-    discounted_sum,
-    ends_in_success,
-    has_succeeded,
-    reports_success,
-)
+from rlctl.checking.families import rewards
 from rlctl.checking.families.state import play_after_ends
 from rlctl.checking.finding import NotJudged, RuleFinding
 from rlctl.checking.instance import Context, find_longest_episode
 from rlctl.checking.messages import FIRST_SEED, CheckedEpisode, ChildMessage, Skipped
 from rlctl.checking.recording import Recording
+from rlctl.checking.records import experiment
 
-MOST_STEPS = 6_000
-"""Steps in all. With them the goal of the bundled `reach`, a ball of 5 cm within reach of an arm, is found from most
-seeds; on a fast environment they take a tenth of a second."""
+MOST_STEPS = 6_000  # in all: they find the goal of the bundled `reach` from most seeds
 MOST_EPISODES = 60
-LONGEST = 200
-"""An episode is left after so many steps: most of a goal's pull shows before."""
-SEGMENTS = 3
-"""Of a sequence, each one action that is held: few numbers to search among."""
+LONGEST = 200  # An episode is left after so many steps: most of a goal's pull shows before
+SEGMENTS = 3  # Of a sequence, each one action that is held: few numbers to search among
 GENERATION = 10
 ELITE = 3
-WIDTH = 0.3
-"""Of the first generation, as a standard deviation; the range of an action is 1."""
+WIDTH = 0.3  # Of the first generation, as a standard deviation; the range of an action is 1
 LEAST_WIDTH = 0.025
-STRETCH = 1.5
-"""How long a sequence's actions reach, against the longest episode so far."""
-CEM_FRACTION = 0.7
-"""Part of the steps that is for generations; after a success there is no need for another."""
-CONTINUED = 12
-"""Episodes that follow the best and then go on otherwise."""
-STOPS = (1, 2, 4, 8)
-"""How many steps before its end an episode that finished is played again with nothing done from there on."""
-FAR_ABOVE = 5.0
-"""The last reward of an episode is that of a goal, where success is not reported, if it stands out by so many times the
-spread of the rewards in its first half: a robot that falls while it walks fast ends with a good reward too."""
-CLEARLY = 0.1
-"""How much more stopping has to earn than finishing."""
-LATE = 10
-"""The mean of so many rewards is what each later step is taken to earn [steps]."""
+STRETCH = 1.5  # How long a sequence's actions reach, against the longest episode so far
+CEM_FRACTION = 0.7  # part of the steps that is for generations
+CONTINUED = 12  # Episodes that follow the best and then go on otherwise
+STOPS = (1, 2, 4, 8)  # steps before the end of a finished episode, to stop there
+FAR_ABOVE = 5.0  # times the spread of early rewards; a robot that falls at speed ends with a good reward
+CLEARLY = 0.1  # How much more stopping has to earn than finishing
+LATE = 10  # The mean of so many rewards is what each later step is taken to earn [steps]
 
 
 @dataclasses.dataclass
@@ -88,10 +67,8 @@ def search(context: Context) -> Iterator[ChildMessage]:
     yield from searcher.cross_entropy_search()
     yield from searcher.perturb_best()
     yield from searcher.stop_early()
-    succeeded = [
-        attempt.sequence[: attempt.played.steps] for attempt in searcher.attempts if has_succeeded(attempt.played)
-    ]
-    yield from play_after_ends(context, succeeded[0] if succeeded else None)
+    first = next((attempt.sequence[: attempt.played.steps] for attempt in searcher.succeeded), None)
+    yield from play_after_ends(context, first)
     if context.budget.why_spent:
         yield Skipped("search", f"{len(searcher.attempts)} episodes were searched: {context.budget.why_spent}")
 
@@ -106,12 +83,17 @@ class _Search:
         self._length = LONGEST
         self._size = sum(int(np.prod(leaf.shape)) for leaf in self.instance.action_leaves)
 
+    @property
+    def succeeded(self) -> list[_Attempt]:
+        """The attempts with a success."""
+        return [attempt for attempt in self.attempts if rewards.has_succeeded(attempt.played)]
+
     def cross_entropy_search(self) -> Iterator[ChildMessage]:
         """Play generations of held actions, each around the best of the one before."""
         shape = (SEGMENTS, self._size)
         mean, width = np.full(shape, 0.5), np.full(shape, WIDTH)
         best, best_score = mean, -np.inf
-        while self._goes_on(CEM_FRACTION) and not any(has_succeeded(attempt.played) for attempt in self.attempts):
+        while self._goes_on(CEM_FRACTION) and not self.succeeded:
             generation: list[tuple[float, NDArray[np.float64]]] = []
             for number in range(GENERATION):
                 centre, spread = (best, WIDTH * width) if number == 0 else (mean, width)
@@ -138,7 +120,7 @@ class _Search:
 
     def stop_early(self) -> Iterator[ChildMessage]:
         """Follow a sequence that finished, do nothing from shortly before its end on, and compare what both earn."""
-        is_reported = reports_success([attempt.played for attempt in self.attempts])
+        is_reported = rewards.reports_success([attempt.played for attempt in self.attempts])
         finished = [attempt for attempt in self.attempts if _finishes(attempt.played, is_reported)]
         if not finished:
             yield Skipped("RL605", "the search for high returns ended no episode at a goal", applies=False)
@@ -189,11 +171,10 @@ class _Search:
 
 
 def _finishes(episode: CheckedEpisode, success_is_reported: bool) -> bool:
-    """Whether an episode ended at the goal: as it reports, or else with a reward far above what it began with."""
     if episode.ended not in ("terminated", "both"):
         return False
     if success_is_reported:
-        return ends_in_success(episode)
+        return rewards.ends_in_success(episode)
     begin = episode.rewards[: episode.steps // 2]
     last = episode.rewards[-1]
     return len(begin) > 1 and bool(last > begin.max() + FAR_ABOVE * np.ptp(begin) and last >= episode.rewards.max())
@@ -203,22 +184,19 @@ def _finishes(episode: CheckedEpisode, success_is_reported: bool) -> bool:
 class Stop:
     """What an episode earns that stops shortly before another one finishes."""
 
-    step: int
-    """The first step that is different."""
-    finishing: float
-    """The discounted rewards of the other one from that step on."""
-    stopping: float
-    """Its own, up to the time limit."""
-    per_step: float
-    """Its mean reward from that step on."""
+    step: int  # The first step that is different
+    finishing: float  # The discounted rewards of the other one from that step on
+    stopping: float  # Its own, up to the time limit
+    per_step: float  # Its mean reward from that step on
 
 
 def compare_returns(one: CheckedEpisode, two: CheckedEpisode, at: int, longest: int) -> Stop:
     """Compare an episode that finished with one that is the same for `at` steps. `longest`: the time limit [steps]."""
     rest = two.rewards[at:]
     to_come = 0 if two.has_ended else longest - two.steps
-    stopping = discounted_sum(rest) + DISCOUNT ** len(rest) * discounted_steps(float(rest[-LATE:].mean()), to_come)
-    return Stop(at + 1, discounted_sum(one.rewards[at:]), stopping, float(rest.mean()))
+    later = rewards.discounted_steps(float(rest[-LATE:].mean()), to_come)
+    stopping = rewards.discounted_sum(rest) + rewards.DISCOUNT ** len(rest) * later
+    return Stop(at + 1, rewards.discounted_sum(one.rewards[at:]), stopping, float(rest.mean()))
 
 
 def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[ChildMessage]:
@@ -230,6 +208,6 @@ def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[Ch
         yield RuleFinding(
             "RL605",
             f"finishing at step {finished.steps} earns {best.finishing:.4g} from step {best.step} on; stopping there "
-            f"instead earns {best.per_step:.3g} per step, {best.stopping:.4g} in all (discounted by {DISCOUNT})",
+            f"earns {best.per_step:.3g} per step instead, {best.stopping:.4g} in all (discount {rewards.DISCOUNT})",
             finished.at(best.step, value=best.stopping, expected=f"below {best.finishing:.6g}", per_step=best.per_step),
         )

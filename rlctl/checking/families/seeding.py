@@ -11,18 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
 from rlctl.checking.families.determinism import compare
 from rlctl.checking.finding import NotJudged, RuleFinding
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import flatten_numbers
 from rlctl.checking.messages import FIRST_SEED, ChildMessage
-from rlctl.checking.records import Records
+from rlctl.checking.records import Records, check, experiment
 
-WATCHED_STEPS = 300
-"""For how many steps the process's random generators are compared."""
-UNSEEDED_RESETS, UNSEEDED_STEPS = 2, 20
-"""Of two discrete starts one may be the same by chance."""
+WATCHED_STEPS = 300  # For how many steps the process's random generators are compared
+UNSEEDED_RESETS, UNSEEDED_STEPS = 2, 20  # Of two discrete starts one may be the same by chance
 FEWEST_SEEDS = 4
 
 
@@ -72,13 +69,11 @@ def _play(instance: Instance, deadline: float, **seed: int) -> NDArray[np.float6
     observations = [start[0] if isinstance(start, tuple) else start for start in starts]
     while not episode.ended:
         observations.append(episode.step().observation)
-    return np.nan_to_num(
-        np.concatenate([flatten_numbers(observation) for observation in observations]).astype(np.float64)
-    )
+    numbers = np.concatenate([flatten_numbers(observation) for observation in observations])
+    return np.nan_to_num(numbers.astype(np.float64))
 
 
 def _differing(one: NDArray[np.float64], two: NDArray[np.float64]) -> list[float]:
-    """Return the first two numbers that differ, as far as both go; nothing where none do."""
     rows = min(len(one), len(two))
     unequal = np.flatnonzero(one[:rows] != two[:rows])
     return [float(numbers[unequal[0]]) for numbers in (one, two)] if unequal.size else []

@@ -8,69 +8,48 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 
 from rlctl.checking.bullet_calls import visible_to_profilers
-from rlctl.checking.clock import read_clock
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
 from rlctl.checking.finding import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.instance import Context, Instance, Timer, rebuilds_world
 from rlctl.checking.messages import ChildMessage, Fact
 from rlctl.checking.profiling import Profile, Stopwatch, TimedCall, find_own_code
-from rlctl.checking.records import Records
+from rlctl.checking.progress import read_clock
+from rlctl.checking.records import Records, check, experiment
 from rlctl.output import format_duration
 
 FIRST_SPEED_SEED = 5000
 TIMED_STEPS = 200
 TIMED_RESETS = 5
-PROFILED_S = 0.15
-"""How long steps are profiled, and resets [s]."""
-MOST_STEPS = 20_000
-"""So many steps, or resets, are enough."""
-BATCH = 25
-"""The time of a step is the median of the means over so many: a disturbance is left out, a step that takes longer every
-now and then is not."""
-LONGEST_S = 2.0
-"""So much time is enough, however much there is: an environment that takes longer for these steps is slow [s]."""
+PROFILED_S = 0.15  # How long steps are profiled, and resets [s]
+MOST_STEPS = 20_000  # So many steps, or resets, are enough
+BATCH = 25  # steps per mean; the median of the means ignores disturbances
+LONGEST_S = 2.0  # enough, however much there is [s]
 MOST_CALLS = 5
 
 MILLION = 1_000_000
-SLOW_STEPS_PER_S = 100.0
-"""Below it a million steps, a small training, take about three hours on one core [steps/s]."""
-CLEARLY_SLOW = 1.25
-"""So many times slower than that is a warning; less may be a busy machine."""
-SLOW_LOADING_S = 0.005
-"""Loading in a reset that takes less is not reported, whatever its share of short episodes: PyBullet's resetSimulation
-of an empty world alone takes half a millisecond [s]."""
-LITTLE_LOADING = 0.05
-"""Share of an episode below which loading in reset is not reported."""
-MOST_LOADING = 0.2
-"""Share of a step that loading or reading files takes from which that is a finding."""
-LEAST_DRAWING = 0.05
-"""Share of a step, or of a reset, below which drawing and waiting are not reported: a `render` that returns at
-once because there is nothing to show."""
-SMALLEST_IMAGE = 8
-"""An observation with two axes at least this long is an image, so a camera is part of the task [pixels]."""
+SLOW_STEPS_PER_S = 100.0  # a million steps then take about three hours [steps/s]
+CLEARLY_SLOW = 1.25  # So many times slower than that is a warning; less may be a busy machine
+SLOW_LOADING_S = 0.005  # [s]; resetSimulation of an empty world takes a tenth of this
+LITTLE_LOADING = 0.05  # Share of an episode below which loading in reset is not reported
+MOST_LOADING = 0.2  # share of a step from which loading there is a finding
+LEAST_DRAWING = 0.05  # share of a step or reset; less is a `render` that returns at once
+SMALLEST_IMAGE = 8  # two axes at least this long are an image [pixels]
 NAMED_CALLS = 3
-LEAST_SHARE = 0.01
-"""Calls that take less are not named among the slowest."""
+LEAST_SHARE = 0.01  # Calls that take less are not named among the slowest
 
 
 @dataclasses.dataclass(frozen=True)
 class Speed:
     """How long steps and resets take, and what takes that long."""
 
-    step_s: float | None
-    """A step with a random action, with nothing measured but time [s]; None where none could be taken."""
+    step_s: float | None  # with a random action [s]; None if none was timed
     reset_s: float | None
-    steps: int
-    """How many were timed."""
+    steps: int  # How many were timed
     resets: int
-    slowest_in_step: list[TimedCall]
-    """By their own time, what they call left out; the slowest first."""
-    suspicious_in_step: list[TimedCall]
-    """Calls that step should not make, with what they call; none is inside another."""
+    slowest_in_step: list[TimedCall]  # by their own time, the slowest first
+    suspicious_in_step: list[TimedCall]  # with what they call; none is inside another
     suspicious_in_reset: list[TimedCall]
-    rebuilds: bool
-    """Whether it is a task of rlctl that declares that every reset loads the world anew."""
+    rebuilds: bool  # a task of rlctl that declares slow resets
 
 
 @experiment("speed", share=1.5)
@@ -108,7 +87,6 @@ def measure_speed(context: Context) -> Iterator[ChildMessage]:
 def _play(
     instance: Instance, timers: Mapping[str, Timer], calls: int, deadline: float, *, only_reset: bool = False
 ) -> None:
-    """Play random episodes for so many steps, or resets, with timers for calls of `step` and `reset`."""
     instance.timers = timers
     number = 0
     try:
@@ -203,8 +181,7 @@ def format_speed(records: Records) -> str:
     )
 
 
-def episode_steps(records: Records) -> float | None:
-    """Return the mean length of an episode with random actions, or of any, cut ones only if there are no others."""
+def _episode_steps(records: Records) -> float | None:
     episodes = [episode for episode in records.episodes if episode.steps]
     whole = [episode for episode in episodes if episode.has_ended] or episodes
     random = [episode for episode in whole if episode.actions == "random"] or whole
@@ -218,7 +195,7 @@ def _require_speed(records: Records) -> Speed:
 
 def _require_times(records: Records) -> tuple[Speed, float, float, float]:
     """Return the speed, the time of a step and of a reset [s], and the steps of an episode."""
-    speed, steps = _require_speed(records), episode_steps(records)
+    speed, steps = _require_speed(records), _episode_steps(records)
     if not speed.step_s or speed.reset_s is None or steps is None:
         raise NotJudged("no step or no reset could be timed")
     return speed, speed.step_s, speed.reset_s, steps
@@ -230,7 +207,6 @@ def _suspicious(speed: Speed, call: str, kinds: Sequence[str]) -> list[TimedCall
 
 
 def _idle(records: Records, speed: Speed, call: str) -> list[TimedCall]:
-    """Return the calls that RL903 finds."""
     shapes = [leaf.shape for leaf in records.require_built().leaves]
     has_image = any(sum(size >= SMALLEST_IMAGE for size in shape) >= 2 for shape in shapes)
     kinds = ("sleeping",) if has_image else ("sleeping", "rendering")
@@ -238,7 +214,6 @@ def _idle(records: Records, speed: Speed, call: str) -> list[TimedCall]:
 
 
 def _loading(speed: Speed, call: str) -> list[TimedCall]:
-    """Return the calls that RL904 finds."""
     if call == "reset" and speed.rebuilds:
         return []
     calls = _suspicious(speed, call, ("loading", "connecting"))

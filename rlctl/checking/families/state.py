@@ -16,7 +16,6 @@ from rlctl.checking.attributes import (
     read_attributes,
 )
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
 from rlctl.checking.failures import EnvironmentRaised
 from rlctl.checking.families.determinism import COMPARED_STEPS, LATE, find_difference, report
 from rlctl.checking.families.rewards import has_succeeded
@@ -25,23 +24,16 @@ from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import flatten_numbers
 from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import Records
+from rlctl.checking.records import Records, check, experiment
 
-HIDDEN_STEPS = 20
-"""How many steps are compared with an attribute changed."""
+HIDDEN_STEPS = 20  # How many steps are compared with an attribute changed
 FEWEST_COMPARED = 5
-MOST_CHANGED = 40
-"""So many attributes are changed."""
-MOST_OBSERVED = 1_000
-"""Larger observations are images or scans, in which a goal may be drawn."""
-REGRESSED_RESETS = 60
-"""Resets over which an attribute is predicted from the observation."""
-SHOWN = 0.9
-"""Part of an attribute's variance that the observation explains, from which it is taken as shown there."""
-MOST_SECOND_STEPS = 1_000
-"""An ordinary episode is left after so many steps: most time limits are shorter."""
-FAINT = 0.01
-"""A late difference that is smaller is a residue of a simulation, not a counter or a flag."""
+MOST_CHANGED = 40  # So many attributes are changed
+MOST_OBSERVED = 1_000  # Larger observations are images or scans, in which a goal may be drawn
+REGRESSED_RESETS = 60  # Resets over which an attribute is predicted from the observation
+SHOWN = 0.9  # part of an attribute's variance that the observation has to explain
+MOST_SECOND_STEPS = 1_000  # most time limits are shorter
+FAINT = 0.01  # smaller late differences are a residue, no counter or flag
 AFTER_ENDS = ("after success", "after termination", "after truncation")
 
 
@@ -65,7 +57,6 @@ def change_attributes(context: Context) -> Iterator[ChildMessage]:
 
 
 def _find_drawn(instance: Instance, trials: Trials) -> dict[str, Attribute]:
-    """Return what reset draws and no step changes, with the values of another seed."""
     instance.reset(SECOND_SEED)
     others = read_attributes(instance.env)
     instance.reset(FIRST_SEED)
@@ -77,7 +68,6 @@ def _find_drawn(instance: Instance, trials: Trials) -> dict[str, Attribute]:
 
 
 def _play_changed(instance: Instance, trials: Trials, name: str, other: Attribute) -> list[Frame] | None:
-    """Play the episode with an attribute changed right after reset; None where it cannot be changed."""
 
     def change() -> None:
         read_attributes(instance.env)[name].assign(other.value)
@@ -89,7 +79,6 @@ def _play_changed(instance: Instance, trials: Trials, name: str, other: Attribut
 
 
 def _hides(plain: Sequence[Frame], changed: Sequence[Frame]) -> bool:
-    """Say whether all observations are the same, and most rewards are not, up to the end of the shorter episode."""
     steps = min(len(plain), len(changed)) - 2  # the last step may reach the goal, the reset has no reward
     differences = find_differences(plain[: steps + 1], changed[: steps + 1])
     only_reward = all(columns.tolist() == [REWARD] for columns in differences.values())
@@ -97,7 +86,6 @@ def _hides(plain: Sequence[Frame], changed: Sequence[Frame]) -> bool:
 
 
 def _is_shown(instance: Instance, name: str) -> bool:
-    """Say whether the observation of reset tells the attribute, as a copy that reset made of it does."""
     rows, values = [], []
     for number in range(REGRESSED_RESETS):
         returned = instance.reset(FIRST_SEED + number)
@@ -165,8 +153,7 @@ def play_after_ends(context: Context, success: Sequence[Any] | None) -> Iterator
 
 
 @check("RL310", "search")
-def compare_after_ends(records: Records) -> Iterator[RuleFinding]:
-    """Compare an episode with its repetition after episodes that succeeded, terminated or were truncated."""
+def _compare_after_ends(records: Records) -> Iterator[RuleFinding]:
     built, first = records.require_built(), records.require_role("before ends")
     again = records.require_role("before ends again")
     if not built.accepts_seed or find_difference(built, first, again) is not None:

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import experiment
 from rlctl.checking.failures import EnvironmentRaised, describe
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import flatten_numbers
 from rlctl.checking.messages import FIRST_SEED, ChildMessage, Skipped
+from rlctl.checking.records import experiment
 from rlctl.environments import info, registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
@@ -23,8 +23,7 @@ from rlctl.errors import RecipeError, RlctlError
 if TYPE_CHECKING:
     from rlctl.environments.info import EnvInfo
 
-STEPS = 60
-"""Of each variant: an event at an interval of a second acts in them."""
+STEPS = 60  # Of each variant: an event at an interval of a second acts in them
 
 
 @experiment("variants", "RL011", "RL012", share=2.0)
@@ -48,7 +47,6 @@ def play_variants(context: Context) -> Iterator[ChildMessage]:
 
 
 def _find_stages(name: str, task: Any) -> Sequence[Any]:
-    """Return the stages that training would use: those of the recipe that comes with the task, or of its class."""
     file = registry.find_recipe_file(name)
     stages = task.stages
     if file is not None and "stages" in file.read_text(encoding="utf-8", errors="replace"):
@@ -92,7 +90,6 @@ def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[RuleFindin
 
 
 def _play(context: Context, spec: EnvSpec) -> bool:
-    """Say whether two episodes of one seed are equal in the environment of `spec`."""
     with Context(spec, context.progress).fresh() as instance:
         episodes = [_record(context, instance) for _ in range(2)]
     shortest = min(len(episode) for episode in episodes)  # where time was up
@@ -100,7 +97,6 @@ def _play(context: Context, spec: EnvSpec) -> bool:
 
 
 def _describe(context: Context, spec: EnvSpec) -> EnvInfo:
-    """Play an episode in the environment of `spec`; return what it is."""
 
     with Context(spec, context.progress).fresh() as instance:
         _record(context, instance)

@@ -1,9 +1,10 @@
-"""A report for people: the worst first, a block per rule, and what was judged."""
+"""What a terminal shows: a report, the worst first with a block per rule, and the texts of `--list` and `--explain`."""
 
 from __future__ import annotations
 
 import io
 import itertools
+import textwrap
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from rlctl import output
 from rlctl.checking.check import CheckReport
 from rlctl.checking.families.speed import format_speed
-from rlctl.checking.finding import FAMILIES, RULES, RuleFinding, Severity
+from rlctl.checking.finding import FAMILIES, RULES, RuleFinding, Severity, find_rule
 from rlctl.checking.formats.structured import Row, action_rows, observation_rows
 
 if TYPE_CHECKING:
@@ -20,14 +21,10 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO: "cyan"}
-LONG = ("traceback", "last_output")
-"""Evidence that is text of several lines; JSON has it whole."""
-SHOWN_LINES = 3
-"""How much of what a dying process printed is shown; a traceback's place is in the message."""
-SHOWN_ITEMS = 4
-"""How much of a list in the evidence is shown; JSON has it whole."""
-SHOWN_ROWS = 16
-"""How many parts of the observation are shown."""
+LONG = ("traceback", "last_output")  # Evidence that is text of several lines; JSON has it whole
+SHOWN_LINES = 3  # of what a dying process printed
+SHOWN_ITEMS = 4  # How much of a list in the evidence is shown; JSON has it whole
+SHOWN_ROWS = 16  # How many parts of the observation are shown
 
 
 def show(report: CheckReport) -> None:
@@ -140,7 +137,6 @@ def _facts(report: CheckReport) -> Iterator[str]:
 
 
 def _families(names: list[str]) -> list[str]:
-    """Shorten ids: a whole family by its name."""
     whole = [f for f in FAMILIES if {rule for rule in RULES if rule.startswith(f)} <= set(names)]
     return [f"{family} {FAMILIES[family]}" for family in whole] + [n for n in names if not n.startswith(tuple(whole))]
 
@@ -154,3 +150,32 @@ def _table(rows: list[Row]) -> Iterator[str]:
         yield f"  {name:<{width}}  {row.low + 0.0:.4g} to {row.high + 0.0:.4g}{observed}"
     if len(rows) > SHOWN_ROWS:
         yield f"  and {len(rows) - SHOWN_ROWS} more"
+
+
+def show_list() -> None:
+    """Print every rule, by family."""
+    from rich.text import Text
+
+    out = output.out()
+    for family, title in FAMILIES.items():
+        out.print(Text(f"{family} {title}", "bold"))
+        for rule in RULES.values():
+            if rule.id.startswith(family):
+                severity = Text(f"{rule.severity:<8}", STYLES[rule.severity])
+                out.print(Text(f"  {rule.id}  ").append_text(severity).append(rule.name))
+    counts = ", ".join(
+        f"{sum(rule.severity is severity for rule in RULES.values())} {severity}s" for severity in Severity
+    )
+    out.print(f"{len(RULES)} rules: {counts}. rlctl check-env --explain {next(iter(RULES))} says more.")
+
+
+def explain(code: str) -> None:
+    """Print what a rule means, and what to do about it."""
+    from rich.text import Text
+
+    out, rule = output.out(), find_rule(code)
+    out.print(Text(f"{rule.id}  {rule.name}", "bold"))
+    out.print(Text(f"{rule.severity}, {FAMILIES[rule.id[:3]]}", STYLES[rule.severity]))
+    out.print("\n" + textwrap.fill(rule.meaning, 100))
+    out.print(f"\nfix: {textwrap.fill(rule.fix, 100)}")
+    out.print(f'waive: rlctl_ignore = {{"{rule.id}": "why this is meant"}} on the class', style="dim")

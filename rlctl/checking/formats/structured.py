@@ -21,8 +21,7 @@ from rlctl.errors import UsageError
 from rlctl.version import __version__
 
 SCHEMA = Path(__file__).parent.parent / "report.schema.json"
-ELEMENTS_SHOWN = 8
-"""So many numbers without names get a row each; more of them share one."""
+ELEMENTS_SHOWN = 8  # So many numbers without names get a row each; more of them share one
 
 
 def text(report: CheckReport) -> str:
@@ -65,21 +64,14 @@ def read_baseline(file: Path) -> set[str]:
         report = json.loads(file.read_text(encoding="utf-8"))
         return {finding["fingerprint"] for part in ("findings", "known") for finding in report[part]}
     except OSError as error:
-        raise UsageError(
-            f"--baseline {file}: {error.strerror}; make one with rlctl check-env TASK --json {file}"
-        ) from None
+        hint = f"write one with rlctl check-env TASK --json {file}"
+        raise UsageError(f"--baseline {file}: {error.strerror}; {hint}") from None
     except (ValueError, KeyError, TypeError):
         raise UsageError(f"--baseline {file} is no report of rlctl check-env --json") from None
 
 
 def _describe(report: CheckReport, finding: RuleFinding) -> dict[str, Any]:
-    place = report.locate(finding)
-    where = {"file": str(place[0]), "line": place[1]} if place else {"file": None, "line": None}
-    return {**finding_json(finding), "fingerprint": report.fingerprint(finding), **where}
-
-
-def finding_json(finding: RuleFinding) -> dict[str, Any]:
-    """Return a finding as plain data."""
+    file, line = report.locate(finding) or (None, None)
     return {
         "rule": finding.rule,
         "name": finding.name,
@@ -87,6 +79,9 @@ def finding_json(finding: RuleFinding) -> dict[str, Any]:
         "message": finding.message,
         "evidence": plain(finding.evidence),
         "fix": finding.fix,
+        "fingerprint": report.fingerprint(finding),
+        "file": str(file) if file else None,
+        "line": line,
     }
 
 
@@ -119,7 +114,6 @@ def _environment(report: CheckReport) -> dict[str, Any] | None:
 
 
 def _speed(report: CheckReport) -> Any:
-    """What one process does; null where no step could be timed."""
     speed: Speed | None = report.records.facts.get("speed")
     if speed is None or speed.step_s is None:
         return None
@@ -132,11 +126,9 @@ class Row:
 
     name: str
     size: int
-    low: float
-    """The lowest declared bound of its numbers."""
+    low: float  # The lowest declared bound of its numbers
     high: float
-    observed: tuple[float, float] | None = None
-    """Smallest and largest value that occurred; None where none was recorded."""
+    observed: tuple[float, float] | None = None  # smallest and largest value
 
 
 def observation_rows(records: Records) -> list[Row]:
