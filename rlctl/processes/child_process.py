@@ -1,8 +1,7 @@
-"""Fresh Python interpreters as child processes, each in a process group of its own, with a connection to it.
+"""New Python interpreters as child processes, each with its own process group and a connection.
 
-Never forks: a process that holds PyBullet or torch cannot be forked safely. (Tests fork from one that does not run any
-environment: `set_start`.) What a child and its own children print goes to descriptors that the caller gives, for
-example to a `LineReader`.
+Never forks: a process with PyBullet or torch cannot be forked safely. (Tests fork from a process that runs no
+environment: `set_start`.) The caller chooses where a child prints, for example to a `LineReader`.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ from typing import Any
 
 from rlctl.processes import messages
 
-# Started this way a child finds the modules that its parent finds and no others (-P: none of the current folder), and
-# the caller's script is not run again.
-# Ctrl-C, `kill` and a cluster's warning may reach a child too, but its parent decides: ignored before anything slow is
-# imported, and held back until then. A handler, not SIG_IGN: an environment's own processes would inherit that.
+# This way a child finds the same modules as its parent (-P: none of the current folder), and does not run the caller's
+# script again.
+# Ctrl-C, `kill` and a cluster's warning may reach a child too, but its parent decides what happens: the child blocks
+# these signals until it ignores them, before any slow import. It uses a handler because processes inherit SIG_IGN.
 _BOOTSTRAP = (
     "import signal; numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2); "
     "[signal.signal(number, lambda *_: None) for number in numbers]; "
@@ -36,39 +35,39 @@ _BOOTSTRAP = (
     "from rlctl.processes.child_process import run_main; run_main(job)"
 )
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
-"""Those that ask a training to stop; clusters send the last two before a job's time is over."""
+"""Signals that ask a training to stop; clusters send the last two before a job's time is over."""
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 StartProcess = Callable[..., "subprocess.Popen[bytes]"]
-"""Takes what `subprocess.Popen` takes, and returns what has its `pid`, `poll` and `wait`."""
+"""Takes the arguments of `subprocess.Popen`; returns an object with its `pid`, `poll` and `wait`."""
 _start: StartProcess = subprocess.Popen
 
 
 def start_process(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
-    """Start a process as `subprocess.Popen` does, or as `set_start` has it."""
+    """Start a process with `subprocess.Popen`, or with the function given to `set_start`."""
     return _start(command, **options)
 
 
 def set_start(start: StartProcess) -> None:
-    """Set how this process starts all others: tests, which start many, fork them from a process made for it."""
+    """Set how this process starts others: tests start many, and fork them from a prepared process."""
     global _start
     _start = start
 
 
 class ChildProcess:
-    """A process that runs `main(connection, **arguments)` of a module; `close` kills it and all that it has started.
+    """A process that runs `main(connection, **arguments)` of a module; `close` kills it and its process group.
 
-    It also ends, with its group, when its parent does; numeric libraries get one thread, except without `one_thread`.
-    Raises `OSError` if it cannot be started.
+    The group also ends when the parent does. With `one_thread` numeric libraries use one thread. Raises `OSError` if
+    the process cannot be started.
     """
 
     def __init__(self, main: str, arguments: Mapping[str, Any], *, one_thread: bool = True, **options: Any) -> None:
         """`main` is "package.module:function"; `arguments` are sent as a message; `options` are those of
-        `subprocess.Popen`, of which `pass_fds` and `env` are added to what every child gets.
+        `subprocess.Popen`; `pass_fds` and `env` are added to the defaults.
         """
         ours, theirs = socket.socketpair()
-        # A pipe that nobody writes to: its end shows the child that this process is gone.
+        # Nobody writes to this pipe; when it closes, the child knows that this process has ended.
         lifeline, self._lifeline = os.pipe()
         job = {"main": main, "sys_path": sys.path, "connection": theirs.fileno(), "lifeline": lifeline}
         options["pass_fds"] = (theirs.fileno(), lifeline, *options.get("pass_fds", ()))
@@ -78,7 +77,7 @@ class ChildProcess:
                 self.process = start_process(
                     [sys.executable, "-P", "-c", _BOOTSTRAP, json.dumps(job)],
                     stdin=subprocess.DEVNULL,
-                    process_group=0,  # so that what an environment starts can be ended with it
+                    process_group=0,  # so that processes started by an environment can be killed too
                     **options,
                 )
         except BaseException:
@@ -86,27 +85,27 @@ class ChildProcess:
             os.close(self._lifeline)
             raise
         self.connection = Connection(ours.detach())
-        with contextlib.suppress(ChildEndedError):  # who waits for its first message will see it
+        with contextlib.suppress(ChildEndedError):  # the first `receive` raises it again
             self.send(dict(arguments))
 
     def send(self, message: Any) -> None:
-        """Send a message; raises `ChildEndedError` if the child cannot receive it any more."""
+        """Send a message; raises `ChildEndedError` if the child has ended."""
         try:
             messages.send(self.connection, message)
         except OSError:
             raise ChildEndedError(self.describe_end()) from None
 
     def receive(self) -> Any:
-        """Wait for a message; raises `ChildEndedError` if the child ends first, or writes what is no message."""
+        """Wait for a message; raises `ChildEndedError` if the child ends first, or writes something else."""
         try:
             return messages.receive(self.connection)
         except messages.UnreadableMessageError as error:
-            raise ChildEndedError(f"wrote to its connection what is {error}") from None
+            raise ChildEndedError(f"wrote invalid data to its connection: {error}") from None
         except (EOFError, OSError):
             raise ChildEndedError(self.describe_end()) from None
 
     def describe_end(self) -> str:
-        """Wait for the end of a child whose connection has closed, and return how it ended."""
+        """Wait for the end of a child whose connection is closed; return how it ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(timeout=5.0)
         code = self.process.poll()
@@ -115,21 +114,21 @@ class ChildProcess:
         return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
 
     def close(self, grace_s: float = 0.0) -> None:
-        """Kill the process group; the child gets `grace_s` seconds to end by itself. A second call does nothing."""
+        """Kill the process group, after `grace_s` seconds in which the child may end. A second call does nothing."""
         if self._lifeline < 0:
             return
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(timeout=grace_s)
-        with contextlib.suppress(ProcessLookupError, PermissionError):  # nobody is left, or only who has ended
+        with contextlib.suppress(ProcessLookupError, PermissionError):  # no process is left, or only ended ones
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
         self.connection.close()
-        os.close(self._lifeline)  # not before it has ended: this kills it
+        os.close(self._lifeline)  # only now: closing it kills the child
         self._lifeline = -1
 
 
 class ChildEndedError(Exception):
-    """A child process can neither receive nor send messages any more; the text says how it ended."""
+    """A child process has ended or sends invalid data; the message says which."""
 
 
 class Standstill:
@@ -148,7 +147,7 @@ class Standstill:
 
 
 def run_main(job: dict[str, Any]) -> None:
-    """In the child: call what the parent asked for."""
+    """In the child: call the function that the parent chose."""
     _end_with_parent(job["lifeline"])
     module, _, name = job["main"].partition(":")
     main, connection = getattr(importlib.import_module(module), name), Connection(job["connection"])
@@ -157,7 +156,7 @@ def run_main(job: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def _block_signals() -> Iterator[None]:
-    """Hold back signals that ask to stop: a child that is started meanwhile takes them when it is ready for them."""
+    """Block signals that ask to stop: a child started meanwhile receives them when its handlers are set."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
         yield
@@ -168,17 +167,17 @@ def _block_signals() -> Iterator[None]:
 def _end_with_parent(lifeline: int) -> None:
     """In a child: end it and its group when its parent ends, even while an environment is stuck in a step.
 
-    `lifeline` is the descriptor of a pipe whose other end the parent alone holds.
+    `lifeline` is the descriptor of a pipe whose other end only the parent has.
     """
     with contextlib.suppress(AttributeError, OSError):  # Linux only
-        # By the system itself: no thread of ours runs while a library is stuck that holds Python's lock.
+        # The system sends the signal: a thread could not run while a stuck library holds Python's lock.
         fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpid() if os.getpgrp() == os.getpid() else os.getpid())
         fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
         fcntl.fcntl(lifeline, fcntl.F_SETFL, os.O_ASYNC)
 
     def watch() -> None:
         with contextlib.suppress(OSError):  # an environment has closed it
-            os.read(lifeline, 1)  # until there is no other end any more
+            os.read(lifeline, 1)  # returns when the other end is closed
         if os.getpgrp() == os.getpid():
             os.killpg(0, signal.SIGKILL)
         os._exit(1)
@@ -187,10 +186,10 @@ def _end_with_parent(lifeline: int) -> None:
 
 
 def anonymous_file() -> int:
-    """Return the descriptor of a new file without a name."""
+    """Return the descriptor of a new unnamed file, in memory where the system can."""
     if hasattr(os, "memfd_create"):
         return os.memfd_create("rlctl-workers")
-    import tempfile  # only where there is no memory for it
+    import tempfile
 
     with tempfile.TemporaryFile() as file:
         return os.dup(file.fileno())

@@ -1,8 +1,7 @@
 """Messages between rlctl's own processes, pickled: rlctl's dataclasses and models, arrays, built-in types.
 
-Nothing else is read this way: neither files nor anything from a network. A child process runs other people's code,
-which may write to any descriptor, so the reader builds plain data only: it imports no other module and calls no other
-function.
+Files and data from a network are never read this way. A child process runs third-party code, which may write to any
+descriptor, so the reader creates plain data only: it imports no other module and calls no other function.
 """
 
 from __future__ import annotations
@@ -26,23 +25,23 @@ _BUILT_IN: dict[type, Any] = {
     list: list,
     dict: dict,
 }
-"""Per built-in type what makes one of an object of a subclass."""
+"""Per built-in type the conversion of an object of a subclass."""
 _ARRAYS = {
     ("numpy", "dtype"),
     ("numpy", "ndarray"),
     ("numpy._core.numeric", "_frombuffer"),
     ("numpy._core.multiarray", "_reconstruct"),
 }
-"""What arrays are read with."""
+"""Names that pickled arrays refer to."""
 
 
 class UnreadableMessageError(OSError):
-    """What arrived is not a message."""
+    """The received bytes are not a message."""
 
 
 class _MessageWriter(pickle.Pickler):
     def reducer_override(self, value: Any) -> Any:
-        """Send numbers, texts and containers of somebody else's classes as built-in ones; refuse other classes."""
+        """Send numbers, strings and containers of third-party classes as built-in ones; refuse other classes."""
         if isinstance(value, np.generic):
             plain = value.item()
             return type(plain), (plain,)
@@ -58,7 +57,7 @@ class _MessageWriter(pickle.Pickler):
 
 class _MessageReader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        """Return a class of plain data; raises `UnpicklingError` for everything else, which stays unimported."""
+        """Return a class of plain data; raises `UnpicklingError` for everything else, without importing it."""
         if module in ("rlctl", "builtins") or module.startswith("rlctl.") or (module, name) in _ARRAYS:
             value = super().find_class(module, name)
             if (module, name) in _ARRAYS or _is_plain(value):
@@ -74,25 +73,25 @@ def _is_plain(kind: Any) -> bool:
 
 
 def encode(message: Any) -> bytes:
-    """Return a message as bytes; raises `TypeError` for what is not plain data."""
+    """Return a message as bytes; raises `TypeError` if it is not plain data."""
     buffer = io.BytesIO()
     _MessageWriter(buffer, protocol=5).dump(message)
     return buffer.getvalue()
 
 
 def decode(content: bytes) -> Any:
-    """Return the message of some bytes; raises `UnreadableMessageError` for anything else."""
+    """Return the message in `content`; raises `UnreadableMessageError` if there is none."""
     try:
         return _MessageReader(io.BytesIO(content)).load()
-    except Exception as error:  # what the bytes happen to say
+    except Exception as error:  # arbitrary bytes may raise anything
         raise UnreadableMessageError(f"not a message of rlctl ({error})") from None
 
 
 def send(connection: Connection, message: Any) -> None:
-    """Send a message; raises `OSError` if nobody can receive it."""
+    """Send a message; raises `OSError` if the other end is closed."""
     connection.send_bytes(encode(message))
 
 
 def receive(connection: Connection) -> Any:
-    """Wait for a message; raises `EOFError` at the end of the connection, `OSError` if it is broken."""
+    """Wait for a message; raises `EOFError` if the connection is closed, `OSError` if it is broken."""
     return decode(connection.recv_bytes())

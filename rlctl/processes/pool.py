@@ -1,4 +1,4 @@
-"""Worker processes that are sent messages and answer each once: started, waited for, watched and ended."""
+"""A pool of worker processes, which answer each message once."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class WorkerException:
 
 
 class ProcessPool:
-    """A process per set of arguments, which runs `main`. Raises `OSError` if one cannot be started.
+    """One process per set of arguments, which runs `main`. Raises `OSError` if a process cannot be started.
 
-    What they print goes to `on_output`, line by line, from a thread. `read_progress` returns what changes whenever an
-    environment begins or ends a call. `pass_fds` are descriptors that all of them get.
+    Printed lines go to `on_output`, from a thread. `read_progress` returns a value that changes whenever an environment
+    begins or ends a call. All processes inherit the descriptors `pass_fds`.
     """
 
     def __init__(
@@ -61,8 +61,8 @@ class ProcessPool:
         self._output = LineReader(self._printed.line, MAX_LINE_BYTES)
         output = self._output.descriptor
         try:
-            for given in arguments:
-                self._processes.append(ChildProcess(main, given, stdout=output, stderr=output, pass_fds=pass_fds))
+            for job in arguments:
+                self._processes.append(ChildProcess(main, job, stdout=output, stderr=output, pass_fds=pass_fds))
         except BaseException:
             self.close(grace_s=0.0)
             raise
@@ -85,11 +85,10 @@ class ProcessPool:
         first: bool = False,
         check: Callable[[], None] | None = None,
     ) -> dict[int, Any]:
-        """Wait for the answer of every worker that was asked, or of the `first` ones; return the answers by worker.
+        """Wait for the answers of all asked workers, or of the `first` ones; return them by worker.
 
-        A `WorkerException` is returned at once. `check` is called several times a second, and may raise to leave.
-        Raises `WorkerFault`, which says what workers were `doing`, if one dies, or if nothing has changed for
-        `timeout_s`.
+        A `WorkerException` is returned at once. `check` is called several times a second; an exception from it ends the
+        wait. Raises `WorkerFault`, which mentions `doing`, if a worker dies or makes no progress for `timeout_s`.
         """
         answers: dict[int, Any] = {}
         standstill = Standstill(self._read_progress)
@@ -106,7 +105,7 @@ class ProcessPool:
                 if isinstance(answers[worker], WorkerException):
                     return answers
             if timeout_s is not None:
-                # A worker answers once for many steps: only one that stands still for so long hangs.
+                # A worker answers once for many steps: it hangs only if there is no progress for so long.
                 left = timeout_s - standstill.seconds()
                 if not ready and left <= 0:
                     message = f"no answer for {timeout_s:g} s while {doing}; if that may take so long, "
@@ -115,10 +114,7 @@ class ProcessPool:
         return answers
 
     def ask_each(self, questions: Sequence[Any], doing: str) -> list[Any]:
-        """Return the answers to questions, each given to the next worker that is free.
-
-        It leaves at the first `WorkerException`, which is then the last of the answers.
-        """
+        """Send each question to the next free worker; return all answers, or only the first `WorkerException`."""
         waiting, asked = deque(enumerate(questions)), dict[int, int]()
         answers: dict[int, Any] = {}
         free = list(range(len(self._processes)))
@@ -151,20 +147,20 @@ class ProcessPool:
             process.close(max(0.0, deadline - time.monotonic()))
         self._processes = []
         self.waiting_for = set()
-        self._read_progress = bytes  # or it would hold its owner, and the memory that this maps
+        self._read_progress = bytes  # drops the reference to its owner, and so the owner's shared memory
         self._output.wait()
         self._printed.end()
 
 
 def _make_fault(worker: int, error: ChildEndedError, doing: str) -> WorkerFault:
-    hint = ": the system does that when memory runs out; fewer environments (--n-envs) need less"
+    hint = ": the system does this when memory runs out; fewer environments (--n-envs) need less memory"
     return WorkerFault(worker, f"worker {worker} {error} while {doing}{hint if 'SIGKILL' in str(error) else ''}")
 
 
 def answer_messages(
     connection: Connection, answer: Callable[[Any], Any], describe: Callable[[BaseException], WorkerException]
 ) -> None:
-    """In a worker: answer messages until the connection closes, with `describe`'s result where `answer` raises."""
+    """In a worker: answer messages until the connection closes; if `answer` raises, send the result of `describe`."""
     try:
         while True:
             try:
@@ -176,5 +172,5 @@ def answer_messages(
             except BaseException as error:
                 content = messages.encode(describe(error))
             connection.send_bytes(content)
-    except OSError:  # the main process needs no more answers, or an environment has closed the connection
+    except OSError:  # the main process, or an environment, has closed the connection
         sys.exit(1)

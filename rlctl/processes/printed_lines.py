@@ -1,4 +1,4 @@
-"""Lines that child processes and environments print: read, thinned out, and written where they can be seen."""
+"""Reads the lines that child processes and environments print, limits their rate, and writes them to stderr."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ MAX_LINES_PER_S = 100
 
 
 class LineReader:
-    """Hands each line that is written to `descriptor` to a function, in a thread of its own.
+    """Calls a function with each line that is written to `descriptor`, in a thread.
 
-    Close `descriptor` (`close_descriptor`) once the children that write to it have been started. A line of more than
-    `max_bytes` comes in parts.
+    Close `descriptor` (`close_descriptor`) once the children that write to it have been started. A line longer than
+    `max_bytes` is split.
     """
 
     def __init__(self, receive: Callable[[str], None], max_bytes: int = -1) -> None:
@@ -32,19 +32,19 @@ class LineReader:
                 self._receive(line.decode(errors="replace").rstrip("\r\n"))
 
     def close_descriptor(self) -> None:
-        """Close this process's end of the pipe: the thread ends with the last child that holds it."""
+        """Close this process's end of the pipe: the thread ends when the last child closes its own."""
         os.close(self.descriptor)
 
     def wait(self, timeout_s: float = 1.0) -> None:
-        """Wait until everything that was written has been read, if that is soon."""
+        """Wait until all written lines have been read, at most `timeout_s`."""
         self._thread.join(timeout=timeout_s)
 
 
 class LineFilter:
-    """Hands lines that environments print to `receive`, at a rate that can be read.
+    """Passes lines that environments print to `receive`, at most 100 per second.
 
-    A process that prints blocks while nobody reads, so lines that come too fast are counted and dropped, and if
-    `receive` raises `OSError`, as a closed stderr does, all that follow.
+    A printing process blocks while nobody reads, so lines above this rate are counted and dropped. All lines are
+    dropped after `receive` raises `OSError`, as a closed stderr does.
     """
 
     def __init__(self, receive: Callable[[str], None]) -> None:
@@ -58,11 +58,10 @@ class LineFilter:
         self._bullet_warnings: set[str] = set()
 
     def line(self, text: str) -> None:
-        """Take a line."""
-        # Many environments print the same line; once is enough.
+        """Pass on a line, unless it repeats the last one or lines come too fast."""
         if text == self._last or text.startswith("pybullet build time"):
             return
-        # PyBullet's warnings have two lines, the second of which says what is wrong.
+        # PyBullet's warnings have two lines; the second contains the reason.
         if text.startswith(("b3Warning[", "b3Error[")):
             self._bullet_head = text
             return
@@ -85,7 +84,7 @@ class LineFilter:
     def end(self) -> None:
         """Report how many lines were left out, if any."""
         if self._left_out:
-            self._report(f"({self._left_out:,} more lines of what environments print are left out)")
+            self._report(f"({self._left_out:,} more lines printed by environments are left out)")
         self._left_out = 0
 
     def _report(self, text: str) -> None:
@@ -97,12 +96,11 @@ class LineFilter:
 
 
 def replace_control_characters(text: str) -> str:
-    """Return a line without what would move a terminal's cursor, or worse."""
+    """Return a line without control characters, which could change a terminal's state."""
     return "".join(character if character.isprintable() or character == "\t" else "\ufffd" for character in text)
 
 
 def write_stderr(text: str) -> None:
-    """Write a line beside what environments print."""
-    # Not by print: an environment may have closed or replaced what that writes to.
+    """Write a line to stderr, even if an environment has closed or replaced `sys.stderr`."""
     with contextlib.suppress(OSError):
         os.write(2, f"{text}\n".encode(errors="replace"))

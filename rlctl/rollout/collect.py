@@ -1,4 +1,4 @@
-"""Playing a list of episodes, each whole inside a worker."""
+"""Plays a list of episodes, each completely inside one worker."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rlctl.rollout.workers import Workers
 from rlctl.run.episode import Trajectory
 
 _CONTACTS_MEASURED = 10
-"""Of recorded episodes, the first ones; it takes about 3 % of a step."""
+"""The first recorded episodes, in which contacts are measured; it takes about 3 % of a step."""
 MOST_STEPS = 100_000
-"""Of an episode whose environment has no time limit; it may never end."""
+"""Steps after which an episode without a time limit is an error: it may never end."""
 _SEGMENT = 1000
-"""Steps after which the main process takes what was recorded of a long episode."""
+"""Steps after which the main process copies the recorded part of a long episode."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,10 +42,9 @@ def play_episodes(
 ) -> list[Episode]:
     """Play an episode per seed with the workers' policy and return them in the order of `seeds`.
 
-    Each worker plays in its first environment. Which one plays which episode does not matter: an episode follows from
-    its seed and the policy alone. `watch` is called with the number of episodes done, several times a second; it may
-    raise to leave, and the workers have to be closed then. Raises `TaskError` where an environment fails, and for an
-    episode that does not end.
+    Each worker plays in its first environment. An episode depends on its seed and the policy only, not on the worker.
+    `watch` is called with the number of finished episodes, several times a second; if it raises, the caller must close
+    the workers. Raises `TaskError` if an environment fails, and for an episode that does not end.
     """
     steps = min(workers.info.max_steps or _SEGMENT, _SEGMENT)
     terms = record and bool(workers.info.reward_weights)  # a plain environment has no terms
@@ -97,14 +96,14 @@ def play_episodes(
 
 
 class _Recorder:
-    """Keeps what the segments of one episode have recorded."""
+    """Joins the recorded segments of one episode."""
 
     def __init__(self, index: int, record: bool) -> None:
         self.index = index
-        """Of the episode in the list."""
+        """Index of the episode in the list."""
         self._record = record
         self.steps = 0
-        """How many were added."""
+        """Number of recorded steps."""
         self._parts: list[Trajectory] = []
 
     def add(self, workers: Workers, env: int, steps: int) -> None:
@@ -120,12 +119,12 @@ class _Recorder:
             self._parts.append(Trajectory(actions, observations, rewards, terms))
 
     def failed_actions(self, workers: Workers, error: EpisodeFailed) -> NDArray[Any]:
-        """Return the actions up to that of the step that failed."""
+        """Return the actions up to and including the failed step."""
         last = workers.arrays.segment.action[error.env, : error.step - self.steps]
         return np.concatenate([*(part.actions for part in self._parts), last])
 
     def finish(self) -> Trajectory | None:
-        """Return the whole episode, if it was to be recorded."""
+        """Return the whole episode; None if it was not recorded."""
         if not self._record:
             return None
         parts = self._parts

@@ -1,17 +1,11 @@
-"""An environment that failed: what its worker reports, and the error that the main process makes of it."""
+"""Failures of environments: the report of a worker, and the error that the main process raises."""
 
 from __future__ import annotations
 
 import shlex
 
 from rlctl import errors
-from rlctl.errors import (
-    EpisodeFailed,
-    RlctlError,
-    TaskError,
-    describe_exception,
-    format_plugin_traceback,
-)
+from rlctl.errors import EpisodeFailed, RlctlError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.processes.pool import WorkerException
 from rlctl.rollout.returned_values import InvalidReturn
 
@@ -29,7 +23,7 @@ class FailedInEpisode(Exception):
 
 
 def describe_failure(error: BaseException) -> WorkerException:
-    """Return what was raised, and where, as plain data."""
+    """Return an exception, and where it was raised, as plain data."""
     where: tuple[int, int, int] | None = None
     if isinstance(error, FailedInEpisode):
         where, error = error.where, error.__cause__ or error
@@ -40,7 +34,7 @@ def describe_failure(error: BaseException) -> WorkerException:
 
 
 def make_error(failure: WorkerException, task: str) -> RlctlError:
-    """Return the error of a failure, which names the task, and the episode if it was raised in one."""
+    """Return the error to raise for a failure; it names the task, and the episode if there is one."""
     message, details = failure.message, failure.details
     kind = getattr(errors, failure.kind) if failure.kind else TaskError
     if kind is TaskError and task not in message.partition("\n")[0]:
@@ -48,12 +42,12 @@ def make_error(failure: WorkerException, task: str) -> RlctlError:
     if failure.where is not None:
         if kind is TaskError:
             return EpisodeFailed(message, *failure.where, hint=format_hint(task), details=details)
-        # Of the policy, or the server that it is on: check-env would not show it.
+        # The policy or its server failed: check-env would not show it.
         message += "\nin environment {}, episode seed {}, step {}".format(*failure.where)
     result: RlctlError = kind(message, details=details)
     return result
 
 
 def format_hint(task: str) -> str:
-    """Return what to type to look at an environment without a training."""
+    """Return the command that tests an environment without a training."""
     return f"to see it alone: rlctl check-env {shlex.quote(task)}"

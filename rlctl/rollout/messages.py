@@ -1,4 +1,4 @@
-"""What the main process asks of a worker, each request a named message, and what it answers."""
+"""Messages from the main process to a worker, and the worker's answer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rlctl.policy.players.player import Exploration
 
 @dataclasses.dataclass(frozen=True)
 class WorkerJob:
-    """What a worker is for: `count` of `total` environments, from number `first` on."""
+    """The environments of a worker: `count` of `total`, beginning with number `first`."""
 
     memory: int
     """Descriptor of the file of the shared arrays."""
@@ -36,7 +36,7 @@ class Build:
 
 @dataclasses.dataclass(frozen=True)
 class SetEvents:
-    """Let the events of another spec act, which differs in nothing else."""
+    """Replace the events by those of a spec that is equal otherwise."""
 
     spec: EnvSpec
     push: dict[str, Any] | None = None
@@ -45,24 +45,24 @@ class SetEvents:
 
 @dataclasses.dataclass(frozen=True)
 class Attach:
-    """Map the shared arrays, with room for segments of `steps` steps."""
+    """Map the shared arrays for segments of `steps` steps."""
 
     steps: int
 
 
 @dataclasses.dataclass(frozen=True)
 class BeginEpisodes:
-    """Begin episodes, and take the steps of some actions."""
+    """Begin episodes and replay actions in them."""
 
     episodes: dict[int, tuple[int, NDArray[Any]]]
     """Per environment the seed, and the actions so far, shape (steps, ...)."""
     may_fail: bool = False
-    """Whether an episode that fails is only reported, as one that ended."""
+    """Whether a failing episode is reported like one that ended, instead of raising."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LoadPolicy:
-    """Act with a policy from now on: one whose numbers are in shared memory, or another one by its name."""
+    """Set the policy: one whose parameters are in shared memory, or another one by its name."""
 
     info: PolicyInfo | None = None
     layout: list[tuple[str, tuple[int, ...], str]] = dataclasses.field(default_factory=list)
@@ -73,7 +73,7 @@ class LoadPolicy:
 
 @dataclasses.dataclass(frozen=True)
 class LimitActions:
-    """Send the actions of the policy that was loaded through a safety filter."""
+    """Pass the actions of the loaded policy through a safety filter."""
 
     limits: dict[str, Any]
     """A `deploy.Limits`."""
@@ -84,17 +84,17 @@ class Play:
     """Play a segment in some environments, one after the other."""
 
     steps: int
-    """Of each environment, at most."""
+    """At most so many steps in each environment."""
     begin: dict[int, int]
-    """Per environment the seed of the episode to begin with; negative: the running one goes on."""
+    """Per environment the seed of the episode to begin; negative: the running episode continues."""
     next_episodes: dict[int, int] = dataclasses.field(default_factory=dict)
-    """Per environment the number of the training episode that begins where one ends; empty: none begins."""
+    """Per environment the number of the training episode that follows when one ends; empty: none follows."""
     run_seed: int = 0
     exploration: Exploration = dataclasses.field(default_factory=Exploration)
     record: bool = False
     """Whether to write reward terms."""
     contacts: bool = False
-    """Whether to measure, after every step, how far bodies of a task overlap."""
+    """Whether to measure after every step how far bodies of a task overlap."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,24 +123,24 @@ class EpisodeResult:
     row: int = dataclasses.field(default=-1, compare=False)
     """The row of the segment in which it ended."""
     report: dict[str, Any] = dataclasses.field(default_factory=dict, compare=False)
-    """What the player has to say of it; see `acting.Player.report`."""
+    """The player's report of the episode; see `Player.report`."""
     deepest_contact: float | None = None
-    """How far two bodies overlapped at most [m]; None where it was not measured."""
+    """How far two bodies overlapped at most [m]; None if it was not measured."""
     acting: float = dataclasses.field(default=0.0, compare=False)
-    """The part of its time that the policy took, the environment the rest."""
+    """Fraction of the episode's time that the policy took; the environment took the rest."""
     metrics: dict[str, float] = dataclasses.field(default_factory=dict)
     """Mean per step of each reward term of weight 0, as the task returned it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """What a worker answers to a message; each fills in what is asked."""
+    """The answer of a worker; it contains only what the message asks for."""
 
     ended: list[EpisodeResult] = dataclasses.field(default_factory=list)
     """Episodes that ended while a segment was played."""
     left: list[int] = dataclasses.field(default_factory=list)
-    """Environments that are not in the episode that they were to begin: it ended, or failed, on the way."""
+    """Environments whose episode ended or failed while its actions were replayed."""
     info: EnvInfo | None = None
-    """What the environments are, where that has changed."""
+    """Description of the environments, if it has changed."""
     rewards: NDArray[np.float64] | None = None
     """Those of `ComputeRewards`, shape (n,)."""

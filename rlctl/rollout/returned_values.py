@@ -1,4 +1,4 @@
-"""What environments return, checked as it comes, so that what is wrong is named and not left to what breaks on it."""
+"""Checks the values that environments return, so that an error names the wrong value."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ class InvalidReturn(ValueError):
 
 
 def check_tuple(returned: Any, names: tuple[str, ...], call: str) -> Any:
-    """Return what a call gave back if it is a tuple with a value for each name."""
+    """Return the result of a call if it is a tuple with a value for each name, else raise `InvalidReturn`."""
     if isinstance(returned, tuple | list) and len(returned) == len(names):
         return returned
     what = format_count(len(returned), "value") if isinstance(returned, tuple | list) else reprlib.repr(returned)
-    raise InvalidReturn(f"{call} returned {what}, and not ({', '.join(names)}), as Gymnasium requires")
+    raise InvalidReturn(f"{call} returned {what}; Gymnasium requires ({', '.join(names)})")
 
 
 def to_float(value: Any, name: str) -> float:
-    """Return a reward, or what else must be a number, as a float."""
+    """Return a number as a float; raises `InvalidReturn`, which mentions `name`, for anything else."""
     try:
         if isinstance(value, str | bytes):
             raise TypeError
@@ -43,7 +43,7 @@ def to_float(value: Any, name: str) -> float:
 
 
 def to_bool(value: Any, name: str) -> bool:
-    """Return `terminated`, or what else must be a bool, as one; numpy's bools and numbers 0 and 1 are accepted."""
+    """Return a flag as a bool; numpy's bools and the numbers 0 and 1 are accepted, else raises `InvalidReturn`."""
     if np.size(value) == 1 and (single := np.ravel(value)[0]) in (0, 1):
         return bool(single)
     raise InvalidReturn(f"{name} is {reprlib.repr(value)}, not a bool")
@@ -56,10 +56,7 @@ def check_info(info: Any) -> None:
 
 
 class ObservationWriter:
-    """Writes observations of a space into arrays, with a part for each key, and checks them.
-
-    `checked`: the environment has done that itself.
-    """
+    """Checks observations and writes them into arrays, one per key; `checked`: the environment has checked them."""
 
     def __init__(self, space: spaces.Space[Any], *, checked: bool) -> None:
         self._checked = checked
@@ -85,7 +82,7 @@ class ObservationWriter:
             raise InvalidReturn(f"{_named(key)} has shape {value.shape}, the space has {shape}")
         if value.dtype is not dtype and value.dtype.kind not in "biuf":
             raise InvalidReturn(f"{_named(key)} is {reprlib.repr(value.tolist())}, not numbers")
-        # A sum is finite unless an element is not, or it overflows: the slow check decides.
+        # The sum is finite if all elements are, unless it overflows: then the slow check decides.
         if value.dtype.kind == "f" and not math.isfinite(np.add.reduce(value, None)):
             bad = np.flatnonzero(~np.isfinite(value))
             if bad.size:
@@ -100,7 +97,7 @@ def _named(key: str) -> str:
 
 
 def _category_bounds(space: spaces.Space[Any]) -> NDArray[Any] | None:
-    """Return the first and last value, shape (2, ...), of a space of categories: a network cannot take others."""
+    """Return the first and last value, shape (2, ...), of a space of categories; a network accepts no others."""
     if isinstance(space, spaces.Discrete):
         return np.array([space.start, space.start + space.n - 1])
     if isinstance(space, spaces.MultiDiscrete):

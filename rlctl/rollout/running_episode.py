@@ -1,4 +1,4 @@
-"""An environment in a worker, and the episode that it is in."""
+"""An environment in a worker, and its running episode."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rlctl.rollout.returned_values import InvalidReturn
 
 
 class RunningEpisode:
-    """One environment and the episode it is in; what it returns is checked, but for observations."""
+    """One environment and its episode; checks all returned values except observations."""
 
     def __init__(self, env: Any, index: int, metrics: Sequence[str] = ()) -> None:
         self.env = env
@@ -24,7 +24,7 @@ class RunningEpisode:
         self._metrics = metrics  # reward terms of weight 0
         self.seed = -1
         self.step = 0
-        """Steps that were begun in the episode."""
+        """Steps begun in the episode."""
         self.acting_s, self.stepping_s = 0.0, 0.0
         """Time that the policy and the environment took in the episode's steps [s]."""
         self._discrete = isinstance(env.action_space, spaces.Discrete)
@@ -44,11 +44,11 @@ class RunningEpisode:
         return observation
 
     def take_step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step the environment, and return what it returned."""
-        given = self.env.step(int(action) if self._discrete else action.copy())
-        if given.__class__ is not tuple or len(given) != 5:
-            given = returned_values.check_tuple(given, returned_values.STEP, "step")
-        observation, reward, terminated, truncated, info = given
+        """Step the environment; return its checked result."""
+        result = self.env.step(int(action) if self._discrete else action.copy())
+        if result.__class__ is not tuple or len(result) != 5:
+            result = returned_values.check_tuple(result, returned_values.STEP, "step")
+        observation, reward, terminated, truncated, info = result
         if reward.__class__ is not float:
             reward = returned_values.to_float(reward, "reward")
         if not math.isfinite(reward):
@@ -73,15 +73,15 @@ class RunningEpisode:
             self._raw_sums[name] += info["metrics"][name]
 
     def measure_contact(self) -> None:
-        """Remember how far bodies overlap now, if it is the most so far."""
+        """Update the largest overlap of bodies in this episode."""
         self._deepest_contact = max(self._deepest_contact or 0.0, self.env.unwrapped.sim.deepest_contact)
 
     def summarize(self, info: dict[str, Any], row: int, report: dict[str, Any]) -> EpisodeResult:
-        """Return how the episode ended, with the `info` of its last step, in a row of a segment."""
+        """Return the result of the episode from the `info` of its last step, which is in a row of a segment."""
         success = info.get("is_success")
-        metrics = info.get("metrics")  # of a plain environment it may be anything
+        metrics = info.get("metrics")  # may be anything in a plain environment
         distance = (metrics if isinstance(metrics, dict) else info).get("distance")
-        # A plain environment may mean something else by it.
+        # "distance" may be anything in a plain environment.
         if not isinstance(distance, int | float | np.number) or not math.isfinite(distance):
             distance = None
         terms = {

@@ -1,4 +1,4 @@
-"""Episode addresses: every episode's seed follows from (run seed, stream, environment, episode)."""
+"""Episode addresses: (run seed, stream, environment, episode) determines the seed of every episode."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Stream(enum.IntEnum):
 def episode_seed(run_seed: int, stream: Stream, env_index: int, episode: int) -> int:
     """Return the seed that an episode's address gives to `env.reset`, in [0, 2**31)."""
     sequence = np.random.SeedSequence(run_seed, spawn_key=(int(stream), env_index, episode))
-    # Some environments hand the seed to a 32-bit signed generator.
+    # Some environments pass the seed to a generator that takes signed 32-bit numbers.
     return int(sequence.generate_state(1)[0]) >> 1
 
 

@@ -1,4 +1,4 @@
-"""Arrays that the main process and its workers see at once, in one anonymous file."""
+"""Arrays that the main process shares with its workers, in one anonymous file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _leaf(space: spaces.Space[Any]) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def map_arrays(descriptor: int, layout: Layout) -> dict[str, NDArray[Any]]:
-    """Map named arrays over a file, which grows if it is too short; each begins at a cache line of its own."""
+    """Map named arrays to a file, which grows if needed; each array begins at its own cache line."""
     size = 0
     offsets = {}
     for name, (shape, dtype) in layout.items():
@@ -53,10 +53,9 @@ def map_arrays(descriptor: int, layout: Layout) -> dict[str, NDArray[Any]]:
 
 
 class SharedArrays:
-    """Per environment what it is in and observes, and `steps` rows for the segment it plays last.
+    """Per environment its episode, its observation, and `steps` rows of its last segment.
 
-    The file has no name, so nothing is left behind whatever kills the processes. Pages that nobody writes to take no
-    memory.
+    The file has no name, so nothing is left behind if the processes are killed. Unused pages take no memory.
     """
 
     def __init__(self, descriptor: int, info: EnvInfo, n_envs: int, steps: int) -> None:
@@ -72,7 +71,7 @@ class SharedArrays:
             "terms": ((len(info.reward_weights),), np.dtype(np.float64)),
             **{f"final/{key}": field for key, field in observation.items()},
         }
-        # What every environment has comes first, so that it stays where it is when segments get longer.
+        # Segments come last, so that the other arrays do not move when segments get longer.
         arrays = map_arrays(
             descriptor,
             {"inside": ((n_envs, 3), np.dtype(np.int64))}
@@ -81,10 +80,10 @@ class SharedArrays:
             | {f"segment/observation/{k}": ((n_envs, steps + 1, *shape), d) for k, (shape, d) in observation.items()},
         )
         self.inside = arrays["inside"]
-        """Episode seed, step and row of the segment of the call an environment is in, shape (n_envs, 3): to name it
-        when its worker dies or hangs. Step 0 is the reset; a negative step: in no call."""
+        """Episode seed, step and row of the segment of an environment's present call, shape (n_envs, 3): names the
+        episode if its worker dies or hangs. Step 0 is the reset; a negative step: no call."""
         self.observation = {key: arrays[f"observation/{key}"] for key in observation}
-        """What the next action is chosen from."""
+        """The present observations, by key."""
         self.segment = SegmentArrays(
             {key: arrays[f"segment/observation/{key}"] for key in observation},
             {key: arrays[f"segment/final/{key}"] for key in observation},
@@ -95,23 +94,23 @@ class SharedArrays:
 
 @dataclasses.dataclass(frozen=True)
 class SegmentArrays:
-    """What was played last: arrays of shape (n_envs, steps, ...)."""
+    """The last segment: arrays of shape (n_envs, steps, ...)."""
 
     observation: dict[str, NDArray[Any]]
-    """What each action was chosen from, and what followed the last; shape (n_envs, steps + 1, ...)."""
+    """The observation before each action, and the one after the last; shape (n_envs, steps + 1, ...)."""
     final: dict[str, NDArray[Any]]
-    """What an episode ended with, in the row of its last step."""
+    """The last observation of an episode, in the row of its last step."""
     stored: NDArray[Any]
-    """Actions as the policy chose them: not clipped, or scaled to [-1, 1]; shape (n_envs, steps, elements)."""
+    """Actions of the policy before clipping, or scaled to [-1, 1]; shape (n_envs, steps, elements)."""
     action: NDArray[Any]
-    """Actions as the environments took them."""
+    """Actions that the environments received."""
     reward: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     terms: NDArray[np.float64]
-    """Raw reward terms, shape (n_envs, steps, terms), where they were to be recorded."""
+    """Raw reward terms, shape (n_envs, steps, terms), if they are recorded."""
     ended: Sequence[EpisodeResult] = ()
-    """The episodes that ended, of `first`."""
+    """The episodes that ended; only in the result of `first`."""
 
     @property
     def done(self) -> NDArray[np.bool_]:
@@ -119,11 +118,11 @@ class SegmentArrays:
         return self.terminated | self.truncated
 
     def first(self, steps: int, ended: Sequence[EpisodeResult]) -> SegmentArrays:
-        """Return the first steps, in which some episodes ended; the arrays are the same memory."""
+        """Return the first steps, with the episodes that `ended` in them; the arrays share memory."""
         return self._select(np.s_[:, :steps], np.s_[:, : steps + 1], ended)
 
     def of(self, env: int) -> SegmentArrays:
-        """Return those of one environment: shape (steps, ...), in the same memory."""
+        """Return the segment of one environment: arrays of shape (steps, ...) that share memory."""
         return self._select(env, env, ())
 
     def _select(self, index: Any, observed: Any, ended: Sequence[EpisodeResult]) -> SegmentArrays:
@@ -136,7 +135,7 @@ class SegmentArrays:
 
 
 class PolicyNumbers:
-    """The numbers of the policy that workers have loaded."""
+    """The parameters of the policy that workers have loaded, in shared memory."""
 
     def __init__(self, descriptor: int, n_envs: int) -> None:
         self._descriptor = descriptor
@@ -150,13 +149,13 @@ class PolicyNumbers:
         return self._arrays.get("state")
 
     def forget(self) -> None:
-        """The workers do not act with them any more."""
+        """Note that the workers use another policy."""
         self._arrays, self._structure = {}, ()
 
     def write(self, policy: PolicyFile) -> list[tuple[str, tuple[int, ...], str]]:
-        """Write a policy's numbers; return name, shape and dtype of each if workers have to load it, else nothing.
+        """Write a policy's parameters; return name, shape and dtype of each if workers must load it, else nothing.
 
-        They do not for other numbers of the same policy; the state stays as it is then.
+        They need not load new parameters of the same policy; its recurrent state is then kept.
         """
         info, numbers = policy.info, dict(policy.actor_only().tensors)
         if (hidden := numbers.get("policy/lstm_actor.weight_hh_l0")) is not None:

@@ -1,7 +1,7 @@
-"""A worker: a process with a few environments, and a policy that plays them; imports no torch.
+"""A worker: a process with a few environments and a policy; imports no torch.
 
-The main process sends a message (`messages.py`); the worker answers once. Observations, actions, rewards, flags and a
-policy's numbers are in shared memory.
+The worker answers each message (`messages.py`) of the main process once. Observations, actions, rewards, flags and the
+policy's parameters are in shared memory.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from rlctl.task.events import Event, EventSettings, push
 
 
 class Worker:
-    """A few environments and what plays them; `Build` comes before all other messages."""
+    """A few environments and the policy that plays them; the first message must be `Build`."""
 
     def __init__(self, job: messages.WorkerJob) -> None:
         self._job = job
@@ -53,7 +53,7 @@ class Worker:
         self._writer: ObservationWriter
 
     def answer(self, message: Message) -> Answer:
-        """Do what is asked."""
+        """Execute a message and return the answer."""
         match message:
             case messages.Play():
                 return Answer(ended=self._play(message))
@@ -85,13 +85,13 @@ class Worker:
         metrics = [name for name, weight in self._info.reward_weights.items() if weight == 0]
         self._episodes = [RunningEpisode(env, self._job.first + index, metrics) for index, env in enumerate(envs)]
         space = envs[0].observation_space
-        # A task's environment has checked its observation itself.
+        # A task's environment checks its observations itself.
         checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
         self._writer = ObservationWriter(space, checked=checked)
-        gc.freeze()  # what is there now stays; collections need not look at it again
+        gc.freeze()  # present objects live long: later collections skip them
 
     def _set_events(self, message: messages.SetEvents) -> None:
-        """Let other events act in all environments; none of them is in an episode then."""
+        """Replace the events of all environments; a new episode must begin afterwards."""
         spec, added = message.spec, {}
         if message.push is not None:
             added["push at mid-episode"] = Event("interval", push, enabled=True, **message.push)
@@ -104,7 +104,7 @@ class Worker:
         self._info = describe(self._episodes[0].env)
 
     def _load_policy(self, message: messages.LoadPolicy) -> None:
-        """Act with another policy from now on."""
+        """Replace the policy."""
         self._states = None
         self._close_player()
         if message.info is None:
@@ -117,7 +117,7 @@ class Worker:
             self._player = PolicyPlayer(PolicyFile(message.info, tensors))
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
-        """Let the policy act within limits from now on."""
+        """Pass the policy's actions through a safety filter."""
         from rlctl.deploy.filter.limited_player import LimitedPlayer  # few evaluations need it
         from rlctl.deploy.filter.limits import Limits
 
@@ -129,30 +129,30 @@ class Worker:
         return self._player
 
     def _begin_episodes(self, message: messages.BeginEpisodes) -> list[int]:
-        """Begin episodes and take the steps that led to where they were; return the environments that left them."""
+        """Begin episodes and replay their actions; return the environments whose episode ended or failed."""
         left = []
         for env, (seed, actions) in message.episodes.items():
             episode = self._episodes[env - self._job.first]
             try:
                 with self._within(episode):
                     self._begin(episode, seed)
-                    if self._repeat(episode, actions):
+                    if self._replay(episode, actions):
                         left.append(env)
             except FailedInEpisode as failure:
                 if not message.may_fail:
                     raise
-                # It did not fail the first time, so its state differs now: it may begin its next episode.
+                # The episode did not fail before, so its state differs now: the environment begins its next episode.
                 left.append(env)
                 write_stderr(f"{failure} when it was replayed")
         return left
 
     def _begin(self, episode: RunningEpisode, seed: int) -> None:
-        """Begin an episode; its first observation is the present one."""
+        """Begin an episode and write its first observation."""
         self._arrays.inside[episode.index] = seed, 0, -1
         self._writer.write(self._arrays.observation, episode.index, episode.start(seed))
 
-    def _repeat(self, episode: RunningEpisode, actions: NDArray[np.generic]) -> bool:
-        """Take steps with given actions; return whether the episode ended by them."""
+    def _replay(self, episode: RunningEpisode, actions: NDArray[np.generic]) -> bool:
+        """Take steps with recorded actions; return whether the episode ended."""
         for action in actions:
             episode.step += 1
             self._arrays.inside[episode.index, 1] = episode.step
@@ -181,7 +181,7 @@ class Worker:
     def _play_one(
         self, episode: RunningEpisode, asked: messages.Play, next_seeds: Iterator[int] | None
     ) -> list[EpisodeResult]:
-        """Play a segment of one environment; without `next_seeds` no episode begins where one ends."""
+        """Play a segment of one environment; without `next_seeds` it stops when an episode ends."""
         arrays, index, player, write = self._arrays, episode.index, self._loaded_player, self._writer.write
         segment, inside = arrays.segment.of(index), arrays.inside[index]
         now = segment.observation
@@ -245,7 +245,7 @@ class Worker:
         self._player = None
 
     def close(self) -> None:
-        """Close the environments, and what plays them."""
+        """Close the environments and the policy."""
         self._close_player()
         for episode in self._episodes:
             try:
@@ -256,7 +256,7 @@ class Worker:
 
 
 def _training_seeds(run_seed: int, env: int, episode: int) -> Iterator[int]:
-    """Yield the seeds of an environment's training episodes, from a number on."""
+    """Yield the seeds of an environment's training episodes, beginning with a number."""
     for number in itertools.count(episode):
         yield episode_seed(run_seed, Stream.TRAIN, env, number)
 

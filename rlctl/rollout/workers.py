@@ -1,7 +1,7 @@
-"""Many environments on few processes: W workers, each with K environments that it plays one after the other.
+"""Many environments on few processes: each worker plays several environments, one after the other.
 
-Observations, actions, rewards, flags and a policy's numbers are in shared memory; messages say what to do, and answers
-which episodes ended. Workers are fresh interpreters, never forks, with one thread each.
+Observations, actions, rewards, flags and a policy's parameters are in shared memory; messages tell workers what to do,
+and answers list the episodes that ended. Workers are new interpreters, never forks, with one thread each.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ RecordedActions = tuple[int, NDArray[Any]]
 class Workers:
     """`n_envs` environments of one kind on `n_workers` processes (default: the cores).
 
-    Building starts at once and is waited for by the first use, so that a caller can do its own slow imports
-    meanwhile. Errors in an environment raise `TaskError` with the episode's seed and step; a worker that dies or
-    does not answer within `timeout_s` does too. After an error the workers are gone. What environments print goes to
-    `on_output`, line by line, from a thread; without it to stderr.
+    Building starts at once and the first use waits for it, so that a caller can do its own slow imports in the
+    meantime. An error in an environment raises `TaskError` with the episode's seed and step, and so does a worker that
+    dies or does not answer within `timeout_s`. After an error the workers are closed. Lines printed by environments go
+    to `on_output`, from a thread, or else to stderr.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Workers:
         self.n_envs = n_envs
         self.timeout_s = timeout_s
         self.spec = spec
-        """What the environments are made from."""
+        """Spec of the environments."""
         n_workers = min(n_envs, n_workers or available_cores())
         bounds = np.linspace(0, n_envs, n_workers + 1).round().astype(int).tolist()
         self._ranges = list(itertools.pairwise(bounds))
@@ -80,7 +80,7 @@ class Workers:
 
     @property
     def info(self) -> EnvInfo:
-        """What the environments are; waits until they are built."""
+        """Description of the environments; waits until they are built."""
         self._wait_until_built()
         return self._info
 
@@ -106,9 +106,9 @@ class Workers:
         return result
 
     def rebuild(self, spec: EnvSpec) -> EnvInfo:
-        """Close the environments and build those of another spec in their place; return what they are.
+        """Replace the environments by those of another spec; return their description.
 
-        None of them is in an episode then: call `reset`. `arrays` are new ones.
+        Call `reset` afterwards. `arrays` is replaced too.
         """
         self._wait_until_built()
         self.spec = spec
@@ -135,10 +135,10 @@ class Workers:
         self._ask_all(messages.Attach(steps), "attaching")
 
     def set_events(self, spec: EnvSpec, push: Mapping[str, Any] | None = None) -> EnvInfo:
-        """Let the events of `spec` act, which differs from the present one in nothing else; return what they are now.
+        """Replace the events by those of `spec`, which is equal otherwise; return the new description.
 
-        Worlds, policy and arrays stay. `push` are the parameters, and `every_s`, of a push that the task does not have.
-        None of the environments is in an episode then.
+        Worlds, policy and arrays do not change. `push` has the parameters, and `every_s`, of a push to add to the
+        task's events. Call `reset` afterwards.
         """
         self._wait_until_built()
         self.spec = spec
@@ -153,10 +153,10 @@ class Workers:
     def replay_actions(
         self, episodes: Mapping[int, RecordedActions], *, doing: str = "stepping", may_fail: bool = False
     ) -> set[int]:
-        """Begin episodes, environment index -> (seed, actions so far), and take those steps.
+        """Begin episodes, environment index -> (seed, actions so far), and replay their actions.
 
-        Return the environments whose episode ended on the way: they are not where they were. With `may_fail` also those
-        in which it failed, which is an error otherwise. `doing` is what an error says of it.
+        Return the environments whose episode ended during the replay; with `may_fail` also those whose episode failed,
+        which raises otherwise. Errors mention `doing`.
         """
         dtype = self.arrays.segment.action.dtype
         for worker, envs in self._by_worker(episodes).items():
@@ -165,19 +165,19 @@ class Workers:
         return {env for answer in self._wait(doing).values() for env in answer.left}
 
     def set_policy(self, policy: PolicyFile) -> None:
-        """Act with the present numbers of a policy from the next segment on."""
+        """Act with the present parameters of a policy, beginning with the next segment."""
         self._wait_until_built()
         if layout := self._numbers.write(policy):
             self._ask_all(messages.LoadPolicy(policy.info, layout), "loading the policy")
 
     def set_other_policy(self, name: str) -> None:
-        """Act with an exported file, by its whole path, or a baseline: `zero`, `random`, `file.py:function`."""
+        """Act with an exported file, by its absolute path, or a baseline: `zero`, `random`, `file.py:function`."""
         self._wait_until_built()
         self._numbers.forget()
         self._ask_all(messages.LoadPolicy(other=name), "loading the policy")
 
     def limit_actions(self, limits: Mapping[str, Any]) -> None:
-        """Send the policy's actions through a safety filter, until another policy is set; `limits` are a `Limits`."""
+        """Pass the policy's actions through a safety filter until another policy is set; `limits` as in `Limits`."""
         self._ask_all(messages.LimitActions(dict(limits)), "applying limits")
 
     @property
@@ -186,10 +186,10 @@ class Workers:
         return self._numbers.state
 
     def start_playing(self, play: messages.Play) -> None:
-        """Begin to play a segment, into rows of `arrays.segment`, which are other arrays if it is a longer one.
+        """Begin to play a segment into `arrays.segment`; a longer segment than before replaces these arrays.
 
-        Where an episode ends the next one begins, by its address in the training of `play.run_seed`; without
-        `play.next_episodes` none does, and the environment stops there.
+        When an episode ends, the next one of the training with `play.run_seed` begins; without `play.next_episodes` the
+        environment stops.
         """
         self._wait_until_built()
         if self._steps < play.steps:
@@ -198,26 +198,26 @@ class Workers:
             self._send(worker, dataclasses.replace(play, begin={env: play.begin[env] for env in envs}))
 
     def finish_playing(self, *, first: bool = False, check: Callable[[], None] | None = None) -> list[EpisodeResult]:
-        """Wait for all workers that play, or for the `first`; return the episodes that ended, by environment and row.
+        """Wait for all playing workers, or for the `first`; return the episodes that ended, by environment and row.
 
-        `check` is called several times a second, and may raise to leave.
+        `check` is called several times a second; an exception from it ends the wait.
         """
         answers = self._wait("stepping", first=first, check=check)
-        # In the order of the environments: what follows from them must repeat.
+        # In the order of the environments, so that results are reproducible.
         return [result for _, answer in sorted(answers.items()) for result in answer.ended]
 
     def compute_rewards(self, achieved: NDArray[Any], desired: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the rewards that environment 0 computes for steps that reached one goal and were to reach another.
+        """Return the rewards that environment 0 computes for achieved and desired goals.
 
-        Goals of shape (n, *goal), rewards (n,). Raises `TaskError`, which names compute_reward, if it raises, hangs, or
-        does not return n finite numbers.
+        Goals of shape (n, *goal), rewards (n,). Raises `TaskError`, which names compute_reward, if that method raises,
+        hangs, or does not return n finite numbers.
         """
         self._wait_until_built()
-        # In rows, so that an environment which adds them up rounds as it does in its own process.
+        # Contiguous rows, so that sums in the environment round as in its own process.
         goals = np.ascontiguousarray(achieved), np.ascontiguousarray(desired)
         self._send(0, messages.ComputeRewards(*goals))
         rewards = self._wait("in compute_reward")[0].rewards
-        assert rewards is not None  # it is what was asked for
+        assert rewards is not None  # the answer to ComputeRewards has them
         return rewards
 
     def _by_worker(self, envs: Iterable[int]) -> dict[int, list[int]]:
@@ -284,12 +284,12 @@ class Workers:
 
 def _info_of(answers: Mapping[int, Answer]) -> EnvInfo:
     info = answers[0].info
-    assert info is not None  # it is what was asked for
+    assert info is not None  # the answer to Build and SetEvents has it
     return info
 
 
 def available_cores() -> int:
-    """Return how many cores this process may use; a cluster gives a run so many by the variable `RLCTL_CORES`."""
+    """Return how many cores this process may use; on a cluster the variable `RLCTL_CORES` limits them."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     share = os.environ.get("RLCTL_CORES", "")
     return min(cores, max(1, int(share))) if share.isdecimal() else cores

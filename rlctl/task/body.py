@@ -19,7 +19,7 @@ Vector = tuple[float, float, float]
 
 
 class MassState(NamedTuple):
-    """The centre of mass of a link, world frame. Plain floats, which are faster than arrays where one is read."""
+    """Pose and velocity of a link's centre of mass, world frame. Plain floats: faster than arrays for single values."""
 
     position: Vector
     """[m]"""
@@ -37,7 +37,7 @@ class MassState(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Points where a body touches another: one element each, none where they are apart."""
+    """Points where a body touches another: one element per point."""
 
     links: list[str]
     """The body's own link, or its base."""
@@ -75,7 +75,7 @@ class Body(Motors):
         self.joint_names = [info[1].decode() for info in movable]
         self.joint_indices = [int(info[0]) for info in movable]
         limits = np.array([info[8:10] for info in movable]).reshape(-1, 2)
-        # Of a joint without limits PyBullet's lower one is above the upper.
+        # PyBullet gives a joint without limits a lower limit above the upper one.
         self.joint_low, self.joint_high = np.where(limits[:, :1] > limits[:, 1:], (-np.inf, np.inf), limits).T
         """Joint limits [rad or m], infinite where the model file has none; each of shape (joints,)."""
         self.joint_max_force: Array = np.array([info[10] for info in movable])
@@ -92,7 +92,7 @@ class Body(Motors):
         # Positions, velocities, and motor torques in a tuple: few tasks need them as an array.
         state = self._cache.get("joints")
         if state is None:
-            # None where a body has no joints.
+            # None for a body without joints.
             raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self.client) or ()
             positions, velocities, _, torques = zip(*raw, strict=True) if raw else ((), (), (), ())
             state = self._cache["joints"] = (np.array(positions), np.array(velocities), torques)
@@ -124,7 +124,7 @@ class Body(Motors):
         return torques
 
     def add_force_sensor(self, joint: str) -> None:
-        """Measure what a joint, which may be a fixed one, carries: read it with `joint_reaction`. For `build`."""
+        """Measure the load of a joint, which may be fixed; `joint_reaction` reads it. Call it in `build`."""
         pybullet.enableJointForceTorqueSensor(self.id, self._joint_number(joint), True, physicsClientId=self.client)
         self._force_sensors.add(joint)
 
@@ -132,7 +132,7 @@ class Body(Motors):
         """Return the force [N] and torque [N m] that a joint carried in the last physics step, shape (6,).
 
         It acts on the link that the joint moves, in the axes of that link's inertial frame and about its centre of
-        mass, without the torque of the joint's own motor. A load that hangs from the joint is pulled up.
+        mass, without the torque of the joint's own motor. If a load hangs from the joint, the force points up.
         """
         if joint not in self._force_sensors:
             raise TaskError(f"joint {joint!r} has no force sensor: call add_force_sensor({joint!r}) in build")
@@ -148,8 +148,8 @@ class Body(Motors):
     ) -> Array:
         """Return joint positions [rad or m], shape (joints,), that bring a link's frame to a world pose.
 
-        `position` [m], `orientation` a quaternion (x, y, z, w), any if not given. The search starts at the present
-        joint positions and stops within 0.1 mm or after 100 iterations, also where the pose cannot be reached.
+        `position` [m]; `orientation` is a quaternion (x, y, z, w), by default any. The search starts at the present
+        joint positions and stops within 0.1 mm or after 100 iterations, even if the pose is out of reach.
         """
         pose = [position] if orientation is None else [position, orientation]
         solution = pybullet.calculateInverseKinematics(
@@ -172,7 +172,7 @@ class Body(Motors):
 
     def link_position(self, link: str) -> Array:
         """Position of the link frame [m], world frame, shape (3,)."""
-        position: Array | None = self._cache.get(("position", link))  # a link may be called "base" or "joints"
+        position: Array | None = self._cache.get(("position", link))  # a pair: a link may be called "base" or "joints"
         if position is None:
             # Items 4 and 5 are the link frame; 0 and 1 are the centre of mass.
             position = self._cache["position", link] = np.array(self._read_link(link)[4])
@@ -206,22 +206,19 @@ class Body(Motors):
         return MassState(*pose, *pybullet.getBaseVelocity(self.id, physicsClientId=self.client))
 
     def mass_positions(self, links: Sequence[str]) -> list[Vector]:
-        """Return the positions of the centres of mass of links [m], world frame, as `mass_state` has them.
-
-        They are read at every call.
-        """
+        """Return the positions of the centres of mass of links [m], world frame, as in `mass_state`; not cached."""
         numbers = [self._links[link] if link in self._links else self._link_index(link) for link in links]
         states = pybullet.getLinkStates(self.id, numbers, physicsClientId=self.client) or ()
         return [state[0] for state in states]
 
     def links_touching(self, other: Body) -> set[str]:
-        """Return the links, or the base, in contact with `other`, which may be the body itself, at the last step."""
+        """Return the links, or the base, that touched `other` in the last step; `other` may be the body itself."""
         points = self._contact_points()
-        # A point has this body first; where it touches itself, it is there once for both links.
+        # Each point lists this body first; a contact of the body with itself is listed once for both links.
         numbers = {point[3] for point in points if point[2] == other.id}
         if other is self:
             numbers |= {point[4] for point in points if point[2] == self.id}
-        return {self._all_names[number] for number in numbers}  # -1, the base, is the last
+        return {self._all_names[number] for number in numbers}  # the base, -1, is the last name
 
     def contacts_with(self, other: Body) -> Contacts:
         """Return the points where this body touches `other`, at the last physics step."""
@@ -276,15 +273,10 @@ class Body(Motors):
         self._cache.clear()
 
     def set_joints(self, positions: Array, velocities: Array | None = None) -> None:
-        """Place the joints: `positions` and `velocities` of shape (joints,), at rest without the latter."""
+        """Place the joints: `positions` and `velocities` of shape (joints,); without velocities they are at rest."""
         count = len(self.joint_indices)
-        at = self._read_values("positions", positions, count)
-        moving = [0.0] * count if velocities is None else self._read_values("velocities", velocities, count)
-        pybullet.resetJointStatesMultiDof(
-            self.id,
-            self.joint_indices,
-            [[each] for each in at],
-            [[each] for each in moving],
-            physicsClientId=self.client,
-        )
+        angles = self._read_values("positions", positions, count)
+        speeds = [0.0] * count if velocities is None else self._read_values("velocities", velocities, count)
+        states = [[angle] for angle in angles], [[speed] for speed in speeds]
+        pybullet.resetJointStatesMultiDof(self.id, self.joint_indices, *states, physicsClientId=self.client)
         self._cache.clear()

@@ -1,4 +1,4 @@
-"""Imports PyBullet where a world is built, and reads what it prints of an error."""
+"""Imports PyBullet on first use, and reads the errors that it prints."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class _LazyModule:
         self._name = name
 
     def __getattr__(self, attribute: str) -> Any:
-        if attribute.startswith("__"):  # inspection is no use
+        if attribute.startswith("__"):  # inspection does not import the module
             raise AttributeError(attribute)
         module = _import_silently(self._name)
         self.__dict__ = vars(module)
@@ -57,7 +57,7 @@ pybullet_data: Any = _LazyModule("pybullet_data")
 
 
 def read_complaint(call: Callable[[], object]) -> str:
-    """Call what failed once more, and return the reason: PyBullet prints it to stdout, its exception leaves it out."""
+    """Repeat a failed call and return the reason, which PyBullet prints to stdout and leaves out of its exception."""
     flush, stdout = ctypes.CDLL(None).fflush, os.dup(1)  # C has a buffer of its own
     with tempfile.TemporaryFile() as file:
         flush(None)
@@ -78,7 +78,7 @@ def check_display() -> None:
     """Raise `UsageError` where PyBullet's window cannot open: PyBullet itself would end the process."""
     if sys.platform != "linux":
         return
-    display, instead = os.environ.get("DISPLAY"), "leave out --gui (in Python: render_mode) to do without"
+    display, instead = os.environ.get("DISPLAY"), "leave out --gui (in Python: render_mode)"
     if not display:
         raise UsageError(f"PyBullet's window needs a display, and DISPLAY is not set; {instead}")
     if not _x_server_answers():

@@ -13,7 +13,7 @@ from rlctl.task.body import Array, Body
 from rlctl.task.bullet import pybullet
 
 Point = Sequence[float]
-_APART = 0.01  # [m]; what is further apart jumps, and takes the world with it
+_APART = 0.01  # [m]; frames farther apart would jump together and make the world unstable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Attachment:
 
     @property
     def inertial_pose(self) -> tuple[Point, Point]:
-        """The frame as PyBullet's constraints want it: relative to the link's centre of mass."""
+        """The frame relative to the link's centre of mass, as PyBullet's constraints need it."""
         if self.index < 0:
             return self.position, self.orientation
         info = pybullet.getDynamicsInfo(self.body.id, self.index, physicsClientId=self.body.client)
@@ -72,11 +72,11 @@ class Joined:
 
 
 class Constraints:
-    """The part of `Sim` that ties links to each other. For `build`: constraints last as long as the world.
+    """The part of `Sim` that connects links. Call it in `build`: constraints last as long as the world.
 
-    `max_force` [N], of gears [N m], is what a constraint gives at most; what pulls harder takes it apart.
-    Under a load it gives way a little: a free body of any mass hangs by its point 1.2 mm low with steps of 1/240 s, and
-    that falls with the square of the step.
+    `max_force` [N], of gears [N m], is the largest force of a constraint; a stronger load pulls the frames apart.
+    A constraint yields slightly: a free body of any mass hangs 1.2 mm too low with physics steps of 1/240 s; the error
+    falls with the square of the step.
     """
 
     client: int
@@ -84,30 +84,25 @@ class Constraints:
     def connect_gear(
         self, body: Body, driver: str, driven: str, *, ratio: float, max_force: float = 1e4, stiffness: float = 0.1
     ) -> None:
-        """Gear two joints of a body: `driven` turns by `ratio` times what `driver` turns by, both counted from 0.
+        """Gear two joints of a body: the position of `driven` is `ratio` times that of `driver`.
 
-        `stiffness` is the part of an error that a physics step takes away, in (0, 1].
+        `stiffness` is the part of an error that a physics step removes, in (0, 1].
         """
         if ratio == 0:
-            raise TaskError(f"gear of {driver!r} and {driven!r}: a ratio of 0 is no gear; fix the joint in the model")
+            raise TaskError(
+                f"gear of {driver!r} and {driven!r}: the ratio must not be 0; to fix a joint, change the model"
+            )
         _ = body.find_joints([driver, driven])  # raises for one that does not move
         indices = [body.all_joint_names.index(joint) for joint in (driven, driver)]
-        made = pybullet.createConstraint(
-            body.id,
-            indices[0],
-            body.id,
-            indices[1],
-            pybullet.JOINT_GEAR,
-            (0, 0, 1),
-            (0, 0, 0),
-            (0, 0, 0),
-            physicsClientId=self.client,
+        links, axis = (body.id, indices[0], body.id, indices[1]), (0, 0, 1)
+        constraint = pybullet.createConstraint(
+            *links, pybullet.JOINT_GEAR, axis, (0, 0, 0), (0, 0, 0), physicsClientId=self.client
         )
         # PyBullet keeps driven + gearRatio * driver at 0.
-        self._change_constraint(made, max_force, gearRatio=-ratio, erp=stiffness)
+        self._change_constraint(constraint, max_force, gearRatio=-ratio, erp=stiffness)
 
     def connect_point(self, first: Attachment, second: Attachment, *, max_force: float = 1e4) -> Joined:
-        """Hold a point of a link on a point of another, free to turn: closes a linkage that a URDF, a tree, cannot."""
+        """Hold a point of a link on a point of another, free to rotate: closes a loop, which a URDF cannot contain."""
         return self._connect(pybullet.JOINT_POINT2POINT, first, second, max_force)
 
     def connect_fixed(self, first: Attachment, second: Attachment, *, max_force: float = 1e4) -> Joined:
@@ -122,15 +117,13 @@ class Constraints:
         if joined.gap > _APART:
             raise TaskError(
                 f"constraint: {first.link!r} of {first.body.name!r} and {second.link!r} of {second.body.name!r} are "
-                f"{joined.gap:.3g} m apart where they should be held together. Place them with set_joints first."
+                f"{joined.gap:.3g} m apart, too far to connect them. Place them with set_joints first."
             )
         position, orientation = first.inertial_pose
         other_position, other_orientation = second.inertial_pose
-        made = pybullet.createConstraint(
-            first.body.id,
-            first.index,
-            second.body.id,
-            second.index,
+        links = first.body.id, first.index, second.body.id, second.index
+        constraint = pybullet.createConstraint(
+            *links,
             kind,
             (0, 0, 0),
             position,
@@ -139,7 +132,7 @@ class Constraints:
             childFrameOrientation=other_orientation,
             physicsClientId=self.client,
         )
-        self._change_constraint(made, max_force)
+        self._change_constraint(constraint, max_force)
         return joined
 
     def _change_constraint(self, constraint: int, max_force: float, **values: Any) -> None:

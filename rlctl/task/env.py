@@ -54,7 +54,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.events = (events or EventSettings()).apply(task.events)
         self.has_success = type(task).is_success is not Task.is_success
         if type(task).compute_reward is not Task.compute_reward:
-            # Only then: whatever relabels goals looks whether an environment has it.
+            # Only then: code that relabels goals checks whether an environment has this method.
             self.compute_reward = task.compute_reward
         self.max_steps = task.max_steps
         # A space holds a random generator: one on the class would be shared by every instance.
@@ -77,7 +77,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             self._signals = Signals(self.events, first, self.action_space, task.observation_bounds)
             self._signals.try_once()
             _check_joints(task)
-            # A task knows its markers once an episode has begun; they join the world as it was built.
+            # A task knows its markers after a reset; they are added to the world as it was built.
             markers = list(task.markers()) if render_mode is not None else []
             if self.events or render_mode is not None:
                 self.sim.restore()
@@ -96,9 +96,9 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.level = float(level)
 
     def set_events(self, events: EventSettings, added: Mapping[str, Event] | None = None) -> None:
-        """Let other events act: those of `events`, and `added` ones; the running episode is over, so call `reset`.
+        """Replace the events that act by those of `events` and the `added` ones; call `reset` afterwards.
 
-        The world stays. Raises `RecipeError` as building the environment does.
+        The world is not built again. Raises `RecipeError` for invalid events.
         """
         self.events = events.apply({**self.task.events, **(added or {})})
         self._acting = ActingEvents(self.events, self.task.control_dt)
@@ -119,7 +119,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What Gymnasium and other libraries read the id and the time limit off; None unless `make` has set it."""
+        """Gymnasium's spec, from which libraries read the id and the time limit; None unless `make` has set it."""
         return self._spec
 
     @spec.setter
@@ -222,7 +222,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         return self._format.assemble(self._signals.observe(self.task.observe()), self._step)
 
     def move_markers(self) -> None:
-        """Put the markers, which an environment that renders has in its world, where the task has them now."""
+        """Move the markers in the world of an environment that renders to the task's present positions."""
         positions = self.task.markers()
         for name, marker in self._markers.items():
             self.sim.move_marker(marker, positions[name])
@@ -244,9 +244,9 @@ def _make_world(task: Task, sim: str, render_mode: str | None) -> Sim:
         iterations, gui = task.solver_iterations, render_mode == "human"
         return Sim(control_dt=task.control_dt, substeps=task.substeps, solver_iterations=iterations, gui=gui)
     if render_mode is not None:
-        raise UsageError("--sim mujoco: no pictures and no window; a recording shows it in 3-D")
+        raise UsageError("--sim mujoco has no pictures and no window; a recording shows the episode in 3-D")
     world: Any = MujocoSim(control_dt=task.control_dt, substeps=task.substeps, solref=solref)
-    return world  # type: ignore[no-any-return]  # has the methods of Sim, or says which it has not
+    return world  # type: ignore[no-any-return]  # has the methods of Sim; UsageError for those without an equivalent
 
 
 def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]:
@@ -262,8 +262,8 @@ def _check_joints(task: Task) -> None:
     if joints is not None and (not isinstance(joints, Joints) or len(joints.names) != count):
         given = list(joints.names) if isinstance(joints, Joints) else joints
         raise TaskError(
-            f"{type(task).__name__}: describe_joints() returned {short_repr(given)}, not what body.describe_joints "
-            f"makes of {count} names, one per element of the action"
+            f"{type(task).__name__}: describe_joints() returned {short_repr(given)}; "
+            f"return body.describe_joints(names) with {count} names, one per element of the action"
         )
 
 

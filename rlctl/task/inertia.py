@@ -1,4 +1,4 @@
-"""Masses and inertias in a URDF that no real link has."""
+"""Finds masses and inertias in a URDF that are physically impossible."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def find_inertia_faults(body: Body) -> list[str]:
         return []
     try:
         root = ElementTree.fromstring(body.file.read_bytes().strip())
-    except (ElementTree.ParseError, LookupError, ValueError):  # the latter for encodings that Python does not have
+    except (ElementTree.ParseError, LookupError, ValueError):  # LookupError and ValueError: an unknown encoding
         return []  # PyBullet reads more than XML allows
     return [f"{body.file.name}, link {name!r}: {fault}" for name, fault in _find_faults(body, root)]
 
@@ -64,7 +64,7 @@ def _find_bad_number(inertial: ElementTree.Element, inertia_used: bool) -> str:
 
 
 def _is_heavy(body: Body, index: int) -> bool:
-    # Frames of a gram with a rounded-up inertia are common, keep a solver stable, and do no harm.
+    # Frames of a gram with a rounded-up inertia are common and harmless: they keep the solver stable.
     masses = [
         pybullet.getDynamicsInfo(body.id, link, physicsClientId=body.client)[0]
         for link in range(-1, len(body.link_names))
@@ -83,7 +83,9 @@ def _judge_inertia(body: Body, index: int, inertial: ElementTree.Element) -> str
     if moments[0] <= 0:
         return f"principal moments {written} kg m^2 are not all above 0, as those of a link of {mass:g} kg are."
     if moments[2] > _ROUNDING * (moments[0] + moments[1]):
-        return f"principal moments {written} kg m^2: the largest exceeds the sum of the others, as in no solid."
+        return (
+            f"principal moments {written} kg m^2: the largest exceeds the sum of the others, which no solid body has."
+        )
     if not pybullet.getCollisionShapeData(body.id, index, physicsClientId=body.client):
         return ""
     low, high = pybullet.getAABB(body.id, index, physicsClientId=body.client)
@@ -92,6 +94,6 @@ def _judge_inertia(body: Body, index: int, inertial: ElementTree.Element) -> str
     if moments[2] > _ROUNDING * most:
         return (
             f"a moment of {moments[2]:.3g} kg m^2 is more than {mass:g} kg within {size:.2g} m can have "
-            f"({most:.2g}). Mend the file, or load it with inertia='shape'."
+            f"({most:.2g}). Correct the file, or load it with inertia='shape'."
         )
     return ""

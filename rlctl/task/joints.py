@@ -11,7 +11,7 @@ from rlctl.errors import TaskError
 
 @dataclasses.dataclass(frozen=True)
 class Joints:
-    """Joints in the order of the action's elements; every other field has an element per joint, or is not known.
+    """Joints in the order of the action's elements; every other field has one element per joint, or is empty.
 
     Positions are in [rad], of sliding joints in [m]; torques in [N m], forces in [N].
     """
@@ -20,7 +20,7 @@ class Joints:
     default_positions: Sequence[float] = ()
     """Where the robot starts and, with `action_scale`, where action 0 sends it."""
     action_scale: Sequence[float] = ()
-    """Only where an action sends the joints to `default_positions + action_scale * action`."""
+    """Only if an action sends the joints to `default_positions + action_scale * action`."""
     stiffness: Sequence[float] = ()
     """Of the position controller that follows the action [N m/rad]."""
     damping: Sequence[float] = ()
@@ -38,7 +38,7 @@ class Joints:
             if values and (len(values) != len(self.names) or not all(map(math.isfinite, values))):
                 raise TaskError(
                     f"joints: {field.name} has {len(values)} values, or one that is not finite, for "
-                    f"{len(self.names)} joints; leave out what is not known"
+                    f"{len(self.names)} joints; leave out unknown values"
                 )
             object.__setattr__(self, field.name, tuple(values))
         object.__setattr__(self, "names", tuple(self.names))

@@ -1,4 +1,4 @@
-"""What drives the joints of a body: position, velocity and torque control, limits, and the torques applied."""
+"""Motors of a body's joints: position, velocity and torque control, limits, and applied torques."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NUMBER = (int, float, np.number)
 
 
 class _Plan(NamedTuple):
-    # What a call of `drive_to` repeats.
+    # The part of a call of `drive_to` that stays the same in later calls.
     limits: tuple[object, ...]
     joints: list[int]
     links: list[int]
@@ -30,9 +30,9 @@ class _Plan(NamedTuple):
 class Motors(Properties):
     """The part of `Body` that drives its joints.
 
-    `joints` are names; none means all, in `joint_names` order. Arrays have one element per joint that is named; a
-    limit may also be one number for all of them. Forces are in [N m], of sliding joints in [N]; speeds in [rad/s], of
-    sliding joints in [m/s].
+    `joints` are names, by default all in `joint_names` order. Arrays have one element per named joint; a limit may
+    also be one number for all. Forces are in [N m], of sliding joints in [N]; speeds in [rad/s], of sliding joints in
+    [m/s].
     """
 
     joint_low: Array
@@ -59,13 +59,13 @@ class Motors(Properties):
         gain: float = 0.1,
         joints: Sequence[str] = (),
     ) -> None:
-        """Set position targets [rad or m]; speed and force are limited, by the model file's limits if not given.
+        """Set position targets [rad or m]; the default limits of speed and force are those of the model file.
 
-        `gain` is the part of the position error that a physics step takes away, in (0, 1].
+        `gain` is the part of the position error that a physics step removes, in (0, 1].
         """
         # Tuples, because two arrays cannot be compared by `!=`.
         speeds, forces = (
-            each if each is None or isinstance(each, _NUMBER) else tuple(each) for each in (max_speed, max_force)
+            limit if limit is None or isinstance(limit, _NUMBER) else tuple(limit) for limit in (max_speed, max_force)
         )
         limits = (speeds, forces, gain)
         plan = self._plans.get(tuple(joints))
@@ -105,7 +105,7 @@ class Motors(Properties):
     def drive_at(
         self, velocities: Array, *, max_force: float | Sequence[float] | None = None, joints: Sequence[str] = ()
     ) -> None:
-        """Set velocity targets [rad/s or m/s]; the force is limited, by the model file's limit if not given.
+        """Set velocity targets [rad/s or m/s]; the default limit of the force is that of the model file.
 
         A velocity of 0 is a brake of that force.
         """
@@ -122,7 +122,7 @@ class Motors(Properties):
         )
 
     def _motor_impulses(self, joints: list[int], max_force: float | Sequence[float] | None) -> list[float]:
-        # PyBullet makes an impulse of a motor's force with the time of a whole step, and gives it in every substep.
+        # PyBullet computes a motor's impulse for the time of a whole step, and applies it in every substep.
         forces = self.joint_max_force[joints] if max_force is None else max_force
         return [force / self._substeps for force in self._read_limits("max_force", forces, len(joints))]
 
@@ -130,7 +130,7 @@ class Motors(Properties):
         return self._read_values(name, [limits] * count if isinstance(limits, _NUMBER) else limits, count)
 
     def _read_values(self, name: str, values: Array | Sequence[float], count: int) -> list[float]:
-        # PyBullet's own message says neither of what body, nor how many there are. A list takes it half the time.
+        # PyBullet's own error names neither the body nor its number of joints; it reads lists twice as fast as arrays.
         array = np.asarray(values, float)
         if array.shape != (count,):
             raise TaskError(
@@ -145,7 +145,7 @@ class Motors(Properties):
                 self._commanded[joint] = math.nan
 
     def disable_motors(self, joints: Sequence[str] = ()) -> None:
-        """Switch off the motors that PyBullet gives every joint, so that only `set_torques` moves it."""
+        """Switch off the motors that PyBullet gives every joint, so that only `set_torques` moves the joints."""
         links = [self.joint_indices[joint] for joint in self.find_joints(joints)]
         count = len(links)
         pybullet.setJointMotorControlArray(
@@ -159,7 +159,7 @@ class Motors(Properties):
         )
 
     def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
-        """Turn or push the joints with `torques` [N m or N] in all substeps of the next step.
+        """Apply `torques` [N m or N] to the joints in all substeps of the next step.
 
         For joints whose motors are disabled: see `disable_motors`.
         """
@@ -177,10 +177,10 @@ class Motors(Properties):
         )
 
     def cap_joint_speed(self, speed: float) -> None:
-        """Never let a joint, whatever pushes it, turn or slide faster than `speed` [rad/s or m/s].
+        """Limit the speed of all joints to `speed` [rad/s or m/s], whatever pushes them.
 
-        PyBullet has one such limit per body, and of a body that is not fixed it also limits the base. `Sim.load` sets
-        it for a fixed body, to the fastest of its joints' limits in the URDF.
+        PyBullet has one such limit per body, which also applies to the base of a free body. `Sim.load` sets it for a
+        fixed body to the highest speed limit of the joints in the URDF.
         """
         if speed <= 0:
             raise TaskError(f"cap_joint_speed: {speed:g} is not above 0")
@@ -189,9 +189,9 @@ class Motors(Properties):
     def describe_joints(
         self, joints: Sequence[str], *, default_positions: Sequence[float] = (), action_scale: Sequence[float] = ()
     ) -> Joints:
-        """Return joints with the limits that the model file has for them, for `Task.describe_joints`.
+        """Return joints with the limits of the model file, for `Task.describe_joints`.
 
-        A kind of limit that the file leaves out for one of them, 0 or without an end, is left out for all.
+        If a limit is missing, 0 or infinite for one of the joints, it is left out for all of them.
         """
         chosen = self.find_joints(joints)
         low, high = self.joint_low[chosen], self.joint_high[chosen]

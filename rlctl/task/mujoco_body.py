@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.task.body import MassState
-from rlctl.task.joints import Joints
 from rlctl.task.motors import Motors
 
 if TYPE_CHECKING:
@@ -25,12 +24,12 @@ _FRICTION = 0.5  # PyBullet's, of a link whose file gives none
 
 
 def refuse(name: str) -> NoReturn:
-    """Raise `UsageError` for what has no equal in MuJoCo."""
-    raise UsageError(f"{name}: not in MuJoCo; this task runs in PyBullet only")
+    """Raise `UsageError` for a feature without an equivalent in MuJoCo."""
+    raise UsageError(f"--sim mujoco does not support {name}: this task runs in PyBullet only")
 
 
 class MujocoBody:
-    """What `Body` is, in MuJoCo."""
+    """The methods of `Body`, for a body in MuJoCo."""
 
     def __init__(self, sim: MujocoSim, name: str, file: Path, fixed: bool, base: str) -> None:
         self._sim, self.name, self.file, self.fixed, self.base_name = sim, name, file, fixed, base
@@ -74,17 +73,17 @@ class MujocoBody:
             self.cap_joint_speed(float(self.joint_max_speed.max()))
 
     def save(self) -> None:
-        """Take the friction of now for that of the built world."""
+        """Save the present friction as that of the built world, with full motor strength."""
         self._built_friction = dict(self.friction)
         self._strength = np.ones(len(self.joint_names))
 
     def restore(self) -> None:
-        """Go back to the built world's friction and motor strength."""
+        """Restore the built world's friction and motor strength."""
         self.friction = dict(self._built_friction)
         self._strength[:] = 1.0
 
     def find_link(self, link: str) -> int:
-        """Return MuJoCo's number of a link; raises `TaskError` for one that is not there."""
+        """Return MuJoCo's index of a link; raises `TaskError` for an unknown name."""
         check_name(link, self.links, f"{self.file.name} has no link", TaskError)
         return self.links[link]
 
@@ -111,7 +110,7 @@ class MujocoBody:
     @property
     def joint_torques(self) -> Array:
         """As `Body.joint_torques`."""
-        return self._sim.given[self._velocities]  # type: ignore[no-any-return]
+        return self._sim.applied[self._velocities]  # type: ignore[no-any-return]
 
     def link_position(self, link: str) -> Array:
         """As `Body.link_position`."""
@@ -125,7 +124,7 @@ class MujocoBody:
         """As `Body.mass_state`, at the end of the last physics step."""
         mujoco, data, number, velocity = self._sim.mujoco, self._sim.forward(), self.find_link(link), np.zeros(6)
         mujoco.mj_objectVelocity(self._sim.model, data, mujoco.mjtObj.mjOBJ_BODY, number, velocity, 0)
-        # Not MuJoCo's inertial frame: its axes may be in another order than the file's.
+        # MuJoCo's own inertial frame may have its axes in another order than the file.
         frame = data.xquat[number][_XYZW]
         return MassState(*(tuple(part.tolist()) for part in (data.xipos[number], frame, velocity[3:], velocity[:3])))
 
@@ -214,7 +213,7 @@ class MujocoBody:
         self._sim.torque[self._velocities[chosen]] = np.array(torques) * self._strength[chosen]
 
     def cap_joint_speed(self, speed: float) -> None:
-        """As `Body.cap_joint_speed`, of the joints alone."""
+        """As `Body.cap_joint_speed`, but only for the joints."""
         _ = self.joint_names  # compiles
         self._sim.velocity_cap[self._velocities] = speed
 
@@ -236,12 +235,7 @@ class MujocoBody:
         """As `Body.scale_motor_strength`."""
         self._strength[self.find_joints(joints)] = factor
 
-    def describe_joints(
-        self, joints: Sequence[str], *, default_positions: Sequence[float] = (), action_scale: Sequence[float] = ()
-    ) -> Joints:
-        """As `Body.describe_joints`."""
-        describe: Any = Motors.describe_joints
-        return describe(self, joints, default_positions=default_positions, action_scale=action_scale)  # type: ignore[no-any-return]
+    describe_joints: Any = Motors.describe_joints
 
 
 _BOUND = (

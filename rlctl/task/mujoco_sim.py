@@ -1,9 +1,9 @@
-"""The world of a task in MuJoCo instead of PyBullet, with the same methods: does a policy depend on the engine?
+"""The world of a task in MuJoCo instead of PyBullet, with the same methods: to test if a policy depends on the engine.
 
-Models are the same URDF files, and motors are what PyBullet's are: a row of the solver that asks for a velocity with a
-bounded force. Two things differ: contacts are soft, `solref` [s] says how soft, at least two physics steps; and a
-joint's damping acts after its motor, so that a light joint with much of it lags. Using what neither `MujocoSim` nor
-`MujocoBody` defines, because MuJoCo has no equal, raises `UsageError`.
+Models are the same URDF files. Motors work as in PyBullet: a row of the solver demands a velocity with a bounded force.
+Two things differ: contacts are soft, with the time constant `solref` [s] of at least two physics steps; and a joint's
+damping acts after its motor, so that a light joint with high damping lags. Methods without an equivalent in MuJoCo are
+not defined here or in `MujocoBody`; using one raises `UsageError`.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ def read_solref(sim: str) -> float | None:
     except ValueError:
         solref = math.nan
     if engine != "mujoco" or not 0 < solref < 1:
-        raise UsageError(f"sim {sim!r}: it is pybullet, mujoco, or mujoco:SOLREF with 0 < SOLREF < 1 s")
+        raise UsageError(f"sim {sim!r}: give pybullet, mujoco, or mujoco:SOLREF with 0 < SOLREF < 1 s")
     return solref
 
 
 class MujocoSim:
-    """What `Sim` is, in MuJoCo. The model is compiled when the world is first read or moved."""
+    """The methods of `Sim`, for a world in MuJoCo. The model is compiled when the world is first read or moved."""
 
     def __init__(self, *, control_dt: float, substeps: int, solref: float) -> None:
         try:
@@ -67,7 +67,7 @@ class MujocoSim:
         option.gravity = [0.0, 0.0, -9.81]
         option.integrator = self.mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         option.cone = self.mujoco.mjtCone.mjCONE_ELLIPTIC
-        option.impratio = 10.0  # feet would creep
+        option.impratio = 10.0  # otherwise feet that stand slide slowly
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -90,18 +90,18 @@ class MujocoSim:
         self_collision: bool = False,
         inertia: Literal["file", "shape"] = "file",
     ) -> MujocoBody:
-        """As `Sim.load`, of URDF files: `flags` and `inertia` mean nothing here."""
+        """As `Sim.load`, for URDF files; `flags` and `inertia` have no effect."""
         path = Path(file)
         if not path.is_absolute() and not path.is_file():
             path = Path(pybullet_data.getDataPath()) / file
         if path.suffix != ".urdf":
-            refuse(f"{path.name}, which is no URDF file,")
+            refuse(f"{path.name}, which is not a URDF file")
         child = self.mujoco.MjSpec.from_file(str(path))
-        child.compiler.fusestatic = False  # links that fixed joints hold keep their names
+        child.compiler.fusestatic = False  # links on fixed joints keep their names
         base = child.worldbody.first_body().name
         bit = 1 << len(self.bodies)
         for geom in child.geoms:
-            # Links of one body do not collide with each other, unless the task says so.
+            # Links of one body do not collide with each other without `self_collision`.
             geom.contype, geom.conaffinity = bit, 0x3FFFFFFF if self_collision else 0x3FFFFFFF & ~bit
             geom.condim = 3
             geom.solref[0] = self._solref
@@ -121,12 +121,12 @@ class MujocoSim:
 
     @property
     def is_compiled(self) -> bool:
-        """Whether nothing was loaded since the model was compiled."""
+        """Whether the compiled model contains all bodies."""
         return self._model is not None
 
     @property
     def model(self) -> Any:
-        """The `mujoco.MjModel`, compiled if a body was loaded since."""
+        """The `mujoco.MjModel`, compiled again if bodies were loaded."""
         if self._model is None:
             self._compile()
         return self._model
@@ -140,7 +140,7 @@ class MujocoSim:
     def _compile(self) -> None:
         model = self._model = self._spec.compile()
         self._data = self.mujoco.MjData(model)
-        model.dof_solimp[:] = (0.9999, 0.9999, 0.001, 0.5, 2)  # motors are as hard as PyBullet's
+        model.dof_solimp[:] = (0.9999, 0.9999, 0.001, 0.5, 2)  # motors are as stiff as PyBullet's
         model.jnt_actfrclimited[:] = 0
         self._positions = np.zeros(model.nv, int)  # index in qpos, by degree of freedom
         self._positions[model.jnt_dofadr] = model.jnt_qposadr
@@ -155,10 +155,10 @@ class MujocoSim:
         count = self._model.nv
         self.target, self.speed = np.full(count, np.nan), np.full(count, np.nan)  # of position, of velocity motors
         self.gain, self.top_speed = np.zeros(count), np.full(count, np.inf)
-        self.force, self.torque, self.given = np.zeros(count), np.zeros(count), np.zeros(count)
+        self.force, self.torque, self.applied = np.zeros(count), np.zeros(count), np.zeros(count)
 
     def spread_friction(self) -> None:
-        """Give the product of two frictions, as PyBullet takes it, to the geoms of what moves."""
+        """Give the geoms of moving bodies the product of their friction and the ground's, as PyBullet computes it."""
         fixed = [body for body in self.bodies.values() if body.fixed and not body.joint_names]
         ground = max((friction for body in fixed for friction in body.friction.values()), default=1.0)
         for body in self.bodies.values():
@@ -167,7 +167,7 @@ class MujocoSim:
                 self.model.geom_friction[geom, 0] = _NO_FRICTION if body in fixed else moving
 
     def forward(self) -> Any:
-        """Return the data with everything computed that follows from the positions."""
+        """Return the data after computing everything that depends on the positions."""
         data = self.data
         if self._dirty:
             self.mujoco.mj_step1(self._model, data)
@@ -175,7 +175,7 @@ class MujocoSim:
         return data
 
     def touch(self) -> Any:
-        """Return the data to change positions or velocities in."""
+        """Return the data for a change of positions or velocities."""
         self._dirty = True
         return self.data
 
@@ -195,15 +195,15 @@ class MujocoSim:
         friction_row = int(self.mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
         driven = ~np.isnan(self.target)
         for _ in range(self._substeps):
-            wanted = np.where(driven, self.gain * (self.target - data.qpos[self._positions]) / dt, self.speed)
-            wanted = np.clip(wanted, -self.top_speed, self.top_speed)
+            speeds = np.where(driven, self.gain * (self.target - data.qpos[self._positions]) / dt, self.speed)
+            speeds = np.clip(speeds, -self.top_speed, self.top_speed)
             rows = np.flatnonzero(data.efc_type == friction_row)
             moved = data.efc_id[rows]
-            # A row of friction holds the velocity 0; with this reference it asks for another, as PyBullet's motor does.
-            data.efc_aref[rows] = (wanted[moved] - data.qvel[moved]) / dt
+            # A friction row holds the velocity at 0; this reference makes it the motor's target, as in PyBullet.
+            data.efc_aref[rows] = (speeds[moved] - data.qvel[moved]) / dt
             self.mujoco.mj_step2(model, data)
-            self.given[:] = self.torque
-            self.given[moved] = data.efc_force[rows]
+            self.applied[:] = self.torque
+            self.applied[moved] = data.efc_force[rows]
             np.clip(data.qvel, -self.velocity_cap, self.velocity_cap, out=data.qvel)
             self.mujoco.mj_step1(model, data)
 

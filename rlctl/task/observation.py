@@ -1,4 +1,4 @@
-"""What a task observes as the observation of its environment: one flat Box, or a Dict space; checked at every step."""
+"""Checks what a task observes at every step, and assembles the environment's observation: a flat Box, or a Dict."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from rlctl.task.task import Task
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
 _ROUNDING = 1e-4
-"""Of floats, by which a value may be outside its bounds: it is clipped. Farther outside it is an error of the task."""
+"""A value this far outside its bounds is clipped as a rounding error; farther outside it is an error of the task."""
 
 
 class ObservationFormat:
-    """The space of a task's observations, and how they are put into it; `first` is one of them, by name."""
+    """The space of a task's observations, and their assembly; `first` is an example, by name."""
 
     def __init__(self, task: Task, first: Mapping[str, Any]) -> None:
         self._task = task
         self._name = type(task).__name__
         self._bounds = task.observation_bounds
         self._shapes = {name: np.shape(value) for name, value in first.items()}
-        # Camera pictures: bytes, as every library that takes images expects them.
+        # Camera pictures stay bytes, as libraries expect images.
         self._dtypes: dict[str, Any] = {
             name: np.uint8 if np.asarray(value).dtype == np.uint8 else np.float32 for name, value in first.items()
         }
@@ -60,7 +60,7 @@ class ObservationFormat:
         return spaces.Box(low, high, dtype=np.float32)
 
     def assemble(self, parts: Mapping[str, Any], step: int) -> Observation:
-        """Return the observation of what was observed at a step; raises `TaskError` for what is not in the space."""
+        """Return the observation made of its parts; raises `TaskError`, with the step, if it is not in the space."""
         if self._task.observation_layout == "dict":
             observed: dict[str, Any] = {name: np.array(value, self._dtypes.get(name)) for name, value in parts.items()}
             if {name: value.shape for name, value in observed.items()} != self._shapes:

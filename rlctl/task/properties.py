@@ -1,4 +1,4 @@
-"""What may change on a body until the next reset: mass, friction, joint damping, colour, motor strength."""
+"""Properties of a body that events change until the next reset: mass, friction, damping, colour, motor strength."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class _Dynamics(NamedTuple):
 
 
 class Properties:
-    """The part of `Body` that events change: always from the values of the built world, back to them at a reset.
+    """The part of `Body` that events change: relative to the values of the built world, which a reset restores.
 
-    `links` and `joints` are names, `base_name` too; nothing given means all of them, the base included.
+    `links` and `joints` are names, `base_name` included; by default all of them.
     """
 
     client: int
@@ -40,7 +40,7 @@ class Properties:
     def __init__(self) -> None:
         self._dynamics_changed = self._damping_changed = self._colors_changed = False
         self.motor_strength: NDArray[np.float64] | None = None
-        """Part of their force that the motors give, shape (joints,); None while it is all of it."""
+        """Fraction of the commanded force that the motors give, shape (joints,); None: all of it."""
         self._built_strength: NDArray[np.float64] | None = None
 
     # PyBullet's saved states have positions and velocities, but none of these values.
@@ -89,7 +89,7 @@ class Properties:
         return colors
 
     def _apply_strength(self, forces: list[float], joints: list[int]) -> list[float]:
-        # What the motors give of what they are asked for: one element per index in `joints`.
+        # The forces that the motors give, one per index in `joints`.
         return forces if self.motor_strength is None else (self.motor_strength[joints] * forces).tolist()
 
     def _change(self, link: int, **values: object) -> None:
@@ -99,7 +99,7 @@ class Properties:
         pybullet.changeVisualShape(self.id, link, shapeIndex=shape, rgbaColor=color, physicsClientId=self.client)
 
     def _link_index(self, link: str) -> int:
-        if link not in self._links:  # asked here, too: links are read at every step
+        if link not in self._links:  # checked first because links are read at every step
             base = f"only its base, {self.base_name!r}"
             check_name(link, self._links, f"{self.file.name} has no link", TaskError, none=base)
         return self._links[link]
@@ -107,7 +107,7 @@ class Properties:
     def find_joints(self, joints: Collection[str] = ()) -> list[int]:
         """Return the indices of joints, or of all, in joint arrays; raises `TaskError` for a name that is not there."""
         for joint in joints:
-            if joint not in self.joint_names:  # asked here, too: tasks may name joints at every step
+            if joint not in self.joint_names:  # checked first because tasks may name joints at every step
                 check_name(joint, self.joint_names, f"{self.file.name} has no joint", TaskError)
         if not self.joint_names:
             raise TaskError(f"{self.file.name} has no joints")
@@ -125,13 +125,13 @@ class Properties:
         return sum(dynamics.mass for dynamics in self._dynamics.values())
 
     def find_trunk(self) -> str | None:
-        """Return what moves about: a free base, or what rails carry, longer than 100 m; None if nothing does."""
+        """Return the link that travels: a free base, or one carried by a sliding joint longer than 100 m, else None."""
         if not self.fixed:
             return self.base_name
         if not self._links:
             return None
         first = pybullet.getJointInfo(self.id, 0, physicsClientId=self.client)
-        limited = 0 <= first[9] - first[8] < _RAIL  # without limits the lower one is above the upper
+        limited = 0 <= first[9] - first[8] < _RAIL  # without limits the lower limit is above the upper one
         if first[2] != pybullet.JOINT_PRISMATIC or limited:
             return None
         # PyBullet 3.2.7 crashes when it is asked for the collision shapes of a body of an MJCF file.
@@ -174,7 +174,7 @@ class Properties:
             self._change(self.joint_indices[index], jointDamping=damping)
 
     def set_color(self, rgb: Sequence[float], links: Sequence[str] = ()) -> None:
-        """Paint the links: red, green, blue in [0, 1]; how opaque they are stays. Until the next reset."""
+        """Paint the links, until the next reset: red, green, blue in [0, 1]; their opacity does not change."""
         chosen, nominal = self._select_links(links), self._colors
         self._colors_changed = True
         for (link, shape), color in nominal.items():
@@ -182,7 +182,7 @@ class Properties:
                 self._paint(link, shape, (*rgb, color[3]))
 
     def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
-        """Let the joints' motors give `factor` times the force they are asked for, until the next reset."""
+        """Scale the force of the joints' motors by `factor`, until the next reset."""
         built = np.ones(len(self.joint_indices)) if self._built_strength is None else self._built_strength
         strength = built.copy() if self.motor_strength is None else self.motor_strength.copy()
         indices = self.find_joints(joints)
@@ -190,7 +190,7 @@ class Properties:
         self.motor_strength = strength
 
     def _mass_centre(self, link: int) -> tuple[float, ...]:
-        # [m], world frame, of a link's index; -1 is the base.
+        # [m], world frame; `link` is an index, -1 the base.
         if link < 0:
             state = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
         else:

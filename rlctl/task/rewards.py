@@ -1,12 +1,12 @@
 """Reward terms that tasks share: pure functions of numbers, without weights.
 
-A term is large where its name holds, whether that is good or bad: the sign is the weight's.
+Terms are unsigned: a weight gives the sign.
 
-| what is judged                    | term                                                        |
+| what is measured                  | term                                                        |
 |-----------------------------------|-------------------------------------------------------------|
 | a goal                            | `distance`, `closeness`, `arrival`, `tolerance`             |
 | effort and smoothness             | `squared` (of actions, joint velocities), `power`, `change` |
-| moving on                         | `forward_velocity`, `forward_while_alive`, `alive`          |
+| forward motion                    | `forward_velocity`, `forward_while_alive`, `alive`          |
 | an upright body                   | `posture`, `fallen`, `speed` (of an angular velocity)       |
 | a grasp                           | `grasp`                                                     |
 | time                              | `time_spent`                                                |
@@ -34,7 +34,7 @@ def distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def closeness(distance: float, scale: float) -> float:
-    """Return 1 at distance 0, falling smoothly to 1/e at `scale` and to nothing beyond: exp(-(distance / scale)^2)."""
+    """Return exp(-(distance / scale)^2): 1 at distance 0, 1/e at `scale`, and close to 0 far beyond it."""
     return math.exp(-((distance / scale) ** 2))
 
 
@@ -54,7 +54,7 @@ def change(x: Array, last: Array) -> float:
 
 
 def power(torques: Array, velocities: Array) -> float:
-    """Return the power that the joints' motors turn over [W]: the sum of |torque [N m] x velocity [rad/s]|."""
+    """Return the mechanical power of the joints' motors [W]: the sum of |torque [N m] x velocity [rad/s]|."""
     return float(np.abs(torques * velocities).sum())
 
 
@@ -64,7 +64,7 @@ def forward_velocity(velocity: Array, heading: Array) -> float:
 
 
 def forward_while_alive(velocity: Array, heading: Array, alive: bool) -> float:
-    """Return `forward_velocity` [m/s] while `alive`, else 0: falling or jumping forward earns nothing."""
+    """Return `forward_velocity` [m/s] while `alive`, else 0: a fall forward earns nothing."""
     return forward_velocity(velocity, heading) if alive else 0.0
 
 
@@ -107,10 +107,10 @@ def time_spent(control_dt: float) -> float:
 
 
 def near_limits(positions: Array, low: Array, high: Array, margin: float) -> float:
-    """Return how far joints are into the last `margin` before a limit: the mean, 0 outside it and 1 at a limit.
+    """Return how close joints are to their limits: 0 farther away than `margin`, 1 at a limit; the mean of all joints.
 
-    Everything in [rad] or [m], arrays of shape (joints,); beyond a limit it goes on rising. A joint whose lower limit
-    is not below its upper one has no limits.
+    Everything in [rad] or [m], arrays of shape (joints,); beyond a limit the value rises further. A joint whose lower
+    limit is not below its upper one has no limits.
     """
     room = np.minimum(positions - low, high - positions)
     inside = np.maximum(0.0, 1.0 - room / margin)
@@ -118,12 +118,12 @@ def near_limits(positions: Array, low: Array, high: Array, margin: float) -> flo
 
 
 def excess_force(forces: Array, limit: float) -> float:
-    """Return by how much contact forces exceed `limit`, added up [N]; no contact, of shape (0,), gives 0."""
+    """Return the sum of the contact forces above `limit` [N]; 0 without contacts, for forces of shape (0,)."""
     return float(np.maximum(0.0, forces - limit).sum())
 
 
 def penetration(distances: Array) -> float:
-    """Return the depth of the deepest contact [m] of contact distances, negative where bodies overlap; 0 for none."""
+    """Return the depth of the deepest contact [m], 0 if there is none; `distances` are negative for overlaps."""
     return float(np.maximum(0.0, -distances).max()) if distances.size else 0.0
 
 
@@ -170,7 +170,7 @@ def tolerance(
     if falloff not in _FALLOFFS:
         raise TaskError(f"tolerance: no falloff {falloff!r}. There are: {', '.join(_FALLOFFS)}")
     if isinstance(x, np.ndarray):
-        values = [tolerance(each, bounds, margin, falloff, at_margin) for each in x.ravel().tolist()]
+        values = [tolerance(element, bounds, margin, falloff, at_margin) for element in x.ravel().tolist()]
         return np.array(values, np.float64).reshape(x.shape)
     outside = max(low - x, x - high)
     if outside <= 0:

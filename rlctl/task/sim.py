@@ -1,7 +1,6 @@
-"""One PyBullet client: bodies by name, SI units, numpy out.
+"""A PyBullet world: bodies by name, SI units, numpy arrays.
 
-Quaternions are (x, y, z, w), as PyBullet has them. Every call passes the client id, and the state of a body is
-read at most once per control step.
+Quaternions are (x, y, z, w), as in PyBullet. The state of a body is read at most once per control step.
 """
 
 from __future__ import annotations
@@ -33,7 +32,9 @@ class _Push:
 
 def _check_joint_names(path: Path) -> None:
     """Raise `TaskError` for two joints of one name, which crash PyBullet."""
-    with contextlib.suppress(ElementTree.ParseError, LookupError, ValueError):  # PyBullet says what it cannot read
+    with contextlib.suppress(
+        ElementTree.ParseError, LookupError, ValueError
+    ):  # PyBullet reports files that it cannot read
         names = [joint.get("name") for joint in ElementTree.fromstring(path.read_bytes().strip()).findall("joint")]
         for name in names:
             if names.count(name) > 1:
@@ -51,7 +52,7 @@ class Sim(Constraints):
             check_display()
         self.client: int = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         if self.client < 0:
-            raise TaskError("PyBullet could not open a window: is there a display? Leave out --gui to do without.")
+            raise TaskError("PyBullet could not open a window; leave out --gui on a machine without a display")
         self.bodies: dict[str, Body] = {}
         self._substeps = substeps
         self._settings = {
@@ -62,7 +63,7 @@ class Sim(Constraints):
             "deterministicOverlappingPairs": 1,
         }
         self._saved: int | None = None
-        self._built_gravity: tuple[float, ...] | None = None  # [m/s^2], known while events have changed it
+        self._built_gravity: tuple[float, ...] | None = None  # [m/s^2], set while events have changed the gravity
         self._pushes: list[_Push] = []
         self._prepare()
 
@@ -72,12 +73,13 @@ class Sim(Constraints):
         self.set_gravity(9.81)
 
     def set_gravity(self, gravity: float) -> None:
-        """Set the downward gravity of the built world [m/s^2], 9.81 where nothing is said. For `build`."""
+        """Set the downward gravity of the built world [m/s^2], by default 9.81. Call it in `build`."""
         pybullet.setGravity(0.0, 0.0, -gravity, physicsClientId=self.client)
 
     def set_contact_stiffness(self, erp: float) -> None:
-        """Set the part of a contact's depth that a physics step takes away, in (0, 1]: Bullet's error reduction
-        parameter, 0.2 where nothing is said. For `build`: the value is kept through all resets.
+        """Set the part of a contact's depth that a physics step removes, in (0, 1]: Bullet's error reduction parameter.
+
+        The default is 0.2. Call it in `build`: resets keep the value.
         """
         pybullet.setDefaultContactERP(erp, physicsClientId=self.client)
 
@@ -95,10 +97,10 @@ class Sim(Constraints):
     ) -> Body:
         """Load the body of a URDF, MJCF (`.xml`) or SDF file: a path, or a name in `pybullet_data`.
 
-        `position` [m], `orientation` and `fixed` are for URDF: the others say themselves where a body is and whether
-        it is fixed. `flags` are PyBullet's URDF_* flags. `self_collision` lets links collide that are not each
-        other's ancestors. `inertia` of a URDF's links is what the file says, or that of their collision shapes with
-        the file's masses, for a file whose values are wrong: see `rlctl.task.inertia`.
+        `position` [m], `orientation` and `fixed` are for URDF files; the other formats contain them. `flags` are
+        PyBullet's URDF_* flags. With `self_collision` links collide, except with their ancestors. `inertia="shape"`
+        is for a URDF whose inertias are wrong (see `rlctl.task.inertia`): PyBullet computes them from the collision
+        shapes and the file's masses.
         """
         self._check_new(name)
         path = Path(file)
@@ -107,7 +109,7 @@ class Sim(Constraints):
         if not path.is_file():  # PyBullet crashes on a folder
             raise TaskError(
                 f"model file {str(file)!r} not found: neither under {Path.cwd()} nor in pybullet_data; "
-                f"for a file beside your module: Path(__file__).with_name({path.name!r})"
+                f"for a file next to your module: Path(__file__).with_name({path.name!r})"
             )
         if path.suffix == ".urdf":
             _check_joint_names(path)
@@ -117,7 +119,9 @@ class Sim(Constraints):
             flags |= pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS
         if path.suffix in (".xml", ".sdf"):
             if fixed or any(position) or tuple(orientation) != (0, 0, 0, 1):
-                raise TaskError(f"{path.name} says itself where its body is: position, orientation, fixed are for URDF")
+                raise TaskError(
+                    f"{path.name} contains the pose of its body: position, orientation and fixed are for URDF"
+                )
             body_id = self._load_scene(path, flags)
             # A base without mass stays where it is.
             fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0
@@ -136,7 +140,7 @@ class Sim(Constraints):
         else:
             ids = self._call_loader(path, pybullet.loadSDF)
         if len(ids) != 1:
-            raise TaskError(f"{path} holds {len(ids)} bodies; load takes files of one, so split it")
+            raise TaskError(f"{path} contains {len(ids)} bodies; split it into files of one body each")
         return int(ids[0])
 
     def _call_loader(self, path: Path, load: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -147,8 +151,8 @@ class Sim(Constraints):
             raise TaskError(f"PyBullet cannot load {path}: {read_complaint(call) or error}") from None
 
     def _check_new(self, name: str) -> None:
-        if name in self.bodies:  # what the first reads would be kept forever
-            raise TaskError(f"a body {name!r} is loaded already; give each its own name")
+        if name in self.bodies:  # the cache of the first body would never be cleared
+            raise TaskError(f"a body {name!r} is already loaded; give each body its own name")
 
     def body(self, name: str) -> Body:
         """Return a loaded body by its name."""
@@ -170,20 +174,20 @@ class Sim(Constraints):
         return max((-float(point[8]) for point in points if point[8] < 0.0), default=0.0)
 
     def save(self) -> None:
-        """Remember the world as it is now, for `restore`."""
+        """Save the present world for `restore`."""
         self._saved = pybullet.saveState(physicsClientId=self.client)
         self._built_gravity = None
         for body in self.bodies.values():
             body._save_nominal()
 
     def restore(self) -> None:
-        """Put the world back as `save` found it."""
+        """Restore the saved world."""
         self._pushes.clear()
         if self._built_gravity is not None:
             pybullet.setGravity(*self._built_gravity, physicsClientId=self.client)
             self._built_gravity = None
         pybullet.restoreState(self._saved, physicsClientId=self.client)
-        # Contacts of the last episode that the saved world does not have would take part in the first step.
+        # Without it, contacts of the last episode would act in the first step.
         pybullet.performCollisionDetection(physicsClientId=self.client)
         for body in self.bodies.values():
             body._cache.clear()
@@ -207,7 +211,7 @@ class Sim(Constraints):
         self._pushes.append(_Push(pushed, index, force, max(1, round(duration_s / self._settings["fixedTimeStep"]))))
 
     def _apply_pushes(self) -> None:
-        # PyBullet forgets a force after a step, but not in restoreState: so none is given to it ahead of time.
+        # PyBullet drops a force after a step, but not in restoreState: forces are applied directly before the step.
         for push in self._pushes:
             centre = push.body._mass_centre(push.link)
             pybullet.applyExternalForce(
@@ -217,7 +221,7 @@ class Sim(Constraints):
         self._pushes = [push for push in self._pushes if push.steps]
 
     def clear(self) -> None:
-        """Empty the world, as if it had just been made."""
+        """Remove everything from the world."""
         pybullet.resetSimulation(physicsClientId=self.client)
         self.bodies.clear()
         self._pushes.clear()
@@ -253,14 +257,11 @@ class Sim(Constraints):
         return body
 
     def add_marker(self, position: Sequence[float], radius: float, color: Sequence[float]) -> int:
-        """Add a sphere that is seen but touches nothing; returns its id, for `move_marker`."""
-        shape = pybullet.createVisualShape(
-            pybullet.GEOM_SPHERE, radius=radius, rgbaColor=color, physicsClientId=self.client
-        )
-        marker: int = pybullet.createMultiBody(
-            baseVisualShapeIndex=shape, basePosition=position, physicsClientId=self.client
-        )
-        return marker
+        """Add a visible sphere without collisions; return its id, for `move_marker`."""
+        sphere, client = pybullet.GEOM_SPHERE, self.client
+        shape = pybullet.createVisualShape(sphere, radius=radius, rgbaColor=color, physicsClientId=client)
+        marker = pybullet.createMultiBody(baseVisualShapeIndex=shape, basePosition=position, physicsClientId=client)
+        return int(marker)
 
     def move_marker(self, marker: int, position: Sequence[float] | Array) -> None:
         """Move a marker to a world position [m]."""
@@ -276,23 +277,17 @@ class Sim(Constraints):
         up: Sequence[float] = (0.0, 0.0, 1.0),
         field_of_view: float = 45.0,
     ) -> NDArray[np.uint8]:
-        """Draw the world on the CPU: an RGB image of shape (height, width, 3); a camera's picture in `Task.observe`.
+        """Draw the world on the CPU and return an RGB image of shape (height, width, 3).
 
-        The camera is at `eye` [m] and looks at `target` [m], with a vertical `field_of_view` [degrees]. Takes 20-40 ms
-        at 320x240.
+        The camera is at `eye` [m] and looks at `target` [m], with a vertical `field_of_view` [degrees]. `Task.observe`
+        may call it. It takes 20-40 ms at 320x240.
         """
         view = pybullet.computeViewMatrix(eye, target, up)
         projection = pybullet.computeProjectionMatrixFOV(field_of_view, width / height, 0.05, 10.0)
         image = pybullet.getCameraImage(
-            width,
-            height,
-            view,
-            projection,
-            shadow=0,
-            renderer=pybullet.ER_TINY_RENDERER,
-            physicsClientId=self.client,
+            width, height, view, projection, shadow=0, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=self.client
         )
-        # Without numpy support PyBullet gives a flat tuple.
+        # PyBullet returns a flat tuple if it was built without numpy.
         return np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[:, :, :3]
 
     def close(self) -> None:

@@ -31,23 +31,23 @@ class Task:
     """Physics steps per action; each takes `control_dt / substeps`."""
     solver_iterations: ClassVar[int] = 50
     episode_s: float = 5.0
-    """Time limit of an episode [s]; reaching it truncates, never terminates. Annotated in a task, a parameter of it."""
+    """Time limit of an episode [s]; reaching it truncates, never terminates. An annotation makes it a parameter."""
     action_space: ClassVar[spaces.Space[Any]]
     action_meaning: ClassVar[str] = ""
     observation_layout: ClassVar[Literal["flat", "dict"]] = "flat"
     """One flat Box in the order of `observe`, or a Dict space with one entry per name."""
     observation_units: ClassVar[Mapping[str, str]] = {}
     observation_bounds: ClassVar[Mapping[str, tuple[float, float]]] = {}
-    """Range per observation name, in its unit; unbounded where nothing is given."""
+    """Range per observation name, in its unit; other observations are unbounded."""
     reward_weights: ClassVar[Mapping[str, float]] = {}
     """Weight per reward term; a term with weight 0 is a metric."""
     events: ClassVar[Mapping[str, Event]] = {}
     stages: ClassVar[Sequence[Mapping[str, Any]]] = ()
-    """Curriculum, as the recipe's key `stages`, which replaces it: `{"task": {"tolerance": 0.2}, "promote":
-    {"success": 0.8, "window": 100}}`, and so on; the last, often `{}`, is what is wanted and evaluated."""
+    """Stages of a curriculum, such as `{"task": {"tolerance": 0.2}, "promote": {"success": 0.8, "window": 100}}`; the
+    last one, often `{}`, is the task that is evaluated. The recipe's key `stages` replaces them."""
     fast_reset: ClassVar[bool] = True
-    """Reset by restoring the built world. False loads the world anew at every reset: slower by a factor of
-    a hundred, for worlds whose contacts do not repeat bit for bit after a restore."""
+    """Reset by restoring the built world. False loads the world again at every reset, which is a hundred times slower:
+    for worlds whose contacts do not repeat bit for bit after a restore."""
 
     sim: Sim
     """The simulation this task was built in; set before `build`."""
@@ -90,22 +90,22 @@ class Task:
         return False
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> NDArray[Any]:
-        """Return what steps would have been rewarded, had other goals been wanted: both (n, size) -> (n,). Optional.
+        """Return the rewards of steps for other desired goals: both of shape (n, size) -> (n,). Optional.
 
-        Hindsight replay (`her` in a recipe) asks for it. Observe `observation`, `achieved_goal` and `desired_goal` in
-        the layout "dict". The result is the weighted sum of `rewards`, of the goals alone: `info` is empty. Write it
-        along the last axis, so that of a single pair of goals, shape (size,), it is one number.
+        Hindsight replay (`her` in a recipe) needs it. Observe `observation`, `achieved_goal` and `desired_goal` in
+        the layout "dict". The result is the weighted sum of `rewards`, computed from the goals only: `info` is empty.
+        Compute along the last axis, so that one pair of goals, shape (size,), gives one number.
         """
         raise NotImplementedError
 
     def markers(self) -> dict[str, NDArray[np.float64]]:
-        """Return points worth drawing, such as the goal: name -> world position of shape (3,) [m]. Optional."""
+        """Return points to draw, such as the goal: name -> world position of shape (3,) [m]. Optional."""
         return {}
 
     def describe_joints(self) -> Joints | None:
         """Return the joints that the action moves, in its order, for controllers of the real robot. Optional.
 
-        Asked once, after `build`. Say what the task knows and nothing else; `Body.describe_joints` reads limits.
+        Called once, after `build`. Leave out unknown values; `Body.describe_joints` reads the limits.
         """
         return None
 
@@ -129,8 +129,8 @@ def check_parameters(task: type[Task]) -> None:
         parameters = [key for key, hint in hints.items() if "ClassVar" not in str(hint)]
         if parameters and "__dataclass_fields__" not in cls.__dict__:
             raise TaskError(
-                f"{cls.__name__} has parameters ({', '.join(parameters)}) and is not a dataclass: "
-                "write @dataclass in the line above its class"
+                f"{cls.__name__} has parameters ({', '.join(parameters)}) but is not a dataclass: "
+                "write @dataclass in the line above the class"
             )
 
 
@@ -142,23 +142,25 @@ def check_methods(task: type[Task]) -> None:
 
 
 def check_definition(task: Task) -> None:
-    """Raise `TaskError` for an attribute of the definition that cannot be what it is."""
+    """Raise `TaskError` for an invalid attribute of a task."""
     name = type(task).__name__
     if not isinstance(getattr(task, "action_space", None), spaces.Space):
         raise TaskError(f"{name} does not define action_space: Box(-1.0, 1.0, (7,), np.float32), for example")
     for key in ("control_dt", "episode_s"):
         if not 0 < (seconds := getattr(task, key)) < math.inf:
-            raise TaskError(f"{name}: {key} is {seconds}: it is a time above 0 [s]")
+            raise TaskError(f"{name}: {key} is {seconds}; it must be a time above 0 [s]")
     if task.control_dt > task.episode_s:
         raise TaskError(f"{name}: control_dt is {task.control_dt} s, longer than an episode of {task.episode_s} s")
     for key in ("substeps", "solver_iterations"):
         if not isinstance(count := getattr(task, key), int) or count < 1:
-            raise TaskError(f"{name}: {key} is {count}: it is a whole number, at least 1")
+            raise TaskError(f"{name}: {key} is {count}; it must be a whole number, at least 1")
     if (layout := task.observation_layout) not in ("flat", "dict"):
-        raise TaskError(f"{name}: observation_layout is {layout!r}: it is 'flat' or 'dict'")
+        raise TaskError(f"{name}: observation_layout is {layout!r}; it must be 'flat' or 'dict'")
     for key, bounds in task.observation_bounds.items():
         if np.shape(bounds) != (2,) or not bounds[0] <= bounds[1]:
-            raise TaskError(f"{name}: observation_bounds of {key!r} are {bounds}: they are two numbers, (low, high)")
+            raise TaskError(
+                f"{name}: observation_bounds of {key!r} are {bounds}; they must be two numbers, (low, high)"
+            )
     for key, event in task.events.items():
         if not isinstance(event, Event):
             raise TaskError(f"{name}: events.{key} is not an Event: Event('reset', scale_mass, body=...), for example")

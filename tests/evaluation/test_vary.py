@@ -271,4 +271,4 @@ def test_what_mujoco_has_not_is_said_before_an_episode_is_played(rlctl):
     pytest.importorskip("mujoco")
     done = rlctl("eval", "gear-arm", "--pretrained", "--sim", "mujoco")
     assert done.returncode == 2
-    assert done.stderr.endswith("error: connect_gear: not in MuJoCo; this task runs in PyBullet only\n")
+    assert done.stderr.endswith("error: --sim mujoco does not support connect_gear: this task runs in PyBullet only\n")

@@ -109,7 +109,7 @@ def test_stiffer_contacts(sim):
 
 
 def test_a_model_says_itself_where_it_is(sim):
-    with pytest.raises(TaskError, match=r"^ant.xml says itself where its body is: position, orientation, fixed are "):
+    with pytest.raises(TaskError, match=r"^ant.xml contains the pose of its body: position, orientation and "):
         sim.load("ant", "mjcf/ant.xml", position=(0, 0, 1))
 
 
@@ -122,7 +122,7 @@ def test_a_file_of_two_bodies(sim, tmp_path):
     file = tmp_path / "two.xml"
     body = '<body name="{}" pos="{} 0 2"><geom type="sphere" size="0.1"/></body>'
     file.write_text(f'<mujoco model="two"><worldbody>{body.format("a", 0)}{body.format("b", 1)}</worldbody></mujoco>')
-    with pytest.raises(TaskError, match=r"two.xml holds 2 bodies; load takes files of one, so split it$"):
+    with pytest.raises(TaskError, match=r"two.xml contains 2 bodies; split it into files of one body each$"):
         sim.load("two", file)
 
 

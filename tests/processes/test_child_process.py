@@ -119,7 +119,7 @@ def test_a_child_does_not_end_by_ctrl_c(started):
 def test_what_an_environment_writes_to_the_connection_is_no_message(started):
     child, *_ = started(prints=True)
     child.receive()
-    with pytest.raises(ChildEndedError, match="wrote to its connection what is not a message of rlctl"):
+    with pytest.raises(ChildEndedError, match="wrote invalid data to its connection: not a message of rlctl"):
         child.receive()
 
 

@@ -209,8 +209,7 @@ def test_window_without_a_display(replay, episode_file, display, reason):
     done = replay(episode_file, "--gui", display=display)
     assert done.returncode == 2
     assert done.stderr == (
-        f"error: PyBullet's window needs a display, and {reason}; "
-        "leave out --gui (in Python: render_mode) to do without\n"
+        f"error: PyBullet's window needs a display, and {reason}; leave out --gui (in Python: render_mode)\n"
     )
 
 

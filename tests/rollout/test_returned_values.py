@@ -38,11 +38,11 @@ def failure(env, **parameters):
         ("objects", "observation is [{}], not numbers"),
         (
             "nothing",
-            "step returned None, and not (observation, reward, terminated, truncated, info), as Gymnasium requires",
+            "step returned None; Gymnasium requires (observation, reward, terminated, truncated, info)",
         ),
         (
             "old gym",
-            "step returned 4 values, and not (observation, reward, terminated, truncated, info), as Gymnasium requires",
+            "step returned 4 values; Gymnasium requires (observation, reward, terminated, truncated, info)",
         ),
         ("no info", "info is None, not a dict"),
         ("text flag", "terminated is 'False', not a bool"),

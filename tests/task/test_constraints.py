@@ -36,7 +36,7 @@ def test_mistakes_in_a_gear(sim, tmp_path):
     wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
     with pytest.raises(TaskError, match=r"^model.urdf has no joint 'letf_joint'. Did you mean 'left_joint'\?"):
         sim.connect_gear(wheels, "letf_joint", "right_joint", ratio=1.0)
-    with pytest.raises(TaskError, match=r"^gear of 'left_joint' and 'right_joint': a ratio of 0 is no gear"):
+    with pytest.raises(TaskError, match=r"^gear of 'left_joint' and 'right_joint': the ratio must not be 0"):
         sim.connect_gear(wheels, "left_joint", "right_joint", ratio=0.0)
 
 
@@ -85,7 +85,7 @@ def test_frames_that_are_apart(sim, tmp_path):
     with pytest.raises(TaskError) as caught:
         sim.connect_point(Attachment(arm, "tip"), Attachment(cube, "baseLink"))
     assert str(caught.value) == (
-        "constraint: 'tip' of 'arm' and 'baseLink' of 'cube' are 0.2 m apart where they should be held together. "
+        "constraint: 'tip' of 'arm' and 'baseLink' of 'cube' are 0.2 m apart, too far to connect them. "
         "Place them with set_joints first."
     )
 

@@ -65,15 +65,15 @@ def missing(*names: str) -> type[Task]:
         ),
         (
             type("Standing", (Whole,), {"control_dt": 0.0}),
-            "Standing: control_dt is 0.0: it is a time above 0 [s]",
+            "Standing: control_dt is 0.0; it must be a time above 0 [s]",
         ),
         (
             type("Endless", (Whole,), {"episode_s": float("inf")}),
-            "Endless: episode_s is inf: it is a time above 0 [s]",
+            "Endless: episode_s is inf; it must be a time above 0 [s]",
         ),
         (
             type("Timeless", (Whole,), {"substeps": 0}),
-            "Timeless: substeps is 0: it is a whole number, at least 1",
+            "Timeless: substeps is 0; it must be a whole number, at least 1",
         ),
         (
             type("Rate", (Whole,), {"control_dt": 50}),
@@ -81,19 +81,19 @@ def missing(*names: str) -> type[Task]:
         ),
         (
             type("Half", (Whole,), {"substeps": 4.5}),
-            "Half: substeps is 4.5: it is a whole number, at least 1",
+            "Half: substeps is 4.5; it must be a whole number, at least 1",
         ),
         (
             type("Layout", (Whole,), {"observation_layout": "Dict"}),
-            "Layout: observation_layout is 'Dict': it is 'flat' or 'dict'",
+            "Layout: observation_layout is 'Dict'; it must be 'flat' or 'dict'",
         ),
         (
             type("Bounds", (Whole,), {"observation_bounds": {"zero": 3.0}}),
-            "Bounds: observation_bounds of 'zero' are 3.0: they are two numbers, (low, high)",
+            "Bounds: observation_bounds of 'zero' are 3.0; they must be two numbers, (low, high)",
         ),
         (
             type("Swapped", (Whole,), {"observation_bounds": {"zero": (1, -1)}}),
-            "Swapped: observation_bounds of 'zero' are (1, -1): they are two numbers, (low, high)",
+            "Swapped: observation_bounds of 'zero' are (1, -1); they must be two numbers, (low, high)",
         ),
         (
             type("Bare", (Whole,), {"events": {"mass": scale_mass}}),
@@ -113,12 +113,12 @@ def missing(*names: str) -> type[Task]:
         ),
         (
             type("Names", (Whole,), {"describe_joints": lambda self: ["hip"]}),
-            "Names: describe_joints() returned ['hip'], not what body.describe_joints makes of 1 names, "
+            "Names: describe_joints() returned ['hip']; return body.describe_joints(names) with 1 names, "
             "one per element of the action",
         ),
         (
             type("Few", (Whole,), {"describe_joints": lambda self: Joints(["hip", "knee"])}),
-            "Few: describe_joints() returned ['hip', 'knee'], not what body.describe_joints makes of 1 names, "
+            "Few: describe_joints() returned ['hip', 'knee']; return body.describe_joints(names) with 1 names, "
             "one per element of the action",
         ),
         (
@@ -127,13 +127,13 @@ def missing(*names: str) -> type[Task]:
         ),
         (
             ForgottenDataclass,
-            "ForgottenDataclass has parameters (tolerance) and is not a dataclass: "
-            "write @dataclass in the line above its class",
+            "ForgottenDataclass has parameters (tolerance) but is not a dataclass: "
+            "write @dataclass in the line above the class",
         ),
         (
             ForgottenBelow,
-            "ForgottenBelow has parameters (height) and is not a dataclass: "
-            "write @dataclass in the line above its class",
+            "ForgottenBelow has parameters (height) but is not a dataclass: "
+            "write @dataclass in the line above the class",
         ),
     ],
 )
@@ -151,7 +151,7 @@ def test_whole_tasks_are_built(cls):
 def test_a_parameter_of_a_class_that_forgot_it(write_module, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_module("arm.py", "from rlctl.task import Task\n\n\nclass Arm(Task):\n    tolerance: float = 0.1\n")
-    with pytest.raises(TaskError, match=r"^Arm has parameters \(tolerance\) and is not a dataclass"):
+    with pytest.raises(TaskError, match=r"^Arm has parameters \(tolerance\) but is not a dataclass"):
         EnvSpec("arm.py:Arm", {"tolerance": 0.2}).make()
 
 

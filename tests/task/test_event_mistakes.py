@@ -131,12 +131,12 @@ def forgets_its_draw(sim, rng, *, size: Range):
         ),
         (
             Event("reset", forgets_its_draw, enabled=True, size=(0, 1)),
-            "events.e: its function must return what it drew, as numbers by name, not None",
+            "events.e: its function must return a dict of the drawn numbers by name, not None",
         ),
         (
             Event("reset", untyped, size=(0, 1)),
-            "events.e: 'size' of untyped has no type, so nothing can be checked. Write `size: Range` if it is drawn "
-            "from, else its type.",
+            "events.e: 'size' of untyped has no type, so it cannot be checked. Write `size: Range` for "
+            "a range of random values, else its type.",
         ),
         (Event("reset", events.scale_mass, body="cub", factor=1.0, enabled=True), "events.e: no body 'cub'. Did you"),
     ],

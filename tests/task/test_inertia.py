@@ -52,12 +52,13 @@ def test_the_inertia_of_the_file(sim, tmp_path):
         ),
         (
             inertial(0.001, 0.001, 0.01),
-            "principal moments 0.001, 0.001, 0.01 kg m^2: the largest exceeds the sum of the others, as in no solid.",
+            "principal moments 0.001, 0.001, 0.01 kg m^2: the largest exceeds the sum of the others, "
+            "which no solid body has.",
         ),
         (
             inertial(1, 1, 1),
             "a moment of 1 kg m^2 is more than 1 kg within 0.31 m can have (0.093). "
-            "Mend the file, or load it with inertia='shape'.",
+            "Correct the file, or load it with inertia='shape'.",
         ),
         (
             inertial("0,3", 0.0076, 0.0076),

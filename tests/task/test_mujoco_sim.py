@@ -98,7 +98,9 @@ def test_events_act_in_mujoco_too():
     ("task", "missing"), [("gear-arm", "connect_gear"), ("peg-insert", "add_force_sensor"), ("ant", "")]
 )
 def test_what_mujoco_has_not_is_named(task, missing):
-    with pytest.raises(UsageError, match=f"^{missing}.*: not in MuJoCo; this task runs in PyBullet only"):
+    with pytest.raises(
+        UsageError, match=f"^--sim mujoco does not support .*{missing}.*: this task runs in PyBullet only"
+    ):
         EnvSpec(task, sim="mujoco").make()
 
 
@@ -108,5 +110,5 @@ def test_engines():
 
 @pytest.mark.parametrize("sim", ["mujoco:stiff", "mujoco:0", "mujoco:nan", "bullet", ""])
 def test_what_is_no_engine(sim):
-    with pytest.raises(UsageError, match="it is pybullet, mujoco, or mujoco:SOLREF"):
+    with pytest.raises(UsageError, match="give pybullet, mujoco, or mujoco:SOLREF"):
         read_solref(sim)

@@ -237,7 +237,7 @@ def test_only_actions_in_a_box_can_be_noisy():
     TaskEnv(Noisy()).close()
     with pytest.raises(TaskError) as caught:
         TaskEnv(Noisy(), events=EventSettings(randomize=True))
-    assert str(caught.value) == "events.late: only actions in a Box can be noisy or late, not Discrete(2)."
+    assert str(caught.value) == "events.late: only actions in a Box can have noise or delay, not Discrete(2)."
 
 
 def test_a_signal_of_the_authors_own(make):
@@ -264,5 +264,7 @@ def test_a_signal_function_that_gives_none():
     class Broken(Slider):
         events = {"broken": Event("observation", lambda rng, first: {"std": 1.0}, enabled=True)}
 
-    with pytest.raises(TaskError, match=r"^events\.broken: its function must return what it drew and a signal, not "):
+    with pytest.raises(
+        TaskError, match=r"^events\.broken: its function must return the drawn values and a signal, not "
+    ):
         TaskEnv(Broken())

@@ -26,7 +26,7 @@ def test_a_model_file_that_is_not_there(sim):
         sim.load("robot", "robot/missing.urdf")
     assert str(caught.value).startswith("model file 'robot/missing.urdf' not found: neither under /")
     assert str(caught.value).endswith(
-        " nor in pybullet_data; for a file beside your module: Path(__file__).with_name('missing.urdf')"
+        " nor in pybullet_data; for a file next to your module: Path(__file__).with_name('missing.urdf')"
     )
 
 
@@ -57,7 +57,7 @@ def test_two_joints_of_one_name(sim, tmp_path):
 
 def test_two_bodies_of_one_name(sim):
     sim.load("cube", "cube.urdf")
-    with pytest.raises(TaskError, match=r"^a body 'cube' is loaded already; give each its own name$"):
+    with pytest.raises(TaskError, match=r"^a body 'cube' is already loaded; give each body its own name$"):
         sim.load("cube", "cube.urdf")
 
 

@@ -114,7 +114,7 @@ def test_bad_behaviour_changes_nothing(train, whole, capfd):
     assert_same_weights(whole, run)
     assert ["sleep", "300.0625"] not in [process.info["cmdline"] for process in psutil.process_iter(["cmdline"])]
     printed = capfd.readouterr().err
-    assert "more lines of what environments print are left out" in printed
+    assert "more lines printed by environments are left out" in printed
     assert "\x1b" not in printed
     assert "Traceback" not in printed
 

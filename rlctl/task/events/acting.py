@@ -22,8 +22,8 @@ Streams = Mapping[str, np.random.Generator]
 def seed_streams(events: Iterable[str], seed: int) -> Streams:
     """Return the generators of an episode's events.
 
-    What an event draws follows from the seed and its name alone: an episode starts the same with and without events,
-    and a change to one event leaves the draws of the others as they are.
+    An event's random numbers depend only on the seed and its name: an episode starts the same with and without events,
+    and a change to one event does not change the draws of the others.
     """
     return {name: np.random.default_rng(np.random.SeedSequence(seed, spawn_key=_to_key(name))) for name in events}
 
@@ -33,7 +33,7 @@ def _to_key(name: str) -> tuple[int, ...]:
 
 
 class ActingEvents:
-    """Changes of the world at `reset`, `start` and `interval`; `level` in [0, 1] is how wide their ranges are."""
+    """Calls the events at `reset`, `start` and `interval`; `level` in [0, 1] sets the width of their ranges."""
 
     def __init__(self, events: Mapping[str, BoundEvent], control_dt: float) -> None:
         self._events: dict[When, list[BoundEvent]] = {"reset": [], "start": [], "interval": []}
@@ -42,7 +42,7 @@ class ActingEvents:
         self._periods = [max(1, round(event.event.every_s / control_dt)) for event in self._events["interval"]]
 
     def run(self, when: When, sim: Sim, streams: Streams, level: float) -> dict[str, Drawn]:
-        """Call the events of `when`; returns what they drew, by name."""
+        """Call the events at a moment; return the values that they drew, by name."""
         return {event.name: event(sim, streams[event.name], level) for event in self._events[when]}
 
     def run_due(self, step: int, sim: Sim, streams: Streams, level: float) -> dict[str, Drawn]:
@@ -56,7 +56,7 @@ class ActingEvents:
         return bool(self._periods)
 
     def try_once(self, moments: Iterable[When], sim: Sim) -> None:
-        """Call events once, to find mistakes: a name that is not in this world, or a result of the wrong type."""
+        """Call events once, to find mistakes: a name that the world does not have, or a result of the wrong type."""
         for when in moments:
             for event in self._events[when]:
                 try:
@@ -67,10 +67,7 @@ class ActingEvents:
 
 
 class Signals:
-    """Noise and delay on observations and actions.
-
-    `bounds` are those of the observations, which noise does not leave.
-    """
+    """Noise and delay on observations and actions; noisy observations stay inside their `bounds`."""
 
     def __init__(
         self,
@@ -87,17 +84,17 @@ class Signals:
         for event in self._on_action:
             if not isinstance(action_space, spaces.Box):
                 raise event.error(
-                    f"events.{event.name}: only actions in a Box can be noisy or late, not {action_space}."
+                    f"events.{event.name}: only actions in a Box can have noise or delay, not {action_space}."
                 )
         pictures = {name: (0, 255) for name, value in first.items() if np.asarray(value).dtype == np.uint8}
         self._bounds = {**pictures, **bounds}
         self._observation_signals: list[tuple[list[str], Signal]] | None = []
         self._action_signals: list[Signal] = []
         self.drawn: dict[str, Drawn] = {}
-        """What was drawn for this episode, by event."""
+        """Values drawn for this episode, by event."""
 
     def begin(self, streams: Streams, level: float) -> None:
-        """Start an episode; each event's chance comes from its stream."""
+        """Start an episode; each event uses its own random stream."""
         self.drawn = {}
         self._streams, self._level = streams, level
         self._observation_signals = None  # begins with the first observation
@@ -113,16 +110,18 @@ class Signals:
         return {_ACTION: np.clip(np.zeros_like(low), low, high)}
 
     def _start(self, event: BoundEvent, first: Parts) -> Signal:
-        made = event(self._streams[event.name], first, self._level)
-        if not (isinstance(made, tuple) and len(made) == 2 and callable(made[1])):
-            raise TaskError(f"events.{event.name}: its function must return what it drew and a signal, not {made!r}")
-        drawn, signal = made
+        result = event(self._streams[event.name], first, self._level)
+        if not (isinstance(result, tuple) and len(result) == 2 and callable(result[1])):
+            raise TaskError(
+                f"events.{event.name}: its function must return the drawn values and a signal, not {result!r}"
+            )
+        drawn, signal = result
         _check_drawn(event.name, drawn)
         self.drawn[event.name] = drawn
         return signal  # type: ignore[no-any-return]
 
     def observe(self, parts: Parts) -> Parts:
-        """Return what the policy sees of an observation."""
+        """Return an observation with noise and delay, as the policy sees it."""
         if self._observation_signals is None:
             return self._observe_first(parts)
         for names, signal in self._observation_signals:
@@ -146,7 +145,7 @@ class Signals:
         return {**parts, **changed}
 
     def act(self, action: Any) -> Any:
-        """Return what the motors get of an action; it stays inside the action space."""
+        """Return an action with noise and delay, as the motors get it; it stays inside the action space."""
         if not self._action_signals:
             return action
         parts = {_ACTION: action}
@@ -167,4 +166,4 @@ def _find_observed(event: BoundEvent, first: Parts) -> list[str]:
 
 def _check_drawn(name: str, drawn: Any) -> None:
     if not isinstance(drawn, dict) or not all(isinstance(value, int | float) for value in drawn.values()):
-        raise TaskError(f"events.{name}: its function must return what it drew, as numbers by name, not {drawn!r}")
+        raise TaskError(f"events.{name}: its function must return a dict of the drawn numbers by name, not {drawn!r}")

@@ -70,7 +70,7 @@ def scale_motor_strength(sim: Sim, rng: Rng, *, body: str, factor: NotNegative, 
 def set_color(
     sim: Sim, rng: Rng, *, body: str, red: Fraction, green: Fraction, blue: Fraction, links: Sequence[str] = ()
 ) -> Drawn:
-    """Paint `links`, or the whole body, in one colour; a texture shows through."""
+    """Paint `links`, or the whole body, in one colour; a texture stays visible."""
     drawn = [float(rng.uniform(*channel)) for channel in (red, green, blue)]
     sim.body(body).set_color(drawn, links)
     return dict(zip(("red", "green", "blue"), drawn, strict=True))
@@ -86,9 +86,9 @@ def offset_joints(
     velocity: Range = (0.0, 0.0),
     joints: Sequence[str] = (),
 ) -> Drawn:
-    """Start `joints`, or all, off where the task's reset put them: position [rad or m] and velocity [rad/s or m/s].
+    """Add random offsets to the start state of `joints`, or all: position [rad or m] and velocity [rad/s or m/s].
 
-    Every joint has draws of its own; positions stay inside the joint's limits.
+    Every joint draws its own offsets; positions stay inside the joint's limits.
     """
     moved = sim.body(body)
     indices = moved.find_joints(joints)
@@ -97,7 +97,7 @@ def offset_joints(
     positions, velocities = moved.joint_positions.copy(), moved.joint_velocities.copy()
     low, high = moved.joint_low[indices], moved.joint_high[indices]
     started = positions[indices] + by_position
-    # A joint without limits says so by a lower one that is not below the upper.
+    # A joint has no limits if its lower limit is not below the upper one.
     positions[indices] = np.where(low < high, np.clip(started, low, high), started)
     velocities[indices] += by_velocity
     moved.set_joints(positions, velocities)
@@ -118,7 +118,7 @@ def push(
 ) -> Drawn:
     """Push a link, or the base, with a horizontal force [N] from a random side for `duration_s` [s].
 
-    Rounded to control steps, of which it lasts at least one.
+    The duration is rounded to control steps, at least one.
     """
     drawn = {
         "force": float(rng.uniform(*force)),
@@ -131,7 +131,7 @@ def push(
 
 @acts_at("start", "interval", speed=0.0)
 def kick(sim: Sim, rng: Rng, *, body: str, speed: NotNegative) -> Drawn:
-    """Change the velocity of the base, at once, by a horizontal `speed` [m/s] in a random direction."""
+    """Add a horizontal `speed` [m/s] in a random direction to the velocity of the base."""
     kicked = sim.body(body)
     if kicked.fixed:
         raise TaskError(f"body {body!r} is fixed to the world: a kick cannot move it")

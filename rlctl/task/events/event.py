@@ -1,4 +1,4 @@
-"""`Event`: a named change of a task, its parameters, and what a recipe makes of them."""
+"""`Event`: a named change of a task with its parameters, which a recipe may set."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ When = Literal["reset", "start", "interval", "observation", "action"]
 Drawn = dict[str, float]
 Parts = dict[str, NDArray[Any]]
 Signal = Callable[[Parts], Parts]
-"""What a control step's values, by name, become: a sensor or a motor that is noisy or late."""
+"""Changes the values of a control step, by name: a sensor or a motor with noise or delay."""
 
 Change = Callable[..., Drawn]
-"""`(sim, rng, **parameters)`: changes the world, always from its nominal values, and returns what it drew."""
+"""`(sim, rng, **parameters)`: changes the world relative to its nominal values; returns the drawn values."""
 SignalMaker = Callable[..., tuple[Drawn, Signal]]
-"""`(rng, first, **parameters)`: starts an episode whose first values are `first`; returns what it drew and a signal."""
+"""`(rng, first, **parameters)`: starts an episode with the values `first`; returns the drawn values and a signal."""
 
 _MOMENTS: tuple[When, ...] = typing.get_args(When)
 _SETTINGS: Mapping[When, list[str]] = {"interval": ["every_s"], "observation": ["of"]}
@@ -34,9 +34,9 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def acts_at(*when: When, **nominal: float) -> Callable[[_Function], _Function]:
-    """Mark an event function with the moments at which it makes sense; any, without this.
+    """Mark an event function with its possible moments; an unmarked function may act at any.
 
-    `nominal` are the values of parameters at which it changes nothing.
+    `nominal` are the values of parameters for which it changes nothing.
     """
 
     def mark(function: _Function) -> _Function:
@@ -48,16 +48,16 @@ def acts_at(*when: When, **nominal: float) -> Callable[[_Function], _Function]:
 
 
 class Event:
-    """A change `function(..., **parameters)` that a task offers and a recipe switches on, or that is part of it.
+    """A change `function(..., **parameters)` that a task offers and a recipe enables, or that is always enabled.
 
     `when` is one of
     - `reset`: before the task's own reset, for properties such as a mass;
     - `start`: after it, for a state such as joint angles or velocities;
     - `interval`: every `every_s` seconds of an episode;
-    - `observation`: on what is observed, or only on the names in `of`, at every step;
-    - `action`: on what `Task.act` gets, at every step.
+    - `observation`: on the observations, or only on the names in `of`, at every step;
+    - `action`: on the action that `Task.act` gets, at every step.
 
-    Events act when the recipe says so; one that is part of the problem says `enabled=True`.
+    A recipe enables events; an event that is part of the task has `enabled=True`.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Event:
 
     @property
     def parameter_names(self) -> list[str]:
-        """What a recipe can set: the function's own parameters, then `every_s` or `of` where they mean something."""
+        """Parameters that a recipe can set: those of the function, then `every_s` or `of` for events that have them."""
         return [*self._signature, *_SETTINGS.get(self.when, [])]
 
     @cached_property
@@ -89,24 +89,24 @@ class Event:
 
     @property
     def ranges(self) -> dict[str, RangeLimits]:
-        """The parameters that are drawn from, those first that the task sets, with what they may hold."""
+        """The parameters that are ranges, with the limits of their values; those that the task sets come first."""
         names = sorted(self._signature, key=lambda name: name not in self.parameters)
         found = {name: _find_limits(self._hints.get(name)) for name in names}
         return {name: limits for name, limits in found.items() if limits is not None}
 
     def nominal(self, parameter: str) -> float | None:
-        """Return the value of a parameter at which nothing changes; None where there is no such number."""
+        """Return the value of a parameter for which nothing changes; None if there is no such number."""
         return _nominal.get(self.function, {}).get(parameter)
 
     def with_parameters(self, name: str, changes: Mapping[str, Any]) -> Event:
-        """Return this event, enabled, with some parameters replaced; `name` is for the error."""
+        """Return this event, enabled, with some parameters replaced; errors mention `name`."""
         for key in changes:
             check_name(key, self.parameter_names, f"events.{name}: no parameter", RecipeError)
         settings = {"every_s": self.every_s, "of": self.of, **self.parameters, **changes}
         return Event(self.when, self.function, enabled=True, **settings)
 
     def bind(self, name: str, error: type[RlctlError] = TaskError) -> BoundEvent:
-        """Check everything that can be known without a world; raises `error` that begins with `events.<name>`."""
+        """Check everything that needs no world; raises `error` with a message that begins with `events.<name>`."""
         where = f"events.{name}"
         check_name(self.when, _MOMENTS, f"{where}: no moment", error, listed="There are")
         possible = _acts_at.get(self.function, _MOMENTS)
@@ -120,8 +120,8 @@ class Event:
             if parameter.annotation is parameter.empty:
                 function = getattr(self.function, "__name__", str(self.function))
                 raise TaskError(
-                    f"{where}: {key!r} of {function} has no type, so nothing can be checked. Write `{key}: Range` if "
-                    "it is drawn from, else its type."
+                    f"{where}: {key!r} of {function} has no type, so it cannot be checked. Write `{key}: Range` for "
+                    "a range of random values, else its type."
                 )
             if parameter.default is parameter.empty and key not in self.parameters:
                 raise error(f"{where}: parameter {key!r} is missing. It has: {', '.join(self.parameter_names)}.")
@@ -129,7 +129,7 @@ class Event:
         if self.when == "observation":
             _check_type(f"{where}.of", str | Sequence[str], self.of, error)
         elif self.of:
-            raise error(f"{where}.of: names observations, so it is for events at 'observation', not {self.when!r}.")
+            raise error(f"{where}.of: only events at 'observation' have it, not {self.when!r}.")
         if self.when == "interval":
             read_range(f"{where}.every_s", self.every_s, RangeLimits(0.0, above=True), error)
         return BoundEvent(name, self, values, error)
@@ -153,7 +153,7 @@ class Event:
 
 
 def _find_limits(hint: Any) -> RangeLimits | None:
-    """Return what a range of this type may hold; None for a type that is not a range."""
+    """Return the limits of a range of this type; None for a type that is not a range."""
     if hint != Range and getattr(hint, "__origin__", None) != Range:
         return None
     return next((m for m in getattr(hint, "__metadata__", ()) if isinstance(m, RangeLimits)), RangeLimits())
@@ -175,7 +175,7 @@ def _check_type(where: str, hint: Any, value: Any, error: type[RlctlError]) -> N
 
 @dataclasses.dataclass(frozen=True)
 class BoundEvent:
-    """An event that acts in an environment, checked; `error` is the kind that its mistakes are."""
+    """A checked event that acts in an environment; its mistakes raise `error`."""
 
     name: str
     event: Event
@@ -190,13 +190,13 @@ class BoundEvent:
 
 @dataclasses.dataclass(frozen=True)
 class EventSettings:
-    """What a recipe says of a task's events."""
+    """The events of a task that a recipe enables and changes."""
 
     randomize: bool = False
     changes: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
 
     def apply(self, events: Mapping[str, Event]) -> dict[str, BoundEvent]:
-        """Return the events that act, by name; checks the others for mistakes too."""
+        """Return the enabled events, by name; the others are checked too."""
         for name in self.changes:
             check_name(name, events, "events: this task has no event", RecipeError)
         active = {}

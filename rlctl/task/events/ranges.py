@@ -1,4 +1,4 @@
-"""Ranges that events draw from: what may be written for one, what it may hold, and how it widens."""
+"""Ranges from which events draw values: how they are written, the limits of their values, and how they widen."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from rlctl.errors import TaskError, did_you_mean
 
 Range = tuple[float, float]
-"""A parameter of an event function that is drawn from: lowest and highest value.
+"""A range of random values, as a parameter of an event function: lowest and highest value.
 
 A task or a recipe writes `[low, high]`, one number, or `{"from": [low, high], "to": [low, high]}` for a range that
 goes from the first to the second as the environment's level goes from 0 to 1.
@@ -21,17 +21,17 @@ goes from the first to the second as the environment's level goes from 0 to 1.
 
 @dataclasses.dataclass(frozen=True)
 class RangeLimits:
-    """What the values of a range may be, in its annotation: `Annotated[Range, RangeLimits(low=0.0)]`."""
+    """RangeLimits of the values of a range, in its annotation: `Annotated[Range, RangeLimits(low=0.0)]`."""
 
     low: float = -math.inf
     high: float = math.inf
     above: bool = False
-    """More than `low`, not `low` itself."""
+    """Whether `low` itself is excluded."""
     whole: bool = False
-    """Whole numbers; `high` of the range is drawn too."""
+    """Whole numbers only; the upper end of the range is included."""
 
     def find_violation(self, value: float) -> str:
-        """Say what is wrong with a value, or nothing."""
+        """Return why a value is outside the limits; empty if it is inside."""
         if self.whole and value != int(value):
             return f"{value:g} is not a whole number"
         if value < self.low or (self.above and value == self.low):
@@ -59,7 +59,7 @@ class Widening(NamedTuple):
 
 
 def read_range(where: str, value: Any, limits: RangeLimits, error: type[Exception] = TaskError) -> Widening:
-    """Read what a task or a recipe has written for a range; raises `error` that begins with `where`."""
+    """Read the range that a task or a recipe gives; raises `error` with a message that begins with `where`."""
     if not isinstance(value, Mapping):
         pair = _pair(where, value, limits, error)
         return Widening(pair, pair, limits.whole)
@@ -90,5 +90,4 @@ def _pair(where: str, value: Any, limits: RangeLimits, error: type[Exception]) -
 
 
 def _is_number(value: Any) -> bool:
-    good = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return good and math.isfinite(value)
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)

@@ -28,9 +28,9 @@ def noise(rng: Rng, first: Parts, *, std: NotNegative) -> tuple[Drawn, Signal]:
 
 @acts_at("observation", "action", steps=0.0)
 def delay(rng: Rng, first: Parts, *, steps: Steps) -> tuple[Drawn, Signal]:
-    """Pass everything on some control steps late; how many is drawn once per episode, both ends included.
+    """Delay all values by some control steps; the number is drawn once per episode, both ends included.
 
-    Until then an observation is the episode's first, and an action is 0, or what is nearest to 0 in the action space.
+    Until then an observation is the episode's first, and an action is 0, or the action nearest to 0.
     """
     drawn = int(rng.integers(int(steps[0]), int(steps[1]) + 1))
     past = deque([_copy_parts(first)] * drawn, maxlen=drawn + 1)
@@ -43,5 +43,5 @@ def delay(rng: Rng, first: Parts, *, steps: Steps) -> tuple[Drawn, Signal]:
 
 
 def _copy_parts(parts: Parts) -> Parts:
-    # A task may go on writing into the arrays that it gave.
+    # A task may change its arrays later.
     return {name: np.array(value) for name, value in parts.items()}
