@@ -153,7 +153,7 @@ class ProcessPool:
 
 
 def _make_fault(worker: int, error: ChildEndedError, doing: str) -> WorkerFault:
-    hint = ": the system does this when memory runs out; fewer environments (--n-envs) need less memory"
+    hint = ": the system does that when memory runs out; fewer environments (--n-envs) need less"
     return WorkerFault(worker, f"worker {worker} {error} while {doing}{hint if 'SIGKILL' in str(error) else ''}")
 
 

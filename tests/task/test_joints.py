@@ -8,7 +8,7 @@ import pytest
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.exporting.actor import metadata
+from rlctl.exporting.actor import make_metadata
 from rlctl.policy.file import PolicyInfo
 from rlctl.task.joints import Joints
 
@@ -24,7 +24,7 @@ def describe_task(task):
 def write_metadata(task):
     env = describe_task(task)[0]
     info = PolicyInfo(algo="ppo", policy="MlpPolicy", env=env, spec=EnvSpec(task).__dict__)
-    return metadata(PolicyInfo.model_validate_json(info.model_dump_json()))
+    return make_metadata(PolicyInfo.model_validate_json(info.model_dump_json()))
 
 
 def test_position_targets_have_the_keys_of_controllers():
