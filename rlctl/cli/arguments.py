@@ -143,7 +143,7 @@ def choose_checkpoint(checkpoint: str, pretrained: bool) -> str:
     from rlctl.policy.shipped import PRETRAINED
 
     if checkpoint not in ("best", PRETRAINED):
-        raise UsageError(f"--pretrained is the policy that ships with a task: leave out --checkpoint {checkpoint}")
+        raise UsageError(f"--pretrained and --checkpoint exclude each other: leave out --checkpoint {checkpoint}")
     return PRETRAINED
 
 

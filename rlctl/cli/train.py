@@ -53,9 +53,9 @@ def train(
         show_group(result.score, json)
         return result.check()
     if on is not None or detach:
-        raise UsageError("--on is about several seeds: give --seeds 0-4, or --resume GROUP")
+        raise UsageError("--on and --detach need several seeds: give --seeds 0-4 or --resume GROUP")
     if jobs is not None:
-        raise UsageError("--jobs is about several seeds: give --seeds 0-4, or --resume GROUP")
+        raise UsageError("--jobs needs several seeds: give --seeds 0-4 or --resume GROUP")
     from rlctl.training.request import run_training
     from rlctl.training.summary import show
 

@@ -106,7 +106,7 @@ def read_group(path: Path) -> Group:
     content: Any = files.read_json(file)
     if isinstance(content, dict) and content.get("version") != VERSION:
         raise ArtifactError(
-            f"{file}: of another version of rlctl, which cannot be resumed as a group; its runs can, one by one"
+            f"{file}: written by another version of rlctl: the group cannot be resumed; resume its runs one by one"
         )
     try:
         if content["request"].keys() & _PLACES:
@@ -117,4 +117,4 @@ def read_group(path: Path) -> Group:
             raise ValueError
         return Group(path, list(seeds), request)
     except (KeyError, TypeError, ValueError, AttributeError):
-        raise ArtifactError(f"{file}: damaged: it does not hold seeds and the request of a training") from None
+        raise ArtifactError(f"{file}: damaged: it must hold seeds and a training request") from None

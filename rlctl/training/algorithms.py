@@ -24,16 +24,16 @@ from rlctl.training.hindsight import replay_arguments
 from rlctl.training.own_networks import write_graph
 from rlctl.training.vec_env import WorkerVecEnv
 
-# numpy reserves a replay buffer without touching it: one of a terabyte is made at once, and fills up step by step.
+# The system provides a replay buffer's memory only when it is written, so one that is too large fails hours later.
 _FLOAT32 = 4  # [bytes]
-_USABLE_SHARE = 0.9  # of the memory that is free; the environments need some as well
+_USABLE_SHARE = 0.9  # of the free memory; the environments need memory too
 _DELAYED_BY_US = frozenset({"sac", "tqc"})
-"""Whose `policy_delay` Stable-Baselines3 does not have."""
+"""Algorithms whose `policy_delay` Stable-Baselines3 does not have."""
 _CONTINUOUS = frozenset({"sac", "td3", "ddpg", "tqc", "crossq"})
 
 
 def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm:
-    """Build the model of a recipe on vector environments; raises `RecipeError` for what does not fit."""
+    """Build the model of a recipe on vector environments; raises `RecipeError` if they do not fit together."""
     _check_device(device)
     cls = ALGORITHMS[recipe.algo]
     kwargs = _algorithm_kwargs(recipe)
@@ -58,7 +58,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         if recipe.algo in _DELAYED_BY_US:
             model.policy_delay = recipe.algo_kwargs.get("policy_delay", 1)  # type: ignore[attr-defined]
         _use_fused_adam(model)
-        write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # what a user's network has wrong shows here
+        write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # reports faults of a user's network
         return model
     except (RlctlError, KeyboardInterrupt):
         raise
@@ -70,9 +70,9 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
 
 
 def keep_compiler_out() -> None:
-    """Take torch's marks for its compiler off the optimisers: nothing is compiled here, and to honour them imports it.
+    """Remove torch's compiler decorators from the optimisers: they import the compiler, which rlctl does not use.
 
-    That takes 1.6 s, more than torch itself.
+    The import takes 1.6 s, more than torch itself.
     """
     for name in ("add_param_group", "load_state_dict", "state_dict", "zero_grad"):
         setattr(torch.optim.Optimizer, name, inspect.unwrap(getattr(torch.optim.Optimizer, name)))
@@ -81,7 +81,7 @@ def keep_compiler_out() -> None:
 
 
 def _use_fused_adam(model: BaseAlgorithm) -> None:
-    """Let Adam update all weights in one call; it computes the same, and a small network's update is mostly calls."""
+    """Let Adam update all weights in one call: same results, and small networks spend most time on calls."""
     parts = [model, *(getattr(model.policy, name, None) for name in ("actor", "critic")), model.policy]
     for part in parts:
         for name in ("optimizer", "ent_coef_optimizer"):
@@ -103,7 +103,7 @@ def _check_device(device: str) -> None:
 
 
 def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
-    """Raise `RecipeError` for spaces that SB3 refuses in its own words, or not before training."""
+    """Raise `RecipeError` for spaces that SB3 refuses with an unclear message, or only during training."""
     actions = short_repr(action_space)
     if algo == "dqn" and not isinstance(action_space, spaces.Discrete):
         others = "ppo or sac" if isinstance(action_space, spaces.Box) else "ppo"
@@ -129,18 +129,18 @@ def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: 
 
 
 def _algorithm_kwargs(recipe: Recipe) -> dict[str, Any]:
-    ours = {"action_noise"}  # which workers add
+    ours = {"action_noise"}  # workers add it
     if recipe.algo in _DELAYED_BY_US:
         ours.add("policy_delay")
     return {name: _make_schedule(value) for name, value in recipe.algo_kwargs.items() if name not in ours}
 
 
 def _make_schedule(value: Any) -> Any:
-    """Return what falls to zero over the training for `lin_3e-4`, as rl-zoo writes it; other values as they are."""
+    """Return a schedule that falls linearly to zero for rl-zoo's `lin_3e-4`; other values unchanged."""
     if not isinstance(value, str) or not value.startswith("lin_"):
         return value
     start = float(value.removeprefix("lin_"))
-    # The last rollout may go past the end, and a negative rate would unlearn.
+    # The last rollout may pass the end, where the rate would be negative.
     return lambda remaining: max(remaining, 0.0) * start
 
 
@@ -152,7 +152,7 @@ def _policy_kwargs(recipe: Recipe) -> dict[str, Any]:
 
 
 def wrap_normalize(env: VecEnv, settings: NormalizeSettings | None, gamma: float) -> VecEnv:
-    """Wrap environments in SB3's VecNormalize, as far as their observations are real numbers."""
+    """Wrap environments in SB3's VecNormalize; only observations of real numbers are normalised."""
     if settings is None:
         return env
     space = env.observation_space
@@ -178,16 +178,16 @@ def _is_real(space: spaces.Space[Any]) -> bool:
 
 
 def _check_memory(recipe: Recipe, env: VecEnv) -> None:
-    """Raise `RecipeError`, with the bytes, for a buffer that does not fit into this machine's memory."""
+    """Raise `RecipeError` for a buffer that does not fit into the free memory."""
     free, (key, size) = memory.available(), _measure_buffer(recipe, env)
     if free is not None and size > _USABLE_SHARE * free:
         needs, are = format_bytes(size), format_bytes(free)
         given = recipe.algo_kwargs.get(key)
-        raise RecipeError(f"algo_kwargs.{key}: {given} needs {needs} of memory, and {are} are free; give less")
+        raise RecipeError(f"algo_kwargs.{key}: {given} needs {needs} of memory, but only {are} are free; reduce it")
 
 
 def _measure_buffer(recipe: Recipe, env: VecEnv) -> tuple[str, int]:
-    """Return the parameter that decides how large the buffer is, and its bytes."""
+    """Return the parameter that sets the size of the buffer, and this size [bytes]."""
     kwargs = recipe.algo_kwargs
     parts = [(math.prod(part.shape or ()), part.dtype) for part in split_space(env.observation_space).values()]
     action = math.prod(env.action_space.shape or ()) * _FLOAT32

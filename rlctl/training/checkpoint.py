@@ -169,12 +169,12 @@ def read_newest(run: RunDirectory) -> tuple[Checkpoint | None, list[str]]:
         try:
             checkpoint = read(folder)
             if checkpoint.state.run not in ("", run.id()):
-                raise ArtifactError(f"{folder}: the checkpoint of another run; nothing of it is used")
+                raise ArtifactError(f"{folder}: this checkpoint belongs to another run and is not used")
             return checkpoint, damage
         except ArtifactError as error:
             damage.append(str(error))
     if damage:
-        raise ArtifactError(f"{damage[0]}\nnone of the checkpoints of {run.path} can be read; train anew")
+        raise ArtifactError(f"{damage[0]}\nno checkpoint of {run.path} can be read; start a new training")
     return None, []
 
 
@@ -208,7 +208,7 @@ def _read_state(folder: Path) -> State:
             f"{file}: not a checkpoint of rlctl: {validation.explain_invalid(error, State, content)}"
         ) from None
     if state.step != int(folder.name):
-        raise ArtifactError(f"{folder}: this is the checkpoint of step {state.step}, under another name")
+        raise ArtifactError(f"{folder}: the folder's name is wrong: it holds the checkpoint of step {state.step}")
     return state
 
 
@@ -267,7 +267,7 @@ def _restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
     """Replay the running episodes; return a message if an environment does not reach its former state."""
     steps = tensors["environments/steps"].tolist()
     if len(steps) != env.num_envs:
-        raise ArtifactError(f"it is of {len(steps)} environments, not {env.num_envs}")
+        raise ArtifactError(f"it was saved with {len(steps)} environments, not {env.num_envs}")
     started = tensors["environments/episodes_started"].tolist()
     actions: list[NDArray[Any]] = np.split(tensors["environments/actions"], np.cumsum(steps)[:-1])
     mismatch = set(env.replay_actions(started, actions))
@@ -277,6 +277,6 @@ def _restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
     if not mismatch:
         return None
     return (
-        f"environment {min(mismatch)} did not come back to where it was with its seed and actions, "
-        "so all begin their next episodes"
+        f"environment {min(mismatch)} did not reach its saved state from its seed and actions, "
+        "so all environments start new episodes"
     )

@@ -53,7 +53,9 @@ class Checkpoints:
         Raises `ArtifactError` if somebody has removed the run, `RunTaken` if another process writes it now.
         """
         if not self.run.status_file.exists():
-            raise ArtifactError(f"{self.run.path}: was removed while it trained, so nothing can be saved; train anew")
+            raise ArtifactError(
+                f"{self.run.path}: was removed during training, so nothing can be saved; start a new training"
+            )
         self.run.check_claim()
         try:
             write()
@@ -64,7 +66,7 @@ class Checkpoints:
 
     def _report(self, problem: str) -> None:
         if problem not in self._reported:
-            self._warn(f"warning: not saved: {problem}; training goes on")
+            self._warn(f"warning: not saved: {problem}; training continues")
         self._reported.add(problem)
         self.problem = problem
 
@@ -140,8 +142,8 @@ class Checkpoints:
         inexact = [*changed, *find_differences(checkpoint.state.computed_with, self._folders.computed_with())]
         inexact += [mismatch] if mismatch else []
         self.saved_step = checkpoint.state.step
-        exactness = f"not bit-exact: {'; '.join(inexact)}" if inexact else "as if it had never stopped"
-        return f"going on at step {checkpoint.state.step:,}, {exactness}"
+        exactness = f"not bit-exact: {'; '.join(inexact)}" if inexact else "bit-exact"
+        return f"resuming at step {checkpoint.state.step:,}, {exactness}"
 
     def cut_back(self, step: int) -> list[str]:
         """Put the run folder back to where the checkpoint of a step has it; return warnings.
@@ -158,8 +160,8 @@ class Checkpoints:
             (self.evals, progress.evals_bytes, progress.evals_sha256),
         )
         return [
-            f"warning: {table.path}: edited or damaged: its rows up to step {step:,} are not those that were written; "
-            "they are kept as they are, without lines that are not whole"
+            f"warning: {table.path}: edited or damaged: its rows up to step {step:,} differ from those that rlctl "
+            "wrote; they are kept, except incomplete lines"
             for table, size, sha256 in tables
             if not table.cut_back(size, sha256, step)
         ]

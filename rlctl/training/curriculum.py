@@ -1,4 +1,4 @@
-"""The present stage of a curriculum, and when the next one begins."""
+"""The curriculum: its current stage, and when the next one begins."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Curriculum:
     def __init__(self, stages: Sequence[Stage], specs: Sequence[EnvSpec], goal: EnvInfo, progress: Progress) -> None:
         self.stages = stages
         self.goal_spec = specs[-1]
-        """The last stage: evaluations are played in it, policies are for it."""
+        """The last stage, in which evaluations are played and which policies store."""
         self.goal = goal
-        """What the environments of `goal_spec` are."""
+        """Description of the environments of `goal_spec`."""
         self._specs = specs
         self._progress = progress
         if stages and not progress.stage:
@@ -43,29 +43,29 @@ class Curriculum:
 
     @property
     def number(self) -> int:
-        """The present stage, from 1; 0 without stages."""
+        """The current stage, from 1; 0 without stages."""
         return self._progress.stage
 
     @property
     def _rule(self) -> Promotion | None:
-        """When the present stage is over; None for the last."""
+        """Promotion rule of the current stage; None for the last."""
         return self.stages[self.number - 1].promote if self.stages else None
 
     @property
     def title(self) -> str:
-        """The present stage for people: `stage 2 of 3: tolerance 0.1`."""
+        """The current stage as text: `stage 2 of 3: tolerance 0.1`."""
         return format_title(self.number, self.stages)
 
     def columns(self) -> dict[str, int]:
-        """Return the columns of the stage for tables: nothing without stages."""
+        """Return the table column `stage`; empty without stages."""
         return {"stage": self.number} if self.stages else {}
 
     def specs(self) -> list[EnvSpec]:
-        """Return what the environments of each stage are made from; nothing without stages."""
+        """Return the spec of each stage; empty without stages."""
         return list(self._specs) if self.stages else []
 
     def count(self, ended: Sequence[EpisodeResult]) -> None:
-        """Take note of training episodes of the present stage, in the order in which they ended."""
+        """Count finished training episodes of the current stage, in the order in which they ended."""
         rule = self._rule
         if rule is None:
             return
@@ -76,16 +76,16 @@ class Curriculum:
         self._progress.stage_episodes = [*self._progress.stage_episodes, *values][-rule.window :]
 
     def measured(self) -> float | None:
-        """Return the success rate or mean return that the rule looks at; None while its window is not full."""
+        """Return the success rate or mean return that the rule compares; None until its window is full."""
         rule = self._rule
         values = self._progress.stage_episodes
         if rule is None or len(values) < rule.window:
             return None
-        # An environment may speak of success only when there is one.
+        # Some environments report success only when there is one.
         return statistics.fmean(0.0 if value is None else value for value in values)
 
     def is_due(self, steps: int) -> bool:
-        """Say whether the present stage is done, after `steps` environment steps of training."""
+        """Return whether the current stage is done after `steps` environment steps."""
         measured = self.measured()
         rule = self._rule
         if rule is None or measured is None:
@@ -93,13 +93,13 @@ class Curriculum:
         return steps - self._progress.stage_began >= rule.min_steps and measured >= rule.threshold
 
     def next_spec(self) -> EnvSpec:
-        """Return what the environments of the next stage are made from."""
+        """Return the spec of the next stage."""
         return self._specs[self.number]
 
     def enter_next_stage(self, steps: int) -> tuple[str, str]:
-        """Enter the next stage; return its title and why it begins."""
+        """Enter the next stage; return its title and the reason."""
         rule, measured = self._rule, self.measured()
-        assert rule is not None  # else nothing would be due
+        assert rule is not None  # else `is_due` is False
         assert measured is not None
         reason = f"success {percent(measured)}" if rule.success is not None else f"return {measured:.2f}"
         progress = self._progress
@@ -108,10 +108,10 @@ class Curriculum:
 
 
 def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
-    """Build an environment of every stage, one after the other; return what those of the last are.
+    """Build an environment of every stage, one after the other; return the description of the last stage's.
 
-    `workers` have the first. Raises `RecipeError` or `TaskError`, which name the stage, for one that cannot be
-    built, and `RecipeError` for one with other spaces or reward terms than the first.
+    `workers` have the first stage. Raises `RecipeError` or `TaskError` with the number of a stage that cannot be
+    built, and `RecipeError` if a stage's spaces or reward terms differ from the first's.
     """
     first = info = None
     for number, spec in enumerate(specs, start=1):
@@ -135,7 +135,7 @@ def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
 
 
 def begin_next_episodes(model: BaseAlgorithm) -> None:
-    """Leave the running episodes and begin the next ones, as SB3 does at the start of a training."""
+    """Cut the running episodes short and start new ones, as SB3 does at the start of a training."""
     env: Any = model.env
     if isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
         _cut_episodes(model.replay_buffer)
@@ -144,12 +144,12 @@ def begin_next_episodes(model: BaseAlgorithm) -> None:
 
 
 def _cut_episodes(buffer: ReplayBuffer) -> None:
-    """Mark the running episodes as cut short but not over: no return, and no goal, reaches into the next stage."""
+    """Mark the running episodes as truncated: no return and no hindsight goal extends into the next stage."""
     if isinstance(buffer, HerReplayBuffer):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # SB3 warns of the very thing
+            warnings.simplefilter("ignore")  # SB3 warns that this truncates episodes
             buffer.truncate_last_trajectory()
         return
     last = buffer.pos - 1
-    running = buffer.dones[last] == 0.0  # the others have ended by themselves
+    running = buffer.dones[last] == 0.0  # the others have ended already
     buffer.timeouts[last, running] = 1.0

@@ -17,13 +17,13 @@ from rlctl.training.evaluation_episodes import EvaluationEpisodes
 from rlctl.training.learner import Learner
 
 _FINAL_EPISODES = 30
-"""At least so many new episodes decide between the best policy and the last."""
+"""Minimum number of new episodes that compare the best policy with the last."""
 
 
 class Evaluator:
-    """Evaluates the policy of a learner, and keeps the best one; nothing of the training changes by it.
+    """Evaluates the policy of a learner and keeps the best one, without any effect on the training.
 
-    `check`, a parameter of its methods, is called several times a second while episodes are played, and may raise.
+    Its methods call `check` several times a second while episodes are played; it may raise to stop them.
     """
 
     def __init__(
@@ -31,7 +31,7 @@ class Evaluator:
     ) -> None:
         self.episodes = episodes
         self.best: PolicyInfo | None = None
-        """The best policy so far, with its score, as its file has it."""
+        """The best policy so far, with its score, as stored in its file."""
         self._learner = learner
         self._recipe = learner.recipe
         self._checkpoints = checkpoints
@@ -41,9 +41,9 @@ class Evaluator:
         self._reported_findings: set[str] = set()
 
     def restore(self) -> None:
-        """Take the best score from the best policy's own file, which may be newer than the checkpoint.
+        """Read the best score from the best policy's file, which may be newer than the checkpoint.
 
-        Shows a warning if there is none although evaluations were made.
+        Shows a warning if the file is missing although there were evaluations.
         """
         rows = read_table(self._checkpoints.run.evals_file)
         self._highest_success = max((row["success"] for row in rows if row["success"] is not None), default=0.0)
@@ -51,36 +51,36 @@ class Evaluator:
             self.best = self._checkpoints.read_best().info
         except ArtifactError as error:
             if rows:
-                self._display.message(f"warning: {error}; the policy of the next evaluation is taken as the best")
+                self._display.message(f"warning: {error}; the next evaluated policy becomes the best")
 
     def is_due(self) -> bool:
-        """Say whether this boundary is evaluated: every so many steps, and at the end."""
+        """Return whether to evaluate at this boundary: every `eval.every_steps` steps, and at the end."""
         steps, progress = self._learner.steps, self._learner.progress
         return steps >= progress.next_eval or (self._learner.is_at_end and progress.last_eval < steps)
 
     def evaluate(self, check: Callable[[], None]) -> None:
         """Play the evaluation episodes, save the best policy, and write the row and the episodes.
 
-        An environment that fails costs this evaluation, not the training.
+        If an environment fails, this evaluation is lost and the training continues.
         """
         steps, progress = self._learner.steps, self._learner.progress
         policy = self._learner.pack()
         self._display.phase("evaluating")
         try:
-            # They may take minutes, too long to wait after a signal; the resumed run repeats them.
+            # Episodes may take minutes, so a signal interrupts them; the resumed run repeats them.
             episodes = self.episodes.play(policy, check)
-        except (TaskError, UsageError, ArtifactError) as error:  # the last two where files were removed meanwhile
+        except (TaskError, UsageError, ArtifactError) as error:  # the last two: files were removed in the meantime
             self._note_failure(error)
         else:
             self._note(episodes, policy)
         progress.last_eval = steps
-        if not self._learner.is_at_end:  # at the end all of it is printed
+        if not self._learner.is_at_end:  # at the end all findings are printed
             self._report_findings()
         while progress.next_eval <= steps:
             progress.next_eval += self._recipe.eval.every_steps or self._recipe.total_timesteps
 
     def _report_findings(self) -> None:
-        """Show the warnings of the run's own records that were not there the last time."""
+        """Show new warnings about the run's records."""
         for finding in diagnose(self._checkpoints.run):
             if finding.grade == Grade.WARNING and finding.id not in self._reported_findings:
                 self._reported_findings.add(finding.id)
@@ -91,7 +91,7 @@ class Evaluator:
         progress.failed_evaluations += 1
         progress.first_failure = progress.first_failure or f"at step {steps:,}: {error}"
         error = self.episodes.keep_failed(error, self._learner.curriculum.goal_spec, steps)
-        self._display.message(f"warning: evaluation at step {steps:,} failed, training goes on: {error}")
+        self._display.message(f"warning: evaluation at step {steps:,} failed, training continues: {error}")
 
     def _note(self, episodes: list[Episode], policy: PolicyFile) -> None:
         learner, steps = self._learner, self._learner.steps
@@ -119,7 +119,7 @@ class Evaluator:
         progress.good_in_a_row = progress.good_in_a_row + 1 if is_good else 0
 
     def _log(self, score: Score, mean_steps: float) -> None:
-        """Write to TensorBoard, by the names that SB3's own evaluations have."""
+        """Write to TensorBoard, with the tags of SB3's own evaluations."""
         logger = self._learner.model.logger
         logger.record("eval/mean_reward", score.mean_return)
         logger.record("eval/mean_ep_length", mean_steps)
@@ -128,15 +128,15 @@ class Evaluator:
         logger.dump(self._learner.steps)
 
     def compare_best_with_last(self, check: Callable[[], None]) -> None:
-        """Take the last policy for the best if new episodes show it.
+        """Play new episodes with the best and the last policy; keep the last as best if it is better in them.
 
-        The best of many evaluations is the luckiest of them, too: chosen by 8 episodes, one policy of a hopper had
-        2,612, and 2,386 in a hundred others, where the last had 2,579.
+        The highest score of many evaluations is partly luck: a hopper's best policy scored 2,612 in 8 episodes, but
+        2,386 in a hundred others, where the last policy scored 2,579.
         """
         steps, best = self._learner.steps, self.best
         rows = read_table(self._checkpoints.run.evals_file)
         if best is None or best.training_steps == steps or not rows or rows[-1]["steps"] != steps:
-            return  # the last is the best, or could not be evaluated
+            return  # the last policy is the best already, or was not evaluated
         count = max(_FINAL_EPISODES, self._recipe.eval.episodes)
         self._display.phase("best or last")
         last = self._learner.pack()
@@ -159,7 +159,7 @@ class Evaluator:
 
     def _is_better(self, score: Score, episodes: int) -> bool:
         if self.best is not None and self.best.training_steps > self._learner.steps:
-            return False  # a resumed run repeats this evaluation: the policy that it led to is there already
+            return False  # a resumed run repeats this evaluation; a later best policy is already stored
         best = None if self.best is None else self.best.evaluation
         return is_better(score, best, self._highest_success, episodes)
 

@@ -1,7 +1,7 @@
-"""Hindsight experience replay: what an episode reached is learnt from as if it had been the goal.
+"""Hindsight experience replay: the model also learns as if the state that an episode reached had been its goal.
 
 M. Andrychowicz et al., Hindsight Experience Replay, 2017, https://arxiv.org/abs/1707.01495; SB3's buffer does it.
-In a curriculum, exchanged goals are rewarded as the present stage does, whichever stage their episode is of.
+In a curriculum the current stage computes the rewards of exchanged goals, also for episodes of earlier stages.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _LEARNING_STARTS = 100  # SB3's own default, of every algorithm
 
 
 def replay_arguments(recipe: Recipe, her: Hindsight, env: EnvInfo) -> dict[str, Any]:
-    """Return the replay buffer for SB3's constructor, and a `learning_starts` by which every first episode is over.
+    """Return SB3's arguments for the replay buffer, and a `learning_starts` after every first episode.
 
-    Raises `RecipeError` for an environment without goals, and for what does not go together with hindsight.
+    Raises `RecipeError` for an environment without goals, and for settings that hindsight excludes.
     """
     _check_goals(env)
     _check_rewards(recipe)
@@ -51,36 +51,36 @@ def _check_goals(env: EnvInfo) -> None:
     achieved, desired = parts["achieved_goal"], parts["desired_goal"]
     if achieved.shape != desired.shape or not isinstance(desired, spaces.Box) or is_image_space(desired):
         raise RecipeError(
-            f"her: achieved_goal is {achieved}, desired_goal {desired}: they take each other's place, so both have to "
-            "be a Box of one shape, and no image"
+            f"her: achieved_goal is {achieved}, desired_goal {desired}: hindsight exchanges them, so both must "
+            "be a Box of the same shape, not an image"
         )
 
 
 def _check_rewards(recipe: Recipe) -> None:
     if recipe.reward_weights or any(stage.reward_weights for stage in recipe.stages):
-        raise RecipeError("her: compute_reward knows nothing of a recipe's reward_weights; leave out one of the two")
+        raise RecipeError("her: compute_reward does not use the recipe's reward_weights; remove her or reward_weights")
     if recipe.algo_kwargs.get("n_steps", 1) != 1:
-        raise RecipeError("algo_kwargs.n_steps: hindsight has no returns over several steps; leave out one of the two")
+        raise RecipeError("algo_kwargs.n_steps: hindsight does not support n-step returns; remove her or n_steps")
 
 
 def _check_room(recipe: Recipe, steps: int) -> None:
     size = int(recipe.algo_kwargs["buffer_size"])
     if size < min(2 * steps, recipe.total_timesteps):
-        raise RecipeError(_no_room(size, recipe.n_envs, f"{2 * steps} will do"))
+        raise RecipeError(_no_room(size, recipe.n_envs, f"{2 * steps} is enough"))
 
 
-def _no_room(size: int, n_envs: int, what_will_do: str) -> str:
+def _no_room(size: int, n_envs: int, advice: str) -> str:
     return (
-        f"algo_kwargs.buffer_size: {size} steps of {n_envs} environments have no room for two episodes of each, "
-        f"and hindsight learns from whole ones; {what_will_do}"
+        f"algo_kwargs.buffer_size: {size} steps of {n_envs} environments cannot hold the two complete episodes of "
+        f"each environment that hindsight needs; {advice}"
     )
 
 
 def has_whole_episode(buffer: ReplayBuffer) -> bool:
-    """Say whether there is one to learn from, if it is a buffer for hindsight; raises `RecipeError` if none can be."""
+    """Return whether a hindsight buffer holds a complete episode; raises `RecipeError` if it is too small for one."""
     if not isinstance(buffer, HerReplayBuffer) or (buffer.ep_length > 0).any():
         return True
     if buffer.full:
-        advice = f"give it twice the steps of an episode, times {buffer.n_envs}"
+        advice = f"set it to twice the steps of an episode, times {buffer.n_envs}"
         raise RecipeError(_no_room(buffer.buffer_size * buffer.n_envs, buffer.n_envs, advice))
     return False

@@ -1,4 +1,4 @@
-"""What learns, and how far it has come."""
+"""The learner: model, environments, curriculum and progress of a training."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rlctl.training.snapshot import pack
 
 
 class Learner:
-    """The model, its environments, the stage of the curriculum, and the progress, which checkpoints keep."""
+    """The model, its environments, the curriculum, and the progress, which checkpoints store."""
 
     def __init__(self, recipe: Recipe, rollouts: Rollouts, curriculum: Curriculum, progress: Progress) -> None:
         self.recipe = recipe
@@ -37,7 +37,7 @@ class Learner:
 
     @property
     def seconds(self) -> float:
-        """Seconds of training so far, with those before a resume."""
+        """Seconds of training so far, including those before a resume."""
         return time.monotonic() - self._started_s
 
     def start_clock(self) -> None:
@@ -45,12 +45,12 @@ class Learner:
         self._started_s = time.monotonic() - self.progress.seconds
 
     def pack(self) -> PolicyFile:
-        """Return the present policy, for the last stage of the curriculum."""
+        """Return the current policy, with the last stage of the curriculum as its environment."""
         policy = pack(self.model, self.recipe.algo, self.curriculum.goal_spec, self.curriculum.goal)
         return policy.with_info(stages=self.curriculum.specs())
 
     def begin_next_stage(self) -> tuple[str, str]:
-        """Leave the running episodes for those of the next stage; return its title and why it begins."""
+        """Cut the running episodes short and begin the next stage; return its title and the reason."""
         self.env.workers.rebuild(self.curriculum.next_spec())
         begin_next_episodes(self.model)
         return self.curriculum.enter_next_stage(self.steps)

@@ -1,7 +1,7 @@
 """A training: play, learn, and at the boundaries between updates write metrics, evaluate, save and stop.
 
-A checkpoint never falls inside a segment. What is done at a boundary is decided by steps, never by the clock, but for
-when to write a checkpoint, which changes nothing: so a run that was resumed is the run that was never stopped.
+Checkpoints are written between segments only. Steps decide what is done at a boundary, never the clock; so a resumed
+run equals one that was never stopped. Only the time of checkpoints depends on the clock, and they change no result.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from rlctl.training.snapshot import check_finite
 
 
 class TrainingLoop:
-    """A training that is set up, with its run folder."""
+    """The loop of a training whose environments, model and run folder are ready."""
 
     def __init__(self, learner: Learner, evaluator: Evaluator, checkpoints: Checkpoints, display: Display) -> None:
         self.learner = learner
         self.evaluator = evaluator
         self.checkpoints = checkpoints
         self.stop_signal: int | None = None
-        """The number of the signal that asks to stop at the next boundary."""
+        """Number of the signal after which to stop at the next boundary."""
         self._metrics = Metrics(learner, checkpoints, display)
         self._display = display
         self._stop_announced = False
         learner.start_clock()
 
     def run(self) -> None:
-        """Play and learn until the recipe's steps are done, or its success rate holds.
+        """Play and learn until the recipe's steps are done, or two evaluations in a row reach its `stop_success`.
 
         Raises `Interrupted` after a signal, when the state is saved.
         """
@@ -51,15 +51,14 @@ class TrainingLoop:
         except TaskError as error:
             raise self._explain_fault(error) from None
         except ValueError:
-            check_finite(
-                learner.model, self.checkpoints.run.path
-            )  # SB3 notices NaN weights by a distribution's complaint
+            # SB3's distributions raise it for NaN weights.
+            check_finite(learner.model, self.checkpoints.run.path)
             raise
 
     def boundary(self) -> bool:
-        """Do what is due between two updates and was not done before a resume; return whether nothing is left to do.
+        """Do what is due between two updates; return whether the training is done.
 
-        Raises `ArtifactError` if what the training ends with cannot be saved.
+        Raises `ArtifactError` if the final state cannot be saved.
         """
         learner = self.learner
         self._metrics.collect_finished_episodes()
@@ -69,7 +68,7 @@ class TrainingLoop:
         stage_is_done = learner.curriculum.is_due(learner.steps)
         if learner.is_at_end or stage_is_done or self._metrics.is_due():
             self._metrics.write()
-        if stage_is_done:  # also at the end: for a resume that makes the run longer
+        if stage_is_done:  # also at the end: a resume may make the run longer
             self._display.stage(*learner.begin_next_stage())
         self._stop_if_requested()
         if self.evaluator.is_due():
@@ -84,14 +83,14 @@ class TrainingLoop:
         return False
 
     def _begin(self) -> None:
-        """Save what the training begins with: better to know now what cannot be saved than after the first update."""
+        """Save the initial state now: a folder that cannot be written is reported before the first update."""
         if self.checkpoints.saved_step is None:
             if self.learner.progress.next_eval == 0:
                 self.evaluate()
             self.checkpoints.save()
 
     def evaluate(self) -> None:
-        """Evaluate the present policy; the rate of training is without the time of evaluations."""
+        """Evaluate the current policy; the training rate excludes this time."""
         began = time.monotonic()
         self.evaluator.evaluate(self._stop_if_requested)
         self._metrics.exclude(time.monotonic() - began)
@@ -100,7 +99,6 @@ class TrainingLoop:
         return self.learner.recipe.stop_success is not None and self.learner.progress.good_in_a_row >= 2
 
     def _announce_stop(self) -> None:
-        """Show, once, that a signal has been taken."""
         if self.stop_signal is not None and not self._stop_announced:
             self._stop_announced = True
             self._display.message(
@@ -122,23 +120,23 @@ class TrainingLoop:
 
     def _save_the_end(self) -> None:
         self.learner.progress.done = True
-        # Once more: after the last checkpoint there is no next one.
+        # Retry once: no later checkpoint will be written.
         if not self.checkpoints.save() and not self.checkpoints.save():
             raise ArtifactError(
                 f"{self.checkpoints.run.path}: the training is done, but could not be saved: {self.checkpoints.problem}"
             )
 
     def _explain_fault(self, error: TaskError) -> TaskError:
-        """Keep the actions of the training episode that failed, and return the error with what to do next."""
+        """Save the actions of the failed training episode; return the error with the commands to use next."""
         lines = [str(self.evaluator.episodes.keep_failed(error, self.learner.env.workers.spec))]
-        if step := self.checkpoints.saved_step:  # at step 0 there is nothing to keep
+        if step := self.checkpoints.saved_step:  # at step 0 there is nothing to resume
             lines.append(f"checkpoint at step {step:,} is intact; resume with: {self._resume_command}")
         return TaskError("\n".join(lines), details=error.details)
 
     def write_end(self, recordings: int) -> list[Path]:
-        """Write that the training is done; return the requested recordings of the last evaluation's episodes."""
+        """Write the status `finished`; return recordings of the last evaluation's last episodes."""
         run, learner, best = self.checkpoints.run, self.learner, self.evaluator.best
-        for _ in range(2):  # once more, if the disk has not taken it
+        for _ in range(2):  # retry once if it cannot be written
             if self.checkpoints.attempt(
                 "run.json", lambda: status.write_end(run, learner.steps, learner.progress, best)
             ):

@@ -11,11 +11,11 @@ from rlctl.training.display import Display
 from rlctl.training.learner import Learner
 from rlctl.training.snapshot import check_finite
 
-_OFF_POLICY_ROWS = 200  # rows of metrics a training has, about: off-policy updates come at every step
+_OFF_POLICY_ROWS = 200  # approximate number of rows: off-policy updates come at every step
 
 
 class Metrics:
-    """Collects the training episodes that have ended, and writes a row about them and the updates."""
+    """Collects finished training episodes, and writes a row about them and the updates."""
 
     def __init__(self, learner: Learner, checkpoints: Checkpoints, display: Display) -> None:
         self._learner = learner
@@ -24,7 +24,7 @@ class Metrics:
         self._last_row_s, self._last_row_steps = time.monotonic(), learner.steps
 
     def collect_finished_episodes(self) -> None:
-        """Take the episodes that have ended from the environments; count observations outside their space."""
+        """Take finished episodes from the environments; count observations outside their space."""
         env, progress = self._learner.env, self._learner.progress
         finished, env.ended = env.ended, []
         progress.recent += finished
@@ -35,12 +35,12 @@ class Metrics:
         env.outside = 0
 
     def is_due(self) -> bool:
-        """Say whether this boundary gets a row: each rollout of an on-policy algorithm does."""
+        """Return whether to write a row: after every rollout of an on-policy algorithm, else at intervals."""
         steps = self._learner.steps
         return self._learner.recipe.algo in ON_POLICY or steps >= self._learner.progress.next_row
 
     def write(self) -> None:
-        """Write a row, and the same to TensorBoard, if there were steps since the last one."""
+        """Write a row to `metrics.csv` and TensorBoard if there were steps since the last one."""
         learner, progress = self._learner, self._learner.progress
         steps, logger, env = learner.steps, learner.model.logger, learner.env
         if steps <= progress.last_row:
@@ -68,5 +68,5 @@ class Metrics:
         progress.next_row = steps + max(1, learner.recipe.total_timesteps // _OFF_POLICY_ROWS)
 
     def exclude(self, seconds: float) -> None:
-        """Leave out some time from the rate of training: that of an evaluation."""
+        """Exclude the time of an evaluation from the training rate."""
         self._last_row_s += seconds

@@ -1,4 +1,4 @@
-"""SAC, TQC, CrossQ, TD3, DDPG and DQN on chunks of steps that workers play while the model learns."""
+"""SAC, TQC, CrossQ, TD3, DDPG and DQN on chunks of steps; with overlap workers play while the model learns."""
 
 from __future__ import annotations
 
@@ -19,17 +19,16 @@ from rlctl.training.vec_env import WorkerVecEnv
 class OffPolicyRollouts(Rollouts):
     """Plays `train_freq` steps, a chunk, into the replay buffer.
 
-    With `overlap` a chunk is played with the policy from before the updates that the chunk before it is due, while
-    these are computed: it is one chunk older than without. The order follows from steps alone, so it repeats exactly.
-    The last chunk's updates stay due then: a run made longer does them beside its next chunk, as one that was that long
-    from the beginning.
+    With `overlap` workers play a chunk while the updates for the previous chunk are computed, so the acting policy is
+    one chunk older than without. The order depends on steps only and repeats exactly. The updates for the last chunk
+    stay due at the end; a run that is made longer does them while its next chunk is played.
     """
 
     def __init__(self, model: Any, env: WorkerVecEnv, recipe: Recipe, progress: Progress) -> None:
         super().__init__(model, env, recipe, progress)
-        # Hindsight asks an environment for rewards while it learns, so they cannot play meanwhile.
+        # Hindsight computes rewards in the environments while the model learns, so they cannot play then.
         self.overlap = recipe.overlap and recipe.her is None
-        default = 0.1 if recipe.algo in DETERMINISTIC else 0.0  # else they would not explore at all
+        default = 0.1 if recipe.algo in DETERMINISTIC else 0.0  # deterministic actors need noise to explore
         self._action_noise = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
 
     def start(self) -> None:
@@ -49,7 +48,7 @@ class OffPolicyRollouts(Rollouts):
         )
 
     def finish(self, check: Check | None) -> None:
-        """Put the chunk into the replay buffer, raw, and do what SB3 does after each step."""
+        """Store the chunk, not normalised, in the replay buffer, and do what SB3 does after each step."""
         segment = self.env.finish(check)
         model, spaces = self.model, split_space(self.model.observation_space)
         observation = {key: to_network_layout(rows, spaces[key]) for key, rows in segment.observation.items()}
@@ -74,7 +73,7 @@ class OffPolicyRollouts(Rollouts):
         self.finish_segment(segment)
 
     def learn(self) -> None:
-        """Do the updates that are due for the last chunk; with hindsight none before the first episode is over."""
+        """Do the updates due for the last chunk; with hindsight none before the first episode has ended."""
         model = self.model
         steps, self._progress.steps_to_learn = self._progress.steps_to_learn, 0
         if steps and model.num_timesteps > model.learning_starts and has_whole_episode(model.replay_buffer):

@@ -1,4 +1,4 @@
-"""PPO, A2C and recurrent PPO on segments that workers have played: values and log-probabilities in one batched pass."""
+"""PPO, A2C and recurrent PPO on segments played by workers: values and log-probabilities in batched passes."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _ROWS = 4096
 
 
 @dataclasses.dataclass(frozen=True)
-class _Judgement:
-    """What the networks say of a segment."""
+class _SegmentValues:
+    """What the networks compute for a segment."""
 
     values: NDArray[np.float32]
     """Shape (environments, steps)."""
     log_probs: NDArray[np.float32]
     last_values: NDArray[np.float32]
-    """Of what followed the last step, shape (environments,)."""
+    """Values of the observations after the last step, shape (environments,)."""
     final_values: NDArray[np.float32]
-    """Of what truncated episodes ended with."""
+    """Values of the final observations of truncated episodes."""
     states: Arrays = dataclasses.field(default_factory=dict)
-    """Of the recurrent buffer: the states before each step."""
+    """LSTM states before each step, for the recurrent buffer."""
 
 
 class OnPolicyRollouts(Rollouts):
@@ -71,11 +71,11 @@ class OnPolicyRollouts(Rollouts):
         observations = {key: self._prepare(key, rows) for key, rows in segment.observation.items()}
         final = {key: self._prepare(key, rows[truncated]) for key, rows in segment.final.items()}
         if hasattr(model, "_last_lstm_states"):
-            judged = self._judge_step_by_step(observations, segment.stored, starts, (truncated, final))
+            evaluated = self._evaluate_step_by_step(observations, segment.stored, starts, (truncated, final))
         else:
-            judged = self._judge(observations, segment.stored, final)
+            evaluated = self._evaluate_segment(observations, segment.stored, final)
         rewards = self.update_reward_statistics(segment)
-        rewards[truncated] += model.gamma * judged.final_values
+        rewards[truncated] += model.gamma * evaluated.final_values
         buffer.reset()
         targets: Any = split(buffer.observations)
         for key, rows in observations.items():
@@ -83,17 +83,17 @@ class OnPolicyRollouts(Rollouts):
         buffer.actions[...] = segment.stored.swapaxes(0, 1)
         buffer.rewards[...] = rewards.T
         buffer.episode_starts[...] = starts[:, :-1].T
-        buffer.values[...] = judged.values.T
-        buffer.log_probs[...] = judged.log_probs.T
-        for name, values in judged.states.items():
+        buffer.values[...] = evaluated.values.T
+        buffer.log_probs[...] = evaluated.log_probs.T
+        for name, values in evaluated.states.items():
             getattr(buffer, name)[...] = values
         buffer.pos, buffer.full = buffer.buffer_size, True
         buffer.compute_returns_and_advantage(
-            last_values=torch.from_numpy(judged.last_values), dones=segment.done[:, -1].astype(np.float32)
+            last_values=torch.from_numpy(evaluated.last_values), dones=segment.done[:, -1].astype(np.float32)
         )
 
     def _prepare(self, key: str, rows: NDArray[Any]) -> NDArray[Any]:
-        """Return raw observations as the networks get them: normalised, images with their channels first."""
+        """Return observations in the networks' form: normalised, images channels-first."""
         if key in self._statistics:
             mean, var = self._statistics[key]
             normalizer = self.model.get_vec_normalize_env()
@@ -101,28 +101,28 @@ class OnPolicyRollouts(Rollouts):
             rows = np.clip((rows - mean) / np.sqrt(var + normalizer.epsilon), -limit, limit).astype(np.float32)
         return to_network_layout(rows, split_space(self.model.observation_space)[key])
 
-    def _judge(self, observations: Arrays, actions: NDArray[Any], final: Arrays) -> _Judgement:
-        """Judge all steps of a segment at once, and what truncated episodes ended with."""
+    def _evaluate_segment(self, observations: Arrays, actions: NDArray[Any], final: Arrays) -> _SegmentValues:
+        """Evaluate all steps of a segment in batches, and the final observations of truncated episodes."""
         policy, (n_envs, steps) = self.model.policy, actions.shape[:2]
         flat = {key: rows[:, :-1].reshape(n_envs * steps, *rows.shape[2:]) for key, rows in observations.items()}
         chosen = self._to_actions(actions.reshape(n_envs * steps, -1))
-        judged = [
+        parts_of_batches = [
             policy.evaluate_actions(self._to_tensor(flat, rows), chosen[rows])[:2] for rows in _slices(len(chosen))
         ]
         values, log_probs = (
             torch.cat([part.flatten() for part in parts]).cpu().numpy().reshape(n_envs, steps)
-            for parts in zip(*judged, strict=True)
+            for parts in zip(*parts_of_batches, strict=True)
         )
         ends = {key: np.concatenate([rows[:, -1], final[key]]) for key, rows in observations.items()}
         count = len(next(iter(ends.values())))
         parts = [policy.predict_values(self._to_tensor(ends, rows)).flatten() for rows in _slices(count)]
         after: NDArray[np.float32] = torch.cat(parts).cpu().numpy()
-        return _Judgement(values, log_probs, after[:n_envs], after[n_envs:])
+        return _SegmentValues(values, log_probs, after[:n_envs], after[n_envs:])
 
-    def _judge_step_by_step(
+    def _evaluate_step_by_step(
         self, observations: Arrays, actions: NDArray[Any], starts: NDArray[np.bool_], ended: tuple[Any, Arrays]
-    ) -> _Judgement:
-        """Judge a segment as the LSTMs go on; `ended` has where episodes were truncated, and what they ended with."""
+    ) -> _SegmentValues:
+        """Evaluate a segment step by step; `ended`: where episodes were truncated, and their final observations."""
         (envs, rows), final = ended
         policy, states, device = self.model.policy, self.model._last_lstm_states, self.model.device
         n_envs, steps = actions.shape[:2]
@@ -143,7 +143,7 @@ class OnPolicyRollouts(Rollouts):
         last = policy.predict_values(self._to_tensor(observations, (slice(None), -1)), states.vf, begins[:, -1])
         names = ("hidden_states_pi", "cell_states_pi", "hidden_states_vf", "cell_states_vf")
         stored = {name: np.stack(parts) for name, parts in zip(names, zip(*before, strict=True), strict=True)}
-        return _Judgement(values, log_probs, last.flatten().cpu().numpy(), final_values, stored)
+        return _SegmentValues(values, log_probs, last.flatten().cpu().numpy(), final_values, stored)
 
     def _step(
         self, observed: Any, actions: torch.Tensor, states: RNNStates, begins: torch.Tensor

@@ -112,7 +112,7 @@ def _check_features(actor: _Actor, sample: tuple[torch.Tensor, ...]) -> None:
     if tuple(features.shape) != expected:
         raise RecipeError(
             f"policy_kwargs.features_extractor_class: {type(actor.extractor).__name__} returns features of shape "
-            f"{tuple(features.shape)} for 2 observations; its features_dim makes it {expected}"
+            f"{tuple(features.shape)} for 2 observations, but its features_dim requires {expected}"
         )
 
 

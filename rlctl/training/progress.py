@@ -1,4 +1,4 @@
-"""What a resume restores beside the model."""
+"""The counters that a resume restores in addition to the model."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ class Progress:
     first_failure: str = ""
     """Why the first of the failed evaluations failed."""
     observations_outside: int = 0
-    """How many training observations were outside their space."""
+    """Number of training observations outside their space."""
     done: bool = False
-    """Whether nothing is left to do."""
+    """Whether the training has finished."""
     seconds: float = 0.0
     metrics_bytes: int = 0
     evals_bytes: int = 0
-    """How long the tables were."""
+    """Sizes of the tables [bytes]."""
     metrics_sha256: str = ""
     evals_sha256: str = ""
-    """Of so much of them; empty where there was none yet."""
+    """Hashes of these bytes; empty if there was no table yet."""
     recent: list[EpisodeResult] = dataclasses.field(default_factory=list)
     """Training episodes that ended after the last row of metrics."""
     steps_to_learn: int = 0
-    """Environment steps that are in the replay buffer and that no update is done for yet."""
+    """Environment steps in the replay buffer whose updates are still due."""
     stage: int = 0
     """Stage of the curriculum, from 1; 0 where there is none."""
     stage_began: int = 0
-    """Environment steps before the stage began."""
+    """Environment steps at the start of the stage."""
     stage_episodes: list[float | None] = dataclasses.field(default_factory=list)
-    """Success (0 or 1, None where not reported) or return of the stage's last episodes, as its rule wants them."""
+    """Success (0 or 1; None if not reported) or return of the stage's last episodes, as its promotion rule needs."""

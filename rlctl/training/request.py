@@ -66,9 +66,9 @@ def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> Tra
     if run.status().get("status") == "running":  # killed after all was done
         status.write_end(run, start.step, progress, best)
     _raise_if_evaluations_failed(run, progress)
-    note = "this run is finished already: nothing to do; -n trains longer"
+    note = "this run has finished: nothing to do; to train longer, give -n"
     if start.request.record:
-        note += f"; to record episodes of it: rlctl replay {run.path}"
+        note += f"; to record episodes: rlctl replay {run.path}"
     seconds = time.monotonic() - start.began
     return TrainResult(run, start.task, start.recipe, start.step, progress, best, seconds, note=note)
 

@@ -1,6 +1,6 @@
-"""Workers play with a model's policy, and the model learns from it: what all algorithms have in common.
+"""Base class of rollouts: workers play with the model's policy, and the model learns from the segments.
 
-A segment is played with the statistics of normalisation of its beginning; they are brought up to date after it.
+The normalisation statistics are constant while a segment is played, and are updated after it.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from rlctl.training.updates import choose_learner
 from rlctl.training.vec_env import WorkerVecEnv
 
 Check = Callable[[], None]
-"""Called several times a second while workers play; may raise to leave."""
+"""Called several times a second while workers play; may raise to stop."""
 Statistics = dict[str, tuple[NDArray[Any], NDArray[Any]]]
 """Mean and variance per normalised observation, "" for one that is not a dict."""
 
 
 class Rollouts(abc.ABC):
-    """Stands in for the loop in an SB3 algorithm's `learn`, which asks the policy for every step."""
+    """Replaces the loop in SB3's `learn`, which would query the policy at every step."""
 
     overlap = False
-    """Whether a segment is played while the model learns from those before."""
+    """Whether a segment is played while the model learns from earlier ones."""
     policy_plays_warmup = False
-    """Whether the steps before the first update are played by the policy, which is a trained one, and not at random."""
+    """Whether the policy, already trained, plays the steps before the first update; else actions are random."""
 
     def __init__(self, model: Any, env: WorkerVecEnv, recipe: Recipe, progress: Progress) -> None:
         self.model = model
@@ -45,11 +45,11 @@ class Rollouts(abc.ABC):
         self._policy_info: PolicyInfo | None = None
 
     def begin(self, total_timesteps: int) -> None:
-        """Prepare the model to learn up to a step; a new training's first episodes begin."""
+        """Prepare the model to learn up to a step; start the first episodes of a new training."""
         self.model._setup_learn(total_timesteps - self.model.num_timesteps, None, reset_num_timesteps=False)
 
     def advance(self, check: Check | None = None) -> None:
-        """Play a segment and learn what is due: from this segment, or with overlap from those before."""
+        """Play a segment and learn: from this segment, or with overlap from earlier ones."""
         self.model.policy.set_training_mode(False)
         self.start()
         if self.overlap:
@@ -60,27 +60,27 @@ class Rollouts(abc.ABC):
 
     @abc.abstractmethod
     def start(self) -> None:
-        """Let the workers begin to play with the present policy."""
+        """Let the workers start to play with the current policy."""
 
     @abc.abstractmethod
     def finish(self, check: Check | None) -> None:
-        """Wait until they have played, and store it in the model's buffer."""
+        """Wait for the segment, and store it in the model's buffer."""
 
     @abc.abstractmethod
     def learn(self) -> None:
-        """Do the updates that are due for what is stored."""
+        """Do the updates due for the stored segments."""
 
     def acting_statistics(self) -> Statistics:
-        """Return a copy of the statistics; until the first segment is over, as if observations were normalised."""
-        found = {}
+        """Return a copy of the statistics; before the first segment has ended, mean 0 and variance 1."""
+        statistics = {}
         for key, rms in observation_statistics(self.model.get_vec_normalize_env()).items():
             mean, var = rms.mean.copy(), rms.var.copy()
-            # Before that there are only the observations of a few resets, and what hardly varies in them would explode.
-            found[key] = (mean, var) if self.model.num_timesteps else (np.zeros_like(mean), np.ones_like(var))
-        return found
+            # A few resets vary too little: dividing by their deviation would give huge values.
+            statistics[key] = (mean, var) if self.model.num_timesteps else (np.zeros_like(mean), np.ones_like(var))
+        return statistics
 
     def send_policy(self, statistics: Statistics) -> None:
-        """Give the workers the present numbers of the model's policy."""
+        """Send the current weights and statistics to the workers."""
         model, workers = self.model, self.env.workers
         if self._policy_info is None:
             self._policy_info = pack(model, self._algo, workers.spec, workers.info).info
@@ -95,7 +95,7 @@ class Rollouts(abc.ABC):
             state[np.asarray(model._last_episode_starts)] = 0.0
 
     def update_reward_statistics(self, segment: SegmentArrays) -> NDArray[np.float32]:
-        """Take the returns of a segment into account, and return its rewards divided by their deviation."""
+        """Update the return statistics with a segment; return its rewards divided by the returns' deviation."""
         normalizer = self.model.get_vec_normalize_env()
         rewards = segment.reward
         if normalizer is None or not normalizer.norm_reward:
@@ -110,7 +110,7 @@ class Rollouts(abc.ABC):
         return normalized
 
     def finish_segment(self, segment: SegmentArrays) -> None:
-        """Take the observations of a stored segment into account."""
+        """Update the observation statistics with a stored segment."""
         model = self.model
         for key, rms in observation_statistics(model.get_vec_normalize_env()).items():
             rows = segment.observation[key][:, 1:]
@@ -120,6 +120,6 @@ class Rollouts(abc.ABC):
 
 
 def to_network_layout(rows: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
-    """Return observations as the network's `space` has them: images with their channels first."""
+    """Return observations in the layout of the network's `space`: images channels-first."""
     shape = space.shape or ()
     return np.moveaxis(rows, -1, -3) if len(shape) == 3 and rows.shape[-3:] != shape else rows

@@ -47,7 +47,7 @@ class SeedsResult:
             group = self.score.group
             raise SeedsFailed(
                 f"{group.path}: {len(self.failed)} of {len(group.seeds)} seeds failed: {which}. "
-                f"Their output is above; to try again: rlctl train --resume {shlex.quote(str(group.path))}",
+                f"Their output is above; to retry: rlctl train --resume {shlex.quote(str(group.path))}",
                 max(self.failed.values()),
             )
 
@@ -96,9 +96,9 @@ def _train(
 def _begin(request: TrainRequest, seeds: str) -> Group:
     """Make a new group, after a look at its task and recipe: what is wrong is wrong for every seed."""
     if request.task is None or request.resume is not None:
-        raise UsageError("--seeds is about a new group: give a task, and no --resume")
+        raise UsageError("--seeds starts a new group: give TASK and leave out --resume")
     if "seed" in request.settings:
-        raise UsageError("--seeds and --seed: give one of the two")
+        raise UsageError("--seeds and --seed exclude each other")
     check_arguments(request)
     numbers = parse_seeds(seeds)
     with preserve_process_state():
@@ -115,7 +115,7 @@ def _print_start(group: Group, waiting: int, trainings: Trainings) -> None:
     if waiting:
         note += f"{f', {done} done' if done else ''}, {trainings.describe()}"
     else:
-        note += ", all done: nothing to train; -n makes them longer"
+        note += ", all done: nothing to train; to train longer, give -n"
     output.print_notes([note])
 
 

@@ -63,7 +63,7 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
         run = start.run or directory.create(start.task, recipe.seed, request.root)
         lock = start.lock or stack.enter_context(run.lock())
         if not lock.keeps_out:
-            display.message(f"warning: {run.path}: no locks on this file system: let no second process write this run")
+            display.message(f"warning: {run.path}: this file system has no locks: let only one process train this run")
         checkpoints = _open_run(run, start, learner, display)
         n_envs = min(recipe.eval.episodes, available_cores())
         make_workers = functools.partial(_make_workers, specs[-1], n_envs, start, display)
@@ -91,7 +91,8 @@ def _warn_of_turned_weights(specs: list[EnvSpec], display: Display) -> None:
     for name, weight in dict.fromkeys(pair for spec in specs for pair in spec.reward_weights.items()):
         if float(own.get(name, 0.0)) * weight < 0.0:
             display.message(
-                f"warning: reward_weights.{name}: {weight:g} turns the sign of the task's own, {float(own[name]):g}"
+                f"warning: reward_weights.{name}: {weight:g} has the opposite sign of "
+                f"the task's own, {float(own[name]):g}"
             )
 
 
@@ -173,7 +174,7 @@ def _refuse_errors(report: CheckReport, display: Display) -> None:
         return  # the workers build it too, and report what is wrong
     task, found = shlex.quote(report.task), report.verdict.findings
     for name in report.verdict.crashed:
-        display.message(f"check before training: {name} crashed, a bug in rlctl; what it would find is not known")
+        display.message(f"check before training: {name} crashed because of a bug in rlctl; this rule was not checked")
     errors = [finding for finding in found if finding.severity is Severity.ERROR]
     if errors:
         text = "; ".join(f"{finding.rule} {finding.name} ({finding.message})" for finding in errors)

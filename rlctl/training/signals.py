@@ -1,4 +1,4 @@
-"""Signals that ask a training to stop, whatever it is doing."""
+"""Signals that stop a training."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rlctl.processes.child_process import STOP_SIGNALS
 if TYPE_CHECKING:
     from rlctl.training.loop import TrainingLoop
 
-_SAME_S = 1.0  # equal signals within it are one: `timeout` sends SIGTERM to the process and to its group
+_SAME_S = 1.0  # equal signals within this time count once: `timeout` sends SIGTERM to the process and to its group
 
 _WARNINGS = (signal.SIGUSR1, signal.SIGUSR2)
 
@@ -24,7 +24,7 @@ Handler = Callable[[int, FrameType | None], None]
 
 
 class HandledSignals:
-    """Lets `handle` take the signals that ask to stop, as long as it is entered.
+    """Passes stop signals to `handle` while it is entered.
 
     SIGHUP comes from a closed terminal. SIGUSR1 and SIGUSR2, which a cluster sends as a warning, count as SIGTERM.
     """
@@ -36,8 +36,7 @@ class HandledSignals:
     def __enter__(self) -> Self:
         # Python has signal handlers in the main thread only; a caller in another keeps its own.
         if threading.current_thread() is threading.main_thread():
-            # Set even where a shell has made SIGINT ignored, as for a command in the background; what `nohup` has made
-            # ignored stays so.
+            # Shells let background commands ignore SIGINT: handle it anyway. `nohup` ignores SIGHUP: keep that.
             self._before = {
                 number: signal.getsignal(number)
                 for number in STOP_SIGNALS
@@ -47,7 +46,7 @@ class HandledSignals:
         return self
 
     def handle_again(self) -> None:
-        """Set the handlers anew: importing a task may have put others there."""
+        """Set the handlers again: importing a task may have replaced them."""
         for number in self._before:
             signal.signal(number, self._handler)
 
@@ -59,8 +58,8 @@ class HandledSignals:
 class StopSignals(HandledSignals):
     """Stops a training by signals.
 
-    Before the training they end the process at once; while it goes on the first ends it at the next boundary and the
-    second at once, if it is another signal or comes more than a second later; when it is done they change nothing.
+    Before the training a signal ends the process immediately. During it the first signal stops at the next boundary; a
+    second stops immediately if it is a different signal or comes over a second later. After it signals do nothing.
     """
 
     def __init__(self) -> None:
@@ -70,16 +69,16 @@ class StopSignals(HandledSignals):
         self._received_s = 0.0
 
     def begin(self, loop: TrainingLoop) -> None:
-        """From now on let `loop` end the training at a boundary."""
+        """Stop `loop` at a boundary from now on."""
         self._loop = loop
         self.handle_again()
 
     def end(self) -> None:
-        """The training is done and saved: later signals change nothing."""
+        """Ignore later signals: the training is done and saved."""
         self._done = True
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        # No output here: it might come in the middle of another.
+        # No output here: it could interrupt other output.
         if number == signal.SIGHUP:
             output.leave_closed_terminal()
         if self._done:

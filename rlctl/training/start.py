@@ -129,13 +129,13 @@ def _find_checkpoint(request: TrainRequest) -> Start:
             command = shlex.join(["rlctl", "train", task, "--from", str(run.path)])
             raise ArtifactError(
                 f"{run.path}: finished, and its checkpoints were removed; "
-                f"for a new training that begins with its policy: {command}"
+                f"to start a new training from its policy: {command}"
             )
         if found is not None and request.settings:
             found = _reopen(found, before, recipe)
-        notes = ["no checkpoint yet: the training begins at its first step"]
+        notes = ["no checkpoint yet: the training starts from step 0"]
         if found is not None:
-            notes = [f"warning: {problem}; going on from step {found.state.step:,}" for problem in damage]
+            notes = [f"warning: {problem}; resuming from step {found.state.step:,}" for problem in damage]
         return Start(request, task, recipe, run, lock, found, tuple(notes), status.get("from"), tuple(changes))
     except BaseException:
         lock.release()
@@ -144,12 +144,12 @@ def _find_checkpoint(request: TrainRequest) -> Start:
 
 def _check_resume(request: TrainRequest) -> None:
     if request.config is not None:
-        raise UsageError("--resume goes on with the run's own recipe: leave out --config")
+        raise UsageError("--resume uses the run's own recipe: leave out --config")
     if request.initial_policy is not None:
-        raise UsageError("--from begins a new run, and --resume goes on with one: give one of the two")
+        raise UsageError("--from and --resume exclude each other: --from starts a new run, --resume continues one")
     for key in request.settings:
         if key != "total_timesteps":
-            raise UsageError(f"--resume goes on with the run's own recipe: {key} cannot be changed, only -n")
+            raise UsageError(f"--resume uses the run's own recipe: {key} cannot be changed; only -n can")
 
 
 def _reopen(found: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:

@@ -1,4 +1,4 @@
-"""The content of `run.json`: how it began and how it ended."""
+"""The content of `run.json`: how the training began and how it ended."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedE
 
 
 def write_start(run: RunDirectory, start: Start) -> None:
-    """Write the recipe, and that a training runs."""
+    """Write the recipe and the status `running`."""
     recipe = start.recipe
     run.write_recipe(recipe)
     changes: dict[str, Any] = {
@@ -49,33 +49,33 @@ def write_start(run: RunDirectory, start: Start) -> None:
         changes |= {
             "id": uuid.uuid4().hex,
             "started": _now(),
-            "folder": os.getcwd(),
-        }  # what a task's path may be relative to
+            "folder": os.getcwd(),  # a task's path may be relative to it
+        }
         if start.source is not None:
             changes["from"] = start.source
     run.write_status(changes)
 
 
 def find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
-    """Return the keys in which a recipe differs from the task's own, and their values; not what follows from them."""
+    """Return the keys and values in which a recipe differs from the task's own, without values derived from these."""
     chosen = {key: getattr(recipe, key) for key in ("algo", "n_envs", "total_timesteps")}
     try:
         packaged, adapted = resolve_packaged(task), resolve_packaged(task, chosen)
-    except RlctlError:  # a packaged recipe that is wrong in itself; this one was made right by --config or --set
+    except RlctlError:  # the packaged recipe is invalid; --config or --set corrected it
         return {}
     own = {key: value for key, value in chosen.items() if value != getattr(packaged, key)}
     return own | {key: value for key, (value, _) in find_difference(recipe, adapted).items()}
 
 
 def write_failure(run: RunDirectory, error: BaseException) -> None:
-    """Write what ended a training before its time."""
+    """Write the status and error of a training that ended early."""
     kind = _STATUS.get(type(error), "failed")
-    if run.status_file.exists() and not isinstance(error, RunTaken):  # else somebody has removed the run
+    if run.status_file.exists() and not isinstance(error, RunTaken):  # else the run was removed or taken over
         run.write_status({"status": kind, "error": str(error) or repr(error), "ended": _now()})
 
 
 def write_end(run: RunDirectory, steps: int, progress: Progress, best: PolicyInfo | None) -> None:
-    """Write that a training is done, and what came of it; `best` is its best policy."""
+    """Write the status `finished` and the results; `best` is the best policy."""
     score = best.evaluation if best else None
     run.write_status(
         {

@@ -71,6 +71,6 @@ def _format_result(result: TrainResult) -> list[str]:
             f"(mean of {output.format_count(result.recipe.eval.episodes, 'episode')})"
         )
     if stages:
-        short = "" if progress.stage == stages else "; evaluated in the last, which it did not reach"
+        short = "" if progress.stage == stages else "; evaluations used the last stage, which training did not reach"
         lines.append(f"ended in stage {progress.stage} of {stages}{short}")
     return lines

@@ -61,8 +61,8 @@ class Trainings:
     def describe(self) -> str:
         """Say where, and how many at a time, they train."""
         return (
-            f"{self._jobs} at a time: a training keeps {CORES_PER_TRAINING} cores busy, there are {available_cores()}; "
-            "--jobs changes it"
+            f"{self._jobs} at a time: a training uses {CORES_PER_TRAINING} cores of {available_cores()}; "
+            "change with --jobs"
         )
 
     def run(self, calls: Sequence[Callable[[], Result]], to_go_on: str) -> list[Result]:

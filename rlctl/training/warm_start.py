@@ -26,14 +26,14 @@ def find_source(text: str, recipe: Recipe) -> dict[str, Any]:
     `UsageError` for an ONNX file and for a policy of another algorithm than the recipe's.
     """
     if Path(text).suffix == ".onnx":
-        raise UsageError(f"--from {text}: an ONNX file cannot be trained on; give the run or its .safetensors file")
+        raise UsageError(f"--from {text}: ONNX files cannot be trained further; give the run or its .safetensors file")
     ships = installed.find(text) is not None and not (Path(text) / "run.json").is_file()
     file = find_policy(text, PRETRAINED if ships else "best").file
     info = PolicyFile.read_info(file)
     if info.algo != recipe.algo:
         raise UsageError(
-            f"--from {file}: a policy of {info.algo}, and the recipe trains {recipe.algo}; add --algo {info.algo}, or "
-            "begin with another policy"
+            f"--from {file}: the policy was trained with {info.algo}, the recipe uses {recipe.algo}; "
+            f"add --algo {info.algo}, or give another policy"
         )
     return {
         "policy": str(file.resolve()),
@@ -57,12 +57,12 @@ def load_source(source: Mapping[str, Any], model: Any, env: EnvInfo) -> str:
     whole = len(policy.actor_only().tensors) < len(policy.tensors)
     _load_weights(info, model, weights)
     _load_normalization(file, info, model, policy.tensors)
-    text = f"begins with {file} ({info.algo}, {info.training_steps:,} steps on {info.spec.task})"
+    text = f"starts from {file} ({info.algo}, {info.training_steps:,} steps on {info.spec.task})"
     if whole:
         return f"{text}: its actor, critic and normalisation"
     return (
-        f"{text}: its actor and normalisation; it has no critic, so that a fresh one is learnt, and the first updates "
-        "may lower the score"
+        f"{text}: its actor and normalisation; it has no critic, so training starts with a new one, and the first "
+        "updates may lower the score"
     )
 
 
@@ -79,9 +79,10 @@ def _check_network(file: Path, info: PolicyInfo, model: Any, weights: Mapping[st
     if not wrong and not different:
         return
     parts = [
-        f"policy_kwargs.{key} is {info.policy_kwargs.get(key)} there and {ours.get(key)} here" for key in different
+        f"policy_kwargs.{key} is {info.policy_kwargs.get(key)} in the policy and {ours.get(key)} in the recipe"
+        for key in different
     ]
-    raise UsageError(f"--from {file}: another network: {'; '.join(parts) or f'tensor {wrong[0]} differs'}")
+    raise UsageError(f"--from {file}: its network differs: {'; '.join(parts) or f'tensor {wrong[0]} differs'}")
 
 
 def _as_plain(value: Any) -> Any:

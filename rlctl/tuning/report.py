@@ -29,15 +29,15 @@ def show(tuning: Tuning, json: str | None) -> None:
     assert best is not None
     task, file = shlex.quote(tuning.task), shlex.quote(str(tuning.best_file))
     if best.number == 0:
-        out.print("nothing was better than the recipe as it is")
+        out.print("no trial was better than the unchanged recipe")
         return
     seeds = f"{tuning.seed + 100}-{tuning.seed + 104}"
     out.print(
         f"best: trial {best.number}, in {tuning.best_file}\n"
-        f"One seed each, and the best of {len(tuning.trials)} looks better than it is. On new seeds:\n"
+        f"Each trial had one seed, so the best of {len(tuning.trials)} looks better than it is. Compare on new seeds:\n"
         f"  rlctl train {task} --config {file} --seeds {seeds}\n"
         f"  rlctl train {task} --seeds {seeds}\n"
-        "and rlctl runs compare, with the two groups, says whether it is better",
+        "then give both groups to rlctl runs compare",
         soft_wrap=True,
     )
 

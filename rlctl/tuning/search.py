@@ -202,7 +202,7 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
         print(f"trial {trial.number}: {line}", file=sys.stderr, flush=True)
 
     changes = [f"{key.rpartition('.')[2]}={value}" for key, value in trial.values.items()]
-    print(f"trial {trial.number}: {', '.join(changes) or 'the recipe as it is'}", file=sys.stderr, flush=True)
+    print(f"trial {trial.number}: {', '.join(changes) or 'the unchanged recipe'}", file=sys.stderr, flush=True)
     code = trainings.train(_make_request(tuning, trial), receive, pruning.is_hopeless if pruning else lacks_metric)
     if pruning is None and lacks_metric():
         raise UsageError(f"--metric {tuning.metric}: this task reports no success (no is_success); use --metric return")
@@ -247,7 +247,7 @@ def _note_end(
     if code == 0 and _has_finished(run):
         trial.score = tuning.measure(trial)
         trial.state = "done" if trial.score is not None else "failed"
-        trial.problem = "" if trial.score is not None else f"no evaluation has a {tuning.metric}: is it reported?"
+        trial.problem = "" if trial.score is not None else f"no evaluation reported {tuning.metric}"
     elif pruned:
         trial.state, trial.score = "pruned", tuning.measure(trial)
     else:

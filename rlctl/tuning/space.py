@@ -104,9 +104,9 @@ def _parse_range(key: str, match: re.Match[str], text: str) -> Dimension:
     try:
         low, high = float(match["low"]), float(match["high"])
     except ValueError:
-        raise UsageError(f"--search {text!r}: {match['low']} and {match['high']} are to be numbers") from None
+        raise UsageError(f"--search {text!r}: {match['low']} and {match['high']} must be numbers") from None
     if not (math.isfinite(low) and math.isfinite(high) and low < high) or match["again"] not in (None, match["prefix"]):
-        raise UsageError(f"--search {text!r}: no range; it goes from a lower number to a higher one of the same kind")
+        raise UsageError(f"--search {text!r}: not a range: write LOW:HIGH with LOW below HIGH and the same prefix")
     whole = all(re.fullmatch(r"-?\d+", match[end]) for end in ("low", "high"))
     return Dimension(key, low=low, high=high, whole=whole, prefix=match["prefix"] or "")
 

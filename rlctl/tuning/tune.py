@@ -91,13 +91,10 @@ def _check(dimension: Dimension, task: str, request: TuneRequest) -> None:
     """Raise `UsageError` for a key that cannot be searched, and `RecipeError` for a value that it cannot have."""
     first = dimension.key.partition(".")[0]
     if dimension.key in ("seed", "total_timesteps", "stop_success") or first in ("eval", "checkpoint"):
-        raise UsageError(
-            f"--search {dimension.key}: no hyperparameter; it would be the same policy, measured otherwise"
-        )
+        raise UsageError(f"--search {dimension.key}: not a hyperparameter: it changes the measurement, not the policy")
     if first in _OF_THE_RETURN and request.metric == "return":
         raise UsageError(
-            f"--search {dimension.key}: it changes what is trained for, so that returns are not comparable; "
-            "give --metric success"
+            f"--search {dimension.key}: it changes the reward, so returns are not comparable; use --metric success"
         )
     for value in dimension.ends():
         resolve_with_stages(task, request.config, merge(request.settings, nest({dimension.key: value})))
@@ -128,7 +125,7 @@ def _search(tuning: Tuning, jobs: int | None, make_trainings: MakeTrainings) -> 
         trainings.run([lambda: train(tuning, first, trainings)], to_go_on)
         tuning.save()
         if first.score is None:
-            raise TaskError(f"{tuning.path}: the recipe as it is failed: {first.problem}\nto try again: {to_go_on}")
+            raise TaskError(f"{tuning.path}: the unchanged recipe failed: {first.problem}\nto retry: {to_go_on}")
     content = recipe.model_dump(mode="json", by_alias=True) | {"algo_kwargs": fill_parameters(recipe)}
     for number in range(1, len(tuning.steps) + 1):
         trainings = make_trainings(tuning.path, tuning.trials_per_step, jobs)
@@ -143,8 +140,8 @@ def _warn_of_long_rollouts(recipe: Recipe) -> list[str]:
         return []
     evaluations = output.format_count(math.ceil(recipe.total_timesteps / rollout), "evaluation")
     return [
-        f"warning: a trial is judged by {evaluations}, which come between rollouts, of {rollout:,} steps here "
-        "(n_steps x n_envs); -n makes it longer"
+        f"warning: a trial has only {evaluations}: they happen between rollouts of {rollout:,} steps "
+        "(n_steps x n_envs); make trials longer with -n"
     ]
 
 
@@ -153,5 +150,5 @@ def _describe(tuning: Tuning, recipe: Recipe, where: str) -> str:
     return (
         f"{tuning.path}: {names}; at most {output.format_count(tuning.trials_per_step, 'trial')} "
         f"{'each, ' if len(tuning.steps) > 1 else ''}of {recipe.total_timesteps:,} steps, {where}; "
-        "-n makes them shorter, --trials fewer"
+        "-n changes their length, --trials their number"
     )

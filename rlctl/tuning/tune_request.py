@@ -21,13 +21,13 @@ class TuneRequest:
     search: Annotated[
         list[str],
         Option(
-            "Search this key, or KEY=A,B,C; repeat it for more, searched together.",
+            "Search this key, or KEY=A,B,C; repeat to search several keys together.",
             metavar="KEY=LOW:HIGH",
             default_text="learning rate; then n_steps and batch_size; then gamma",
         ),
     ] = dataclasses.field(default_factory=list)
     trials: Annotated[
-        int, Option("Trainings per step of the search, at most; the first is the recipe as it is.", min=2, max=1000)
+        int, Option("Trainings per step of the search, at most; the first has the unchanged recipe.", min=2, max=1000)
     ] = 8
     metric: Annotated[Metric, Option("What to maximise.", metavar="return|success")] = "return"
     storage: Annotated[

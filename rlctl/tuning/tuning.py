@@ -115,4 +115,4 @@ def load(folder: Path) -> Tuning:
     try:
         return pydantic.TypeAdapter(Tuning).validate_python({**content, "path": folder})
     except (pydantic.ValidationError, TypeError):
-        raise ArtifactError(f"{file}: damaged: it does not say what was tuned") from None
+        raise ArtifactError(f"{file}: damaged: it does not describe a tuning") from None

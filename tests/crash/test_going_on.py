@@ -30,7 +30,7 @@ def test_a_finished_run_made_longer_is_a_longer_run(trials, folders, name):
     run = only_run(first.folder)
     longer = trials.run([*resume(run), "-n", str(long)], first.folder)
     assert [ended.code for ended in (whole, first, longer)] == [0, 0, 0]
-    assert f"going on at step {short}, as if it had never stopped" in longer.stderr
+    assert f"resuming at step {short}, bit-exact" in longer.stderr
     assert_same_end(run, only_run(whole.folder))
 
 
@@ -48,7 +48,7 @@ def test_a_finished_run_has_nothing_to_do(trials, folders, more):
     again = trials.run(resume(run), ended.folder)
     assert_quiet(again)
     assert again.code == 0
-    assert "this run is finished already: nothing to do; -n trains longer" in again.stdout
+    assert "this run has finished: nothing to do; to train longer, give -n" in again.stdout
     assert contents(run) == before
 
 
@@ -61,7 +61,7 @@ def test_killed_before_its_first_checkpoint(trials, whole, folders):
     assert run.checkpoints() == []
     again = trials.run(resume(run), ended.folder)
     assert again.code == 0, again.stderr
-    assert "no checkpoint yet: the training begins at its first step" in again.stderr
+    assert "no checkpoint yet: the training starts from step 0" in again.stderr
     assert_same_end(run, only_run(before.folder))
 
 
@@ -93,7 +93,7 @@ def test_an_environment_that_is_mended(trials, folders):
     assert "mine.py has changed since the run began. The policy may no longer fit; " in refused.stderr
     forced = trials.run([*resume(run), "--force"], folder)
     assert forced.code == 0, forced.stderr
-    assert "going on at step 64, not bit-exact: " in forced.stderr
+    assert "resuming at step 64, not bit-exact: " in forced.stderr
     whole = trials.run(arguments, next(folders))
     assert whole.code == 0, whole.stderr
     assert_same_end(run, only_run(whole.folder))  # what was mended had not happened yet

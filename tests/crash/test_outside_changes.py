@@ -50,7 +50,9 @@ def test_a_run_that_is_removed_ends_its_training(trials, folders, what):
     ended = trials.run(ARGUMENTS[NAME], next(folders), outside_change={"what": what, "after": AFTER})
     assert_quiet(ended)
     assert ended.code == 5
-    assert ended.stderr.splitlines()[-1].endswith(": was removed while it trained, so nothing can be saved; train anew")
+    assert ended.stderr.splitlines()[-1].endswith(
+        ": was removed during training, so nothing can be saved; start a new training"
+    )
     assert only_run(ended.folder) is None
 
 
@@ -72,7 +74,7 @@ def test_the_next_checkpoint_is_whole(trials, whole, change, name, what, after):
     again = trials.run([*resume(run), "-n", "96"], ended.folder)
     assert again.code == 0, again.stderr
     saved, _ = checkpoint.read_newest(only_run(whole(name).folder))
-    assert f"going on at step {saved.state.step}, as if" in again.stderr
+    assert f"resuming at step {saved.state.step}, bit-exact" in again.stderr
 
 
 @pytest.mark.parametrize(
@@ -111,7 +113,7 @@ def test_evaluations_table_removed(whole, change):
 def test_a_disk_that_takes_nothing_for_a_while(whole, change, what, message):
     _, run, warnings = change(what, after=16, until=64)
     assert warnings[0].startswith("warning: not saved: ")
-    assert warnings[0].endswith(f"{message}; training goes on")
+    assert warnings[0].endswith(f"{message}; training continues")
     assert warnings[-1] == "saved again, at step 64"
     assert_same_end(run, only_run(whole(NAME).folder))
 

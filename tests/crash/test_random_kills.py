@@ -39,4 +39,4 @@ def test_killed_while_the_workers_are_stuck(trials, tmp_path, how):
     (run,) = tmp_path.glob("runs/Stuck/*")
     again = trials.run(["train", "--resume", str(run)], tmp_path)
     assert again.code == 0, again.stderr
-    assert again.went_on_at >= ended.announced > 0
+    assert again.resumed_at >= ended.announced > 0

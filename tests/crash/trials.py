@@ -77,10 +77,10 @@ class Ended:
         return max((int(line.split()[1]) for line in self.log if line.startswith("operation ")), default=0)
 
     @property
-    def went_on_at(self) -> int:
-        """The step that a resume went on from; 0 if it began anew."""
-        found = re.search(r"^going on at step ([\d,]+)", self.stderr, re.MULTILINE)
-        return int(found[1].replace(",", "")) if found else 0
+    def resumed_at(self) -> int:
+        """The step at which a resume continued; 0 if it started from the first step."""
+        match = re.search(r"^resuming at step ([\d,]+)", self.stderr, re.MULTILINE)
+        return int(match[1].replace(",", "")) if match else 0
 
 
 class Trials:

@@ -102,7 +102,7 @@ def test_another_task_is_refused_unless_forced(plugin, resume, capfd, what):
     assert str(caught.value) == (f"{run.path}: {message}. The policy may no longer fit; --force resumes anyway")
     assert run.status_file.read_bytes() == before
     resume(run, force=True)
-    assert f"going on at step 64, not bit-exact: {message}" in capfd.readouterr().err.splitlines()
+    assert f"resuming at step 64, not bit-exact: {message}" in capfd.readouterr().err.splitlines()
     assert run.status()["status"] == "finished"
     assert [row["steps"] for row in rows(run.metrics_file)] == ["32", "64", "96", "128"]
 
@@ -140,7 +140,7 @@ def test_other_libraries_are_named(killed, resume, monkeypatch, capfd):
     resume(run)
     now = versions()
     assert (
-        f"going on at step 64, not bit-exact: torch 1.0 -> {now['torch']}; numpy 1.26.4 -> {now['numpy']}"
+        f"resuming at step 64, not bit-exact: torch 1.0 -> {now['torch']}; numpy 1.26.4 -> {now['numpy']}"
     ) in capfd.readouterr().err.splitlines()
     assert run.status()["status"] == "finished"
 
@@ -162,8 +162,8 @@ def test_an_environment_that_no_seed_reaches_begins_new_episodes(killed, resume,
     resume(run)
     printed = capfd.readouterr().err
     assert (
-        "going on at step 64, not bit-exact: environment 0 did not come back to where it was with its seed and "
-        "actions, so all begin their next episodes"
+        "resuming at step 64, not bit-exact: environment 0 did not reach its saved state from its seed "
+        "and actions, so all environments start new episodes"
     ) in printed
     after, damage = checkpoint.read_newest(run)
     assert damage == []
@@ -199,7 +199,7 @@ def test_an_environment_that_fails_in_the_replay_begins_new_episodes(killed, res
     printed = capfd.readouterr().err
     assert "RuntimeError: the gripper fell off in environment " in printed
     assert ", step 2, when it was replayed" in printed
-    assert "did not come back to where it was with its seed and actions, so all begin their next episodes" in printed
+    assert "did not reach its saved state from its seed and actions, so all environments start new episodes" in printed
     assert run.status()["status"] == "finished"
 
 

@@ -56,7 +56,7 @@ def test_training_goes_on(train, settings, tmp_path, capfd, fault, message):
     assert [row["steps"] for row in rows(run.metrics_file)] == ["32", "64", "96", "128"]
     assert run.best_policy.exists()
     printed = capfd.readouterr().err
-    assert printed.count("failed, training goes on: task ") == 2
+    assert printed.count("failed, training continues: task ") == 2
     kept = [file for file in sorted(run.episodes.glob("*.npz")) if load_episode(file).info.failure]
     assert [load_episode(file).info.policy for file in kept] == ["training step 64", "training step 96"]
     assert all(len(load_episode(file).actions) == 7 for file in kept)

@@ -154,6 +154,6 @@ def test_a_file_system_without_locks_is_warned_of(train, monkeypatch, capfd):
 
     monkeypatch.setattr(fcntl, "flock", flock)
     run = train("Line", TINY).run
-    assert f"warning: {run.path}: no locks on this file system: let no second process write this run" in (
+    assert f"warning: {run.path}: this file system has no locks: let only one process train this run" in (
         capfd.readouterr().err
     )

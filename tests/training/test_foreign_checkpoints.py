@@ -20,8 +20,8 @@ def test_a_checkpoint_of_another_run_is_not_used(runs, resume, capsys):
     result = resume(run, total_timesteps=192)
     assert result.steps == 192
     shown = capsys.readouterr().err
-    assert f"{run.checkpoint(256)}: the checkpoint of another run; nothing of it is used" in shown
-    assert "going on from step 128" in shown
+    assert f"{run.checkpoint(256)}: this checkpoint belongs to another run and is not used" in shown
+    assert "resuming from step 128" in shown
 
 
 def test_without_one_of_its_own_the_run_is_refused(runs, resume):

@@ -186,13 +186,13 @@ NEEDS = (
         (
             "OtherGoal",
             {},
-            "her: achieved_goal is Box(-1.0, 1.0, (2,), float32), desired_goal Box(-1.0, 1.0, (3,), float32): they "
-            "take each other's place, so both have to be a Box of one shape, and no image",
+            "her: achieved_goal is Box(-1.0, 1.0, (2,), float32), desired_goal Box(-1.0, 1.0, (3,), float32): "
+            "hindsight exchanges them, so both must be a Box of the same shape, not an image",
         ),
         (
             "Plane",
             {"algo_kwargs": {**FAST, "n_steps": 3}},
-            "algo_kwargs.n_steps: hindsight has no returns over several steps; leave out one of the two",
+            "algo_kwargs.n_steps: hindsight does not support n-step returns; remove her or n_steps",
         ),
     ],
 )
@@ -214,16 +214,16 @@ def test_it_is_refused_before_there_is_a_run(train, tmp_path):
     [
         (
             {"reward_weights": {"away": -2.0}},
-            "her: compute_reward knows nothing of a recipe's reward_weights; leave out one of the two",
+            "her: compute_reward does not use the recipe's reward_weights; remove her or reward_weights",
         ),
         (
             {"stages": [{"promote": {"return": 0.0}, "reward_weights": {"away": -2.0}}, {}]},
-            "her: compute_reward knows nothing of a recipe's reward_weights; leave out one of the two",
+            "her: compute_reward does not use the recipe's reward_weights; remove her or reward_weights",
         ),
         (
             {"algo_kwargs": {"buffer_size": 399}},
-            "algo_kwargs.buffer_size: 399 steps of 4 environments have no room for two episodes of each, and hindsight "
-            "learns from whole ones; 400 will do",
+            "algo_kwargs.buffer_size: 399 steps of 4 environments cannot hold the two complete episodes of "
+            "each environment that hindsight needs; 400 is enough",
         ),
     ],
 )
@@ -246,8 +246,8 @@ def test_a_buffer_without_room_for_an_episode_ends_a_run(train, tmp_path):
     with pytest.raises(RecipeError) as caught:
         train("Plane", {**SMALL_HER, "algo_kwargs": {**FAST, "learning_starts": 44, "buffer_size": 52}})
     assert str(caught.value) == (
-        "algo_kwargs.buffer_size: 52 steps of 4 environments have no room for two episodes of each, and hindsight "
-        "learns from whole ones; give it twice the steps of an episode, times 4"
+        "algo_kwargs.buffer_size: 52 steps of 4 environments cannot hold the two complete episodes of each "
+        "environment that hindsight needs; set it to twice the steps of an episode, times 4"
     )
     (status,) = tmp_path.glob("runs/*/*/run.json")
     assert json.loads(status.read_text())["status"] == "failed"

@@ -33,7 +33,7 @@ def test_a_reward_weight_of_the_other_sign_is_warned_of(train, small_ppo, capsys
     stages = [{"reward_weights": {"distance": 2.0}, "promote": {"return": 0.0}}, {"reward_weights": {"distance": -0.5}}]
     train("reach", recipes.merge(small_ppo, {"stages": stages}))
     warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: reward_weights")]
-    assert warnings == ["warning: reward_weights.distance: 2 turns the sign of the task's own, -1"]
+    assert warnings == ["warning: reward_weights.distance: 2 has the opposite sign of the task's own, -1"]
 
 
 def test_task_and_resume_exclude_each_other():

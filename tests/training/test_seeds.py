@@ -210,7 +210,7 @@ def test_what_is_wrong_for_every_seed_is_said_at_once(tmp_path):
     request = TrainRequest(LINE, settings={"algo_kwargs": {"gama": 1}}, root=tmp_path, check=False)
     with pytest.raises(RecipeError, match="gamma"):
         train_seeds(request, "0-1")
-    with pytest.raises(UsageError, match="--seeds and --seed: give one of the two"):
+    with pytest.raises(UsageError, match="--seeds and --seed exclude each other"):
         train_seeds(TrainRequest(LINE, settings={"seed": 1}, root=tmp_path, check=False), "0-1")
     with pytest.raises(ArtifactError, match=r"not a group of runs: it has no group\.json"):
         train_seeds(TrainRequest(resume=str(tmp_path), check=False), None)
@@ -247,5 +247,5 @@ def test_the_file_of_a_group_names_no_other_place(change, tmp_path):
 
 def test_a_group_of_another_version(tmp_path):
     (tmp_path / "group.json").write_text('{"task": "reach", "seeds": [0], "options": ["--json=/elsewhere"]}')
-    with pytest.raises(ArtifactError, match="of another version of rlctl"):
+    with pytest.raises(ArtifactError, match="written by another version of rlctl"):
         read_group(tmp_path)

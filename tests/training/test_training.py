@@ -183,7 +183,7 @@ def test_resume_falls_back_to_the_checkpoint_before_a_damaged_one(copied, resume
     content[-1] ^= 1
     newest.write_bytes(bytes(content))
     resume(copied)
-    assert f"warning: {newest}: damaged: its content does not match its sha256; going on from step " in (
+    assert f"warning: {newest}: damaged: its content does not match its sha256; resuming from step " in (
         capsys.readouterr().err
     )
     assert (newest.parent.parent / "000000256.damaged").is_dir()

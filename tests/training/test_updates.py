@@ -224,5 +224,5 @@ def test_a_delayed_actor_learns_at_every_other_update():
 def test_sb3_cannot_delay_the_actor():
     model = make_off_policy(network={"activation_fn": torch.nn.ELU})
     model.policy_delay = 2
-    with pytest.raises(RecipeError, match="policy_delay: only for multi-layer perceptrons"):
+    with pytest.raises(RecipeError, match="policy_delay: supported only for multi-layer perceptrons"):
         choose_learner(model)

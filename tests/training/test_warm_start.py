@@ -56,25 +56,30 @@ def test_a_shipped_actor_gets_a_fresh_critic(train, capfd):
     shipped = PolicyFile.read(find_shipped_policy("reach")).tensors
     begun = PolicyFile.read(result.run.policy_file("0")).tensors
     assert_same_but_for_first_observations({name: begun[name] for name in shipped}, shipped)
-    assert "it has no critic, so that a fresh one is learnt, and the first updates" in capfd.readouterr().err
+    assert "it has no critic, so training starts with a new one, and the first updates" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("env", "settings", "kind", "message"),
     [
-        ("Line", {"algo": "a2c", "algo_kwargs": None}, UsageError, "a policy of ppo, and the recipe trains a2c; add"),
+        (
+            "Line",
+            {"algo": "a2c", "algo_kwargs": None},
+            UsageError,
+            "the policy was trained with ppo, the recipe uses a2c; add",
+        ),
         ("Discrete", {}, ArtifactError, "this policy is not for this task: its action space is"),
         (
             "Line",
             {"policy_kwargs": {"net_arch": [8]}},
             UsageError,
-            r"another network: policy_kwargs.net_arch is {.*} there and \[8\] here",
+            r"its network differs: policy_kwargs.net_arch is {.*} in the policy and \[8\] in the recipe",
         ),
         (
             "Line",
             {"policy_kwargs": {"activation_fn": "relu"}},
             UsageError,
-            "another network: policy_kwargs.activation_fn is tanh there and relu here",
+            "its network differs: policy_kwargs.activation_fn is tanh in the policy and relu in the recipe",
         ),
         (
             "Line",
@@ -93,11 +98,13 @@ def test_what_does_not_fit(source, train, tmp_path, env, settings, kind, message
 
 
 def test_what_is_no_source(train, resume, source):
-    with pytest.raises(UsageError, match=r"an ONNX file cannot be trained on; give the run or its \.safetensors file"):
+    with pytest.raises(
+        UsageError, match=r"ONNX files cannot be trained further; give the run or its \.safetensors file"
+    ):
         train("Line", TINY, initial_policy="policy.onnx")
     with pytest.raises(ArtifactError, match="no run 'nothing'"):
         train("Line", TINY, initial_policy="nothing")
-    with pytest.raises(UsageError, match="--from begins a new run, and --resume goes on with one"):
+    with pytest.raises(UsageError, match="--from and --resume exclude each other"):
         run_training(TrainRequest(resume=str(source.path), initial_policy="reach", check=False))
 
 

@@ -31,9 +31,9 @@ def test_a_search(text, dimension):
     [
         (["gamma"], "--search 'gamma': write KEY=LOW:HIGH or KEY=A,B,C"),
         (["algo_kwargs.gamma=0.9"], "--search 'algo_kwargs.gamma=0.9': a search needs two values or more"),
-        (["algo_kwargs.gamma=0.9:0.8"], "--search 'algo_kwargs.gamma=0.9:0.8': no range"),
-        (["algo_kwargs.gamma=1e-4:lin_1"], "--search 'algo_kwargs.gamma=1e-4:lin_1': no range"),
-        (["algo_kwargs.gamma=a:b"], "--search 'algo_kwargs.gamma=a:b': a and b are to be numbers"),
+        (["algo_kwargs.gamma=0.9:0.8"], "--search 'algo_kwargs.gamma=0.9:0.8': not a range"),
+        (["algo_kwargs.gamma=1e-4:lin_1"], "--search 'algo_kwargs.gamma=1e-4:lin_1': not a range"),
+        (["algo_kwargs.gamma=a:b"], "--search 'algo_kwargs.gamma=a:b': a and b must be numbers"),
         (["n_envs=1,2", "n_envs=3,4"], "--search: n_envs is given twice"),
     ],
 )

@@ -115,8 +115,7 @@ def test_the_best_of_all_trials_is_a_recipe(played, tmp_path, rlctl):
 def test_too_few_evaluations_are_named(played, tmp_path, capsys):
     begin(tmp_path, RATES, trials=1, settings={"algo_kwargs": {"n_steps": 32, "batch_size": 32}})
     assert (
-        "warning: a trial is judged by 2 evaluations, which come between rollouts, of 64 steps"
-        in capsys.readouterr().err
+        "warning: a trial has only 2 evaluations: they happen between rollouts of 64 steps" in capsys.readouterr().err
     )
     begin(tmp_path / "longer", RATES, trials=1, settings={"total_timesteps": 1024})
     assert "warning" not in capsys.readouterr().err
@@ -171,7 +170,7 @@ def test_a_trial_that_fails_stops_no_other(played, tmp_path, rlctl):
 
 def test_a_recipe_that_cannot_be_trained_is_not_tuned(played, tmp_path):
     played.fails = lambda settings: True
-    with pytest.raises(TaskError, match="the recipe as it is failed: it diverged"):
+    with pytest.raises(TaskError, match="the unchanged recipe failed: it diverged"):
         begin(tmp_path, RATES)
     assert len(played.calls) == 1
 
@@ -205,7 +204,7 @@ def test_an_interrupted_tuning_goes_on(played, tmp_path, interrupted_at):
 def test_a_trial_that_was_killed_is_tried_again(played, tmp_path, killed_at):
     played.killed_at = killed_at
     if killed_at == 1:
-        with pytest.raises(TaskError, match="the recipe as it is failed: killed by SIGKILL"):
+        with pytest.raises(TaskError, match="the unchanged recipe failed: killed by SIGKILL"):
             begin(tmp_path, RATES, trials=4)
     else:
         begin(tmp_path, RATES, trials=4)
@@ -280,8 +279,8 @@ def test_its_runs_are_runs(played, tmp_path):
 @pytest.mark.parametrize(
     ("search", "error", "message"),
     [
-        ("seed=0,1", UsageError, "--search seed: no hyperparameter"),
-        ("reward_weights.x=1,2", UsageError, "--search reward_weights.x: it changes what is trained for"),
+        ("seed=0,1", UsageError, "--search seed: not a hyperparameter"),
+        ("reward_weights.x=1,2", UsageError, "--search reward_weights.x: it changes the reward"),
         ("algo_kwargs.gama=0.9,0.99", RecipeError, "Did you mean 'gamma'?"),
         ("algo_kwargs.gamma=0.9:1.5", RecipeError, "gamma"),
     ],

@@ -1,4 +1,4 @@
-"""Updates with gradients computed in NumPy, without autograd; other algorithms and networks are updated by SB3."""
+"""Updates with gradients computed in NumPy, without autograd; SB3 updates all other algorithms and networks."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from rlctl.training.updates.tqc import TqcUpdate
 
 
 def choose_learner(model: Any) -> Any:
-    """Return whose `train` updates a model: one of these, or the model itself, which is SB3's."""
+    """Return the object whose `train` updates a model: a class of this package, or the SB3 model itself."""
     updates: tuple[Any, ...] = (PpoUpdate, SacUpdate, TqcUpdate, Td3Update, DqnUpdate)
     for update in updates:
         if not has_own_parts(model.policy) and update.supports(model):
             return update(model)
     if type(model) in (SAC, TQC) and getattr(model, "policy_delay", 1) > 1:
         raise RecipeError(
-            "policy_delay: only for multi-layer perceptrons with tanh or ReLU on the CPU; Stable-Baselines3's updates, "
-            "which all other networks have, cannot delay the actor's: leave it out"
+            "policy_delay: supported only for multi-layer perceptrons with tanh or ReLU on the CPU. "
+            "Stable-Baselines3 updates all other networks and cannot delay the actor: leave it out"
         )
     return model
