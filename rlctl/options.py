@@ -1,7 +1,7 @@
-"""How the fields of a request are given on the command line: declared once, beside the field.
+"""Command-line options of the fields of a request, declared once, next to the field.
 
-A request is a dataclass with the arguments of a command. The command line fills it (`rlctl.cli.arguments.command`), and
-Python passes it, a group stores it and a child process receives it as it is.
+A request is a dataclass with the arguments of a command. The command line fills it (`rlctl.cli.arguments.command`),
+Python passes it, a group stores it and a child process receives it.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ class Option:
 
     help: str
     flags: tuple[str, ...] = ()
-    """`("--from",)`; none: the field's name. `(" /--no-check",)` has a flag for False only."""
+    """`("--from",)`; empty: the field's name. `(" /--no-check",)` has a flag for False only."""
     metavar: str | None = None
     min: float | None = None
     max: float | None = None
     completes: Literal["task", "run", "algorithm"] | None = None
     """What the shell offers after TAB."""
     default_text: str | None = None
-    """The default as help shows it, where that is not the field's own."""
+    """The default in help, if it differs from the field's own."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Argument(Option):
-    """An argument: it has no flag, and its place on the command line gives it its meaning."""
+    """A positional argument."""
 
 
 TASK_FORMS = "Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id."
 
 OptionalTask = Annotated[str | None, Argument(TASK_FORMS, metavar="TASK", completes="task")]
-Config = Annotated[Path | None, Option("Recipe that goes over the task's own, or presets/NAME.", metavar="FILE")]
+Config = Annotated[Path | None, Option("Recipe that overrides the task's own, or presets/NAME.", metavar="FILE")]
 RunsFolder = Annotated[Path, Option("Where run folders go.", ("--output", "-o"), metavar="FOLDER")]
 EnvTimeout = Annotated[
     float, Option("How long a step or reset may take.", ("--env-timeout",), metavar="SECONDS", min=0.1)

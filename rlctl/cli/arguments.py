@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share, and what they do first."""
+"""Arguments and options that several commands share."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _COMPLETIONS = {
 
 @dataclasses.dataclass(frozen=True)
 class RecipeFlags:
-    """Keys of a recipe that are given on the command line; those with a flag of their own go over `--set`."""
+    """Recipe keys from the command line; a flag overrides `--set`."""
 
     settings: Annotated[
         list[str], Option("Set a key, e.g. task.tolerance=0.02, randomize=true.", ("--set",), metavar="KEY=VALUE")
@@ -82,7 +82,7 @@ def suggest_setting(option: str) -> str | None:
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
-    """Return a function for Typer: each parameter that is a dataclass is replaced by its fields that are options."""
+    """Return a function for Typer: the option fields of a dataclass parameter replace the parameter."""
     parameters, requests = [], {}
     for parameter in inspect.signature(function, eval_str=True).parameters.values():
         if not dataclasses.is_dataclass(parameter.annotation):
@@ -122,7 +122,7 @@ def _make_parameter(name: str, annotation: Any, default: Any) -> inspect.Paramet
 
 
 def _make_typer_option(option: Option, *, shows_default: bool) -> Any:
-    """Return what Typer has for an option or argument of a request."""
+    """Return Typer's option or argument for a request's field."""
     make = typer.Argument if isinstance(option, Argument) else typer.Option
     return make(
         *option.flags,
@@ -136,7 +136,7 @@ def _make_typer_option(option: Option, *, shows_default: bool) -> Any:
 
 
 def choose_checkpoint(checkpoint: str, pretrained: bool) -> str:
-    """Return which policy was asked for, by `--checkpoint` or by `--pretrained`."""
+    """Return the requested policy, from `--checkpoint` or `--pretrained`."""
     if not pretrained:
         return checkpoint
     from rlctl.errors import UsageError
@@ -148,7 +148,7 @@ def choose_checkpoint(checkpoint: str, pretrained: bool) -> str:
 
 
 def claim_stdout() -> None:
-    """Keep stdout for the result: what a plugin prints from now on goes to stderr."""
+    """Reserve stdout for the result; print output of plugins to stderr from now on."""
     from rlctl import output
 
     output.results()

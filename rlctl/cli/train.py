@@ -31,7 +31,7 @@ def train(
     detach: Annotated[bool, Option("Submit to SLURM and do not wait.", ("--detach",))] = False,
     json: Json = None,
 ) -> None:
-    """Train a policy, evaluate as it goes, and keep the best and the last."""
+    """Train a policy, evaluate during the training, and save the best and the last policy."""
     claim_stdout()
     from rlctl.run.group import find_group
 

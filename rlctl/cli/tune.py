@@ -14,7 +14,7 @@ from rlctl.tuning.tune_request import TuneRequest
 class TuneFlags(RecipeFlags):
     """The keys of a recipe that have a flag of `rlctl tune`."""
 
-    seed: Annotated[int | None, Option("Seed of the first trial; the others have the next ones.")] = None
+    seed: Annotated[int | None, Option("Seed of the first trial; trial n has seed + n.")] = None
     total_timesteps: Annotated[
         str | None, Option("Environment steps of a trial.", ("--total-timesteps", "-n"), metavar="STEPS")
     ] = None

@@ -15,8 +15,8 @@ from rlctl.storage import files
 
 VERSION = 2
 """Of the format of `group.json`."""
-_PLACES = {"root", "resume"}
-"""What is not stored of a request: a group's runs are in its folder, whatever its file says."""
+_NOT_STORED = {"root", "resume"}
+"""Arguments that are not stored: the runs of a group are always in its folder."""
 _MOST_SEEDS = 1000
 _RANGE = re.compile(r"(\d{1,9})-(\d{1,9})")
 
@@ -28,7 +28,7 @@ class Group:
     path: Path
     seeds: list[int]
     request: TrainRequest
-    """What every seed trains; the seed is set for each."""
+    """The request of every seed, without the seed."""
 
     @property
     def task(self) -> str:
@@ -45,7 +45,7 @@ class Group:
         return find_run_of_seed(self.path, seed)
 
     def is_done(self, seed: int) -> bool:
-        """Say whether a seed's training has finished; False for a run that cannot be read."""
+        """Return whether a seed's training has finished; False if its run cannot be read."""
         run = self.find_run(seed)
         try:
             return run is not None and run.status().get("status") == "finished"
@@ -84,13 +84,13 @@ def parse_seeds(text: str) -> list[int]:
 def create_group(request: TrainRequest, seeds: list[int]) -> Group:
     """Make a new group folder, `<root>/<task>/<time>_seeds`, for the task of a request."""
     folder = create_group_folder(request.task or "", "seeds", request.root)
-    content = {key: value for key, value in request.to_json().items() if key not in _PLACES}
+    content = {key: value for key, value in request.to_json().items() if key not in _NOT_STORED}
     files.write_json(folder / GROUP_FILE, {"version": VERSION, "seeds": seeds, "request": content})
     return Group(folder, seeds, dataclasses.replace(request, root=folder))
 
 
 def find_group(text: str, root: Path = ROOT) -> Path | None:
-    """Return the group that a user's word stands for, if it does: its folder, or a word whose newest run is in one."""
+    """Return the group of a folder, a task's name or `latest`; None if the run is not in a group."""
     if is_group(Path(text)):
         return Path(text)
     folder = find_run(text, root, to_train=True).path.parent
@@ -109,7 +109,7 @@ def read_group(path: Path) -> Group:
             f"{file}: written by another version of rlctl: the group cannot be resumed; resume its runs one by one"
         )
     try:
-        if content["request"].keys() & _PLACES:
+        if content["request"].keys() & _NOT_STORED:
             raise ValueError
         seeds = content["seeds"]
         request = TrainRequest.from_json({**content["request"], "root": str(path)})

@@ -1,4 +1,4 @@
-"""What a training is asked for: the arguments of `rlctl train` as data. Imports nothing heavy."""
+"""The arguments of `rlctl train` as data. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class TrainRequest:
     root: RunsFolder = Path("runs")
 
     def to_json(self) -> dict[str, Any]:
-        """Return the request as what JSON can hold."""
+        """Return the request as JSON data."""
         return {
             field.name: str(value) if isinstance(value := getattr(self, field.name), Path) else value
             for field in dataclasses.fields(self)
@@ -54,7 +54,7 @@ class TrainRequest:
 
     @classmethod
     def from_json(cls, content: Any) -> TrainRequest:
-        """Return the request of `to_json`; raises `ValueError` for data that is none."""
+        """Return the request of `to_json`; raises `ValueError` for invalid data."""
         import pydantic
 
         adapter: pydantic.TypeAdapter[TrainRequest] = pydantic.TypeAdapter(cls)

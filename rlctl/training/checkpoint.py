@@ -1,8 +1,8 @@
-"""Checkpoints: everything to go on with a training exactly as if it had never stopped, without pickle.
+"""Checkpoints: everything that a bit-exact resume needs, without pickle.
 
-A folder with `policy.safetensors` (a policy file), `state.safetensors` (optimisers, generators, statistics, the actions
-of running episodes) and `state.json` (plain data, and each file's sha256); it appears whole or not at all. The replay
-buffer of an off-policy algorithm is in segments beside the folders.
+A checkpoint is a folder with `policy.safetensors` (a policy file), `state.safetensors` (optimisers, generators,
+statistics, the actions of running episodes) and `state.json` (plain data, and each file's sha256), written atomically.
+The replay buffer of an off-policy algorithm is in segments next to the folders.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ class State(pydantic.BaseModel):
 
     format: int = FORMAT
     run: str = ""
-    """The `id` of the run that it is of."""
+    """The `id` of its run."""
     step: int
     model: dict[str, Any]
     """Plain data of `snapshot.take`."""
     progress: Progress
     segments: list[Segment] = []
-    """Where the replay buffer is."""
+    """The segments of the replay buffer."""
     computed_with: dict[str, str]
-    """What the last bits of a result depend on: versions, processor, threads."""
+    """What bit-exact results depend on: versions, processor, threads."""
     sha256: dict[str, str]
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint that was read and found whole."""
+    """A checkpoint that was read and is undamaged."""
 
     folder: Path
     state: State
@@ -72,7 +72,7 @@ class Checkpoint:
 
 
 class CheckpointFolders:
-    """Writes the folders of a run's checkpoints, and restores what one of them holds."""
+    """Writes the checkpoint folders of a run, and restores the training from one."""
 
     def __init__(self, run: RunDirectory, model: BaseAlgorithm, env: WorkerVecEnv, keep: int) -> None:
         self._run = run
@@ -90,11 +90,11 @@ class CheckpointFolders:
 
     @property
     def _added(self) -> int:
-        """How many transitions the replay buffer has been given: one for each step of all environments."""
+        """Number of transitions added to the replay buffer; a step of all environments is one."""
         return self._model.num_timesteps // self._env.num_envs
 
     def save(self, policy: PolicyFile, progress: Progress) -> None:
-        """Write a checkpoint of the present boundary; raises `OSError` if the disk does not take it."""
+        """Write a checkpoint of the current boundary; raises `OSError` if it cannot be written."""
         tensors, plain = snapshot.take(self._model)
         tensors |= _environment_tensors(self._env)
         segments: list[Segment] = []
@@ -120,7 +120,7 @@ class CheckpointFolders:
             files.write_new(folder / _STATE, _encode_state(state.model_dump(mode="json")))
 
     def computed_with(self) -> dict[str, str]:
-        """Return what the last bits of this training's results depend on."""
+        """Return what bit-exact results of this training depend on."""
         return {
             **collect_versions(),
             "machine": platform.machine(),
@@ -130,7 +130,7 @@ class CheckpointFolders:
         }
 
     def remove_old(self) -> None:
-        """Remove all checkpoints but the newest few, and the segments of the replay buffer that none of them names."""
+        """Remove all checkpoints except the newest `keep`, and replay segments that none of these needs."""
         for old in self._run.checkpoints()[: -self._keep]:
             files.remove_tree(old)
         if self._replay is not None:
@@ -139,7 +139,7 @@ class CheckpointFolders:
     def restore(self, checkpoint: Checkpoint) -> str | None:
         """Restore model, replay buffer and environments from a checkpoint.
 
-        Return a message if an environment did not reach its former state; then all begin their next episodes.
+        Return a message if an environment did not reach its saved state; then all start new episodes.
         """
         model, tensors = self._model, checkpoint.tensors
         try:
@@ -150,7 +150,7 @@ class CheckpointFolders:
             mismatch = _restore_environments(self._env, tensors)
         except (ArtifactError, KeyError) as error:
             raise ArtifactError(f"{checkpoint.folder}: {error}") from None
-        # That there is one keeps SB3 from a reset; nothing else is done with it.
+        # SB3 resets the environments if this is None; it has no other use here.
         model._last_obs = self._env.workers.observations()
         if mismatch is not None:
             begin_next_episodes(model)
@@ -160,7 +160,7 @@ class CheckpointFolders:
 
 
 def read_newest(run: RunDirectory) -> tuple[Checkpoint | None, list[str]]:
-    """Return the newest undamaged checkpoint, and what is wrong with those after it; None where there is none yet.
+    """Return the newest undamaged checkpoint (None without any), and the problems of newer ones.
 
     Raises `ArtifactError` if all are damaged.
     """
@@ -179,7 +179,7 @@ def read_newest(run: RunDirectory) -> tuple[Checkpoint | None, list[str]]:
 
 
 def read(folder: Path) -> Checkpoint:
-    """Read a checkpoint and check all of it; raises `ArtifactError` if something is missing, damaged or not ours."""
+    """Read and verify a checkpoint; raises `ArtifactError` if a file is missing, damaged or not a checkpoint's."""
     state = _read_state(folder)
     for name in (_POLICY, _TENSORS):
         files.check_digest(folder / name, state.sha256.get(name, ""))
@@ -231,17 +231,17 @@ def _named_segments(run: RunDirectory) -> list[Segment]:
 
 
 def _cpu_vendor() -> str:
-    """Return the vendor of the processor, where known: libraries choose their code by that too."""
+    """Return the processor's vendor if known: libraries choose their code by it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return platform.processor() or "unknown"
-    found = (line.partition(":")[2].strip() for line in lines if line.startswith(("vendor_id", "CPU implementer")))
-    return next(found, "unknown")
+    vendors = (line.partition(":")[2].strip() for line in lines if line.startswith(("vendor_id", "CPU implementer")))
+    return next(vendors, "unknown")
 
 
 def find_differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
-    """Return `torch 2.13.0 -> 2.14.0` for each entry that is another one now."""
+    """Return `torch 2.13.0 -> 2.14.0` for each entry that has changed."""
     names = dict.fromkeys([*before, *now])
     return [
         f"{name} {before.get(name, 'none')} -> {now.get(name, 'none')}"
@@ -251,7 +251,7 @@ def find_differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
 
 
 def _environment_tensors(env: WorkerVecEnv) -> Tensors:
-    """Return the episodes that environments are in, what was done in them, and what was observed last."""
+    """Return the numbers, actions and last observations of the running episodes."""
     histories = [env.history.of(index) for index in range(env.num_envs)]
     tensors = {
         "environments/episodes_started": np.array(env.episodes_started, np.int64),
@@ -264,7 +264,7 @@ def _environment_tensors(env: WorkerVecEnv) -> Tensors:
 
 
 def _restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
-    """Replay the running episodes; return a message if an environment does not reach its former state."""
+    """Replay the running episodes; return a message if an environment does not reach its saved state."""
     steps = tensors["environments/steps"].tolist()
     if len(steps) != env.num_envs:
         raise ArtifactError(f"it was saved with {len(steps)} environments, not {env.num_envs}")

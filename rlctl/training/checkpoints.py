@@ -1,4 +1,4 @@
-"""What a training writes into its run folder, and what a resume takes back; a disk that fails stops nothing."""
+"""What a training writes into its run folder, and what a resume restores; a failing disk stops no training."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from rlctl.training.learner import Learner
 from rlctl.training.snapshot import check_finite
 
 STEP_LABEL = "training step "
-"""What a kept episode was played with, for people: followed by the number."""
+"""Start of the `policy` text of a saved episode; the step's number follows."""
 CHECKPOINT_TIME_SHARE = 0.02
-"""Part of the training's time that checkpoints may take."""
+"""Share of the training time that checkpoints may take."""
 
 
 class Checkpoints:
-    """Writes tables, policies and checkpoints. What cannot be written costs a warning and is tried again."""
+    """Writes tables, policies and checkpoints. A write that fails causes a warning and is repeated later."""
 
     def __init__(self, learner: Learner, run: RunDirectory, keep: int, warn: Callable[[str], None]) -> None:
-        """Write into the folder of a run, which keeps the newest `keep` checkpoints; `warn` shows a message."""
+        """Write into the folder of `run`, keep its newest `keep` checkpoints; `warn` shows a message."""
         self.run = run
         self.metrics = Table(run.metrics_file)
         self.evals = Table(run.evals_file)
         self.saved_step: int | None = None
-        """Step of the last checkpoint that is whole on the disk."""
+        """Step of the last complete checkpoint."""
         self.problem = ""
-        """What could not be written the last time, and why."""
+        """The last write that failed, and why."""
         self._learner = learner
         self._folders = CheckpointFolders(run, learner.model, learner.env, keep)
         self._warn = warn
         self._next_s = time.monotonic()
         self._uncounted_checkpoints = 1
-        """Checkpoints that come whether they are due or not: the last one."""
+        """Checkpoints that are written even if not due: the last one."""
         self._reported: set[str] = set()
-        """Problems that were reported since everything was saved."""
+        """Problems reported since the last successful checkpoint."""
         self._unsaved_best: PolicyFile | None = None
-        """The best policy, until the disk takes it."""
+        """The best policy, if it could not be written yet."""
 
     def attempt(self, what: str, write: Callable[[], object]) -> bool:
-        """Write something; False, with a warning, if the disk does not take it.
+        """Call `write`; on an `OSError` show a warning about `what` and return False.
 
-        Raises `ArtifactError` if somebody has removed the run, `RunTaken` if another process writes it now.
+        Raises `ArtifactError` if the run was removed, `RunTaken` if another process has taken it over.
         """
         if not self.run.status_file.exists():
             raise ArtifactError(
@@ -71,7 +71,7 @@ class Checkpoints:
         self.problem = problem
 
     def row(self, table: Table, row: dict[str, Any]) -> None:
-        """Add a row to a table; one that the disk does not take now is written with the next."""
+        """Add a row to a table; a row that cannot be written now is written with the next one."""
         table.add(row)
         self.attempt(table.path.name, table.flush)
 
@@ -90,13 +90,13 @@ class Checkpoints:
         self._unsaved_best = None
 
     def is_due(self) -> bool:
-        """Say whether the time that checkpoints may take allows one."""
+        """Return whether a checkpoint is due within `CHECKPOINT_TIME_SHARE`."""
         return time.monotonic() >= self._next_s
 
     def save(self) -> bool:
-        """Write the last policy and a checkpoint; False, with a warning, if the disk does not take it.
+        """Write the last policy and a checkpoint; False, with a warning, if they cannot be written.
 
-        Raises `DivergedError` where a number that is learnt is not finite.
+        Raises `DivergedError` if a learned number is not finite.
         """
         check_finite(self._learner.model, self.run.path)
         self._learner.progress.seconds = self._learner.seconds
@@ -117,7 +117,7 @@ class Checkpoints:
         self._reported.clear()
 
     def _write(self, policy: PolicyFile) -> None:
-        # Whoever resumes from a checkpoint will not come by here again: everything before it must be on the disk.
+        # A resume does not repeat earlier writes, so they must be on the disk before the checkpoint.
         progress = self._learner.progress
         self.metrics.flush(sync=True)
         self.evals.flush(sync=True)
@@ -131,7 +131,7 @@ class Checkpoints:
     def restore(self, checkpoint: Checkpoint, changed: Sequence[str]) -> str:
         """Restore model and environments; return a message about how exactly the training is resumed.
 
-        `changed` is why it cannot be exact, as far as is known before.
+        `changed` holds the reasons known so far why it cannot be exact.
         """
         file = checkpoint.folder / "policy.safetensors"
         info = PolicyFile.read_info(file)
@@ -146,9 +146,9 @@ class Checkpoints:
         return f"resuming at step {checkpoint.state.step:,}, {exactness}"
 
     def cut_back(self, step: int) -> list[str]:
-        """Put the run folder back to where the checkpoint of a step has it; return warnings.
+        """Return the run folder to its state at the checkpoint of a step; return warnings.
 
-        Tables are cut back, later checkpoints are set aside, and the episodes of later evaluations are removed.
+        Later table rows and episodes of later evaluations are removed, later checkpoints are set aside.
         """
         for folder in self.run.checkpoints():
             if int(folder.name) > step:
@@ -173,7 +173,7 @@ def _remove_episodes_after(run: RunDirectory, step: int) -> None:
         try:
             policy = load_episode(file).info.policy
         except ArtifactError:
-            continue  # not one that a training has written whole
+            continue  # damaged, or not written by a training
         number = policy.removeprefix(STEP_LABEL)
         if policy.startswith(STEP_LABEL) and number.isdigit() and int(number) > step:
             files.remove(file)

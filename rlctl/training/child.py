@@ -1,4 +1,4 @@
-"""A training in a process of its own: receives a request as JSON, and ends with the exit code of `rlctl train`."""
+"""Child process of a training: receives a request as JSON, exits with the exit code of `rlctl train`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rlctl.processes import error_boundary, messages
 
 
 def main(connection: Connection, request: dict[str, Any], command: Sequence[str]) -> None:
-    """Train; a message is sent as soon as signals stop the training. `command` is that of the parent process."""
+    """Train; send a message when signals can stop the training. `command` is the parent's command line."""
     sys.argv[:] = command
     error_boundary.prepare_streams()
     code = error_boundary.run(lambda: _train(connection, request))

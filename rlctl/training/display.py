@@ -16,7 +16,7 @@ from rlctl.runs.summary import find_best_row, read_table
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _ASCII_BLOCKS = "_.-=+*#@"
-_CURVE = 200  # points that are kept; as many are drawn as there is room for
+_CURVE = 200  # points of a curve
 _WIDE = 100  # columns of a terminal
 _LINE_EVERY_S = 5.0
 
@@ -51,7 +51,7 @@ def format_score(success: float | None, mean_return: float) -> str:
 
 
 class Display:
-    """Shows what happens in a training: here as lines for a log, some seconds apart."""
+    """Shows the progress of a training as lines for a log, some seconds apart."""
 
     def __init__(self, title: str, total: int) -> None:
         self.title = title
@@ -69,26 +69,26 @@ class Display:
         return
 
     def phase(self, text: str) -> None:
-        """What is done before the first step, or now, begins: `text` names it. A log does without."""
+        """A phase such as evaluating begins; a log does not show it."""
 
     def run_folder(self, run: RunDirectory) -> None:
-        """The run's folder is known; of a resumed run its tables hold the earlier rows."""
+        """The run's folder is known; the tables of a resumed run hold its earlier rows."""
 
     def steps(self, steps: int) -> None:
-        """So many environment steps are done; called after each segment."""
+        """`steps` environment steps are done; called after each segment."""
         if self._first is None:
             self._first = (time.monotonic(), steps)
         self._steps = steps
 
     def time_left(self) -> str:
-        """Return how long the rest takes at the rate so far; empty where that is not known yet."""
+        """Return the remaining time at the rate so far; empty if unknown."""
         if self._first is None or self._steps <= self._first[1]:
             return ""
         rate = (self._steps - self._first[1]) / max(time.monotonic() - self._first[0], 1e-9)
         return duration(max(self.total - self._steps, 0) / rate)
 
     def metrics(self, row: Mapping[str, Any]) -> None:
-        """An update is done; `row` is that of `metrics.csv`."""
+        """An update is done; `row` is its row of `metrics.csv`."""
         now = time.monotonic()
         if now - self._last_line < _LINE_EVERY_S:
             return
@@ -103,7 +103,7 @@ class Display:
         self.message("  ".join(part for part in parts if part))
 
     def stage(self, title: str, why: str = "") -> None:
-        """A stage of the curriculum begins, or goes on after a resume."""
+        """A stage of the curriculum begins or is resumed."""
         self._stage = title.partition(":")[0]
         self.message(_format_stage(title, why))
 
@@ -112,7 +112,7 @@ class Display:
         self.message(_format_evaluation(steps, success, mean_return, best))
 
     def message(self, text: str) -> None:
-        """Text to show: a warning, or what an environment printed."""
+        """Show a warning, or output of an environment."""
         print(text, file=sys.stderr, flush=True)
 
 
@@ -125,7 +125,7 @@ def _format_evaluation(steps: int, success: float | None, mean_return: float, be
 
 
 class LiveDisplay(Display):
-    """A progress bar with curves; what others print scrolls above it."""
+    """A progress bar with curves; messages scroll above it."""
 
     def __init__(self, title: str, total: int) -> None:
         super().__init__(title, total)
@@ -155,7 +155,7 @@ class LiveDisplay(Display):
     def run_folder(self, run: RunDirectory) -> None:
         """Show the folder; draw the earlier rows of a resumed run."""
         self._folder = str(run.path)
-        with contextlib.suppress(OSError, csv.Error):  # what cannot be read is not drawn
+        with contextlib.suppress(OSError, csv.Error):  # unreadable rows are not drawn
             for row in read_table(run.metrics_file):
                 self._add_to_curves(row)
             evaluations = read_table(run.evals_file)

@@ -1,4 +1,4 @@
-"""Evaluation while training: the same episodes each time, and which of them a run keeps: the first and the worst."""
+"""Evaluation episodes of a training: the same each time; the first and the worst are saved."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from rlctl.version import collect_versions
 
 
 class EvaluationEpisodes:
-    """Plays the evaluation episodes of a run, and writes some; nothing of the training changes by it.
+    """Plays the evaluation episodes of a run, and saves some of them, without any effect on the training.
 
-    `goal` is what the environments are in which it evaluates.
+    `goal` describes the environments of the evaluations.
     """
 
     def __init__(
@@ -35,16 +35,16 @@ class EvaluationEpisodes:
         self._make_workers = make_workers
         self._checkpoints = checkpoints
         self._goal = goal
-        # They build their environments beside the first updates, which leave a core idle.
+        # They build their environments during the first updates, which leave a core idle.
         self._workers: Workers | None = make_workers()
         self._spec = self._workers.spec
         self._latest: list[RecordedEpisode] = []
 
     def play(self, policy: PolicyFile, check: Callable[[], None], *, unseen: int | None = None) -> list[Episode]:
-        """Return the episodes of a policy: those of every evaluation, or a number that no evaluation has played.
+        """Play the episodes of every evaluation, or `unseen` new ones; return them.
 
-        `check` is called several times a second and may raise to leave. Raises `TaskError` if an environment fails;
-        the next call begins with new environments.
+        `check` is called several times a second and may raise to stop. Raises `TaskError` if an environment fails;
+        the next call uses new environments.
         """
         settings = self._recipe.eval
         workers = self._workers = self._workers or self._make_workers()
@@ -60,13 +60,13 @@ class EvaluationEpisodes:
             raise
 
     def close(self) -> None:
-        """End the environments' processes."""
+        """Stop the environments' processes."""
         if self._workers is not None:
             self._workers.close()
         self._workers = None
 
     def keep(self, episodes: list[Episode], steps: int) -> None:
-        """Write the first and the worst of an evaluation; remember all of it for `record`."""
+        """Save the first and the worst episode of an evaluation; remember all for `record`."""
         self._latest = recorded = [self._recorded(episode, steps) for episode in episodes]
         worst = min(
             range(len(episodes)), key=lambda i: (episodes[i].result.success is True, episodes[i].result.total_reward)
@@ -75,7 +75,7 @@ class EvaluationEpisodes:
             self._write(recorded[index])
 
     def record(self, count: int) -> list[Path]:
-        """Write the last `count` episodes of the last evaluation, and recordings of them; return these."""
+        """Save the last `count` episodes of the last evaluation with recordings; return the recordings' paths."""
         recordings = []
         for episode in self._latest[-count:] if count else []:
             from rlctl.replaying.reproduce import record_episode
@@ -88,9 +88,9 @@ class EvaluationEpisodes:
         return recordings
 
     def keep_failed(self, error: RlctlError, spec: EnvSpec, evaluated_at: int | None = None) -> RlctlError:
-        """Write the actions of an episode that failed, if they are known; return the error, with the file in its hint.
+        """Save the actions of a failed episode, if known; return the error with a hint that names the file.
 
-        It was of environments of `spec`, in training or in the evaluation at a step.
+        The episode was played in `spec`, in training or, at step `evaluated_at`, in an evaluation.
         """
         if not isinstance(error, EpisodeFailed) or error.actions is None:
             return error
@@ -103,7 +103,7 @@ class EvaluationEpisodes:
             failure=str(error).partition("\n")[0],
         )
         nothing = np.zeros(0)
-        # Of a reset that failed there is no action to take the shape from.
+        # If the reset failed there are no actions with a shape.
         actions = np.asarray(error.actions).reshape(-1, *(self._goal.spaces()[1].shape or ()))
         episode = RecordedEpisode(actions, nothing, nothing, nothing.reshape(0, 0), info)
         written: list[Path] = []

@@ -1,7 +1,7 @@
-"""The columns of `metrics.csv` and `evals.csv`, beside those of steps, time and stage.
+"""The columns of `metrics.csv` and `evals.csv`, except steps, time and stage.
 
-Actions, exploration, values and gradients are read from what SB3 holds after an update anyway; it depends on steps
-alone, so a resumed run measures the same. Where something does not exist, as limits of discrete actions, it is None.
+Actions, exploration, values and gradients are read from SB3's buffers and optimisers after an update. These depend on
+steps only, so a resumed run measures the same. A value that does not exist, e.g. limits of discrete actions, is None.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from rlctl.rollout.messages import EpisodeResult
 from rlctl.training.vec_env import WorkerVecEnv
 
 HISTOGRAMS = 20
-"""How many times in a training TensorBoard gets histograms, which cost more than numbers."""
+"""Number of times per training that histograms are written; they take more time than numbers."""
 
 _ROWS = 500
-"""Steps of each environment that are looked at, the last ones."""
+"""Maximum number of last steps per environment that are measured."""
 _SAMPLES = 2000
 """Values in a histogram."""
 _AT_LIMIT = 0.99
-"""From this part of its range on an action counts as saturated."""
+"""An action counts as saturated from this fraction of half its range."""
 
 
 _LOSSES = (
@@ -45,19 +45,19 @@ _LOSSES = (
 
 @dataclasses.dataclass(frozen=True)
 class LastSteps:
-    """The last steps of all environments; arrays of shape (n_envs, steps, ...) but for `values`."""
+    """The last steps of all environments; arrays of shape (n_envs, steps, ...) except `values`."""
 
     observation: Mapping[str, NDArray[Any]]
-    """As the environments gave them."""
+    """Not normalised."""
     action: NDArray[Any]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
     values: NDArray[Any] | None
-    """What the critic expected of each step, in any order; None where it was not computed."""
+    """The critic's values of the steps, in any order; None if they were not computed."""
 
 
 def measure(model: BaseAlgorithm, env: WorkerVecEnv, last_row: int, total_timesteps: int) -> dict[str, float | None]:
-    """Return columns for the environment steps since the last row; log them, and now and then distributions."""
+    """Return columns for the environment steps since the last row; log them, and histograms at intervals."""
     steps = model.num_timesteps
     last = _read_last_steps(model, env, steps - last_row)
     row = {
@@ -77,10 +77,7 @@ def measure(model: BaseAlgorithm, env: WorkerVecEnv, last_row: int, total_timest
 
 
 def _read_last_steps(model: BaseAlgorithm, env: WorkerVecEnv, steps: int) -> LastSteps | None:
-    """Return the environments' last steps, at most `steps` of all together; None before there are any.
-
-    On-policy they are the last segment, else the newest of the replay buffer.
-    """
+    """Return at most the last `steps` steps, None before the first: the last segment, or from the replay buffer."""
     replay: Any = getattr(model, "replay_buffer", None)
     if replay is not None:
         return _read_replay_buffer(model, replay, max(1, steps // env.num_envs))
@@ -91,7 +88,7 @@ def _read_last_steps(model: BaseAlgorithm, env: WorkerVecEnv, steps: int) -> Las
     observation = {key: rows[:, :-1] for key, rows in segment.observation.items()}
     space, action, half = env.action_space, segment.action, _half_range(env.action_space)
     if isinstance(space, spaces.Box) and half is not None:
-        action = (action - (space.high + space.low) / 2) / half  # as a replay buffer has it
+        action = (action - (space.high + space.low) / 2) / half  # scaled as in a replay buffer
     return LastSteps(observation, action, segment.terminated, segment.truncated, rollout.values.ravel())
 
 
@@ -117,7 +114,7 @@ def _half_range(space: spaces.Space[Any]) -> NDArray[Any] | None:
 def summarize_steps(
     last: LastSteps | None, space: spaces.Space[Any], log: Mapping[str, Any]
 ) -> dict[str, float | None]:
-    """Return what can be said of steps with actions of a space; `log` is what SB3 logged of the update."""
+    """Return measurements of steps with actions of a space; `log` holds the values that SB3 logged in the update."""
     limited = _half_range(space) is not None
     actions = None if last is None or not isinstance(space, spaces.Box) else last.action.astype(np.float32)
     return {
@@ -141,10 +138,10 @@ def _mean_change(actions: NDArray[np.float32], last: LastSteps) -> float | None:
 
 
 def _exploration(space: spaces.Space[Any], entropy_loss: Any) -> float | None:
-    """Return how widely an on-policy algorithm explores: 1 is the half range of an action, or any choice of all.
+    """Return how widely an on-policy algorithm explores, as a fraction of half the action range or of all choices.
 
-    For a normal distribution it is the standard deviation that has the logged entropy; gSDE's own log has the one of a
-    matrix instead.
+    For a normal distribution it is the standard deviation that has the logged entropy; the one that SB3 logs for gSDE
+    is that of a matrix.
     """
     if entropy_loss is None or not math.isfinite(entropy_loss):
         return None
@@ -157,9 +154,9 @@ def _exploration(space: spaces.Space[Any], entropy_loss: Any) -> float | None:
 
 
 def _expected_value(last: LastSteps | None, log: Mapping[str, Any]) -> float | None:
-    """Return what the critic expects: the mean over a rollout, or over the replay buffer's samples of an update.
+    """Return the critic's mean value over a rollout, or over the minibatches of an off-policy update.
 
-    The loss of an off-policy actor is minus that value, SAC's with the entropy that it is paid for.
+    The off-policy actor's loss is minus this value; SAC's includes the entropy bonus.
     """
     if last is not None and last.values is not None:
         return float(last.values.mean())
@@ -168,10 +165,10 @@ def _expected_value(last: LastSteps | None, log: Mapping[str, Any]) -> float | N
 
 
 def _gradient_norm(model: BaseAlgorithm) -> float | None:
-    """Return the norm of the last minibatch's gradient as it was applied: not above `max_grad_norm`, if clipped.
+    """Return the norm of the last minibatch's gradient after clipping.
 
-    Of an off-policy actor and critic it is the critic's root mean square over about the last thousand updates: Adam
-    keeps it, and the gradients of the last minibatch are mixed with those that passed through to the actor.
+    For an off-policy actor and critic it is the critic's root mean square over about 1,000 updates, from Adam's state:
+    the actor's update also changes the critic's gradients of the last minibatch.
     """
     if (critic := getattr(model, "critic", None)) is not None:
         return recent_gradient_norm(critic.optimizer)
@@ -182,7 +179,7 @@ def _gradient_norm(model: BaseAlgorithm) -> float | None:
 
 
 def recent_gradient_norm(optimizer: torch.optim.Optimizer) -> float | None:
-    """Return the root mean square of a gradient's norm over some 1,000 updates, as Adam remembers it; else None."""
+    """Return the root mean square of the gradient's norm over about 1,000 updates, from Adam's state; else None."""
     squares = [
         state["exp_avg_sq"].sum().item() / (1 - group["betas"][1] ** float(state["step"]))
         for group in optimizer.param_groups
@@ -193,11 +190,11 @@ def recent_gradient_norm(optimizer: torch.optim.Optimizer) -> float | None:
 
 
 def collect_histograms(last: LastSteps, info: EnvInfo) -> dict[str, torch.Tensor]:
-    """Return what TensorBoard draws distributions of: actions, values, and observations by name."""
-    found = {"actions": last.action, **_named_observations(last.observation, info)}
+    """Return the samples of TensorBoard's histograms: actions, values, and observations by name."""
+    samples = {"actions": last.action, **_named_observations(last.observation, info)}
     if last.values is not None:
-        found["values"] = last.values
-    return {f"histograms/{name}": _sample(values) for name, values in found.items()}
+        samples["values"] = last.values
+    return {f"histograms/{name}": _sample(values) for name, values in samples.items()}
 
 
 def _named_observations(observation: Mapping[str, NDArray[Any]], info: EnvInfo) -> dict[str, NDArray[Any]]:
@@ -207,7 +204,7 @@ def _named_observations(observation: Mapping[str, NDArray[Any]], info: EnvInfo) 
 
 
 def estimate_values(model: BaseAlgorithm, last: LastSteps) -> NDArray[Any]:
-    """Return what an off-policy critic expects of some of the steps: the mean of its networks and quantiles."""
+    """Return an off-policy critic's values of a sample of steps: the mean of its networks and quantiles."""
     picked = slice(None, None, max(1, last.action[..., 0].size // _SAMPLES))
     rows = {key: values.reshape(-1, *values.shape[2:])[picked] for key, values in last.observation.items()}
     observation, normalizer = join(rows), model.get_vec_normalize_env()
@@ -220,8 +217,8 @@ def estimate_values(model: BaseAlgorithm, last: LastSteps) -> NDArray[Any]:
         if isinstance(model, DQN):
             values = model.q_net(tensors).gather(1, actions.long())
         else:
-            found = model.critic(tensors, actions.float())  # type: ignore[attr-defined]
-            values = found if isinstance(found, torch.Tensor) else torch.cat(found, dim=1)
+            estimates = model.critic(tensors, actions.float())  # type: ignore[attr-defined]
+            values = estimates if isinstance(estimates, torch.Tensor) else torch.cat(estimates, dim=1)
     result: NDArray[Any] = values.flatten(1).mean(1).cpu().numpy()
     return result
 
@@ -234,9 +231,9 @@ def _sample(values: NDArray[Any]) -> torch.Tensor:
 def training_row(
     recent: Sequence[EpisodeResult], weights: Mapping[str, float], log: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what the episodes that ended lately have come to, and what SB3 logged of the last update.
+    """Return the means of recent episodes, and the values that SB3 logged in the last update.
 
-    `weights` are those of the reward terms; missing values are None.
+    `weights` are the weights of the reward terms; missing values are None.
     """
     means, metrics = mean_terms(recent), mean_metrics(recent)
     return {
@@ -252,7 +249,7 @@ def training_row(
 
 
 def tensorboard_values(row: Mapping[str, Any]) -> dict[str, float]:
-    """Return what TensorBoard gets of a row of metrics, by its tags, beside what SB3 and `measurements` log."""
+    """Return the values of a metrics row by TensorBoard tag, without those that SB3 and `measure` log."""
     tags = {"return": "rollout/ep_rew_mean", "length": "rollout/ep_len_mean", "success": "rollout/success_rate"}
     tags |= {"distance": "rollout/final_distance", "stage": "curriculum/stage"}
     tags |= {name: f"reward_terms/{name.removeprefix('term/')}" for name in row if name.startswith("term/")}
@@ -261,7 +258,7 @@ def tensorboard_values(row: Mapping[str, Any]) -> dict[str, float]:
 
 
 def evaluation_row(results: Sequence[EpisodeResult]) -> dict[str, Any]:
-    """Return what the episodes of an evaluation have come to."""
+    """Return the columns of an evaluation's episodes."""
     depths = [episode.deepest_contact for episode in results if episode.deepest_contact is not None]
     return {
         "episodes": len(results),
@@ -276,6 +273,5 @@ def evaluation_row(results: Sequence[EpisodeResult]) -> dict[str, Any]:
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    """Return the mean of the values that are known; None without any."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None

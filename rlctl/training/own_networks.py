@@ -1,4 +1,4 @@
-"""A user's own networks: torch writes the part that is not ours as an ONNX graph, with which workers act."""
+"""A user's own networks: their part is exported as an ONNX graph, which workers run to act."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CACHE = "rlctl_own_graph"
 
 
 def has_own_parts(policy: Any) -> bool:
-    """Return whether a policy has a features extractor or an activation function that a user wrote or chose."""
+    """Return whether a policy has a user's own features extractor or activation function."""
     own_activation = getattr(policy, "activation_fn", None) not in (None, *ACTIVATIONS.values())
     return own_activation or is_own_extractor(policy.features_extractor_class)
 
@@ -44,7 +44,7 @@ def write_graph(model: Any, algo: str, raw_space: spaces.Space[Any]) -> Tensors:
 
 
 class _Actor(torch.nn.Module):
-    """From the normalised parts of raw observations to the last hidden layer; of recurrent PPO to the LSTM."""
+    """Maps the normalised parts of raw observations to the last hidden layer, for recurrent PPO to the LSTM's input."""
 
     def __init__(self, policy: Any, algo: str, raw_space: spaces.Space[Any]) -> None:
         super().__init__()
@@ -60,9 +60,9 @@ class _Actor(torch.nn.Module):
         self._space, self._normalize_images = policy.observation_space, policy.normalize_images
 
     def compute_features(self, *parts: torch.Tensor) -> torch.Tensor:
-        wanted = split_space(self._space)
+        network_spaces = split_space(self._space)
         arranged = {
-            key: value if value.shape[1:] == (wanted[key].shape or ()) else value.permute(0, 3, 1, 2)
+            key: value if value.shape[1:] == (network_spaces[key].shape or ()) else value.permute(0, 3, 1, 2)
             for key, value in zip(self.parts, parts, strict=True)
         }
         observation: Any = preprocess_obs(join(arranged), self._space, normalize_images=self._normalize_images)
@@ -122,7 +122,7 @@ def _export(actor: _Actor, sample: tuple[torch.Tensor, ...]) -> NDArray[np.uint8
     names = [f"{OBSERVATION}{'' if key == SINGLE else key}" for key in actor.parts]
     file = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # this exporter is called deprecated; the new one needs onnxscript
+        warnings.simplefilter("ignore")  # the exporter is deprecated, but the new one needs onnxscript
         torch.onnx.export(
             actor,
             sample,
@@ -141,7 +141,7 @@ def _export(actor: _Actor, sample: tuple[torch.Tensor, ...]) -> NDArray[np.uint8
 
 
 def _take_weights_out(graph: Any, actor: _Actor) -> None:
-    """Make the weights inputs that have the names of a policy file's tensors, without values."""
+    """Turn the weights into inputs without values, named as the tensors of a policy file."""
     renamed = {}
     for tensor in graph.initializer:
         begin = next((begin for begin in actor.prefixes if tensor.name.startswith(begin)), None)

@@ -1,8 +1,8 @@
 """The replay buffer on disk: segments of transitions, each written once.
 
-A buffer of hours is too large to be written at every checkpoint. Transitions are numbered as they come, those of all
-environments in a step being one; a segment holds a range of them, and a checkpoint names the segments that make up the
-buffer, oldest first. Where two overlap the later one holds. Segments that no checkpoint names any more are removed.
+A full buffer is too large to write at every checkpoint. Transitions are numbered in the order of the steps; a step of
+all environments is one transition. A segment holds a range of them, and a checkpoint lists the segments of the buffer,
+oldest first. Where two overlap the later one is valid. Segments that no checkpoint lists are removed.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from rlctl.storage import files
 Tensors = dict[str, NDArray[Any]]
 
 SEGMENT_BYTES = 8 * 2**20
-"""Size of a segment; the last one is written again, longer, until it has it."""
+"""Size of a segment [bytes]; the last one is written again until it has this size."""
 _FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _NAME = re.compile(r"^\d{12}-\d{12}\.safetensors$")
 
 
 class Segment(pydantic.BaseModel):
-    """Transitions from `first` up to `last`, which is not one of them, in a file."""
+    """The transitions from `first` to `last` - 1, in a file."""
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
 
@@ -61,14 +61,14 @@ class ReplaySegments:
         self._most_rows = max(1, SEGMENT_BYTES // self._row_bytes)
 
     def mark_last_changed(self, added: int) -> None:
-        """Say that the last of `added` transitions is another one now than when it was added."""
+        """Note that the last of `added` transitions was changed after it was added."""
         self._written = min(self._written, added - 1)
 
     def save(self, added: int) -> list[Segment]:
-        """Write what is new after `added` transitions in all; return the segments that make up the buffer."""
+        """Write new transitions, of `added` in total; return the segments of the buffer."""
         oldest = max(0, added - self.buffer.buffer_size)
         segments = [segment for segment in self._segments if segment.last > oldest]
-        if not all((self.folder / segment.name).exists() for segment in segments):  # somebody has removed some
+        if not all((self.folder / segment.name).exists() for segment in segments):  # some were removed
             segments, self._written = [], 0
         rows = self._most_rows
         first = max(self._written // rows * rows, oldest)
@@ -85,7 +85,7 @@ class ReplaySegments:
         return segment
 
     def load(self, segments: Sequence[Segment], added: int) -> None:
-        """Fill the buffer with the last of `added` transitions; raises `ArtifactError` if they are not its own."""
+        """Fill the buffer with the last of `added` transitions; raises `ArtifactError` if they do not fit it."""
         buffer = self.buffer
         reached = max(0, added - buffer.buffer_size)
         for segment in segments:
@@ -112,7 +112,7 @@ class ReplaySegments:
 
 
 def check(folder: Path, segments: Iterable[Segment]) -> None:
-    """Raise `ArtifactError` if a segment is not there, or not as it was written."""
+    """Raise `ArtifactError` if a segment is missing or damaged."""
     for segment in segments:
         files.check_digest(folder / segment.name, segment.sha256)
 
@@ -136,7 +136,7 @@ def _arrays(buffer: ReplayBuffer) -> Tensors:
 
 
 def hindsight_tensors(buffer: ReplayBuffer) -> Tensors:
-    """Return where the episodes of a HER buffer are, and where those that run began; nothing of another buffer."""
+    """Return the positions of the episodes in a HER buffer; empty for other buffers."""
     if not isinstance(buffer, HerReplayBuffer):
         return {}
     return {
@@ -147,7 +147,7 @@ def hindsight_tensors(buffer: ReplayBuffer) -> Tensors:
 
 
 def restore_hindsight(buffer: ReplayBuffer, tensors: Tensors) -> None:
-    """Give a HER buffer, whose transitions are there, the episodes that `hindsight_tensors` returned."""
+    """Restore the positions of episodes that `hindsight_tensors` returned."""
     if isinstance(buffer, HerReplayBuffer):
         for name, array in hindsight_tensors(buffer).items():
             array[...] = tensors[name]

@@ -28,11 +28,11 @@ class TrainResult:
     recipe: Recipe
     steps: int
     progress: Progress
-    """The stage of the curriculum, and the seconds of training, with those before a resume."""
+    """Stage of the curriculum, and seconds of training, including those before a resume."""
     best: PolicyInfo | None
-    """The best policy, with the score that it was kept for; None where no evaluation succeeded."""
+    """The best policy with its score; None if no evaluation could be played."""
     wall_seconds: float
-    """From the call to the end: with the start of the workers, the check, imports and saving."""
+    """Duration of the call [s], including start of workers, check, imports and saving."""
     recordings: list[Path] = dataclasses.field(default_factory=list)
     note: str = ""
 
@@ -41,7 +41,7 @@ class TrainResult:
 
 
 def run_training(request: TrainRequest) -> TrainResult:
-    """Train, or go on with a run; returns when it is done.
+    """Train or resume; returns when the training is done.
 
     Raises `Interrupted` after a signal, and `TaskError` if evaluations failed.
     """
@@ -63,7 +63,7 @@ def run_training(request: TrainRequest) -> TrainResult:
 
 def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> TrainResult:
     best = _read_best(run)
-    if run.status().get("status") == "running":  # killed after all was done
+    if run.status().get("status") == "running":  # killed before the end was written
         status.write_end(run, start.step, progress, best)
     _raise_if_evaluations_failed(run, progress)
     note = "this run has finished: nothing to do; to train longer, give -n"

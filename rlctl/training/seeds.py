@@ -1,4 +1,4 @@
-"""`rlctl train TASK --seeds 0-4`: an ordinary run for every seed, each in a process of its own, in one group."""
+"""`rlctl train TASK --seeds 0-4`: a group with an ordinary run for every seed, each in its own process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rlctl.training.warm_start import find_source
 
 
 class SeedsFailed(RlctlError):
-    """Some seeds of a group have failed; the exit code is the highest of theirs."""
+    """Some seeds of a group failed; the exit code is the highest of their exit codes."""
 
     def __init__(self, message: str, exit_code: int) -> None:
         super().__init__(message)
@@ -60,10 +60,10 @@ def train_seeds(
     episodes: int = 100,
     make_trainings: MakeTrainings = make_local_trainings,
 ) -> SeedsResult:
-    """Train a request with several seeds, or go on with the group that it resumes; then evaluate each best policy.
+    """Train a request with several seeds, or resume its group; then evaluate the best policy of each seed.
 
-    At most `jobs` train at a time, where `make_trainings` says. Seeds that are done are left as they are, and one that
-    fails stops no other. Raises `UsageError` for seeds that are none, `RecipeError` for a recipe that is wrong, and
+    At most `jobs` train at a time; `make_trainings` decides where. Finished seeds are not trained again, and a seed
+    that fails does not stop the others. Raises `UsageError` for invalid seeds, `RecipeError` for an invalid recipe, and
     `Interrupted` after a signal, when all have saved their checkpoints.
     """
     if seeds is not None:
@@ -78,7 +78,7 @@ def train_seeds(
 def _train(
     group: Group, resume: TrainRequest, jobs: int | None, episodes: int, make_trainings: MakeTrainings
 ) -> SeedsResult:
-    """Train the seeds of a group that are not done; `resume` is what is different now."""
+    """Train the unfinished seeds of a group; `resume` has the arguments that change."""
     requests = {seed: _make_request(group, seed, resume) for seed in group.seeds if _is_waiting(group, seed, resume)}
     trainings = make_trainings(group.path, len(requests), jobs)
     _print_start(group, len(requests), trainings)
@@ -94,7 +94,7 @@ def _train(
 
 
 def _begin(request: TrainRequest, seeds: str) -> Group:
-    """Make a new group, after a look at its task and recipe: what is wrong is wrong for every seed."""
+    """Make a new group after checking its task and recipe, which all seeds share."""
     if request.task is None or request.resume is not None:
         raise UsageError("--seeds starts a new group: give TASK and leave out --resume")
     if "seed" in request.settings:
@@ -120,7 +120,7 @@ def _print_start(group: Group, waiting: int, trainings: Trainings) -> None:
 
 
 def _make_request(group: Group, seed: int, resume: TrainRequest) -> TrainRequest:
-    """Return a seed's request: that of its group, with what `resume` changes; a run that has begun is resumed."""
+    """Return a seed's request: the group's, with the changes of `resume`; a run that exists is resumed."""
     default = TrainRequest()
     changes = {name: value for name, value in vars(resume).items() if value != getattr(default, name)}
     request = dataclasses.replace(group.request, **{**changes, "root": group.path})
@@ -134,9 +134,9 @@ def _make_request(group: Group, seed: int, resume: TrainRequest) -> TrainRequest
 
 
 def _is_waiting(group: Group, seed: int, resume: TrainRequest) -> bool:
-    """Say whether a seed is to be trained: it has not finished, or something is to be different now."""
-    asks_for_more = resume != TrainRequest(resume=resume.resume, root=resume.root)
-    return asks_for_more or not group.is_done(seed)
+    """Return whether to train a seed: it has not finished, or `resume` changes arguments."""
+    has_changes = resume != TrainRequest(resume=resume.resume, root=resume.root)
+    return has_changes or not group.is_done(seed)
 
 
 def _print_line(seed: int, line: str) -> None:

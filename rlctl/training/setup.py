@@ -1,4 +1,4 @@
-"""Sets up a training: what is open while it goes on: workers, the check before it, the lock and the run folder."""
+"""Sets up a training: workers, the check before it, the lock and the run folder."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 
 
 _CHECK_BUDGET_S = 2.0
-"""Time for playing episodes [s]; importing and building the environment come on top."""
+"""Time for playing episodes [s], without importing and building the environment."""
 _EXPERIMENTS = ("build", "comparisons", "episodes")
 """What one child process can do in that time."""
 
 
 @contextlib.contextmanager
 def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
-    """Open what a training needs; at the end its processes are ended, and the run has what ended it before its time."""
+    """Open what a training needs; at the end stop its processes, and write an error that ended it to the run."""
     recipe, request = start.recipe, start.request
     specs = recipe.env_specs(start.task, named_by=RUN if start.run else "")
     display.phase(f"building {format_count(recipe.n_envs, 'environment')}, importing PyTorch")
@@ -56,7 +56,7 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
 
         learner = _build_learner(start, specs, workers, display)
         if start.run is None:
-            _warn_of_turned_weights(specs, display)
+            _warn_of_opposite_weights(specs, display)
         if checked is not None:
             display.phase("checking the environment")
             _refuse_errors(checked.result(), display)
@@ -85,8 +85,8 @@ def _make_workers(spec: EnvSpec, n_envs: int, start: Start, display: Display) ->
     return Workers(spec, n_envs, timeout_s=start.request.env_timeout_s, on_output=display.message)
 
 
-def _warn_of_turned_weights(specs: list[EnvSpec], display: Display) -> None:
-    """Warn of weights that pay for what the task itself penalises, or the other way round; all stages can be built."""
+def _warn_of_opposite_weights(specs: list[EnvSpec], display: Display) -> None:
+    """Warn of reward weights with the opposite sign of the task's own."""
     own = getattr(registry.load(specs[0].task), "reward_weights", {})
     for name, weight in dict.fromkeys(pair for spec in specs for pair in spec.reward_weights.items()):
         if float(own.get(name, 0.0)) * weight < 0.0:
@@ -109,12 +109,12 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
 
     pin_threads()
     recipe, goal = start.recipe, workers.info
-    if len(specs) > 1:  # a look at every stage now, not after hours of training
+    if len(specs) > 1:  # check every stage now, not after hours of training
         with _make_workers(specs[0], 1, start, display) as probe:
             goal = check_stages(specs, probe)
-    # Of a plain environment it is not known before an episode has ended.
+    # A plain Gymnasium environment shows only at the end of an episode whether it reports success.
     start.check_may_succeed(workers.info.has_success or not workers.info.reward_weights)
-    # What a training begins with is evaluated: it may be better than all that follows.
+    # The policy of --from is evaluated first: it may be better than all later ones.
     progress = Progress(next_eval=0 if start.source else recipe.eval.every_steps or recipe.total_timesteps)
     if start.checkpoint is not None:
         progress = start.checkpoint.progress
@@ -129,7 +129,7 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
 
 
 def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Checkpoints:
-    """Restore the checkpoint, if there is one, and return what writes from now on."""
+    """Restore the checkpoint, if any, and return the writer of the run folder."""
     from rlctl.training.checkpoints import Checkpoints
     from rlctl.training.tensorboard import list_parameters, make_logger
 
@@ -147,7 +147,7 @@ def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Displa
 
 
 def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[CheckReport]:
-    """Check an environment in a child process, watched by a thread of this one."""
+    """Check an environment in a child process; a thread of this process waits for it."""
     future: Future[CheckReport] = Future()
 
     def run() -> None:
@@ -161,7 +161,7 @@ def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[CheckReport]:
                 show_progress=False,
             )
             future.set_result(report)
-        except BaseException as error:  # raised again where somebody waits for it
+        except BaseException as error:  # `result()` raises it
             future.set_exception(error)
 
     threading.Thread(target=run, daemon=True).start()  # the child ends with this process
@@ -171,11 +171,11 @@ def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[CheckReport]:
 def _refuse_errors(report: CheckReport, display: Display) -> None:
     """Raise `AnswerIsNo` if the check found an error, and show its warnings."""
     if report.records.built is None:
-        return  # the workers build it too, and report what is wrong
-    task, found = shlex.quote(report.task), report.verdict.findings
+        return  # the workers build it too, and report the error
+    task, findings = shlex.quote(report.task), report.verdict.findings
     for name in report.verdict.crashed:
         display.message(f"check before training: {name} crashed because of a bug in rlctl; this rule was not checked")
-    errors = [finding for finding in found if finding.severity is Severity.ERROR]
+    errors = [finding for finding in findings if finding.severity is Severity.ERROR]
     if errors:
         text = "; ".join(f"{finding.rule} {finding.name} ({finding.message})" for finding in errors)
         count = format_count(len(errors), "error")
@@ -183,6 +183,6 @@ def _refuse_errors(report: CheckReport, display: Display) -> None:
             f"the check before training found {count}: {text}\n"
             f"rlctl check-env {task} shows details; --no-check trains anyway."
         )
-    warnings = [finding.rule for finding in found if finding.severity is Severity.WARNING]
+    warnings = [finding.rule for finding in findings if finding.severity is Severity.WARNING]
     if warnings:
         display.message(f"check before training: warnings {', '.join(warnings)}; rlctl check-env {task} shows details")

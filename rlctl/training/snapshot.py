@@ -1,6 +1,6 @@
-"""Everything in a training's memory that decides how it goes on, as tensors and plain data, and back; and its policy.
+"""Saves and restores the model's state as tensors and plain data; packs its policy.
 
-The environments' part is in `checkpoint.py`, the replay buffer's in `replay_segments.py`.
+`checkpoint.py` does this for the environments, `replay_segments.py` for the replay buffer.
 """
 
 from __future__ import annotations
@@ -30,15 +30,12 @@ Tensors = dict[str, NDArray[Any]]
 _COUNTERS = (
     "num_timesteps", "_n_updates", "_episode_num", "_n_calls", "exploration_rate", "_current_progress_remaining",
 )  # fmt: skip
-# Explained variance, for one, is not a number where rewards are constant, and nothing is wrong.
+# Other values may be NaN without a fault, e.g. the explained variance if rewards are constant.
 _MUST_BE_FINITE = ("loss", "value_loss", "policy_gradient_loss", "policy_loss", "actor_loss", "critic_loss")
 
 
 def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> PolicyFile:
-    """Return a model's policy, with the normalisation it has now.
-
-    The arrays are copies: training may go on.
-    """
+    """Return a copy of a model's policy, with its current normalisation."""
     tensors = {f"policy/{key}": value.cpu().numpy().copy() for key, value in model.policy.state_dict().items()}
     statistics = observation_statistics(model.get_vec_normalize_env())
     for key, rms in statistics.items():
@@ -60,14 +57,14 @@ def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> Policy
 
 
 def observation_statistics(normalizer: VecNormalize | None) -> dict[str, RunningMeanStd]:
-    """Return the running statistics per observation key, "" for an observation that is no dict."""
+    """Return the running statistics per observation key; the key is "" if the observation is not a dict."""
     if normalizer is None or not normalizer.norm_obs:
         return {}
     return split(normalizer.obs_rms)
 
 
 def learned_tensors(model: BaseAlgorithm) -> tuple[Tensors, Any]:
-    """Return all that training changes in a model and its normalisation, and the structure of its state dicts."""
+    """Return all learned tensors of a model and its normalisation, and the structure of its state dicts."""
     weights, structure = _flatten(model.get_parameters(), "parameters")
     return {**weights, **_variables(model), **_normalizer_tensors(model)}, structure
 
@@ -84,14 +81,14 @@ def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
 
 
 def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
-    """Give a model the state that `take` returned; raises `ArtifactError` if it is another kind of model."""
+    """Restore the state that `take` returned; raises `ArtifactError` if it does not fit the model."""
     try:
         parameters = _unflatten(plain["parameters"], tensors)
         model.set_parameters(parameters, exact_match=True, device=model.device)
         _restore_variables(model, tensors)
         _restore_normalizer(model, tensors)
         _restore_rollout(model, tensors)
-        for name in _COUNTERS:  # no other: a file does not choose what is set
+        for name in _COUNTERS:  # only these: a file must not choose attributes to set
             if name in plain["counters"]:
                 setattr(model, name, plain["counters"][name])
         _restore_randomness(tensors)
@@ -100,7 +97,7 @@ def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> No
 
 
 def _restore_randomness(tensors: Tensors) -> None:
-    """Restore the generators that updates draw from; gSDE's matrices need not be: updates draw them anew."""
+    """Restore the generators that updates draw from; gSDE's matrices are drawn again by updates."""
     torch.set_rng_state(torch.from_numpy(tensors["randomness/torch"].copy()))
     keys, position, has_gauss, cached = (tensors[f"randomness/numpy/{part}"] for part in _NUMPY)
     np.random.set_state(("MT19937", keys, int(position), int(has_gauss), float(cached)))  # noqa: NPY002 (SB3 draws there)
@@ -154,7 +151,7 @@ def _unflatten(structure: Any, tensors: Tensors) -> Any:
 
 
 def _variables(model: BaseAlgorithm) -> Tensors:
-    """Return what SB3 trains beside the networks: SAC's entropy coefficient, which `get_parameters` leaves out."""
+    """Return what SB3 trains besides the networks: SAC's entropy coefficient, which `get_parameters` omits."""
     _, names = model._get_torch_save_params()
     return {f"variables/{name}": _array(getattr(model, name)) for name in names}
 
@@ -162,7 +159,7 @@ def _variables(model: BaseAlgorithm) -> Tensors:
 def _restore_variables(model: BaseAlgorithm, tensors: Tensors) -> None:
     _, names = model._get_torch_save_params()
     for name in names:
-        # In place: an optimiser holds this very tensor.
+        # In place: the optimiser holds the same tensor.
         getattr(model, name).data.copy_(torch.from_numpy(tensors[f"variables/{name}"].copy()))
 
 
@@ -188,7 +185,7 @@ def _restore_normalizer(model: BaseAlgorithm, tensors: Tensors) -> None:
 
 
 def _rollout_tensors(model: BaseAlgorithm) -> Tensors:
-    """Return what the next step depends on beside the environments."""
+    """Return what the next step depends on besides the environments."""
     tensors: Tensors = {"rollout/starts": np.asarray(model._last_episode_starts)}
     states: Any = getattr(model, "_last_lstm_states", None)
     for kind, pair in zip(("pi", "vf"), states or (), strict=False):
@@ -208,12 +205,12 @@ def _restore_rollout(model: BaseAlgorithm, tensors: Tensors) -> None:
 
 
 def check_finite(model: BaseAlgorithm, run: Path) -> None:
-    """Raise `DivergedError`, which names `run`, if a loss, or a number that is learnt, is not finite."""
+    """Raise `DivergedError`, which names `run`, if a loss or a learned number is not finite."""
     tensors, _ = learned_tensors(model)
     losses = {name: np.array(model.logger.name_to_value.get(f"train/{name}", 0.0)) for name in _MUST_BE_FINITE}
     for name, values in {**tensors, **losses}.items():
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             raise DivergedError(
-                f"training diverged: {name.replace('/', ' ')} is not finite at step {model.num_timesteps:,}. A smaller "
-                f"algo_kwargs.learning_rate or a smaller reward helps most often.\nWhat was saved before is in {run}"
+                f"training diverged: {name.replace('/', ' ')} is not finite at step {model.num_timesteps:,}. Try "
+                f"a smaller algo_kwargs.learning_rate or smaller rewards.\nThe last saved state is in {run}"
             )

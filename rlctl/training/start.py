@@ -1,4 +1,4 @@
-"""Where a training starts: at nothing, or at the newest good checkpoint of a run."""
+"""Start of a training: from step 0, or from the newest undamaged checkpoint of a run."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ _DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """Where a training starts; holds the lock of a run that is resumed, as long as it is entered."""
+    """Start of a training; while entered it holds the lock of a resumed run."""
 
     request: TrainRequest
     task: str
     recipe: Recipe
     run: RunDirectory | None = None
-    """The run that is resumed."""
+    """The resumed run; None for a new one."""
     lock: RunLock | None = None
     checkpoint: Checkpoint | None = None
     notes: tuple[str, ...] = ()
     """Messages for the user, before the first step."""
     source: Mapping[str, Any] | None = None
-    """The policy that it began with; see `warm_start.find_source`."""
+    """The policy of `--from`; see `warm_start.find_source`."""
     inexact: tuple[str, ...] = ()
-    """Why the run cannot go on as if it had never stopped, as far as is known before it goes on."""
+    """Reasons, known before the start, why the resume cannot be bit-exact."""
     began: float = dataclasses.field(default_factory=time.monotonic)
 
     def __enter__(self) -> Start:
@@ -66,7 +66,7 @@ class Start:
         return self.checkpoint.state.step if self.checkpoint else 0
 
     def check_may_succeed(self, may_succeed: bool) -> None:
-        """Raise `RecipeError` where the recipe waits for success and the task does not report it."""
+        """Raise `RecipeError` if the recipe needs success rates and the task does not report success."""
         recipe = self.recipe
         if may_succeed:
             return
@@ -81,7 +81,7 @@ class Start:
 
 
 def find_start(request: TrainRequest) -> Start:
-    """Return where a request starts, after a look at all that can be wrong with it; nothing is changed yet."""
+    """Check a request and return its start; nothing is changed yet."""
     check_arguments(request)
     return _find_new(request) if request.task is not None else _find_checkpoint(request)
 
@@ -90,7 +90,7 @@ def check_arguments(request: TrainRequest) -> None:
     """Raise `UsageError` for arguments that exclude each other, and for a device that cannot exist."""
     if (request.task is None) == (request.resume is None):
         raise UsageError("TASK and --resume exclude each other: give a task to train, or a run to resume")
-    if not _DEVICE.fullmatch(request.device):  # now, and not after half a minute of imports
+    if not _DEVICE.fullmatch(request.device):  # checked before slow imports
         raise UsageError(f"--device {request.device!r}: no such device; give cpu, cuda, cuda:1, or auto")
     if request.resume is not None:
         _check_resume(request)
@@ -107,9 +107,9 @@ def _find_new(request: TrainRequest) -> Start:
 
 
 def _find_checkpoint(request: TrainRequest) -> Start:
-    """Find a run, lock it, and read its newest good checkpoint.
+    """Find a run, lock it, and read its newest undamaged checkpoint.
 
-    Raises `UsageError` for settings that cannot be others now, and unless it is forced for a task that has changed.
+    Raises `UsageError` for settings that a resume cannot change, and, without --force, for a changed task.
     """
     from rlctl.training import checkpoint
 
@@ -124,19 +124,19 @@ def _find_checkpoint(request: TrainRequest) -> Start:
         if changes and not request.force:
             raise UsageError(f"{run.path}: {'; '.join(changes)}. The policy may no longer fit; --force resumes anyway")
         run.recover()
-        found, damage = checkpoint.read_newest(run)
-        if found is None and status.get("status") == "finished":
+        newest, damage = checkpoint.read_newest(run)
+        if newest is None and status.get("status") == "finished":
             command = shlex.join(["rlctl", "train", task, "--from", str(run.path)])
             raise ArtifactError(
                 f"{run.path}: finished, and its checkpoints were removed; "
                 f"to start a new training from its policy: {command}"
             )
-        if found is not None and request.settings:
-            found = _reopen(found, before, recipe)
+        if newest is not None and request.settings:
+            newest = _reopen(newest, before, recipe)
         notes = ["no checkpoint yet: the training starts from step 0"]
-        if found is not None:
-            notes = [f"warning: {problem}; resuming from step {found.state.step:,}" for problem in damage]
-        return Start(request, task, recipe, run, lock, found, tuple(notes), status.get("from"), tuple(changes))
+        if newest is not None:
+            notes = [f"warning: {problem}; resuming from step {newest.state.step:,}" for problem in damage]
+        return Start(request, task, recipe, run, lock, newest, tuple(notes), status.get("from"), tuple(changes))
     except BaseException:
         lock.release()
         raise
@@ -152,20 +152,20 @@ def _check_resume(request: TrainRequest) -> None:
             raise UsageError(f"--resume uses the run's own recipe: {key} cannot be changed; only -n can")
 
 
-def _reopen(found: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:
-    """Let a training that was done go on, if it is asked for more than it was."""
-    if not found.progress.done or recipe.total_timesteps <= max(found.state.step, before.total_timesteps):
-        return found
-    progress = dataclasses.replace(found.progress, done=False, good_in_a_row=0)
-    return dataclasses.replace(found, state=found.state.model_copy(update={"progress": progress}))
+def _reopen(newest: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:
+    """Mark a finished training as not done if the request asks for more steps."""
+    if not newest.progress.done or recipe.total_timesteps <= max(newest.state.step, before.total_timesteps):
+        return newest
+    progress = dataclasses.replace(newest.progress, done=False, good_in_a_row=0)
+    return dataclasses.replace(newest, state=newest.state.model_copy(update={"progress": progress}))
 
 
 @contextlib.contextmanager
 def preserve_process_state() -> Iterator[None]:
-    """Restore what importing somebody's module may change and a training relies on.
+    """Restore global state that importing a user's module may change.
 
-    That is the working directory, how numpy takes overflows, and torch's number type, device and gradients. Signal
-    handlers are set anew when the training begins.
+    Working directory, NumPy's error handling, torch's default type, device and gradients. The training sets signal
+    handlers later.
     """
     try:
         with contextlib.chdir("."), np.errstate():

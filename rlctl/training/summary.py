@@ -27,7 +27,7 @@ def show(result: TrainResult, json: str | None) -> None:
 
 
 def list_next_commands(result: TrainResult) -> list[str]:
-    """Return what to type next; a policy that never succeeded is not to be exported."""
+    """Return the next commands; without export if the policy never succeeded."""
     run = shlex.quote(str(result.run.path))
     score = result.best.evaluation if result.best else None
     export = [] if score is not None and score.success == 0 else [f"rlctl export {run} --onnx"]

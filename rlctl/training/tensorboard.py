@@ -1,4 +1,4 @@
-"""SB3's logger, writing TensorBoard's event files; a full disk costs that log, not the training."""
+"""SB3's logger, which writes TensorBoard's event files; if it cannot write, the training continues."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _COMPARED = ("eval/success_rate", "eval/mean_reward", "eval/mean_ep_length")
 
 
 class _EventFile(KVWriter):
-    """Writes each event when it comes: TensorBoard's own writer does it in a thread, whose errors nobody can catch.
+    """Writes each event immediately; errors of TensorBoard's own writer, which uses a thread, cannot be caught.
 
-    Begins another file whenever the one before was not written whole.
+    After a write that failed it starts a new file.
     """
 
     def __init__(self, folder: Path, warn: Callable[[str], None]) -> None:
@@ -37,7 +37,7 @@ class _EventFile(KVWriter):
         self._file: RecordWriter | None = None
 
     def write(self, key_values: dict[str, Any], key_excluded: Mapping[str, tuple[str, ...]], step: int = 0) -> None:
-        """Write the numbers and, of tensors, the distributions of a step."""
+        """Write the numbers of a step, and histograms of its tensors."""
         summary = Summary()
         for tag, value in key_values.items():
             if "tensorboard" in (key_excluded.get(tag) or ()):
@@ -49,7 +49,7 @@ class _EventFile(KVWriter):
         self.add(Event(step=step, summary=summary))
 
     def add(self, event: Event) -> None:
-        """Write an event; a disk that does not take it costs a warning."""
+        """Write an event; a warning is shown if it cannot be written."""
         event.wall_time = time.time()
         try:
             if self._file is None:
@@ -77,7 +77,7 @@ class _EventFile(KVWriter):
         """Close the file."""
         before, self._file = self._file, None
         if before is not None:
-            with contextlib.suppress(OSError):  # reported when it happened first
+            with contextlib.suppress(OSError):  # already reported
                 before.close()
 
 
@@ -89,8 +89,8 @@ def make_logger(
 ) -> Logger:
     """Return a logger that writes to a TensorBoard folder; `warn` is called if it cannot.
 
-    What was written after the step that a training resumes at is not shown any more. `parameters` are the
-    hyperparameters that TensorBoard compares runs by, with their evaluations.
+    TensorBoard hides what was written after the step `resumed_at`. `parameters` are the hyperparameters of its HPARAMS
+    table, which compares runs.
     """
     events = _EventFile(folder, warn)
     if resumed_at is not None:
@@ -102,7 +102,7 @@ def make_logger(
 
 
 def list_parameters(recipe: Recipe) -> dict[str, bool | str | float]:
-    """Return what TensorBoard compares runs by: the algorithm, its parameters, seed and size of a training."""
+    """Return the hyperparameters for TensorBoard: the algorithm, its parameters, seed and size of the training."""
     values: dict[str, Any] = {
         "algo": recipe.algo,
         "seed": recipe.seed,

@@ -1,4 +1,4 @@
-"""Trainings in processes of their own, some of them at a time: on this machine, each with its share of the cores.
+"""Trainings in child processes, several at a time, each with its share of this machine's cores.
 
 `rlctl.cluster` has subclasses of `Trainings` that train on other machines.
 """
@@ -26,19 +26,19 @@ from rlctl.run.train_request import TrainRequest
 from rlctl.training.signals import HandledSignals
 
 CORES_PER_TRAINING = 2
-"""One plays while the other learns, in turn or side by side."""
+"""One for the workers, one for the updates."""
 _WATCH_S = 0.25
 _ASK_S = 0.5
 Result = TypeVar("Result")
 
 
 def choose_jobs(jobs: int | None, waiting: int) -> int:
-    """Return how many of `waiting` trainings run at a time: as many as the cores allow, if `jobs` does not say it."""
+    """Return how many of `waiting` trainings run at a time: `jobs`, else as many as the cores allow."""
     return min(jobs or max(1, available_cores() // CORES_PER_TRAINING), max(waiting, 1))
 
 
 class Detached(Exception):
-    """The trainings were submitted, and the driver does not wait for them."""
+    """The trainings were submitted; rlctl does not wait for them."""
 
 
 NextSignal = Callable[[], int]
@@ -46,40 +46,40 @@ NextSignal = Callable[[], int]
 
 
 class Trainings:
-    """Runs calls that each `train`, some of them at a time, on this machine; a signal stops them all."""
+    """Runs calls of `train`, several at a time, on this machine; a signal stops all."""
 
     resume_options = ""
-    """What a command that resumes them has besides: ` --on slurm`."""
+    """Options that the resume command needs: ` --on slurm`."""
 
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
-        self._places = itertools.count()
+        self._thread_numbers = itertools.count()
         self._signals: list[int] = []
         self.stopped_by: int | None = None
-        """The signal that stops all; what has not begun then does not begin."""
+        """The signal that stopped all; later trainings do not start."""
 
     def describe(self) -> str:
-        """Say where, and how many at a time, they train."""
+        """Return as text where trainings run, and how many at a time."""
         return (
             f"{self._jobs} at a time: a training uses {CORES_PER_TRAINING} cores of {available_cores()}; "
             "change with --jobs"
         )
 
-    def run(self, calls: Sequence[Callable[[], Result]], to_go_on: str) -> list[Result]:
-        """Return what each call returns. Raises `Interrupted` after a signal, with the command to go on with."""
+    def run(self, calls: Sequence[Callable[[], Result]], resume_command: str) -> list[Result]:
+        """Return the results of the calls. Raises `Interrupted` after a signal, with the command to resume."""
         with HandledSignals(self._pass_on), ThreadPoolExecutor(self._jobs, initializer=self._prepare_thread) as pool:
             results = [future.result() for future in [pool.submit(call) for call in calls]]
         if self.stopped_by is not None:
-            raise Interrupted(f"interrupted; resume with: {to_go_on}{self.resume_options}", self.stopped_by)
+            raise Interrupted(f"interrupted; resume with: {resume_command}{self.resume_options}", self.stopped_by)
         return results
 
     def _prepare_thread(self) -> None:
-        """Let what this thread starts use its share of the cores, from which it also takes its number of workers."""
-        place = next(self._places)
+        """Give this thread's trainings their share of the cores, which also sets their number of workers."""
+        thread_number = next(self._thread_numbers)
         if self._jobs > 1 and hasattr(os, "sched_setaffinity"):
             cores = sorted(os.sched_getaffinity(0))
             share = max(1, len(cores) // self._jobs)
-            first = place * share % len(cores)
+            first = thread_number * share % len(cores)
             os.sched_setaffinity(0, cores[first : first + share])
 
     def train(
@@ -88,9 +88,9 @@ class Trainings:
         receive: Callable[[str], None],
         is_hopeless: Callable[[], bool] | None = None,
     ) -> int:
-        """Train in a process that ends with this one; return the exit code. `receive` gets the lines that it prints.
+        """Train in a child process that ends with this one; return its exit code. `receive` gets its output lines.
 
-        `is_hopeless` is asked twice a second, and ends the training with a checkpoint.
+        `is_hopeless` is called twice a second; True stops the training with a checkpoint.
         """
         if self.stopped_by is not None:
             return 0
@@ -120,7 +120,7 @@ class Trainings:
 
 
 MakeTrainings = Callable[[Path, int, int | None], Trainings]
-"""Takes the folder of the runs, how many are to be trained, and how many at a time if the user says it."""
+"""Takes the folder of the runs, the number of trainings, and `--jobs`."""
 
 
 def make_local_trainings(folder: Path, waiting: int, jobs: int | None) -> Trainings:
@@ -136,9 +136,9 @@ def train_in_child(
     command: Sequence[str] | None = None,
     env: Mapping[str, str] | None = None,
 ) -> int:
-    """Train in a process that ends with this one; return its exit code, which is 128 + N after signal N.
+    """Train in a child process that ends with this one; return its exit code, 128 + N after signal N.
 
-    `receive` gets the lines that it prints. Any exception from `next_signal` kills it and is raised.
+    `receive` gets its output lines. Any exception from `next_signal` kills the process and is raised.
     """
     reader = LineReader(receive)
     child = ChildProcess(
@@ -152,7 +152,7 @@ def train_in_child(
     reader.close_descriptor()
     try:
         with contextlib.suppress(ChildEndedError):
-            child.receive()  # until then it ignores signals
+            child.receive()  # it ignores signals until it is ready
         while True:
             if number := next_signal():
                 with contextlib.suppress(ProcessLookupError):

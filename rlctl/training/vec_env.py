@@ -1,4 +1,4 @@
-"""The worker environments as Stable-Baselines3 wants them."""
+"""The worker environments as a VecEnv of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from rlctl.rollout.workers import Workers
 
 
 class ActionHistory:
-    """Stores the actions of each environment's running episode; `episodes` are those so far, shape (steps, ...)."""
+    """Stores the actions of each environment's running episode; `episodes` are the actions so far, (steps, ...)."""
 
     def __init__(self, episodes: Iterable[NDArray[Any]]) -> None:
         self._parts = [[actions] for actions in episodes]
 
     def add_segment(self, actions: NDArray[Any], ended: Iterable[tuple[int, int]]) -> None:
-        """Store a segment, shape (n_envs, steps, ...), in which episodes ended: (environment, row) each, by row."""
+        """Store a segment, shape (n_envs, steps, ...); `ended` are pairs (environment, row), ordered by row."""
         last = dict(ended)
         for env, rows in enumerate(actions):
             if env in last:
@@ -40,8 +40,8 @@ class ActionHistory:
 
 
 def _count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[Any]]) -> tuple[int, str]:
-    """Return how many observations, shape (n_envs, steps, ...), are outside their space, and what is wrong with one."""
-    outside: Any = False  # of each observation, once there is one
+    """Count observations, shape (n_envs, steps, ...), outside their space; return also a message about one."""
+    outside: Any = False  # later an array, one element per observation
     message = ""
     for key, box in split_space(space).items():
         if not isinstance(box, spaces.Box) or box.dtype == np.uint8:
@@ -58,21 +58,21 @@ def _count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[
 
 
 class WorkerVecEnv(VecEnv):
-    """Steps `Workers` for SB3. Every episode's seed follows from its address; SB3's own seeding is not used."""
+    """Plays with `Workers` for SB3. Seeds follow from run seed, environment and episode number, not from SB3."""
 
     def __init__(self, workers: Workers, run_seed: int) -> None:
         self.workers = workers
         self.run_seed = run_seed
         self.episodes_started = [0] * workers.n_envs
-        """Per environment, how many episodes have begun: the next one's number."""
+        """Per environment the number of episodes that have begun."""
         self.history = ActionHistory(workers.arrays.segment.action[:, :0])
-        """What was done in the running episodes."""
+        """The actions of the running episodes."""
         self.outside, self.outside_message = 0, ""
-        """Observations outside their space since it was set to 0, and what was wrong with one."""
+        """Number of observations outside their space since it was set to 0, and a message about one."""
         self.ended: list[EpisodeResult] = []
-        """Episodes that ended since it was emptied."""
+        """Episodes that ended since the list was emptied."""
         self.last_segment: SegmentArrays | None = None
-        """What `finish` returned last; its arrays are overwritten by the next."""
+        """The last result of `finish`; the next segment overwrites its arrays."""
         self.waited_s = 0.0
         """Time spent waiting for the environments to play [s], since it was set to 0."""
         self._steps = 0
@@ -93,10 +93,9 @@ class WorkerVecEnv(VecEnv):
         return self.workers.observations()
 
     def replay_actions(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
-        """Put each environment into its running episode by replaying the actions.
+        """Restore each environment's running episode by replaying its actions, shape (steps, ...) per environment.
 
-        `actions` has shape (steps, ...) per environment. Return the environments whose episode ended on the way,
-        which they would not if they were deterministic.
+        Return the environments whose episode ended too early, which happens only if they are not deterministic.
         """
         self.episodes_started = list(episodes_started)
         seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
@@ -108,11 +107,11 @@ class WorkerVecEnv(VecEnv):
     def start(self, steps: int, exploration: Exploration) -> None:
         """Begin to play `steps` steps of each environment."""
         self._steps = steps
-        going_on, following = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
-        self.workers.start_playing(Play(steps, going_on, following, self.run_seed, exploration=exploration))
+        running, next_episodes = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
+        self.workers.start_playing(Play(steps, running, next_episodes, self.run_seed, exploration=exploration))
 
     def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
-        """Wait for what `start` has begun; `check` is called several times a second."""
+        """Wait for the steps that `start` began; `check` is called several times a second."""
         began = time.monotonic()
         try:
             ended = self.workers.finish_playing(check=check)
@@ -132,7 +131,7 @@ class WorkerVecEnv(VecEnv):
         return self.last_segment
 
     def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any]:
-        """Return the actions of a failed episode, that of the failed step last."""
+        """Return the actions of a failed episode; the last is that of the failed step."""
         arrays = self.workers.arrays
         rows = int(arrays.inside[error.env, 2]) + 1
         if error.step <= rows:
@@ -152,7 +151,7 @@ class WorkerVecEnv(VecEnv):
         self.workers.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return `render_mode` per environment, which is None; raise `AttributeError` for any other name."""
+        """Return `render_mode`, None per environment; raise `AttributeError` for other names."""
         if attr_name == "render_mode":
             return [None for _ in self._get_indices(indices)]
         raise AttributeError(f"worker environments do not hand out attributes: {attr_name}")

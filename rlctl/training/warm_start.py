@@ -1,4 +1,4 @@
-"""`rlctl train TASK --from POLICY`: begins with the weights and the normalisation of a policy."""
+"""`rlctl train TASK --from POLICY`: starts with the weights and the normalisation of a policy."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from rlctl.policy.shipped import PRETRAINED
 from rlctl.recipe.recipe import Recipe
 from rlctl.run.lookup import find_policy
 
-# They change what the same tensors compute.
+# With other values the same tensors compute other actions.
 _SAME_FUNCTION = ("activation_fn", "use_sde", "squash_output", "use_expln", "clip_mean", "batch_norm_eps")
 _TARGETS = {"td3": ("actor.", "actor_target."), "ddpg": ("actor.", "actor_target."), "dqn": ("q_net.", "q_net_target.")}
 
 
 def find_source(text: str, recipe: Recipe) -> dict[str, Any]:
-    """Find the policy to begin with, and return what `run.json` says of it as `from`.
+    """Find the policy to start with; return the entry `from` of `run.json`.
 
-    `text` is a run, a policy file, or the name of a task, which stands for the policy that it ships. Raises
-    `UsageError` for an ONNX file and for a policy of another algorithm than the recipe's.
+    `text` is a run, a policy file, or the name of a task that ships a policy. Raises `UsageError` for an ONNX file, and
+    if the algorithm is not the recipe's.
     """
     if Path(text).suffix == ".onnx":
         raise UsageError(f"--from {text}: ONNX files cannot be trained further; give the run or its .safetensors file")
@@ -44,10 +44,9 @@ def find_source(text: str, recipe: Recipe) -> dict[str, Any]:
 
 
 def load_source(source: Mapping[str, Any], model: Any, env: EnvInfo) -> str:
-    """Put weights and normalisation of `find_source`'s policy into a model; return a message about it.
+    """Load weights and normalisation of `find_source`'s policy into a model; return a message for the user.
 
-    Raises `ArtifactError` for other spaces and `UsageError` for another network or normalisation; they name what
-    differs.
+    Raises `ArtifactError` if the spaces differ, `UsageError` if the network or normalisation differs.
     """
     file = Path(source["policy"])
     policy = PolicyFile.read(file)
@@ -96,7 +95,7 @@ def _load_weights(info: PolicyInfo, model: Any, weights: Mapping[str, Any]) -> N
     actor, target = _TARGETS.get(info.algo, ("", ""))
     if actor and not any(name.startswith(target) for name in state):
         state |= {target + name.removeprefix(actor): tensor for name, tensor in state.items() if name.startswith(actor)}
-    model.policy.load_state_dict(state, strict=False)  # what may be missing is the critic
+    model.policy.load_state_dict(state, strict=False)  # the critic may be missing
 
 
 def _load_normalization(file: Path, info: PolicyInfo, model: Any, tensors: Mapping[str, Any]) -> None:
@@ -120,6 +119,4 @@ def _load_normalization(file: Path, info: PolicyInfo, model: Any, tensors: Mappi
     for key, moments in statistics.items():
         moments.mean[...] = tensors[f"normalize/{key}/mean"]
         moments.var[...] = tensors[f"normalize/{key}/var"]
-        moments.count = max(
-            float(info.training_steps), 1.0
-        )  # observations seen; new ones count as much as each of them
+        moments.count = max(float(info.training_steps), 1.0)  # number of observations so far

@@ -1,4 +1,4 @@
-"""What a tuning found, on the terminal and as JSON."""
+"""The results of a tuning, on the terminal and as JSON."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rlctl.tuning.tuning import Trial, Tuning
 
 
 def show(tuning: Tuning, json: str | None) -> None:
-    """Print the trials, best first, and what to do with the best; or JSON alone for `-`."""
+    """Print the trials, best first, and the next commands; or only JSON for `-`."""
     runs = {trial.number: summarize(run.path) for trial in tuning.trials if (run := tuning.find_run(trial)) is not None}
     if output.present(as_json(tuning, runs), json):
         return

@@ -1,4 +1,4 @@
-"""A step of a tuning: Optuna proposes values, a training tries them, and those that fall behind are stopped."""
+"""A step of a tuning: Optuna proposes values, trainings try them; trainings below the median are stopped."""
 
 from __future__ import annotations
 
@@ -25,39 +25,39 @@ from rlctl.training.trainings import Trainings
 from rlctl.tuning.space import get_value, nest
 from rlctl.tuning.tuning import Trial, Tuning, find_best
 
-_RANDOM_SHARE = 3  # a third of a step's trials are random, so that there is something to learn from
-_EVALUATIONS_UNJUDGED = 2
-_TRIALS_UNJUDGED = 3
+_RANDOM_SHARE = 3  # a third of a step's trials are random: the sampler learns from them
+_EVALUATIONS_BEFORE_PRUNING = 2
+_TRIALS_BEFORE_PRUNING = 3
 _MOST_REPEATS = 50
 _KILLED = 128 + signal.SIGKILL
 _LABEL = "trial"
-"""User attribute of Optuna's trials: which of which tuning it is."""
+"""User attribute of Optuna's trials: tuning and number of the trial."""
 _STATES = {"done": TrialState.COMPLETE, "pruned": TrialState.PRUNED, "failed": TrialState.FAIL}
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
 
 class StepSearch:
-    """Searches the dimensions of one step; what earlier steps found is kept. Several threads may `run_next`."""
+    """Searches the dimensions of one step, with the best values of earlier steps. `run_next` is thread-safe."""
 
     def __init__(self, tuning: Tuning, number: int, recipe: dict[str, Any], trainings: Trainings) -> None:
-        """Begin, or go on with, step `number`, from 1. `recipe` is the task's, with defaults, as plain data."""
+        """Begin or resume step `number`, from 1. `recipe` is the task's, with defaults, as plain data."""
         self._tuning, self._number, self._trainings = tuning, number, trainings
         self._dimensions = tuning.steps[number - 1]
         self._distributions = {dimension.key: dimension.make_distribution() for dimension in self._dimensions}
         best = find_best([trial for trial in tuning.trials if trial.step < number])
-        assert best is not None  # the recipe as it is
-        self._recipe, self._kept = recipe, best.values
+        assert best is not None  # at least the unchanged recipe
+        self._recipe, self._best_values = recipe, best.values
         self._study = self._open_study()
         self._lock = threading.Lock()
         own = [trial for trial in tuning.trials if trial.step == number]
         self._begun = [trial for trial in own if trial.state == "begun"]
-        # What the best so far has of these dimensions is known already.
+        # The best trial so far also has values of these dimensions.
         for trial in (best, *(trial for trial in own if trial.state != "begun")):
             self._add(trial)
 
     def _open_study(self) -> optuna.Study:
-        """Return Optuna's study: the one that all tuners of an equal search share, if there is a storage."""
+        """Return Optuna's study; with a storage, tuners with an equal search share it."""
         tuning = self._tuning
         study = optuna.create_study(
             storage=tuning.storage,
@@ -65,37 +65,39 @@ class StepSearch:
             load_if_exists=True,
             direction="maximize",
             sampler=optuna.samplers.TPESampler(
-                # Tuners that share a study are not to propose the same.
+                # Tuners that share a study must not propose equal values.
                 seed=None if tuning.storage else tuning.seed + self._number,
                 n_startup_trials=max(2, tuning.trials_per_step // _RANDOM_SHARE),
             ),
-            pruner=optuna.pruners.MedianPruner(0, n_warmup_steps=_EVALUATIONS_UNJUDGED, n_min_trials=_TRIALS_UNJUDGED),
+            pruner=optuna.pruners.MedianPruner(
+                0, n_warmup_steps=_EVALUATIONS_BEFORE_PRUNING, n_min_trials=_TRIALS_BEFORE_PRUNING
+            ),
         )
         for asked in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-            if str(asked.user_attrs.get(_LABEL, "")).startswith(f"{tuning.path.name}/"):  # of a tuner that was stopped
+            if str(asked.user_attrs.get(_LABEL, "")).startswith(f"{tuning.path.name}/"):  # its tuner was stopped
                 study.tell(asked.number, state=TrialState.FAIL)
         return study
 
     def _name_study(self) -> str:
-        """Return a name that is the same for tuners whose scores can be compared, and for no others."""
+        """Return a name that only tuners with comparable scores share."""
         tuning = self._tuning
         settings = {key: value for key, value in tuning.settings.items() if key != "seed"}
         search = [dataclasses.asdict(dimension) for dimension in self._dimensions]
-        content = [tuning.task, str(tuning.config), settings, tuning.metric, search, self._kept]
+        content = [tuning.task, str(tuning.config), settings, tuning.metric, search, self._best_values]
         digest = files.digest(json.dumps(content, sort_keys=True).encode())
         return f"{registry.make_slug(tuning.task)} {', '.join(self._distributions)} {digest[:8]}"
 
     def count_waiting(self) -> int:
-        """Return how many trials are still to be trained, those that were begun included."""
+        """Return the number of trials to train, including unfinished ones."""
         sizes = [len(dimension.choices) or math.inf for dimension in self._dimensions]
-        # The recipe as it is, trained before, counts as the first trial of the first step.
+        # The unchanged recipe, already trained, is the first trial of the first step.
         trials = self._tuning.trials_per_step - (self._number == 1)
-        most = min(trials, math.prod(sizes) - 1)  # the best so far has one of them
+        most = min(trials, math.prod(sizes) - 1)  # the best trial has one of them
         finished = [trial for trial in self._tuning.trials if trial.step == self._number and trial.state != "begun"]
         return max(0, int(most) - len(finished))
 
     def run_next(self) -> None:
-        """Train the next trial, and say what came of it."""
+        """Train the next trial, and store its result."""
         if self._trainings.stopped_by is not None:
             return
         with self._lock:
@@ -109,20 +111,20 @@ class StepSearch:
                 self._tuning.save()
 
     def _tell(self, trial: Trial, asked: optuna.Trial | None) -> None:
-        """Let Optuna know how a trial ended."""
+        """Report the end of a trial to Optuna."""
         if asked is None:
             self._add(trial)
         else:
             self._study.tell(asked, trial.score if trial.state == "done" else None, _STATES[trial.state])
 
     def _propose(self) -> tuple[Trial, optuna.Trial | None] | None:
-        """Return a trial and Optuna's, None for one that was begun before; None where all proposals have been tried."""
+        """Return a trial and Optuna's (None for a resumed trial); None if all proposals were tried before."""
         if self._begun:
             return self._begun.pop(0), None
         for _ in range(_MOST_REPEATS):
             asked = self._study.ask(self._distributions)
             drawn = {dimension.key: dimension.to_value(asked.params[dimension.key]) for dimension in self._dimensions}
-            values = {**self._kept, **drawn}
+            values = {**self._best_values, **drawn}
             values = {key: value for key, value in values.items() if value != get_value(self._recipe, key)}
             known = next((trial for trial in self._tuning.trials if trial.values == values), None)
             if known is None:
@@ -131,7 +133,7 @@ class StepSearch:
                 self._tuning.save()
                 asked.set_user_attr(_LABEL, self._label(trial))
                 return trial, asked
-            # A training more of the same would tell little; Optuna is told what came of the first.
+            # Do not train equal values twice: report the first result to Optuna.
             state = _STATES.get(known.state, TrialState.FAIL)
             self._study.tell(asked, known.score if state == TrialState.COMPLETE else None, state)
         return None
@@ -140,14 +142,14 @@ class StepSearch:
         return f"{self._tuning.path.name}/{trial.number}"
 
     def _list_drawn(self, trial: Trial) -> dict[str, Any]:
-        """Return what Optuna would have drawn for a trial; None for a value that it never draws."""
+        """Return Optuna's parameters of a trial; None for a value outside its distribution."""
         content = merge(self._recipe, nest(trial.values))
         return {
             dimension.key: dimension.from_value(get_value(content, dimension.key)) for dimension in self._dimensions
         }
 
     def _add(self, trial: Trial) -> None:
-        """Let Optuna know of a trial that has ended, if it could have drawn its values."""
+        """Add a finished trial to Optuna's study if its values are within the distributions."""
         drawn, label, state = self._list_drawn(trial), self._label(trial), _STATES[trial.state]
         known = (asked.user_attrs.get(_LABEL) for asked in self._study.get_trials(deepcopy=False, states=(state,)))
         if None in drawn.values() or label in known:
@@ -165,7 +167,7 @@ class StepSearch:
 
 
 class _Pruning:
-    """Whether a trial is so far behind the others that it is not worth its time: asked while it trains."""
+    """Decides while a trial trains whether to stop it."""
 
     def __init__(self, tuning: Tuning, trial: Trial, asked: optuna.Trial | None) -> None:
         self._tuning, self._trial, self._asked = tuning, trial, asked
@@ -173,7 +175,7 @@ class _Pruning:
         self.decided = False
 
     def is_hopeless(self) -> bool:
-        """Report the evaluations since the last call; decide."""
+        """Report the evaluations since the last call; return whether to stop the trial."""
         if self._asked is None:
             return False
         scores = self._tuning.list_scores(self._trial)
@@ -185,9 +187,9 @@ class _Pruning:
 
 
 def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning | None = None) -> None:
-    """Train a trial, or go on with it, and write down how it ended; after a signal it is left as begun.
+    """Train or resume a trial, and store how it ended; after a signal its state stays `begun`.
 
-    Without `pruning` raises `UsageError` as soon as an evaluation does not have the metric.
+    Without `pruning` raises `UsageError` as soon as an evaluation lacks the metric.
     """
     lines: list[str] = []
 
@@ -211,12 +213,12 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
         return
     with _claim(run) as problem:
         if problem or code in (_KILLED, RunTaken.exit_code):
-            # Nothing is known about its values: `tune --resume` tries it again.
+            # The result is unknown: `tune --resume` trains it again.
             trial.problem = problem or ("killed by SIGKILL" if code == _KILLED else "another process trained it")
             return
         _note_end(tuning, trial, run, code, lines, pruned=pruning is not None and pruning.decided)
         if run is not None:
-            # Replay buffers of dozens of trainings that nobody resumes; their policies stay.
+            # Nobody resumes these trainings, and their replay buffers are large; the policies stay.
             files.remove_tree(run.checkpoint(0).parent)
 
 
@@ -226,7 +228,7 @@ def _has_finished(run: RunDirectory | None) -> bool:
 
 @contextlib.contextmanager
 def _claim(run: RunDirectory | None) -> Iterator[str]:
-    """Hold the lock of a run, if there is one; give an error's text where another process holds it."""
+    """Hold the lock of a run, if any; yield an error message if another process holds it."""
     if run is None:
         yield ""
         return
@@ -242,7 +244,7 @@ def _claim(run: RunDirectory | None) -> Iterator[str]:
 def _note_end(
     tuning: Tuning, trial: Trial, run: RunDirectory | None, code: int, lines: list[str], *, pruned: bool
 ) -> None:
-    """Write into a trial how its training ended; `lines` is what it printed."""
+    """Store in a trial how its training ended; `lines` is its output."""
     trial.problem = ""
     if code == 0 and _has_finished(run):
         trial.score = tuning.measure(trial)
@@ -263,6 +265,6 @@ def _make_request(tuning: Tuning, trial: Trial) -> TrainRequest:
         tuning.task,
         config=tuning.config,
         settings=merge(tuning.settings, nest(trial.values)) | {"seed": tuning.seed + trial.number},
-        check=trial.number == 0,  # the recipe as it is has had the environment checked
+        check=trial.number == 0,  # the first trial has checked the environment
         root=tuning.path,
     )

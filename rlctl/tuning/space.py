@@ -1,4 +1,4 @@
-"""What is searched: hyperparameters and the values that they may take, in the order in which they are tuned."""
+"""The search space: hyperparameters and their values, in the order in which they are tuned."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Dimension:
     high: float = 0.0
     whole: bool = False
     prefix: str = ""
-    """`lin_`: before the number, as the recipe has it."""
+    """`lin_` before the number of a linear schedule."""
 
     @property
     def name(self) -> str:
@@ -40,11 +40,11 @@ class Dimension:
         return self.key.rpartition(".")[2]
 
     def ends(self) -> list[Any]:
-        """Return every choice, or both ends."""
+        """Return all choices, or the lower and upper end of the range."""
         return list(self.choices) or [self._format(self.low), self._format(self.high)]
 
     def make_distribution(self) -> BaseDistribution:
-        """Return what Optuna draws from: the numbers, or the places of the choices; wide ranges by their logarithm."""
+        """Return Optuna's distribution: of numbers, logarithmic if wide, or of indices of the choices."""
         from optuna import distributions
 
         if self.choices:
@@ -55,14 +55,14 @@ class Dimension:
         return distributions.FloatDistribution(self.low, self.high, log=log)
 
     def to_value(self, drawn: float) -> Any:
-        """Return the recipe's value for what Optuna drew."""
+        """Return the recipe's value of Optuna's parameter."""
         if self.choices:
             return self.choices[int(drawn)]
         rounded = drawn if self.whole else float(f"{drawn:.{_DIGITS}g}")
         return self._format(min(max(rounded, self.low), self.high))
 
     def from_value(self, value: Any) -> float | None:
-        """Return what Optuna would have drawn for a value; None for one that it never draws."""
+        """Return Optuna's parameter for a value; None outside the distribution."""
         if self.choices:
             return self.choices.index(value) if value in self.choices else None
         try:
@@ -79,7 +79,7 @@ class Dimension:
 
 
 def parse_search(texts: Sequence[str]) -> list[Dimension]:
-    """Return the dimensions of `--search KEY=LOW:HIGH` and `KEY=A,B,C`; raises `UsageError` for text that is none."""
+    """Return the dimensions of `--search KEY=LOW:HIGH` and `KEY=A,B,C`; raises `UsageError` for invalid text."""
     dimensions = [_parse_dimension(text) for text in texts]
     keys = [dimension.key for dimension in dimensions]
     if twice := [key for key in keys if keys.count(key) > 1]:
@@ -112,7 +112,7 @@ def _parse_range(key: str, match: re.Match[str], text: str) -> Dimension:
 
 
 def list_usual_steps(recipe: Recipe) -> list[list[Dimension]]:
-    """Return what matters most first: the learning rate; rollout or n-step return, and minibatch; the discount.
+    """Return the usual steps: learning rate; then rollout or n-step return, and minibatch; then discount.
 
     Each is searched around the value that the recipe has.
     """
@@ -173,9 +173,9 @@ def nest(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def get_value(content: Mapping[str, Any], key: str) -> Any:
     """Return the value of a dotted key; None if it is not there."""
-    place: Any = content
+    value: Any = content
     for part in key.split("."):
-        if not isinstance(place, Mapping):
+        if not isinstance(value, Mapping):
             return None
-        place = place.get(part)
-    return place
+        value = value.get(part)
+    return value

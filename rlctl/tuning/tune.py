@@ -1,8 +1,8 @@
-"""`rlctl tune TASK`: hyperparameters for a task, a few at a time, by trainings that are compared.
+"""`rlctl tune TASK`: searches hyperparameters of a task, a few at a time, by comparing trainings.
 
-A ladder as practitioners climb it: the learning rate first, then rollout and minibatch, then the discount; each step
-keeps the best so far. Values are proposed by TPE (Bergstra et al. 2011, https://papers.nips.cc/paper/4443), and trials
-that are below the median of the others at the same evaluation are stopped.
+The usual order: first the learning rate, then rollout and minibatch, then the discount; each step starts from the best
+values so far. TPE (Bergstra et al. 2011, https://papers.nips.cc/paper/4443) proposes values, and a trial is stopped if
+it is below the median of the others at the same evaluation.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ def tune(
 ) -> Tuning:
     """Search hyperparameters, or resume a tuning, whose interrupted trials are resumed; return every trial.
 
-    Raises `UsageError` without optuna, or for a search that is none; `RecipeError` for values that a recipe cannot
-    have; `TaskError` if the recipe as it is cannot be trained; `Interrupted` after a signal.
+    Raises `UsageError` without optuna or for an invalid search, `RecipeError` for values that a recipe cannot have,
+    `TaskError` if the unchanged recipe cannot be trained, `Interrupted` after a signal.
     """
     if (request.task is None) == (request.resume is None):
-        raise UsageError("give a task to tune, or --resume FOLDER")
+        raise UsageError("TASK and --resume exclude each other: give a task to tune, or --resume FOLDER")
     _require_optuna()
-    # It is read before a lock is written into a folder that is none, and again by the holder of the lock.
+    # Read twice: first to refuse a folder that is no tuning before locking it, then again under the lock.
     tuning = _begin(request, request.task or "") if request.resume is None else load(request.resume)
     with RunLock(tuning.path, "tuning"):
         return _search(load(tuning.path), jobs, make_trainings)
@@ -101,7 +101,7 @@ def _check(dimension: Dimension, task: str, request: TuneRequest) -> None:
 
 
 def _evaluate_often_enough(recipe: Recipe, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings, with evaluations more often where too few would come to compare trials by."""
+    """Return the settings, with more frequent evaluations if there were too few to compare trials."""
     every = recipe.eval.every_steps or recipe.total_timesteps
     if recipe.total_timesteps // every >= _FEWEST_EVALUATIONS:
         return dict(settings)
@@ -109,10 +109,10 @@ def _evaluate_often_enough(recipe: Recipe, settings: Mapping[str, Any]) -> dict[
 
 
 def _search(tuning: Tuning, jobs: int | None, make_trainings: MakeTrainings) -> Tuning:
-    # It imports optuna, which may not be there.
+    # It imports optuna, which is optional.
     from rlctl.tuning.search import StepSearch, train
 
-    to_go_on = f"rlctl tune --resume {shlex.quote(str(tuning.path))}"
+    resume_command = f"rlctl tune --resume {shlex.quote(str(tuning.path))}"
     with preserve_process_state():
         recipe = resolve_with_stages(tuning.task, tuning.config, tuning.settings)
     trainings = make_trainings(tuning.path, tuning.trials_per_step, jobs)
@@ -122,15 +122,15 @@ def _search(tuning: Tuning, jobs: int | None, make_trainings: MakeTrainings) -> 
     first = tuning.trials[0]
     if first.state in ("begun", "failed"):
         trainings = make_trainings(tuning.path, 1, 1)
-        trainings.run([lambda: train(tuning, first, trainings)], to_go_on)
+        trainings.run([lambda: train(tuning, first, trainings)], resume_command)
         tuning.save()
         if first.score is None:
-            raise TaskError(f"{tuning.path}: the unchanged recipe failed: {first.problem}\nto retry: {to_go_on}")
+            raise TaskError(f"{tuning.path}: the unchanged recipe failed: {first.problem}\nto retry: {resume_command}")
     content = recipe.model_dump(mode="json", by_alias=True) | {"algo_kwargs": fill_parameters(recipe)}
     for number in range(1, len(tuning.steps) + 1):
         trainings = make_trainings(tuning.path, tuning.trials_per_step, jobs)
         step = StepSearch(tuning, number, content, trainings)
-        trainings.run([step.run_next] * step.count_waiting(), to_go_on)
+        trainings.run([step.run_next] * step.count_waiting(), resume_command)
     return tuning
 
 

@@ -1,4 +1,4 @@
-"""What a tuning is asked for: the arguments of `rlctl tune` as data. Imports nothing heavy."""
+"""The arguments of `rlctl tune` as data. Imports nothing heavy."""
 
 from __future__ import annotations
 

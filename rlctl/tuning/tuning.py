@@ -1,4 +1,4 @@
-"""The folder of a tuning: what is searched, every trial and what came of it; trials are ordinary runs in it."""
+"""The folder of a tuning: its search, trials and results; trials are ordinary runs in it."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Trial:
     """A training with some values of the hyperparameters."""
 
     number: int
-    """From 0, which is the recipe as it is."""
+    """From 0; trial 0 has the unchanged recipe."""
     step: int
-    """Of the search, from 1; 0 for the recipe as it is."""
+    """Step of the search, from 1; 0 for the unchanged recipe."""
     values: dict[str, Any]
-    """Per recipe key, dotted, where it is not the recipe's own."""
+    """Values by dotted key, without those equal to the recipe's own."""
     state: Literal["begun", "done", "pruned", "failed"] = "begun"
     score: float | None = None
     """Mean of the metric over the last third of the evaluations."""
@@ -47,14 +47,14 @@ class Tuning:
     task: str
     config: Path | None
     settings: dict[str, Any]
-    """Of `--set` and the other flags, for every trial."""
+    """Recipe keys from the command line, for every trial."""
     metric: Metric
     trials_per_step: int
     seed: int
-    """Of the first trial; every other one has the next, and Optuna's draws follow from it."""
+    """Seed of the first trial and of Optuna; trial n has `seed` + n."""
     steps: list[list[Dimension]]
     storage: str | None = None
-    """The URL of Optuna's storage, which its dashboard reads and equal searches share; None: no other process does."""
+    """URL of Optuna's storage, for its dashboard and for other tuners with an equal search."""
     trials: list[Trial] = dataclasses.field(default_factory=list)
 
     @property
@@ -92,10 +92,12 @@ class Tuning:
             files.write_text(self.best_file, yaml_text.dump(self._make_recipe(best.values)))
 
     def _make_recipe(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what goes over the task's recipe; how long and with which seed is left to the training."""
-        kept = {key: value for key, value in self.settings.items() if key not in ("seed", "total_timesteps", "eval")}
+        """Return the changes to the task's recipe, without seed, length and evaluations."""
+        settings = {
+            key: value for key, value in self.settings.items() if key not in ("seed", "total_timesteps", "eval")
+        }
         config = read(self.config) if self.config is not None else {}
-        return merge(merge(config, kept), nest(values))
+        return merge(merge(config, settings), nest(values))
 
 
 def find_best(trials: list[Trial]) -> Trial | None:
@@ -107,7 +109,7 @@ def find_best(trials: list[Trial]) -> Trial | None:
 
 
 def load(folder: Path) -> Tuning:
-    """Read the folder of a tuning; raises `UsageError` for one that is not, `ArtifactError` for a damaged one."""
+    """Read the folder of a tuning; raises `UsageError` if it is not one, `ArtifactError` if damaged."""
     file = folder / TUNE_FILE
     if not file.is_file():
         raise UsageError(f"{folder}: not the folder of a tuning: it has no {TUNE_FILE}")

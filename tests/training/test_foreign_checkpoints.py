@@ -28,5 +28,5 @@ def test_without_one_of_its_own_the_run_is_refused(runs, resume):
     run, other = runs
     shutil.rmtree(run.checkpoints()[0].parent)
     shutil.copytree(other.checkpoint(256), run.checkpoint(256))
-    with pytest.raises(ArtifactError, match=r"000000256: the checkpoint of another run"):
+    with pytest.raises(ArtifactError, match=r"000000256: this checkpoint belongs to another run"):
         resume(run, total_timesteps=512)

@@ -16,18 +16,18 @@ from rlctl.training.updates.mlp import Floats
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """A minibatch, shape (batch, ...) each; `features` are what the networks get of the observations."""
+    """A minibatch, shape (batch, ...) each; `features` are the networks' inputs."""
 
     features: Floats
     next_features: Floats
     actions: NDArray[Any]
     rewards: Floats
     discounts: Floats
-    """What the value of the next observation counts: 0 where the episode ended."""
+    """Factor of the next observation's value: 0 where the episode ended."""
 
 
 def sample_batches(model: Any, network: Any, count: int, size: int) -> list[Batch]:
-    """Return `count` minibatches of `size` transitions, the same that SB3 would draw one after the other.
+    """Return `count` minibatches of `size` transitions, the same that SB3 would draw.
 
     Features are what `network`, an actor or a Q-network of SB3, extracts from observations.
     """

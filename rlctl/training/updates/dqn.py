@@ -1,4 +1,4 @@
-"""DQN's updates with gradients computed without autograd: what SB3's `DQN.train` computes, but for rounding.
+"""DQN's updates without autograd; equal to SB3's `DQN.train` except for rounding.
 
 V. Mnih et al., Human-level control through deep reinforcement learning, Nature, 2015.
 """
@@ -24,14 +24,14 @@ class DqnUpdate:
 
     @classmethod
     def supports(cls, model: Any) -> bool:
-        """Return whether a model can be updated so; otherwise SB3 does it."""
+        """Return whether this class can update a model; SB3 updates all others."""
         return (
             type(model) is DQN and is_mlp(model.q_net.q_net) and not list(model.q_net.features_extractor.parameters())
         )
 
     @torch.no_grad()
     def train(self, gradient_steps: int, batch_size: int) -> None:
-        """Do a number of updates with batches of the replay buffer, and log what SB3 logs."""
+        """Do `gradient_steps` updates with minibatches of the replay buffer; log what SB3 logs."""
         model = self._model
         model._update_learning_rate(model.policy.optimizer)
         losses = [self._update(batch) for batch in sample_batches(model, model.q_net, gradient_steps, batch_size)]
@@ -46,7 +46,7 @@ class DqnUpdate:
         actions = batch.actions.astype(np.int64)
         errors = np.take_along_axis(values[-1][0], actions, 1) - (batch.rewards + batch.discounts * best)
         to_values = np.zeros_like(values[-1])
-        # The slope of Huber's loss is the error, at most 1 either way.
+        # The derivative of the Huber loss is the error, clipped to [-1, 1].
         np.put_along_axis(to_values[0], actions, errors.clip(-1, 1) / np.float32(len(errors)), 1)
         self._network.backpropagate(values, to_values)
         clip_norm(self._network.gradients, self._model.max_grad_norm)

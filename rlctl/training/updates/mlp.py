@@ -1,8 +1,8 @@
 """Multi-layer perceptrons in NumPy whose gradients are computed without autograd.
 
-The networks of robot learning are so small that autograd's bookkeeping takes longer than their arithmetic. It also
-computes gradients that nobody needs, as those of a critic's weights where it only judges an actor. NumPy, because its
-matrix products are up to twice as fast as torch's on processors of AMD, and a call costs a third.
+The networks of robot learning are so small that autograd's overhead takes longer than their arithmetic. It also
+computes unneeded gradients, e.g. of the critic's weights in the actor's update. NumPy's matrix products are up to twice
+as fast as torch's on AMD processors, and a NumPy call takes a third of the time.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _ACTIVATIONS = (nn.Tanh, nn.ReLU)
 
 
 class _Layer:
-    """Linear layers of equal size, one per network; their parameters become parts of arrays that are shared here."""
+    """Linear layers of equal size, one per network; their parameters become slices of shared arrays."""
 
     def __init__(self, linears: Sequence[nn.Linear]) -> None:
         weights, biases = [linear.weight for linear in linears], [linear.bias for linear in linears]
@@ -34,7 +34,7 @@ class _Layer:
 
 
 class MlpStack:
-    """Perceptrons of equal shape: linear layers with one activation after each, but not after the last.
+    """Perceptrons of equal shape: linear layers with an activation after each except the last.
 
     Arrays have the shape (networks, batch, size). The weights stay those of the modules; they are on the CPU.
     """
@@ -44,7 +44,7 @@ class MlpStack:
         self._uses_tanh = any(isinstance(module, nn.Tanh) for module in modules[0])
         linears = [[module for module in network if isinstance(module, nn.Linear)] for network in modules]
         self._layers = [_Layer(row) for row in zip(*linears, strict=True)]
-        self._room: dict[tuple[str, int], list[Floats]] = {}
+        self._buffers: dict[tuple[str, int], list[Floats]] = {}
 
     @property
     def count(self) -> int:
@@ -58,16 +58,16 @@ class MlpStack:
 
     @property
     def gradients(self) -> list[Floats]:
-        """Gradients of the parameters, in another order."""
+        """Gradients of the parameters; the order differs from `parameters`."""
         return [*(layer.weight_gradient for layer in self._layers), *(layer.bias_gradient for layer in self._layers)]
 
     def run(self, inputs: Floats, use: str) -> list[Floats]:
-        """Return the inputs and what each layer makes of them; the outputs come last.
+        """Return the inputs and the output of each layer.
 
-        Inputs of shape (1, batch, features) are those of all networks. The next run for the same `use` overwrites what
-        this one returns.
+        Inputs of shape (1, batch, features) are used by all networks. The next run with the same `use` overwrites the
+        returned arrays.
         """
-        values = [inputs, *self._find_room(use, inputs.shape[1])]
+        values = [inputs, *self._get_buffers(use, inputs.shape[1])]
         for index, layer in enumerate(self._layers):
             output = values[index + 1]
             np.matmul(values[index], layer.weight.swapaxes(1, 2), out=output)
@@ -76,12 +76,12 @@ class MlpStack:
                 self._activate(output)
         return values
 
-    def _find_room(self, use: str, batch: int) -> list[Floats]:
-        room = self._room.get((use, batch))
-        if room is None:
+    def _get_buffers(self, use: str, batch: int) -> list[Floats]:
+        buffers = self._buffers.get((use, batch))
+        if buffers is None:
             shapes = [(self.count, batch, layer.bias.shape[2]) for layer in self._layers]
-            room = self._room[use, batch] = [np.empty(shape, np.float32) for shape in shapes]
-        return room
+            buffers = self._buffers[use, batch] = [np.empty(shape, np.float32) for shape in shapes]
+        return buffers
 
     def _activate(self, values: Floats) -> None:
         if self._uses_tanh:
@@ -90,12 +90,12 @@ class MlpStack:
             torch.from_numpy(values).relu_()  # a tenth of NumPy's time
 
     def backpropagate(self, values: list[Floats], gradient: Floats, *, latent: Floats | None = None) -> None:
-        """Set the gradients of the weights from that of the outputs, where `values` is what `run` returned.
+        """Set the gradients of the weights from the gradient of the outputs; `values` is the result of `run`.
 
         `latent` is a gradient of the last hidden layer's values that is added to the one that comes from the outputs.
         """
         ones = np.ones((1, gradient.shape[1]), np.float32)
-        hidden = self._find_room("gradients", gradient.shape[1])
+        hidden = self._get_buffers("gradients", gradient.shape[1])
         for index in reversed(range(len(self._layers))):
             layer = self._layers[index]
             np.matmul(gradient.swapaxes(1, 2), values[index], out=layer.weight_gradient)
@@ -108,8 +108,8 @@ class MlpStack:
                 self._derive(gradient, values[index])
 
     def input_gradient(self, values: list[Floats], gradient: Floats, first: int) -> Floats:
-        """Return the gradient of the inputs from number `first` on from that of the outputs."""
-        hidden = self._find_room("gradients", gradient.shape[1])
+        """Return the gradient of inputs `first` and later, from the gradient of the outputs."""
+        hidden = self._get_buffers("gradients", gradient.shape[1])
         for index in reversed(range(1, len(self._layers))):
             gradient = np.matmul(gradient, self._layers[index].weight, out=hidden[index - 1])
             self._derive(gradient, values[index])
@@ -117,7 +117,7 @@ class MlpStack:
         return result
 
     def _derive(self, gradient: Floats, activated: Floats) -> None:
-        """Turn the gradient of activated values into that of the values before, in place."""
+        """Turn the gradient of activated values into that of the values before activation, in place."""
         changed, values = torch.from_numpy(gradient), torch.from_numpy(activated)
         if self._uses_tanh:
             torch.ops.aten.tanh_backward.grad_input(changed, values, grad_input=changed)
@@ -126,7 +126,7 @@ class MlpStack:
 
 
 def is_mlp(modules: Iterable[nn.Module]) -> bool:
-    """Return whether `MlpStack` can be made of these modules."""
+    """Return whether `MlpStack` supports these modules."""
     modules = list(modules)
     kinds = [type(module) for module in modules]
     hidden = kinds[1::2]
@@ -136,12 +136,12 @@ def is_mlp(modules: Iterable[nn.Module]) -> bool:
 
 
 def count_weights(modules: Iterable[nn.Module]) -> int:
-    """Return how many weights the linear layers have: the products of a forward pass, for each row of a batch."""
+    """Return the number of weights of the linear layers: multiplications per row of a batch."""
     return sum(module.weight.numel() for module in modules if isinstance(module, nn.Linear))
 
 
 def join_outputs(linears: Sequence[nn.Linear]) -> nn.Linear:
-    """Return a layer with the outputs of layers that have the same inputs; call `share_joined` when it is in use."""
+    """Return a layer with the outputs of all `linears`, which have the same inputs; call `share_joined` later."""
     joined = nn.Linear(linears[0].in_features, sum(linear.out_features for linear in linears))
     joined.weight.data = torch.cat([linear.weight.data for linear in linears])
     joined.bias.data = torch.cat([linear.bias.data for linear in linears])
@@ -149,7 +149,7 @@ def join_outputs(linears: Sequence[nn.Linear]) -> nn.Linear:
 
 
 def share_joined(linears: Sequence[nn.Linear], joined: nn.Linear) -> None:
-    """Let the parameters of layers, and their gradients, be parts of those of the layer that joins them."""
+    """Make the parameters and gradients of layers slices of those of the joined layer."""
     first = 0
     for linear in linears:
         rows = slice(first, first + linear.out_features)
@@ -161,7 +161,7 @@ def share_joined(linears: Sequence[nn.Linear], joined: nn.Linear) -> None:
 
 
 def clip_norm(gradients: Iterable[Floats], limit: float) -> None:
-    """Scale gradients, in place, to a Euclidean norm of all together of at most `limit`, as torch does."""
+    """Scale gradients in place so that their total Euclidean norm is at most `limit`, as torch does."""
     gradients = list(gradients)
     norm = math.sqrt(sum(float(np.vdot(gradient, gradient)) for gradient in gradients))
     if not norm <= limit:
@@ -176,7 +176,7 @@ def allocate_gradient(parameter: Tensor) -> Floats:
 
 
 def _share(parameters: Sequence[Tensor]) -> Tensor:
-    """Let parameters of equal shape be parts of one array, which is returned."""
+    """Make parameters of equal shape slices of one array; return it."""
     shared = torch.stack([parameter.data for parameter in parameters])
     for parameter, part in zip(parameters, shared, strict=True):
         parameter.data = part
@@ -184,7 +184,7 @@ def _share(parameters: Sequence[Tensor]) -> Tensor:
 
 
 def _share_gradients(parameters: Sequence[Tensor]) -> Floats:
-    """Give parameters of equal shape gradients that are parts of one array, which is returned."""
+    """Give parameters of equal shape gradients that are slices of one array; return it."""
     shared = torch.zeros(len(parameters), *parameters[0].shape)
     for parameter, part in zip(parameters, shared, strict=True):
         parameter.grad = part

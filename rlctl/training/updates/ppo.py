@@ -1,7 +1,7 @@
-"""PPO's updates with gradients computed without autograd: what SB3's `PPO.train` computes, but for rounding.
+"""PPO's updates without autograd; equal to SB3's `PPO.train` except for rounding.
 
-J. Schulman et al., Proximal Policy Optimization Algorithms, 2017, https://arxiv.org/abs/1707.06347. Below, what a
-gradient is of stands in its name: `to_mean` is the gradient of the loss with respect to the mean.
+J. Schulman et al., Proximal Policy Optimization Algorithms, 2017, https://arxiv.org/abs/1707.06347. The name of a
+gradient is its variable: `to_mean` is the gradient of the loss with respect to the mean.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class PpoUpdate:
 
     @staticmethod
     def supports(model: Any) -> bool:
-        """Return whether a model can be updated so; otherwise SB3 does it."""
+        """Return whether this class can update a model; SB3 updates all others."""
         policy = model.policy
         if type(model) is not PPO or not policy.share_features_extractor:
             return False
@@ -56,7 +56,7 @@ class PpoUpdate:
 
     @torch.no_grad()
     def train(self) -> None:
-        """Update the policy with the rollout in the model's buffer, and log what SB3 logs."""
+        """Update the policy with the rollout in the model's buffer; log what SB3 logs."""
         model, policy = self._model, self._policy
         model._update_learning_rate(policy.optimizer)
         clip_range = model.clip_range(model._current_progress_remaining)
@@ -76,7 +76,7 @@ class PpoUpdate:
         self._log(logged, clip_range, clip_range_vf)
 
     def _read_buffer(self) -> dict[str, NDArray[Any]]:
-        """Return a rollout, shape (steps * environments, ...) each; of the observations what the networks get."""
+        """Return the rollout, shape (steps * environments, ...) each, with features for observations."""
         buffer = self._model.rollout_buffer
         observations = join(
             {key: torch.from_numpy(buffer.swap_and_flatten(rows)) for key, rows in split(buffer.observations).items()}
@@ -93,7 +93,7 @@ class PpoUpdate:
         clip_range_vf: float | None,
         logged: dict[str, list[float]],
     ) -> bool:
-        """Learn from a minibatch; return False, and do not, where the policy has moved further than `target_kl`."""
+        """Learn from a minibatch; return False without an update if the policy has moved beyond `target_kl`."""
         model = self._model
         of_actor, of_critic = self._side_by_side.run(
             [
@@ -127,7 +127,7 @@ class PpoUpdate:
         log_ratio = log_prob - batch["log_probs"]
         ratio = np.exp(log_ratio)
         unclipped, clipped = advantages * ratio, advantages * ratio.clip(1 - clip_range, 1 + clip_range)
-        # Where the clipped term is the smaller one, the loss does not depend on the policy.
+        # If the clipped term is smaller, the loss does not depend on the policy.
         to_log_prob = (unclipped * (unclipped <= clipped) / -size)[:, None]
         self._actor.backpropagate(actor, (to_log_prob * z / std)[None])
         self._set_std_gradient(actor, std, to_log_prob * (np.square(z) - 1) - model.ent_coef / size)
@@ -155,7 +155,7 @@ class PpoUpdate:
         return {"value_loss": loss}
 
     def _compute_std(self, actor: list[Floats]) -> Floats:
-        """Return the standard deviation of actions: of all alike, or with gSDE of each, shape (batch, actions)."""
+        """Return the standard deviation of actions, shape (actions,), with gSDE (batch, actions)."""
         policy = self._policy
         log_std: Floats = policy.log_std.numpy()
         if not policy.use_sde:
@@ -192,7 +192,7 @@ class PpoUpdate:
 
 
 def _shuffle(data: dict[str, NDArray[Any]], size: int) -> Iterator[dict[str, NDArray[Any]]]:
-    """Yield minibatches of an epoch, in the order that SB3's buffer has them."""
+    """Yield the minibatches of an epoch in SB3's order."""
     total = len(data["actions"])
     order = np.random.permutation(total)  # noqa: NPY002 (SB3's generator: checkpoints hold its state)
     shuffled = {name: rows[order] for name, rows in data.items()}

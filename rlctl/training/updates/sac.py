@@ -1,4 +1,4 @@
-"""SAC's updates with gradients computed without autograd: what SB3's `SAC.train` computes, but for rounding.
+"""SAC's updates without autograd; equal to SB3's `SAC.train` except for rounding.
 
 T. Haarnoja et al., Soft Actor-Critic Algorithms and Applications, 2018, https://arxiv.org/abs/1812.05905.
 """
@@ -19,7 +19,7 @@ from rlctl.training.updates.side_by_side import SideBySide
 from rlctl.training.updates.squashed_actor import Sample, SquashedGaussianActor
 
 _LOSS_EVERY = 8
-"""Of so many updates in a row the first computes the losses, which are only logged."""
+"""Every so many updates the losses are computed, for the log only."""
 
 
 class SacUpdate:
@@ -29,7 +29,7 @@ class SacUpdate:
 
     def __init__(self, model: Any) -> None:
         self._model = model
-        self._policy_delay = getattr(model, "policy_delay", 1)  # models of SB3 alone have none
+        self._policy_delay = getattr(model, "policy_delay", 1)  # SB3's own models have none
         self._actor = SquashedGaussianActor(model.actor)
         self._side_by_side = SideBySide(list(model.critic.q_networks), model.batch_size)
         self._critics = self._side_by_side.make_stacks(model.critic.q_networks)
@@ -39,7 +39,7 @@ class SacUpdate:
 
     @classmethod
     def supports(cls, model: Any) -> bool:
-        """Return whether a model can be updated so; otherwise SB3 does it."""
+        """Return whether this class can update a model; SB3 updates all others."""
         if type(model) is not cls.algorithm:
             return False
         actor, critic = model.actor, model.critic
@@ -52,7 +52,7 @@ class SacUpdate:
 
     @torch.no_grad()
     def train(self, gradient_steps: int, batch_size: int) -> None:
-        """Do a number of updates with batches of the replay buffer, and log what SB3 logs."""
+        """Do `gradient_steps` updates with minibatches of the replay buffer; log what SB3 logs."""
         model = self._model
         optimizers = [model.actor.optimizer, model.critic.optimizer]
         if model.ent_coef_optimizer is not None:
@@ -86,13 +86,12 @@ class SacUpdate:
             logged["actor_loss"].append(self._update_actor(batch.features, sample, coefficient))
 
     def _read_coefficient(self) -> float:
-        """Return the weight of the entropy."""
         model = self._model
         tensor = model.ent_coef_tensor if model.ent_coef_optimizer is None else model.log_ent_coef.exp()
         return float(tensor.item())
 
     def _update_coefficient(self, sample: Sample, logged: dict[str, list[float]]) -> None:
-        """Learn the weight of the entropy, if it is to be learnt."""
+        """Update the entropy coefficient if it is learned."""
         model = self._model
         if model.ent_coef_optimizer is None:
             return
@@ -102,7 +101,7 @@ class SacUpdate:
         model.ent_coef_optimizer.step()
 
     def _compute_target(self, batch: Batch, coefficient: float) -> Floats:
-        """Return what the critics are to expect, shape (batch, estimates)."""
+        """Return the critics' targets, shape (batch, estimates)."""
         sample = self._actor.sample(batch.next_features, "next")
         inputs = np.concatenate([batch.next_features, sample.action], 1)[None]
         passes = self._side_by_side.run([functools.partial(stack.run, inputs, "target") for stack in self._targets])
@@ -140,12 +139,11 @@ class SacUpdate:
         return float((coefficient * sample.log_prob - value).mean())
 
     def _choose_estimates(self, outputs: Floats) -> Floats:
-        """Return the estimates of target critics that count, shape (batch, estimates)."""
+        """Return the target critics' estimates that form the target, shape (batch, estimates)."""
         estimates: Floats = outputs.min(0)
         return estimates
 
     def _compute_loss(self, outputs: Floats, target: Floats) -> float:
-        """Return the critics' loss."""
         return 0.5 * float(np.square(outputs - target).mean((1, 2)).sum())
 
     def _differentiate_loss(self, outputs: Floats, target: Floats) -> Floats:
@@ -153,7 +151,7 @@ class SacUpdate:
         return (outputs - target) / np.float32(outputs.shape[1])
 
     def _value(self, outputs: Floats) -> tuple[Floats, Floats]:
-        """Return the value of actions by the critics' outputs, shape (batch, 1), and its gradient for the outputs."""
+        """Return the value from the critics' outputs, shape (batch, 1), and its gradient with respect to them."""
         lowest = outputs.argmin(0)
         to_outputs = (np.arange(len(outputs))[:, None, None] == lowest).astype(np.float32)
         return outputs.min(0), to_outputs

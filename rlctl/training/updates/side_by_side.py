@@ -1,4 +1,4 @@
-"""Networks that do not depend on one another are updated side by side, on two cores."""
+"""Updates independent networks in parallel, on two cores."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from rlctl.training.updates.mlp import MlpStack, count_weights
 Result = TypeVar("Result")
 
 _WORTHWHILE = 8_000_000
-"""Products of a forward pass from which on a thread saves more time than it costs."""
+"""Multiplications per forward pass from which a second thread saves time."""
 
 
 class SideBySide:
-    """Makes several calls, the first of them on this thread and the others on a second one.
+    """Runs the first of several calls on this thread and the others on a second one.
 
-    For small networks and on one core, all on this thread. The results are the same to the last bit.
+    For small networks or on one core all run on this thread. The results are bit-exact either way.
     """
 
     def __init__(self, networks: Sequence[Iterable[nn.Module]], batch_size: int) -> None:
@@ -31,7 +31,7 @@ class SideBySide:
             self._second = ThreadPoolExecutor(1, initializer=_prepare_thread)
 
     def make_stacks(self, networks: Iterable[Iterable[nn.Module]]) -> list[MlpStack]:
-        """Return networks of equal shape as one stack, or as one each where a second thread is used."""
+        """Return networks of equal shape as one stack, or, with a second thread, as one stack per network."""
         if self._second is None:
             return [MlpStack(list(networks))]
         return [MlpStack([network]) for network in networks]
@@ -45,6 +45,6 @@ class SideBySide:
 
 
 def _prepare_thread() -> None:
-    # Torch keeps both for each thread.
+    # Both are settings of a thread in torch.
     torch.set_grad_enabled(False)
     torch.set_num_threads(1)

@@ -1,6 +1,6 @@
-"""The actor of SAC and TQC: actions that it draws, and gradients of its weights, without autograd.
+"""The actor of SAC and TQC: samples actions, and computes gradients of its weights without autograd.
 
-What a gradient is of stands in its name: `to_action` is the gradient of the loss with respect to the action.
+The name of a gradient is its variable: `to_action` is the gradient of the loss with respect to the action.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0  # SB3's limits, without gSDE
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """Actions of a batch that the actor drew, and what their gradients are computed from; (batch, actions) each."""
+    """Sampled actions of a batch, and the values for their gradients; shape (batch, actions) each."""
 
     values: list[Floats]
-    """What the layers of the actor made of the observations."""
+    """The outputs of the actor's layers."""
     noise: Floats
-    """What was added to the mean before the actions were squashed."""
+    """Added to the mean before tanh."""
     std: Floats
     action: Floats
     log_prob: Floats
@@ -97,7 +97,7 @@ class SquashedGaussianActor:
         return variances
 
     def backpropagate(self, sample: Sample, to_action: Floats, to_log_prob: float) -> None:
-        """Set the gradients of the weights from those of drawn actions and of each of their log-probabilities."""
+        """Set the gradients of the weights from those of sampled actions and of their log-probabilities."""
         slope = 1 - np.square(sample.action)
         to_mean = to_action * slope + sample.action * slope / (slope + self._epsilon) * (2 * to_log_prob)
         outputs = sample.values[-1][0]

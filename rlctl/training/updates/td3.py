@@ -1,4 +1,4 @@
-"""TD3's and DDPG's updates with gradients computed without autograd: what SB3's `TD3.train` computes, but for rounding.
+"""TD3's and DDPG's updates without autograd; equal to SB3's `TD3.train` except for rounding.
 
 S. Fujimoto et al., Addressing Function Approximation Error in Actor-Critic Methods, 2018,
 https://arxiv.org/abs/1802.09477.
@@ -34,7 +34,7 @@ class Td3Update:
 
     @classmethod
     def supports(cls, model: Any) -> bool:
-        """Return whether a model can be updated so; otherwise SB3 does it."""
+        """Return whether this class can update a model; SB3 updates all others."""
         if type(model) not in (TD3, DDPG):
             return False
         actor, critic = model.actor, model.critic
@@ -47,7 +47,7 @@ class Td3Update:
 
     @torch.no_grad()
     def train(self, gradient_steps: int, batch_size: int) -> None:
-        """Do a number of updates with batches of the replay buffer, and log what SB3 logs."""
+        """Do `gradient_steps` updates with minibatches of the replay buffer; log what SB3 logs."""
         model = self._model
         model._update_learning_rate([model.actor.optimizer, model.critic.optimizer])
         logged: dict[str, list[float]] = collections.defaultdict(list)
@@ -62,7 +62,7 @@ class Td3Update:
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
 
     def _compute_target(self, batch: Batch) -> Floats:
-        """Return what the critics are to expect, shape (batch, 1)."""
+        """Return the critics' targets, shape (batch, 1)."""
         model = self._model
         noise = np.empty(batch.actions.shape, np.float32)
         torch.from_numpy(noise).normal_(0, model.target_policy_noise)  # torch's generator, as in SB3
@@ -91,7 +91,7 @@ class Td3Update:
         """Return the actor's loss."""
         passed = self._actor.run(features[None], "learning")
         action = np.tanh(passed[-1])
-        first = self._critics[0]  # its first network judges the actor
+        first = self._critics[0]  # the actor learns from the first critic only
         values = first.run(np.concatenate([features[None], action], 2), "actor")
         to_value = np.zeros_like(values[-1])
         to_value[0] = -1 / len(features)

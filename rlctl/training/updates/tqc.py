@@ -1,4 +1,4 @@
-"""TQC's updates with gradients computed without autograd: what sb3-contrib's `TQC.train` computes, but for rounding.
+"""TQC's updates without autograd; equal to sb3-contrib's `TQC.train` except for rounding.
 
 A. Kuznetsov et al., Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional Quantile
 Critics, 2020, https://arxiv.org/abs/2005.04269.
@@ -16,7 +16,7 @@ from rlctl.training.updates.sac import SacUpdate
 
 
 class TqcUpdate(SacUpdate):
-    """SAC's update with critics that estimate quantiles of the return, of which the highest do not count."""
+    """SAC's update with critics that estimate quantiles of the return; the highest are dropped from targets."""
 
     algorithm: ClassVar[Any] = TQC
 
@@ -34,8 +34,8 @@ class TqcUpdate(SacUpdate):
         return float((sizes * np.where(errors < 0, 1 - shares, shares)).mean())
 
     def _differentiate_loss(self, outputs: Floats, target: Floats) -> Floats:
-        # The slope of Huber's loss is the error, at most 1 either way. It counts by the quantile's share where it is
-        # positive, by the rest where it is negative; both sums come from the slopes' and their sizes'.
+        # The derivative of the Huber loss is the error, clipped to [-1, 1]. Its weight is the
+        # quantile's share if positive, else 1 - share; both sums follow from the slopes' sum and absolute sum.
         slopes = target[:, None, :] - outputs[..., None]
         np.clip(slopes, -1, 1, out=slopes)
         ones = np.ones(target.shape[1], np.float32)  # short sums are faster as products
@@ -52,6 +52,6 @@ class TqcUpdate(SacUpdate):
 
 
 def _quantile_shares(outputs: Floats) -> Floats:
-    """Return how much of the returns is to lie below each quantile, shape (quantiles,)."""
+    """Return the share of returns below each quantile, shape (quantiles,)."""
     count = outputs.shape[-1]
     return (np.arange(count, dtype=np.float32) + np.float32(0.5)) / np.float32(count)
