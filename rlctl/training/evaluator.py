@@ -80,7 +80,6 @@ class Evaluator:
             progress.next_eval += self._recipe.eval.every_steps or self._recipe.total_timesteps
 
     def _report_findings(self) -> None:
-        """Show new warnings about the run's records."""
         for finding in diagnose(self._checkpoints.run):
             if finding.grade == Grade.WARNING and finding.id not in self._reported_findings:
                 self._reported_findings.add(finding.id)

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pydantic
-from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
@@ -24,8 +23,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from rlctl.environments.dict_spaces import split
 from rlctl.errors import ArtifactError
 from rlctl.storage import files
-
-Tensors = dict[str, NDArray[Any]]
+from rlctl.training.snapshot import Tensors
 
 SEGMENT_BYTES = 8 * 2**20
 """Size of a segment [bytes]; the last one is written again until it has this size."""

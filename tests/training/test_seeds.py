@@ -241,7 +241,7 @@ def test_the_file_of_a_group_names_no_other_place(change, tmp_path):
     content = json.loads(file.read_text())
     content["request"] |= change
     file.write_text(json.dumps(content))
-    with pytest.raises(ArtifactError, match=r"group\.json: damaged: it does not hold seeds and the request"):
+    with pytest.raises(ArtifactError, match=r"group\.json: damaged: it must hold seeds and a training request"):
         read_group(group.path)
 
 

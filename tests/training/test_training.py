@@ -173,7 +173,7 @@ def test_resuming_a_finished_run_does_nothing(copied, resume):
 
 
 def test_resume_takes_no_other_recipe(copied, resume):
-    with pytest.raises(UsageError, match="algo cannot be changed, only -n"):
+    with pytest.raises(UsageError, match="algo cannot be changed; only -n can"):
         resume(copied, algo="sac")
 
 
