@@ -72,13 +72,35 @@ class ObservationLayout:
         return {name: _convert(values[name], name, shape, self._dtypes[name]) for name, shape in known.items()}
 
     def flatten(self, observation: Any) -> NDArray[np.float64]:
-        """Return the numbers of an observation without its images, shape (size,)."""
+        """Return the numbers of an observation without its images, shape (size,).
+
+        Raises `ObservationError` for what is not numbers, or not as many.
+        """
         parts = split(observation)
-        if SINGLE in parts:
-            return np.asarray(parts[SINGLE], np.float64).ravel()
-        if not self.slices:
-            return np.zeros(0)
-        return np.concatenate([np.asarray(parts[key], np.float64).ravel() for key in self.slices])
+        keys = [SINGLE] if SINGLE in parts else [*self.slices]
+        if missing := [key for key in keys if key not in parts]:
+            raise ObservationError(f"observation names missing: {_list(missing)}")
+        numbers = [read_numbers(parts[key]) for key in keys]
+        values = numbers[0] if len(numbers) == 1 else np.concatenate([np.zeros(0), *numbers])
+        if values.size != self.size:
+            raise ObservationError(f"the observation has {values.size} numbers, the policy takes {self.size}")
+        return values
+
+
+def read_numbers(values: Any) -> NDArray[np.float64]:
+    """Return a flat float64 copy of real numbers; raises `ObservationError` for everything else."""
+    try:
+        if np.ma.is_masked(values):
+            raise ObservationError("masked values, which are none")
+        array = np.asarray(values)
+    except ObservationError:
+        raise
+    except Exception as error:  # conversion calls what the object brings, which may raise anything
+        raise ObservationError(f"a value that is no array of numbers ({type(error).__name__})") from None
+    if array.dtype.kind not in "biuf":
+        raise ObservationError(f"values of type {array.dtype}, not real numbers")
+    with np.errstate(over="ignore"):  # what float64 cannot hold is not finite then
+        return array.astype(np.float64).ravel()
 
 
 def _convert(value: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
@@ -154,7 +176,7 @@ class SensorChecks:
         elif self._has_range and (outside := self._find_outside(values)) is not None:
             low, high = float(self._low[outside]), float(self._high[outside])
             fault = ("range", self._name(outside), float(values[outside]), low if values[outside] < low else high)
-        elif not age_s <= self._oldest:
+        elif not abs(age_s) <= self._oldest:  # from the future: the clocks differ, so nobody knows how old it is
             fault = ("stale", "age", age_s, self._oldest)
         if self._frozen:
             fault = self._check_frozen(values) or fault

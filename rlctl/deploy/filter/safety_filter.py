@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rlctl.deploy.filter.command import Command, UnsafeCommand
 from rlctl.deploy.filter.fitting import fit_limits
 from rlctl.deploy.filter.limits import Limits, read_limits
-from rlctl.deploy.filter.observation import SensorChecks
+from rlctl.deploy.filter.observation import ObservationError, SensorChecks, read_numbers
 from rlctl.deploy.filter.safety_events import Intervention, Kind, SafetyEvent
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import UsageError, short_repr
@@ -168,12 +168,15 @@ class SafetyFilter:
     def observe(self, observation: Any, age_s: float = 0.0) -> bool:
         """Check an observation in the policy's form; None: it is missing. Return whether it may be used.
 
-        `age_s` is its age [s].
+        `age_s` is its age [s]; what is further in the future than it may be old is a fault too.
         """
         if observation is None:
             return self.fail("missing")
-        values = self.layout.flatten(observation)
-        fault = self._sensors.check(values, age_s)
+        try:
+            values, (age,) = self.layout.flatten(observation), read_numbers(age_s)
+        except ValueError as error:  # no numbers, or an age that is not one number
+            return self.fail("observation", short_repr(str(error), 200))
+        fault = self._sensors.check(values, float(age))
         self._observed = True
         if fault is not None:
             kind, name, value, limit = fault
@@ -212,10 +215,9 @@ class SafetyFilter:
         if action is None:
             return None, ""
         try:
-            # A copy: a policy may write the next one into the same memory.
-            numbers = np.array(action, np.float64).ravel()
-        except (TypeError, ValueError, OverflowError):
-            return None, "a value that is no float64 number"
+            numbers = read_numbers(action)  # a copy: a policy may write the next one into the same memory
+        except ObservationError as error:
+            return None, str(error)
         if numbers.shape != self._zeros.shape:
             return None, f"shape {numbers.shape}"
         if np.isfinite(numbers).tobytes() != self._all_finite:

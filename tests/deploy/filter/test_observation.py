@@ -6,6 +6,7 @@ from gymnasium import spaces
 
 from rlctl.deploy.filter.observation import ObservationError, ObservationLayout
 from rlctl.environments.info import EnvInfo, space_to_json
+from tests.deploy.conftest import make_filter, observe_at, run_filter
 
 ACTION = space_to_json(spaces.Box(-1, 1, (1,)))
 DICT = spaces.Dict(
@@ -59,3 +60,52 @@ def test_pictures_of_another_scale_or_on_their_side(picture, message):
         camera.read({"camera": picture})
     for same in (np.full((1, 4, 6, 3), 7.0), np.full(72, 7)):
         assert camera.read({"camera": same})["camera"].tolist() == np.full((4, 6, 3), 7).tolist()
+
+
+class Hostile:
+    def __array__(self, *args, **kwargs):
+        raise ZeroDivisionError
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *(
+            1 + 2j,
+            np.array([1, 2j, 0, 0, 0]),
+            "1",
+            ["1"] * 5,
+            [10**400] * 5,
+            [[1], [2, 3]],
+            {1, 2},
+            {"positions": [0, 0]},
+        ),
+        *(Hostile(), [], np.zeros(4), np.zeros(6), np.ma.array(np.zeros(5), mask=True), np.zeros(5, "datetime64[s]")),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_is_not_an_observation_is_a_fault(arm, value):
+    safety = make_filter(arm)
+    assert run_filter(safety, observe_at(0, 0), [1, 1]) == pytest.approx([1, 1])
+    assert not safety.observe(value)
+    assert not safety.trusts_observation
+    assert safety.limit([1, 1]) == pytest.approx([0, 0])
+    assert safety.state == "holding"
+
+
+@pytest.mark.parametrize("age", [None, "1", [], [0, 0], 1j, np.nan, 1e9, -1e9], ids=repr)
+def test_what_is_not_an_age_is_a_fault(arm, age):
+    safety = make_filter(arm)
+    assert not safety.observe(observe_at(0, 0), age)
+    assert safety.limit([1, 1]) == pytest.approx([0, 0])
+
+
+@pytest.mark.parametrize(
+    "action",
+    [np.array([1j, 0]), ["1", "2"], Hostile(), np.ma.array([1, 2], mask=[True, False]), np.zeros(2, "datetime64[s]")],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_is_not_an_action_is_a_fault(arm, action):
+    safety = make_filter(arm)
+    assert run_filter(safety, observe_at(0, 0), action) == pytest.approx([0, 0])
+    assert safety.state == "holding"
