@@ -38,7 +38,7 @@ OptionalTask = Annotated[str | None, Argument(TASK_FORMS, metavar="TASK", comple
 Config = Annotated[Path | None, Option("Recipe that overrides the task's own, or presets/NAME.", metavar="FILE")]
 RunsFolder = Annotated[Path, Option("Where run folders go.", ("--output", "-o"), metavar="FOLDER")]
 EnvTimeout = Annotated[
-    float, Option("How long a step or reset may take.", ("--env-timeout",), metavar="SECONDS", min=0.1)
+    float, Option("How long a step or reset may take.", ("--env-timeout",), metavar="SECONDS", min=0.1, max=1e6)
 ]
 On = Annotated[
     str | None,

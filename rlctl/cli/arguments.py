@@ -33,7 +33,9 @@ Set = Annotated[
 ]
 Json = Annotated[str | None, typer.Option("--json", metavar="FILE", help="Write JSON too; - for stdout, alone.")]
 EpisodeSeed = Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)]
-EnvTimeout = Annotated[float, typer.Option(metavar="SECONDS", help="How long a step or reset may take.", min=0.1)]
+EnvTimeout = Annotated[
+    float, typer.Option(metavar="SECONDS", help="How long a step or reset may take.", min=0.1, max=1e6)
+]
 NEnvs = Annotated[int | None, typer.Option(help="Environments stepped side by side.", min=1)]
 Checkpoint = Annotated[str, typer.Option(metavar="best|last|STEP", help="Which policy of the run.")]
 

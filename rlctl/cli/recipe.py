@@ -28,6 +28,8 @@ def recipe(
         return
     if task is None:
         raise UsageError("give a task, such as rlctl recipe reach, or --schema")
+    from rlctl.environments import registry
     from rlctl.recipe.sources import resolve
 
+    registry.load(task)  # a name that is no task has no recipe
     output.results().write(resolve(task, None, {}).to_yaml())

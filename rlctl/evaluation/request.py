@@ -43,7 +43,7 @@ class EvalOptions:
     )
     """Limits on the policy's actions; it is also evaluated without them."""
     env_timeout_s: Annotated[
-        float, Option("Time limit of a step or reset.", ("--env-timeout",), metavar="SECONDS", min=0.1)
+        float, Option("Time limit of a step or reset.", ("--env-timeout",), metavar="SECONDS", min=0.1, max=1e6)
     ] = 60.0
 
 

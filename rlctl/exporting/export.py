@@ -20,6 +20,7 @@ from rlctl.policy.policy import Policy
 from rlctl.policy.shipped import PRETRAINED
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import lookup
+from rlctl.run.directory import refuse_links_out
 from rlctl.run.lookup import FoundPolicy
 from rlctl.storage import files
 
@@ -44,6 +45,8 @@ def export_policy(request: ExportRequest) -> list[ExportReport]:
     if source.file.suffix == ".onnx":
         raise UsageError(f"{source.file} is an ONNX file already; export the run or its .safetensors file")
     if output is None:
+        if source.run is not None:
+            refuse_links_out(source.run.path)
         folder = Path() if request.checkpoint == PRETRAINED else source.file.parent
         output = source.run.onnx_file if source.run else folder / source.file.name
         output = output.with_suffix(f".{formats[0]}")

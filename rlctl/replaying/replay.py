@@ -26,7 +26,7 @@ from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
-from rlctl.run.directory import RunDirectory
+from rlctl.run.directory import RunDirectory, refuse_links_out
 from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
 from rlctl.run.lookup import find_owner, find_policy, locate_task
 
@@ -232,6 +232,8 @@ class _PolicySource:
     def _next_recording(self) -> Path:
         """Return `--output`, or the next number in that folder, in the run, or (without a run) in ./episodes."""
         if self._output is None:
+            if self._run is not None:
+                refuse_links_out(self._run.path)
             owner = self._run or RunDirectory(Path())
             return owner.episode_file(owner.next_episode_number()).with_suffix(".rrd")
         if self._output.suffix == ".rrd":

@@ -161,10 +161,6 @@ class RunDirectory:
         Raises `RunTaken` if another process holds it, and `ArtifactError` for a symbolic link that leads out of the
         folder. On a file system without locks, the last process to claim the run owns it.
         """
-        own = self.path.resolve()
-        for place in self.path.rglob("*"):
-            if place.is_symlink() and not place.resolve().is_relative_to(own):
-                raise ArtifactError(f"{place}: a symbolic link out of the run's folder; remove it")
         lock = RunLock(self.path)
         with contextlib.suppress(OSError):  # the disk may be full
             claim = uuid.uuid4().hex
@@ -187,6 +183,14 @@ class RunDirectory:
             raise RunTaken(f"{self.path}: another process has taken over this run; this process no longer writes to it")
 
 
+def refuse_links_out(folder: Path, kind: str = "run") -> None:
+    """Raise `ArtifactError` for a folder with a link out of it: what is written or uploaded must be in the folder."""
+    own = folder.resolve()
+    for place in folder.rglob("*"):
+        if place.is_symlink() and not place.resolve().is_relative_to(own):
+            raise ArtifactError(f"{place}: a symbolic link out of the {kind}'s folder; remove it")
+
+
 class RunLock:
     """Prevents two processes from writing the same run, or another `kind` of folder with runs.
 
@@ -194,6 +198,7 @@ class RunLock:
     """
 
     def __init__(self, folder: Path, kind: str = "run") -> None:
+        refuse_links_out(folder, kind)
         self._kind = kind
         self.keeps_out = True
         """False on a file system without locks, where other processes can write too."""
@@ -236,7 +241,7 @@ class RunLock:
 def is_being_written(folder: Path) -> bool:
     """Say whether a process trains in a run folder now; False where the file system has no locks."""
     try:
-        descriptor = os.open(folder / ".lock", os.O_RDONLY)
+        descriptor = os.open(folder / ".lock", os.O_RDONLY | os.O_NONBLOCK)
     except OSError:
         return False
     try:

@@ -115,6 +115,8 @@ def read_group(path: Path) -> Group:
         request = TrainRequest.from_json({**content["request"], "root": str(path)})
         if request.task is None or not all(type(seed) is int and seed >= 0 for seed in seeds):
             raise ValueError
+        if len(set(seeds)) != len(seeds):
+            raise ValueError
         return Group(path, list(seeds), request)
     except (KeyError, TypeError, ValueError, AttributeError):
         raise ArtifactError(f"{file}: damaged: it must hold seeds and a training request") from None

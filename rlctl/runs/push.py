@@ -10,7 +10,7 @@ from rlctl import output
 from rlctl.errors import UsageError
 from rlctl.hub import store
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.run.directory import RunDirectory
+from rlctl.run.directory import RunDirectory, refuse_links_out
 from rlctl.run.lookup import find_run
 
 _CARD = "README.md"
@@ -33,6 +33,7 @@ def push_run(run: str | None, address: str) -> PushResult:
     if not store.is_address(address):
         raise UsageError(f"{address}: not an address, such as hf://ORG/NAME or s3://BUCKET/NAME")
     directory = find_run(run)
+    refuse_links_out(directory.path)  # in somebody else's run it may lead to any file
     policy = directory.policy_file("best")
     info = PolicyFile.read_info(policy)
     contents: dict[str, Path | bytes] = {"policies/best.safetensors": policy}

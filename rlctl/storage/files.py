@@ -33,6 +33,8 @@ def name_in_errors(path: Path) -> Iterator[None]:
 
 def write_with(path: Path, write: Callable[[Path], None]) -> None:
     """Let `write` create a temporary file next to `path`, sync it to disk, and rename it to `path`."""
+    if not path.name:  # `/`, which has no name to put a file beside
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     os.makedirs(path.parent, exist_ok=True)
     beside = path.with_name(f".{os.getpid()}.part.{path.name}")  # the suffix stays: some writers depend on it
     try:

@@ -11,6 +11,7 @@ import pytest
 from rlctl.checking import families
 from rlctl.checking.check import check, judge
 from rlctl.checking.finding import choose_rules
+from rlctl.checking.formats.structured import read_baseline
 from rlctl.checking.records import Check, Records
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
@@ -145,6 +146,11 @@ def test_command_of_a_broken_environment(tmp_path):
     assert content["speed"]["steps_per_second"] > 0
     assert content["environment"]["action_space"].startswith("Box(-1.0, 1.0, (2,)")
     assert content["not_judged"] == []
+
+
+def test_a_baseline_that_is_a_device_is_refused():
+    with pytest.raises(UsageError, match="not a file"):
+        read_baseline(Path("/dev/zero"))
 
 
 def test_findings_of_the_baseline_fail_nothing(tmp_path):

@@ -91,6 +91,10 @@ def test_run_gets_it_into_its_exports(small, train, write, tmp_path, monkeypatch
     assert report.path == policies.parent / "exports" / "policy.onnx"
     with pytest.raises(ArtifactError, match="no last policy yet"):
         export_policy(ExportRequest(None, ("onnx",), "last", None))
+    shutil.move(report.path.parent, tmp_path / "elsewhere")
+    report.path.parent.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ArtifactError, match="exports: a symbolic link out of the run's folder; remove it"):
+        export_policy(ExportRequest(str(policies.parent), ("onnx",), "best", None))
 
 
 def test_not_verified_is_not_kept(small, train, write, tmp_path):

@@ -157,3 +157,12 @@ def test_an_s3_server(run, monkeypatch):
             push_run(str(run), "s3://nobody/reach")
     finally:
         server.stop()
+
+
+def test_what_a_link_leads_to_is_not_uploaded(run, tmp_path):
+    (tmp_path / "secret").write_text("secret")
+    link = run / "tensorboard_notes"
+    link.symlink_to(tmp_path / "secret")
+    with pytest.raises(ArtifactError, match="a symbolic link out of the run's folder; remove it"):
+        push_run(str(run), ADDRESS)
+    link.unlink()

@@ -32,6 +32,15 @@ def test_rollouts_go_into_the_run_and_are_numbered_on(run):
     assert recorded.info.versions.keys() >= {"rlctl", "pybullet", "torch"}
 
 
+def test_nothing_is_recorded_through_a_link(run, tmp_path):
+    (tmp_path / "precious").mkdir()
+    shutil.copytree(run.run.path, tmp_path / "run", ignore=shutil.ignore_patterns("episodes"))
+    (tmp_path / "run" / "episodes").symlink_to(tmp_path / "precious")
+    with pytest.raises(ArtifactError, match="episodes: a symbolic link out of the run's folder; remove it"):
+        run_replay(ReplayRequest(str(tmp_path / "run"), episodes=1))
+    assert not [*(tmp_path / "precious").iterdir()]
+
+
 def test_episodes_that_are_there_are_kept(run, tmp_path):
     (tmp_path / "000004.npz").write_bytes(b"of a training, which records few of its episodes")
     (episode,) = run_replay(ReplayRequest(str(run.run.path), output=tmp_path)).episodes

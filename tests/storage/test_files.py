@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -197,3 +198,8 @@ def test_changes_to_a_sealed_file_are_noticed(tmp_path):
     for length in range(len(sealed)):
         path.write_bytes(sealed[:length])
         assert not files.is_as_sealed(path)
+
+
+def test_the_root_of_all_folders_is_no_file():
+    with pytest.raises(IsADirectoryError):
+        files.write_bytes(Path("/"), b"")

@@ -11,7 +11,7 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.run.directory import RunDirectory
+from rlctl.run.directory import RunDirectory, RunLock, is_being_written
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.run.lookup import FoundPolicy, find_policy
 from rlctl.storage import files
@@ -245,6 +245,19 @@ def test_a_run_with_a_link_out_of_it_is_not_written(name, tmp_path):
     with pytest.raises(ArtifactError, match=rf"{name}: a symbolic link out of the run's folder; remove it$"):
         RunDirectory(tmp_path / "run").lock()
     assert outside.read_text() == "kept"
+
+
+def test_a_group_with_a_link_out_of_it_is_not_written(tmp_path):
+    (tmp_path / "elsewhere_s0").mkdir()
+    (tmp_path / "group").mkdir()
+    (tmp_path / "group" / "x_s0").symlink_to(tmp_path / "elsewhere_s0")
+    with pytest.raises(ArtifactError, match=r"x_s0: a symbolic link out of the group's folder; remove it$"):
+        RunLock(tmp_path / "group", "group")
+
+
+def test_a_lock_that_is_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / ".lock")
+    assert not is_being_written(tmp_path)
 
 
 @pytest.mark.parametrize("step", ["²", "9" * 5000, "-1", "../../x", ""])

@@ -249,3 +249,11 @@ def test_a_group_of_another_version(tmp_path):
     (tmp_path / "group.json").write_text('{"task": "reach", "seeds": [0], "options": ["--json=/elsewhere"]}')
     with pytest.raises(ArtifactError, match="written by another version of rlctl"):
         read_group(tmp_path)
+
+
+def test_a_group_with_a_seed_twice_is_damaged(tmp_path):
+    group = create_group(TrainRequest(LINE, settings=TINY, root=tmp_path), [0])
+    file = group.path / "group.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "seeds": [0, 0]}))
+    with pytest.raises(ArtifactError, match=r"group\.json: damaged"):
+        read_group(group.path)

@@ -61,6 +61,8 @@ def content(report: CheckReport) -> dict[str, Any]:
 def read_baseline(file: Path) -> set[str]:
     """Return the fingerprints of all findings of a JSON report; raises `UsageError` for another file."""
     try:
+        if file.exists() and not file.is_file():
+            raise UsageError(f"--baseline {file}: not a file")
         report = json.loads(file.read_text(encoding="utf-8"))
         return {finding["fingerprint"] for part in ("findings", "known") for finding in report[part]}
     except OSError as error:

@@ -88,12 +88,11 @@ class Command:
 
     def follow(self, action: Array) -> NDArray[Any]:
         """Return the allowed action closest to the policy's. Raises `UnsafeCommand`."""
-        with np.errstate(over="ignore"):  # actions may be arbitrarily large
-            start = self._present(action)
-            target = action if self._is_action else self._bounds.offset + action * self._bounds.factor
-            if self._alpha < 1.0 or self._blend_left:
-                target = self._apply_smoothing(self._bounds.clip_ends(target, self._note), start)
-            return self._move(target)
+        start = self._present(action)
+        target = action if self._is_action else self._bounds.offset + action * self._bounds.factor
+        if self._alpha < 1.0 or self._blend_left:
+            target = self._apply_smoothing(self._bounds.clip_ends(target, self._note), start)
+        return self._move(target)
 
     def _apply_smoothing(self, target: Array, start: Array) -> Array:
         """Apply low-pass and blend to a command within its bounds, so that neither overflows nor winds up."""
@@ -116,10 +115,9 @@ class Command:
         self._smooth = None
         present = self._present(None)
         home = self._home if go_home else None
-        with np.errstate(over="ignore"):
-            if self._bounds.is_value:
-                return self._move(self._safe if not self._is_position else present if home is None else home)
-            return self._move(self._zeros if home is None or self.position is None else home - self.position)
+        if self._bounds.is_value:
+            return self._move(self._safe if not self._is_position else present if home is None else home)
+        return self._move(self._zeros if home is None or self.position is None else home - self.position)
 
     def stand_still(self) -> NDArray[Any]:
         """Return the action of the last command that kept its limits: its value, or no motion. Forgets all smoothing.

@@ -192,6 +192,7 @@ class SafetyFilter:
         self._fault = what
         return False
 
+    @np.errstate(all="ignore")  # a policy may want anything; what is computed is checked at the end
     def limit(self, action: Any | None) -> Array:
         """Return the robot's action for the policy's action; None: the policy could not act."""
         self.steps += 1

@@ -6,6 +6,7 @@ float64. The limits are checked here from their definition alone.
 
 import itertools
 import math
+import warnings
 
 import hypothesis.extra.numpy as arrays
 import hypothesis.strategies as st
@@ -186,7 +187,8 @@ def attack(options, space, dt, steps):
             position = None
         observation = np.array([*where, 0.0, where[0], 0.0])
         position = where if safety.observe(observation, age) else position
-        output = safety.limit(action)
+        with warnings.catch_warnings(action="error"):
+            output = safety.limit(action)
         assert output.dtype == box.dtype
         assert output.shape == box.shape
         assert np.isfinite(output).all()
