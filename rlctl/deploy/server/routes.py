@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import re
 import tempfile
 import time
 from pathlib import Path
@@ -20,6 +21,7 @@ from rlctl.errors import RlctlError
 
 _MAX_POLICY_SIZE = 64 * 2**20  # [bytes]
 _BODY_TIMEOUT_S = 10.0
+_FILE_NAME = re.compile(r"[A-Za-z0-9_. +-]{1,100}")
 _ORDERS = ("stop", "home", "hold", "resume")
 
 
@@ -113,7 +115,9 @@ class _Routes:
         # The format of safetensors begins with the length of its header, in JSON.
         suffix = ".safetensors" if content[8:9] == b"{" else ".onnx"
         with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
-            file = Path(folder) / (name if name.endswith(suffix) and len(name) < 100 else f"uploaded{suffix}")
+            file = Path(folder) / (
+                name if _FILE_NAME.fullmatch(name) and name.endswith(suffix) else f"uploaded{suffix}"
+            )
             await asyncio.to_thread(file.write_bytes, content)
             try:
                 await self.server.replace_policy(file)

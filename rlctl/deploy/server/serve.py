@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import gc
+import logging
 import os
 import signal
 import sys
@@ -78,6 +79,7 @@ async def serve_until(
     from rlctl.deploy.server.routes import make_app
 
     request = server.request
+    logging.getLogger("aiohttp.server").addFilter(_is_worth_a_traceback)
     connections = Connections(count_allowed_connections(request.max_clients))
     runner = web.AppRunner(make_app(server, connections), access_log=None, shutdown_timeout=1.0)
     await runner.setup()
@@ -108,6 +110,13 @@ async def serve_until(
         if listener is not None:
             listener.close()
         await runner.cleanup()
+
+
+def _is_worth_a_traceback(record: logging.LogRecord) -> bool:
+    """Say whether an error is one of the server; what is no HTTP is answered with 400, and not logged."""
+    from aiohttp.http_exceptions import HttpProcessingError
+
+    return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))
 
 
 def _handle_signals(server: PolicyServer, end: asyncio.Event) -> None:

@@ -196,3 +196,12 @@ def test_arrays_come_back(tmp_path):
     with pytest.raises(TypeError, match="cannot be sent"):
         messages.pack(np.array([1j]))
     assert messages.unpack(messages.pack({"a": os.name})) == {"a": os.name}
+
+
+@pytest.mark.parametrize("request_line", [b"\x00\x01", b"GET / HTTP/9.9", b"GET /\x1b[31m HTTP/1.1"])
+def test_what_is_no_http_leaves_no_traceback(server, request_line, caplog):
+    connection = socket.create_connection(("127.0.0.1", server.port), timeout=120)
+    connection.sendall(request_line + b"\r\nHost: localhost\r\n\r\n")
+    assert read_all(connection).startswith(b"HTTP/1.0 400 ")
+    assert not caplog.records
+    assert works(server)

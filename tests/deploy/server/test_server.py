@@ -251,6 +251,8 @@ def test_another_policy_without_a_gap(serve, tmp_path):
             server.post("/policy", other.read_bytes()[:-1]),
             server.post("/policy", write_policy(tmp_path / "x.safetensors", env=other_names).read_bytes()),
         ]
+        for name in ("%00.safetensors", "%F0%9F%A4%96" * 90 + ".safetensors"):
+            refused.append(server.post(f"/policy?name={name}", other.read_bytes()[:-1]))
         before = len(seen)
         status, text = server.post("/policy?name=other.safetensors", other.read_bytes())
         while len(seen) < before + 20:
@@ -258,7 +260,7 @@ def test_another_policy_without_a_gap(serve, tmp_path):
     finally:
         end.set()
         thread.join()
-    assert [code for code, _ in refused] == [422, 422, 422]
+    assert [code for code, _ in refused] == [422] * 5
     assert "different names or a different order" in refused[2][1]
     assert (status, json.loads(text)["policy"]) == (200, "other.safetensors")
     changes = [index for index in range(1, len(seen)) if seen[index] != seen[index - 1]]
