@@ -159,8 +159,8 @@ def check_name(
 ) -> None:
     """Raise `error` if a name is unknown: `no_such`, the name, the closest known name, all known names."""
     if name not in (names := list(known)):
-        there = short_repr(", ".join(names) or none, 200)
-        raise error(f"{no_such} {short_repr(name)!r}.{did_you_mean(str(name), names)} {listed}: {there}.")
+        known_names = short_repr(", ".join(names) or none, 200)
+        raise error(f"{no_such} {short_repr(name)!r}.{did_you_mean(str(name), names)} {listed}: {known_names}.")
 
 
 def explain_missing_package(user: str, missing: str | None, extra: str) -> str:

@@ -18,8 +18,8 @@ from rlctl.processes import error_boundary
 from rlctl.version import __version__
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(requested: bool) -> None:
+    if requested:
         print(f"rlctl {__version__}")
         raise typer.Exit
 

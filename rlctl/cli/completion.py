@@ -28,8 +28,8 @@ def complete_run(incomplete: str) -> list[str]:
     tasks = dict.fromkeys(run.parent.name for run in runs)
     latest = ["latest"] if runs else []
     files = [*_list_paths(incomplete, "*.safetensors"), *_list_paths(incomplete, "*.onnx")]
-    found = [*latest, *tasks, *(str(run) for run in runs[:_MOST]), *files]
-    return [text for text in found if text.startswith(incomplete)]
+    candidates = [*latest, *tasks, *(str(run) for run in runs[:_MOST]), *files]
+    return [text for text in candidates if text.startswith(incomplete)]
 
 
 def _list_paths(incomplete: str, pattern: str) -> list[str]:

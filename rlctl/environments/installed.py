@@ -84,9 +84,8 @@ def _find_state(folder: str) -> tuple[int, ...]:
 
 @functools.lru_cache(maxsize=4)
 def _list_installed(path: tuple[tuple[str, tuple[int, ...]], ...]) -> list[TaskEntry]:
-    declared: dict[
-        tuple[str, str], TaskEntry
-    ] = {}  # of equal lines the first: a checkout on sys.path next to its own installation declares the same
+    # A checkout on sys.path may declare the same tasks as its own installation: the first one is used.
+    declared: dict[tuple[str, str], TaskEntry] = {}
     for distribution in importlib.metadata.distributions():
         for entry in _read_distribution(distribution):
             declared.setdefault((entry.name, entry.target), entry)

@@ -31,13 +31,13 @@ def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.Mj
 
 def describe_model(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     """Return `control_dt` [s] and `joints` of an environment that MuJoCo simulates; empty for any other."""
-    found = find_mujoco(env)
-    if found is None:
+    simulation = find_mujoco(env)
+    if simulation is None:
         return {}
     dt = getattr(env.unwrapped, "dt", None)  # not from the frame rate, which is rounded: 67 for a step of 0.015 s
     step = {"control_dt": float(dt)} if isinstance(dt, float | int) and dt > 0 else {}
     size = int(np.prod(env.action_space.shape or ()))
-    return {**step, "joints": _describe_joints(found[0]) if size == found[0].nu else None}
+    return {**step, "joints": _describe_joints(simulation[0]) if size == simulation[0].nu else None}
 
 
 def _describe_joints(model: mujoco.MjModel) -> Joints | None:

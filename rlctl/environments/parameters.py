@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rlctl.environments.plugin_code import call_plugin
-from rlctl.errors import RecipeError, did_you_mean, short_repr
+from rlctl.errors import RecipeError, check_name, short_repr
 from rlctl.storage import validation
 
 
@@ -19,8 +19,8 @@ def check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -
         return
     for key in parameters:
         is_of_gymnasium = key == "max_episode_steps" and hasattr(constructor, "gymnasium_id")
-        if key not in known and not is_of_gymnasium:
-            raise _unknown_parameter(task, key, list(known))
+        if not is_of_gymnasium:
+            check_name(key, known, f"task.{key}: {task} has no parameter", RecipeError)
 
 
 def read_parameters(constructor: Any) -> Mapping[str, inspect.Parameter] | None:
@@ -39,24 +39,17 @@ def read_parameters(constructor: Any) -> Mapping[str, inspect.Parameter] | None:
     return inspect.signature(constructor).parameters
 
 
-def _unknown_parameter(task: str, key: str, known: list[str]) -> RecipeError:
-    return RecipeError(
-        f"task.{key}: {task} has no parameter {key!r}.{did_you_mean(key, known)} It has: {', '.join(known) or 'none'}."
-    )
-
-
-def check_fields(task: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+def check_fields(task: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return a `Task`'s parameters, converted to the types of its fields; raises `RecipeError` for a wrong value."""
     import typing
 
     import pydantic
 
     fields = task.parameters()
-    hints = call_plugin(task.__name__, lambda: typing.get_type_hints(task)) if given else {}
+    hints = call_plugin(task.__name__, lambda: typing.get_type_hints(task)) if values else {}
     checked = {}
-    for key, value in given.items():
-        if key not in fields:
-            raise _unknown_parameter(task.__name__, key, list(fields))
+    for key, value in values.items():
+        check_name(key, fields, f"task.{key}: {task.__name__} has no parameter", RecipeError)
         _check_number(key, hints[key], value)
         adapter = pydantic.TypeAdapter(hints[key])
         try:

@@ -62,8 +62,8 @@ def _list_classes(file: Path) -> list[str]:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError, RecursionError):
         return []
-    found = [node for node in tree.body if isinstance(node, ast.ClassDef) and not node.name.startswith("_")]
-    bases = {node.name: " ".join(map(ast.unparse, node.bases)) for node in found}
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and not node.name.startswith("_")]
+    bases = {node.name: " ".join(map(ast.unparse, node.bases)) for node in classes}
     return [name for name, base in bases.items() if "Task" in base or "Env" in base] or list(bases)
 
 

@@ -184,7 +184,6 @@ def make(
 
 
 def _make_gymnasium_spec(task: str, render_mode: str | None, randomize: bool, events: Any, parameters: Any) -> Any:
-    """Return the spec from which Gymnasium and other libraries read an environment's id and time limit."""
     from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
     kwargs = {"task": task, "render_mode": render_mode, "randomize": randomize, "events": events, **parameters}

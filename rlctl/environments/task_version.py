@@ -34,7 +34,7 @@ def describe_task_changes(before: Mapping[str, Any], task: str, since: str = "th
 def find_git_commit() -> str | None:
     """Return the commit of the current folder's repository; None outside of one."""
     try:
-        found = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5.0, check=False)
+        result = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5.0, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return found.stdout.strip() or None
+    return result.stdout.strip() or None

@@ -16,7 +16,6 @@ _PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
 
 
 def _widths(default: str, *examples: str) -> Any:
-    """Return the field `net_arch`; SB3 chooses its default."""
     return Field(None, examples=list(examples) or None, json_schema_extra={"default_text": default})
 
 

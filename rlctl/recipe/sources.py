@@ -9,7 +9,7 @@ from typing import Any
 
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvChanges, merge
-from rlctl.errors import ArtifactError, RecipeError, did_you_mean, short_repr
+from rlctl.errors import ArtifactError, RecipeError, check_name, did_you_mean, short_repr
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.recipe.recipe import NormalizeSettings, Recipe, Source, validate
 from rlctl.storage import yaml_text
@@ -33,17 +33,17 @@ def resolve(
     packaged = read(packaged_file) if packaged_file else {}
     config = find_config(config) if config else None
     from_config = read(config) if config else {}
-    given = merge(from_config, settings)
+    overrides = merge(from_config, settings)
     sources = [
         Source("", settings),
         Source(str(config), from_config, config),
         Source(str(packaged_file), packaged, packaged_file),
     ]
-    algo = given.get("algo", packaged.get("algo", "ppo"))
+    algo = overrides.get("algo", packaged.get("algo", "ppo"))
     if packaged.get("algo", "ppo") != algo:
         # The packaged hyperparameters and number of environments are for another algorithm.
         packaged = {k: v for k, v in packaged.items() if k not in _OF_THE_ALGORITHM}
-    merged = merge(packaged, given)
+    merged = merge(packaged, overrides)
     if stages and "stages" not in merged:
         merged["stages"] = validate({"stages": list(stages)}, f"class of {task}").model_dump(by_alias=True)["stages"]
     return fill_defaults(validate(merged, *sources))
@@ -119,11 +119,7 @@ def find_config(config: Path) -> Path:
     if config.exists() or len(config.parts) != 2 or config.parts[0] != _PRESETS.name or config.suffix:
         return config
     file = _PRESETS / f"{config.name}.yaml"
-    if not file.exists():
-        presets = list_presets()
-        raise ArtifactError(
-            f"no preset {str(config)!r}.{did_you_mean(str(config), presets)} Presets: {', '.join(presets)}."
-        )
+    check_name(str(config), list_presets(), "no preset", ArtifactError, listed="Presets")
     return file
 
 

@@ -14,8 +14,8 @@ _CGROUPS = Path("/sys/fs/cgroup")
 
 def available() -> int | None:
     """Return how many bytes this process can still use, by machine and control groups; None if unknown."""
-    found = [value for value in (_read_machine(), *_read_control_groups()) if value is not None]
-    return max(min(found), 0) if found else None
+    limits = [value for value in (_read_machine(), *_read_control_groups()) if value is not None]
+    return max(min(limits), 0) if limits else None
 
 
 def _read_machine() -> int | None:
@@ -39,9 +39,9 @@ def _read_control_groups() -> list[int]:
     own = next((entry[3:] for entry in entries if entry.startswith("0::")), "/")
     folder = _CGROUPS / own.strip("/")
     groups = [group for group in (folder, *folder.parents) if group.is_relative_to(_CGROUPS)]
-    found = [_read_group(group, "memory.max", "memory.current", "file") for group in groups]
-    found.append(_read_group(_CGROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "cache"))
-    return [value for value in found if value is not None]
+    limits = [_read_group(group, "memory.max", "memory.current", "file") for group in groups]
+    limits.append(_read_group(_CGROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "cache"))
+    return [value for value in limits if value is not None]
 
 
 def _read_group(group: Path, limit: str, used: str, cache_name: str) -> int | None:

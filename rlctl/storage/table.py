@@ -93,5 +93,4 @@ def _read_first_number(row: str) -> float:
 
 
 def _read_size(path: Path) -> int:
-    """Return a file's size in bytes; 0 if it does not exist."""
     return path.stat().st_size if path.exists() else 0

@@ -26,14 +26,8 @@ def _descend(root: Schema, path: Sequence[str | int]) -> tuple[Schema, int]:
     # Also returns how many parts of `path` the schema has; the rest are pydantic's names of types in a union.
     node = root
     for depth, part in enumerate(path):
-        inner = next(
-            (
-                part_schema
-                for part_schema in (_find_part(one, part) for one in _list_alternatives(root, node))
-                if part_schema
-            ),
-            None,
-        )
+        parts = (_find_part(alternative, part) for alternative in _list_alternatives(root, node))
+        inner = next(filter(None, parts), None)
         if inner is None:
             return node, depth
         node = inner
@@ -50,14 +44,8 @@ def _find_part(node: Schema, part: str | int) -> Schema | None:
 
 def list_keys(root: Schema, node: Schema) -> list[str]:
     """Return the allowed keys of a mapping; none if `node` is not a mapping, or allows any key."""
-    return next(
-        (
-            list(alternative["properties"])
-            for alternative in _list_alternatives(root, node)
-            if "properties" in alternative
-        ),
-        [],
-    )
+    alternatives = _list_alternatives(root, node)
+    return list(next((schema["properties"] for schema in alternatives if "properties" in schema), ()))
 
 
 def describe_value(root: Schema, node: Schema) -> str:
@@ -100,9 +88,7 @@ def explain(
     if problem["type"] == "extra_forbidden":
         keys = list_keys(root, find_schema(root, path[:-1]))
         name, outer = path[-1], (find_schema(root, [*path[:-1], key_here]) for key_here in keys)
-        inner = [
-            f"{key_here}.{name}" for key_here, node in zip(keys, outer, strict=True) if name in list_keys(root, node)
-        ]
+        inner = [f"{parent}.{name}" for parent, node in zip(keys, outer, strict=True) if name in list_keys(root, node)]
         hint = f" Did you mean {inner[0]!r}?" if inner else did_you_mean(str(name), keys)
         return f"no key {key!r}{of}.{hint} Keys here: {', '.join(keys)}."
     label = f"{key}: " if key else ""
@@ -110,17 +96,17 @@ def explain(
         return f"{label}{problem['ctx']['error']}"
     if problem["type"] == "missing":
         return f"{label}is missing"
-    part, given = find_schema(root, path), values
+    part, value = find_schema(root, path), values
     for part_key in path:
-        given = given[part_key]
+        value = value[part_key]
     expected = describe_value(root, part)
     if expected == _ANY:  # the schema has no words for the type
-        return f"{label}{problem['msg'].removeprefix('Input ')}, got {short_repr(given)}"
+        return f"{label}{problem['msg'].removeprefix('Input ')}, got {short_repr(value)}"
     if unit:
         expected = f"{expected.removesuffix(' or null')} [{unit}]"
     examples = f", such as {' or '.join(part['examples'])}" if "examples" in part else ""
-    close = did_you_mean(given, part.get("enum", ())) if isinstance(given, str) else ""
-    got = repr(short_repr(given)) if isinstance(given, str) else short_repr(given)
+    close = did_you_mean(value, part.get("enum", ())) if isinstance(value, str) else ""
+    got = repr(short_repr(value)) if isinstance(value, str) else short_repr(value)
     return f"{label}expected {expected}{examples}, got {got}{close and f'.{close}'}"
 
 

@@ -65,8 +65,8 @@ def _make_error(message: str, node: Any) -> yaml.YAMLError:
 
 def _check_key(node: yaml.Node) -> str:
     if node.tag != f"{_PREFIX}str" or not isinstance(node.value, str):
-        given = short_repr(node.value) if isinstance(node.value, str) else "a list or a mapping"
-        raise _make_error(f"{given} cannot be a key: keys are text, numbers in quotes", node)
+        shown = short_repr(node.value) if isinstance(node.value, str) else "a list or a mapping"
+        raise _make_error(f"{shown} cannot be a key: keys are text, numbers in quotes", node)
     return node.value
 
 

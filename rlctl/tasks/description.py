@@ -110,7 +110,6 @@ def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> 
 
 
 def _describe_definition(env: TaskEnv) -> dict[str, Any]:
-    """Return the fields that only a `Task` has."""
     from rlctl.task.inertia import find_inertia_faults
 
     task = env.task
@@ -152,12 +151,12 @@ def _describe_event(name: str, offered: Event, acting: Event | None) -> dict[str
 def _list_parameters(constructor: Callable[..., Any]) -> list[dict[str, Any]]:
     """Return the parameters of a constructor without `render_mode`; empty if Python cannot inspect it."""
     try:
-        found = inspect.signature(constructor).parameters.values()
+        accepted = inspect.signature(constructor).parameters.values()
     except (TypeError, ValueError):  # written in C
         return []
     fields = getattr(constructor, "__dataclass_fields__", {})
     parameters = []
-    for p in found:
+    for p in accepted:
         if p.kind not in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) or p.name == "render_mode":
             continue
         kind = p.annotation if isinstance(p.annotation, str) else inspect.formatannotation(p.annotation)
@@ -203,7 +202,6 @@ def _format_space(space: Any) -> str:
 
 
 def _list_observations(env: TaskEnv) -> list[dict[str, Any]]:
-    """Return the named parts of a task's observation."""
     units = env.task.observation_units
     parts = _list_quantities(env.observation_space)
     if env.task.observation_layout == "flat":

@@ -48,7 +48,6 @@ def show(description: Description, json: str | None) -> None:
 
 
 def _list_scores(info: PolicyInfo | None) -> list[Row]:
-    """Return the measured scores of the shipped policy, of zero actions and of random actions."""
     if info is None:
         return []
     steps = f"{info.algo}, {info.training_steps:,} steps"
@@ -62,10 +61,10 @@ def _print_section(title: str, rows: Iterable[Row], none: str = "") -> None:
     from rich.text import Text
 
     name, _, rest = title.partition("  ")
-    out, found = output.out(), list(rows)
+    out, listed = output.out(), list(rows)
     out.print()
-    out.print(Text.assemble((name, "bold"), f"  {rest if found or not none else none}".rstrip()))
-    _print_rows(found, indent="  ")
+    out.print(Text.assemble((name, "bold"), f"  {rest if listed or not none else none}".rstrip()))
+    _print_rows(listed, indent="  ")
 
 
 def _print_rows(rows: list[Row], indent: str = "") -> None:
