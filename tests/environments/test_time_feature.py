@@ -131,5 +131,5 @@ def test_one_number_more_that_is_not_the_time_is_refused(tmp_path):
 
     model = PPO("MlpPolicy", DummyVecEnv([lambda: Wider(EnvSpec(BLOCK).make())]), device="cpu")
     model.save(tmp_path / "model.zip")
-    with pytest.raises(ArtifactError, match=r"it observes Box\(4,\), .* gives Box\(3,\)"):
+    with pytest.raises(ArtifactError, match=r"it observes Box\(4,\), .* returns Box\(3,\)"):
         import_model(tmp_path / "model.zip", BLOCK, output=tmp_path / "policy.safetensors")
