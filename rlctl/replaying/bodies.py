@@ -1,4 +1,4 @@
-"""Draws a world: bodies by the shapes of their links, markers, paths."""
+"""Draws a world in a recording: the shapes of bodies, markers, paths."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _MESHES = {".obj", ".stl", ".dae", ".glb", ".gltf"}
 
 
 def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> tuple[str, BodyMotion] | None:
-    """Draw everything under `world/`; `warn` receives what could not be drawn as it should be.
+    """Draw everything under `world/`; `warn` receives messages about what could not be drawn.
 
-    Returns the entity that the camera is to follow, the trunk of the first robot that has one, if it was drawn.
+    Returns the entity that the camera follows: the trunk of the first robot with a trunk, if it was drawn.
     """
     trunks: list[tuple[str, BodyMotion]] = []
     timelines.stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -42,10 +42,10 @@ def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> tuple[str, Bod
 
 
 def _draw_marker(name: str, positions: NDArray[np.float64], color: tuple[int, int, int], timelines: Timelines) -> None:
-    """Draw a labelled point, and a halo around it that is still seen when a hand is there."""
+    """Draw a labelled point, and a halo that stays visible when a gripper covers the point."""
     entity, steps = _entity("world", "markers", name), range(len(positions))
     stream = timelines.stream
-    # Not static positions: static data would hide the moving ones for good.
+    # Positions are not static: static data would hide the moving ones.
     point = rr.Points3D.from_fields(radii=0.03, colors=color, labels=name, show_labels=True)
     stream.log(entity, point, static=True)
     timelines.send(entity, steps, rr.Points3D.columns(positions=positions))
@@ -103,7 +103,7 @@ def bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _draw_path(body: BodyMotion, timelines: Timelines) -> None:
-    """Draw the path of a robot's trunk, or else of its last link: a segment per step."""
+    """Draw the path of a robot's trunk, or else of its last link, with one segment per step."""
     if not body.joint_names:
         return
     points = _path_points(body).astype(np.float32)
@@ -117,7 +117,7 @@ def _path_points(body: BodyMotion) -> NDArray[np.float64]:
     if body.trunk is None:
         return body.positions[:, -1]
     centers = shape_centers(body, body.trunk)
-    # The frame of an MJCF body may lie far outside of it.
+    # The frame of an MJCF body may be far from its shapes.
     return centers[0] if body.file.suffix == ".xml" and len(centers) else body.positions[:, body.trunk]
 
 
@@ -138,7 +138,7 @@ def draw_shapes(body: BodyMotion, timelines: Timelines, warn: Warn) -> list[str]
             continue
         entity = _entity("world", body.name, name)
         positions, orientations = body.positions[:, link], body.orientations[:, link]
-        # What never moves has one row.
+        # A link that never moves has one row.
         rows = 1 if np.ptp(positions, axis=0).max() == np.ptp(orientations, axis=0).max() == 0.0 else len(positions)
         columns = rr.Transform3D.columns(translation=positions[:rows], quaternion=orientations[:rows])
         timelines.send(entity, range(rows), columns)
@@ -150,7 +150,9 @@ def draw_shapes(body: BodyMotion, timelines: Timelines, warn: Warn) -> list[str]
             timelines.stream.log(part, archetype, static=True)
             timelines.stream.log(part, _pose(shape), static=True)
             drawn.append(part)
-    if len(drawn) < len(body.shapes) or (not drawn and body.file.suffix == ".xml"):  # which PyBullet alone can read
+    if len(drawn) < len(body.shapes) or (
+        not drawn and body.file.suffix == ".xml"
+    ):  # a file that only PyBullet can read
         warn(f"{body.file.name}: {len(drawn)} of {len(body.shapes)} shapes of {body.name!r} could be drawn")
     return drawn
 

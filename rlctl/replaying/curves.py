@@ -1,4 +1,4 @@
-"""Sends the columns of a recording: the numbers of an episode as curves, each with a name and a colour."""
+"""Sends the numbers of an episode to a recording, as curves with names and colours."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import split_names
 from rlctl.replaying.recorder import Rollout
-from rlctl.replaying.scene import BodyMotion, Scene, encode_jpeg
+from rlctl.replaying.scene import Scene, encode_jpeg
 
 Color = tuple[int, int, int]
 # Distinct on the viewer's dark and light background; the first eight also to colour-blind eyes.
@@ -46,7 +46,7 @@ class Timelines:
         sequence = np.asarray(steps, np.int64)
         indexes = [rr.TimeColumn("step", sequence=sequence)]
         if self.dt is not None:
-            # Floating-point times are cut off by Rerun, not rounded: two rows a nanosecond apart would result.
+            # Rerun truncates floating-point times, so equal times could become rows one nanosecond apart.
             nanoseconds = np.round(sequence * self.dt * 1e9).astype("timedelta64[ns]")
             indexes.append(rr.TimeColumn("sim_time", duration=nanoseconds))
         self.stream.send_columns(entity, indexes, columns)
@@ -61,13 +61,13 @@ class Plot:
     kind: str
     """reward, action, joints, observation or image."""
     values: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
-    """What it shows, shape (rows, curves)."""
+    """Values of the curves, shape (rows, curves)."""
 
     @property
     def legend(self) -> tuple[str, tuple[float, float]]:
-        """The corner in which a legend needs the least room, and a range of the values with which it covers none.
+        """The corner where a legend needs the least extra room, and an axis range with which it covers no curve.
 
-        A legend is taken to cover a third of the width, and a tenth of the height for each of at most six curves.
+        A legend is assumed to cover a third of the width, and a tenth of the height for each of at most six curves.
         """
         values = self.values[np.isfinite(self.values).all(axis=1)] if self.values.size else np.zeros((1, 1))
         values = values if len(values) else np.zeros((1, 1))
@@ -91,7 +91,7 @@ def send_curves(rollout: Rollout, timelines: Timelines) -> list[Plot]:
 
 
 def palette(count: int) -> list[Color]:
-    """Return colours, which are distinct as long as there are enough of them."""
+    """Return `count` colours, distinct up to 10."""
     return [_PALETTE[index % len(_PALETTE)] for index in range(count)]
 
 
@@ -146,15 +146,12 @@ def _joints(scene: Scene, timelines: Timelines) -> list[Plot]:
         _send(timelines, velocities, 0, body.joint_velocities, names)
     if not robots:
         return []
-    shown = [np.concatenate(values, axis=1) for values in zip(*map(_joint_states, robots), strict=True)]
+    all_positions = np.concatenate([body.joint_positions for body in robots], axis=1)
+    all_velocities = np.concatenate([body.joint_velocities for body in robots], axis=1)
     return [
-        Plot("joint positions", "joints/position", "joints", shown[0]),
-        Plot("joint velocities", "joints/velocity", "joints", shown[1]),
+        Plot("joint positions", "joints/position", "joints", all_positions),
+        Plot("joint velocities", "joints/velocity", "joints", all_velocities),
     ]
-
-
-def _joint_states(body: BodyMotion) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return body.joint_positions, body.joint_velocities
 
 
 def _numbered(name: str, count: int) -> list[str]:

@@ -25,7 +25,7 @@ class Difference:
     size: float | None
     """Absolute difference there; None if it is not a finite number."""
     steps: int
-    """How many steps differ; 0 if it is only the end that does."""
+    """How many steps differ; 0 if only the end differs."""
     length: int
     """Steps of the recorded episode."""
 
@@ -72,15 +72,15 @@ def _bits(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def find_difference(recorded: RecordedEpisode, rollout: Rollout) -> Difference | None:
-    """Compare observations, rewards, reward terms and the end; None if every bit is the same."""
+    """Compare observations, rewards, reward terms and the end; return None if all bits are equal."""
     length, columns = len(recorded.rewards), _columns(recorded, rollout)
     differing = [column.differing() for column in columns]
     steps = set().union(*differing)
     if not steps:
         return _different_end(recorded, rollout, length)
     first = min(steps)
-    # At the same step the earlier column counts: what is observed explains what is rewarded.
-    column = next(column for column, found in zip(columns, differing, strict=True) if first in found)
+    # If several columns differ in this step, report the first: a different observation explains a different reward.
+    column = next(column for column, column_steps in zip(columns, differing, strict=True) if first in column_steps)
     return Difference(first, *column.describe(first), len(steps), length)
 
 

@@ -1,4 +1,4 @@
-"""Films of episodes, `.mp4` or `.gif`, without a display: from PyBullet's software renderer, or `render()`."""
+"""Writes films of episodes, `.mp4` or `.gif`, without a display: with PyBullet's software renderer, or `render()`."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ SUFFIXES = (".mp4", ".gif")
 
 _SIZE = {".mp4": (640, 480), ".gif": (400, 300)}  # [pixels]
 _RATE = {".mp4": 30.0, ".gif": 20.0}  # [1/s], at most
-_DT = 1 / 30  # [s] a step, where an environment does not say
+_DT = 1 / 30  # [s] per step, if an environment gives no time
 _PAUSE_S = 0.5  # [s] at the end of each episode
 
 
 def check_file(path: Path) -> None:
-    """Raise `UsageError` for a file that is not a film's, or one that nothing installed can encode."""
+    """Raise `UsageError` for a file that is not a film, or if the package that encodes it is not installed."""
     if path.suffix not in SUFFIXES:
         raise UsageError(f"--video {path}: give a file that ends in .mp4 or .gif")
     if path.suffix == ".mp4":
@@ -40,7 +40,7 @@ def check_file(path: Path) -> None:
 
 
 def make_filmable(spec: EnvSpec) -> Env:
-    """Build an environment that can be filmed; raises `UsageError` for one that makes no pictures."""
+    """Build an environment for a film; raises `UsageError` if it makes no pictures."""
     try:
         return spec.make("rgb_array")
     except RlctlError as error:
@@ -51,7 +51,7 @@ def make_filmable(spec: EnvSpec) -> Env:
 def film_episodes(
     path: Path, env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose], *, policy: str
 ) -> tuple[list[Rollout], FilmReport]:
-    """Play an episode per seed and write one film of all, whole or not at all."""
+    """Play an episode per seed and write one film of all of them, atomically."""
     film = _Film(env, path.suffix)
     rollouts: list[Rollout] = []
 
@@ -84,7 +84,7 @@ class _Film:
         self.writer = (_Mp4 if path.suffix == ".mp4" else _Gif)(path, self._rate)
 
     def watch(self, step: int) -> None:
-        """Take a picture of the reset, and of every few steps."""
+        """Take a picture after the reset and after every n-th step."""
         if step == 0:
             self._view.begin()
         self._is_taken = step % self._every == 0
@@ -99,7 +99,7 @@ class _Film:
         self.writer.add(self._last)
 
     def pause(self) -> None:
-        """Take the end of an episode, and stay there for a moment."""
+        """Take the last picture of an episode and show it for a moment."""
         if not self._is_taken:
             self._take()
         for _ in range(round(_PAUSE_S * self._rate)):
@@ -111,7 +111,7 @@ class _Film:
 
 
 class _Mp4:
-    """H.264 in MP4, by PyAV: plays in browsers and slides."""
+    """H.264 in MP4, written by PyAV: browsers and slides can play it."""
 
     def __init__(self, path: Path, rate: float) -> None:
         import av
@@ -134,7 +134,7 @@ class _Mp4:
 
 
 class _Gif:
-    """An animated GIF, by Pillow, whose pictures are kept with their 256 colours until the end."""
+    """An animated GIF, written by Pillow at the end; pictures have 256 colours."""
 
     def __init__(self, path: Path, rate: float) -> None:
         self._path = path

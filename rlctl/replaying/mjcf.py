@@ -1,8 +1,8 @@
 """The shapes of an MJCF file, read from the file.
 
-PyBullet itself cannot say: getVisualShapeData loses the pose of a geom that is given by its ends (`fromto`), and
-getCollisionShapeData crashes on some robots. Read here is what PyBullet 3.2 makes of the file, for recordings show
-what was simulated: `axisangle` is in radians whatever the compiler says, `euler`, `zaxis` and `xyaxes` do not count.
+PyBullet cannot list them: getVisualShapeData loses the pose of a geom that is given by its ends (`fromto`), and
+getCollisionShapeData crashes on some robots. Recordings show what was simulated, so this module interprets the file as
+PyBullet 3.2 does: `axisangle` is always in radians; `euler`, `zaxis` and `xyaxes` are ignored.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 
 class ShapeKind(enum.Enum):
-    """What a shape is; `OTHER` is known to be there and not drawn."""
+    """The kind of a shape; `OTHER` cannot be drawn."""
 
     SPHERE = "sphere"
     CAPSULE = "capsule"
@@ -56,7 +56,7 @@ class Shape:
 
 _KINDS = {kind.value: kind for kind in ShapeKind if kind not in (ShapeKind.MESH, ShapeKind.OTHER)}
 _COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's, RGBA
-_OUTERMOST = "main"  # what MJCF calls the class of all geoms that name none
+_OUTERMOST = "main"  # MJCF's class of geoms without a class
 _Defaults = Mapping[str, Mapping[str, str]]  # attributes of geoms, by class
 
 
@@ -76,7 +76,7 @@ def read_shapes(file: Path) -> list[Shape]:
 
 
 def _defaults(group: ElementTree.Element | None, outer: Mapping[str, str]) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """Yield each default class with what it says of geoms, itself or by the class around it."""
+    """Yield each default class with its attributes of geoms, own and inherited."""
     if group is None:
         return
     geom = group.find("geom")
@@ -126,7 +126,7 @@ def _orientation(geom: Mapping[str, str]) -> tuple[float, ...]:
 
 
 def _between(start: np.ndarray, end: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...], float]:
-    """Return the centre [m], quaternion and length [m] of what reaches from `start` to `end` along its z axis."""
+    """Return the centre [m], quaternion and length [m] of a shape whose z axis reaches from `start` to `end`."""
     along = end - start
     length = float(np.linalg.norm(along))
     direction = along / length if length else np.array([0.0, 0.0, 1.0])

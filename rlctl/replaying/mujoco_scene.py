@@ -1,4 +1,4 @@
-"""What an episode of any MuJoCo environment looks like: the geoms of its model, moved by its state."""
+"""The scene of an episode in a MuJoCo environment: the geoms of its model, moved by its state."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Array = NDArray[np.float64]
 _VISIBLE_GROUPS = 3  # of geoms: those that MuJoCo's viewer shows; the others are for collisions
 _GROUND_SIZE = 8.0  # [m]
 _RAIL = 100.0  # [m]; a sliding joint that is longer has no limits
-_SHORTEST_PATH = 0.3  # [m]; a trunk that moves less stays where it is
+_SHORTEST_PATH = 0.3  # [m]; a body that moves less is not a trunk
 _NO_COLOR = [0.5, 0.5, 0.5, 1.0]  # of a geom that has a material, or none
 _XYZW = [1, 2, 3, 0]
 
 
 @dataclasses.dataclass(frozen=True)
 class _State:
-    """What the poses of all bodies follow from."""
+    """The part of the state that determines the poses of all bodies."""
 
     qpos: Array
     qvel: Array
@@ -38,7 +38,7 @@ class _State:
 
 
 class MujocoReader:
-    """Reads the state after every step; changes nothing."""
+    """Reads the state after every step, without changing it."""
 
     def __init__(self, env: Env) -> None:
         self._env = env
@@ -47,7 +47,7 @@ class MujocoReader:
 
     def read(self, step: int) -> None:
         """Read the world after a step; 0 is the reset."""
-        if step == 0:  # only now: a reset may load the model anew
+        if step == 0:  # only now: a reset may load the model again
             self._states, self._markers = [], {}
         self._model, data = find_mujoco(self._env)  # type: ignore[misc]
         self._states.append(_State(*(getattr(data, field.name).copy() for field in dataclasses.fields(_State))))
@@ -72,7 +72,7 @@ class MujocoReader:
 def _find_ground(model: mujoco.MjModel) -> list[int]:
     import mujoco
 
-    # MuJoCo 4 compares its own numbers one way only.
+    # MuJoCo 4's enums can be compared with integers only after conversion.
     plane, box = (model.geom_type == int(kind) for kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX))
     wide = box & (model.geom_size[:, :2].min(axis=1) > _GROUND_SIZE / 2)  # what PyBullet's plane.urdf is
     fixed = (model.body_weldid[model.geom_bodyid] == 0) & (model.geom_group < _VISIBLE_GROUPS)
@@ -110,7 +110,7 @@ def _find_height(model: mujoco.MjModel, geom: int) -> float:
 def _move_bodies(
     model: mujoco.MjModel, states: list[_State], grounds: list[int]
 ) -> tuple[BodyMotion, dict[str, Array]]:
-    """Return the motion of all bodies, and of the sites that are called goal or target."""
+    """Return the motion of all bodies, and of the sites named goal or target."""
     import mujoco
 
     scratch = mujoco.MjData(model)
@@ -156,7 +156,7 @@ def _move_bodies(
 
 
 def _find_trunk(model: mujoco.MjModel, positions: Array) -> int | None:
-    """Return the first body with a free joint, or with a sliding one without limits, that moves about."""
+    """Return the first body that travels on a free joint, or on a sliding joint without limits."""
     import mujoco
 
     free, slide = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)

@@ -1,4 +1,4 @@
-"""Plays an episode in this process and records it: its numbers, a log, and what can be drawn of it."""
+"""Plays an episode in this process and records its numbers, a log, and the scene to draw."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from rlctl.task.env import TaskEnv
 from rlctl.version import collect_versions
 
 Choose = Callable[[Any, int], Any]
-"""From an observation and the number of steps done to an action; None ends the episode."""
+"""Returns the action for an observation and the number of steps so far; None ends the episode."""
 Watch = Callable[[int], None]
-"""Looks at an environment after a step; 0 is the reset."""
+"""Called with the number of a step after it; 0 is the reset."""
 
 ONLY_OF_POLICIES = ("torch", "stable-baselines3", "sb3-contrib")
-"""What policies depend on and episodes, whose actions are recorded, do not."""
+"""Packages that policies need, but recorded episodes, which contain the actions, do not."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,14 +51,14 @@ class Rollout:
     weighted_terms: NDArray[np.float64]
     """Shape (T, terms); they add up to the reward."""
     successes: NDArray[np.bool_] | None
-    """Whether the goal held after each step, shape (T,); None where the environment does not report it."""
+    """Whether the goal held after each step, shape (T,); None if the environment does not report it."""
     ended: bool
     """Whether the environment ended the episode, rather than the list of actions."""
     log: list[LogEntry]
     dt: float | None
-    """Time between two steps [s], where known."""
+    """Time between two steps [s]; None if unknown."""
     scene: Scene
-    """Empty if nothing was to be drawn."""
+    """Empty if the episode was played without `draw`."""
 
     @property
     def length(self) -> int:
@@ -67,7 +67,7 @@ class Rollout:
 
 
 def make_drawable(spec: EnvSpec, warn: Warn) -> Env:
-    """Build an environment that can be drawn; `warn` receives why there will be no pictures."""
+    """Build an environment that can be drawn; `warn` receives the reason if there are no pictures."""
     if registry.is_task(spec.constructor()):
         return spec.make()  # its bodies are drawn; pictures would be slow and show less
     try:
@@ -87,7 +87,7 @@ def _make_reader(env: Env, warn: Warn) -> SceneReader | MujocoReader | Camera:
 
 
 class _Step(NamedTuple):
-    # What an environment returned for an action; what it may go on writing into is copied.
+    # The values that an environment returned for an action; arrays are copied, as it may change them later.
     action: Any
     observation: Any
     reward: float
@@ -110,8 +110,8 @@ def play_episode(
 ) -> Rollout:
     """Play the episode of a seed and record it; `watch` is called after its reset and each of its steps.
 
-    With `draw` the rollout has a scene, and `draw` receives why parts of it are missing. Raises `TaskError`, with
-    seed and step, for whatever the environment raises.
+    With `draw` the rollout has a scene, and `draw` receives the reasons for missing parts. Raises `TaskError`, with
+    seed and step, for any exception of the environment.
     """
     about, space = describe(env), env.observation_space
     reader = _make_reader(env, draw) if draw is not None else None
@@ -150,13 +150,12 @@ def _read_step(action: Any, observation: Any, reward: float, info: dict[str, Any
         raise ValueError(f"reward is {reward}")
     names = list(about.reward_weights)
     raw, weighted = ([float(info[key][name]) for name in names] for key in ("metrics", "reward_terms"))
-    success = None if (given := info.get("is_success")) is None else bool(given)
+    success = None if info.get("is_success") is None else bool(info["is_success"])
     return _Step(np.array(action), observation, reward, raw, weighted, success, _find_events(info, about))
 
 
 def _find_events(info: dict[str, Any], about: EnvInfo) -> dict[str, dict[str, float]]:
-    found: dict[str, dict[str, float]] = info.get("events", {}) if about.events else {}
-    return found  # of a plain environment it may be anything
+    return info.get("events", {}) if about.events else {}  # may be anything in a plain environment
 
 
 def _make_episode(
@@ -183,7 +182,7 @@ def _stack_terms(rows: list[list[float]], about: EnvInfo) -> NDArray[np.float64]
 
 
 def _log_steps(steps: Iterable[_Step]) -> Iterator[LogEntry]:
-    """Yield what was drawn in each step, and where the goal was reached or lost."""
+    """Yield the events of each step, and the steps in which the goal was reached or lost."""
     held = False
     for number, step in enumerate(steps, start=1):
         yield from _log_events(number, step.events)
@@ -205,13 +204,13 @@ def _log_events(step: int, events: Mapping[str, Mapping[str, float]]) -> Iterato
 
 
 def frame_time(env: Env) -> float | None:
-    """Return the time between two steps [s], where an environment has it."""
+    """Return the time between two steps [s]; None if the environment does not give it."""
     fps = env.metadata.get("render_fps")
     return describe(env).control_dt or (1.0 / fps if fps else None)
 
 
 def recorded_actions(episode: RecordedEpisode, env: Env, path: Path | None = None) -> Choose:
-    """Return what chooses the actions of a recorded episode; raises `ArtifactError` if it cannot be reproduced."""
+    """Return a function that chooses the recorded actions; raises `ArtifactError` if they cannot be replayed."""
     acting = [name for name, acts in describe(env).events.items() if acts]
     if episode.info.format < 2 and acting:
         raise ArtifactError(
@@ -223,11 +222,12 @@ def recorded_actions(episode: RecordedEpisode, env: Env, path: Path | None = Non
 
 
 def check_actions(episode: RecordedEpisode, shape: tuple[int, ...], path: Path | None = None) -> None:
-    """Raise `ArtifactError` if the actions of an episode do not have the shape that its task has now."""
-    given = episode.actions.shape[1:]
-    if given != shape:
-        name = path or f"episode of {episode.info.spec.task}"
-        raise ArtifactError(f"{name}: its actions have shape {given}, those of {episode.info.spec.task} have {shape}")
+    """Raise `ArtifactError` if the shape of an episode's actions is not that of its task's actions."""
+    recorded = episode.actions.shape[1:]
+    if recorded != shape:
+        task = episode.info.spec.task
+        name = path or f"episode of {task}"
+        raise ArtifactError(f"{name}: its actions have shape {recorded}, but those of {task} have {shape}")
 
 
 def current_versions(task: str) -> dict[str, str]:
@@ -242,7 +242,7 @@ def _cast_action(action: Any, space: spaces.Space[Any]) -> Any:
 
 @contextlib.contextmanager
 def _locate_errors(task: str, seed: int, step: int) -> Iterator[None]:
-    """Add the task, the episode and the step to whatever an environment raises, `SystemExit` included."""
+    """Add the task, the episode and the step to any exception of an environment, `SystemExit` included."""
     try:
         yield
     except KeyboardInterrupt:

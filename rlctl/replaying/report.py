@@ -1,4 +1,4 @@
-"""What a replay prints."""
+"""The result of a replay, as text and JSON."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ class ReplayResult:
     episodes: list[ReplayedEpisode]
     verification: Verification | None = None
     policy_file: str = ""
-    """Where the policy is, and what it is; empty for a recorded episode."""
+    """Path and description of the policy; empty for a recorded episode."""
     choice: str = ""
-    """What the episodes are of many others, where they were chosen by outcome."""
+    """How the episodes were chosen by outcome; empty if they were not."""
     film: FilmReport | None = None
 
     def check(self) -> None:
@@ -84,7 +84,7 @@ def show(result: ReplayResult, json: str | None) -> None:
         return
     out = output.out()
     randomization = describe_randomization(result.episodes[0].events) if result.episodes else ""
-    parts = [each for each in (result.policy_file or result.policy, randomization) if each]
+    parts = [part for part in (result.policy_file or result.policy, randomization) if part]
     out.print(f"{result.task}: {', '.join(parts)}" if parts else result.task)
     if result.choice:
         out.print(result.choice)
@@ -113,7 +113,7 @@ def _show_verification(result: ReplayResult, verification: Verification) -> None
     verdict = "identical, bit for bit" if verification.difference is None else "not identical"
     out.print(f"{verification.episode}: {result.task}, {_line(episode)}: {verdict}")
     for name, (recorded, now) in verification.other_versions.items():
-        out.print(f"recorded with {name} {recorded}, here is {now or 'none'}")
+        out.print(f"recorded with {name} {recorded}, now {now or 'not installed'}")
 
 
 def open_command(result: ReplayResult) -> str | None:
@@ -123,7 +123,7 @@ def open_command(result: ReplayResult) -> str | None:
 
 
 def as_json(result: ReplayResult) -> dict[str, Any]:
-    """Return what is written as JSON."""
+    """Return the result as plain data for JSON."""
     content: dict[str, Any] = {
         "task": result.task,
         "policy": result.policy,

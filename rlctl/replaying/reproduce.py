@@ -1,4 +1,4 @@
-"""Reproduces recorded episodes: compares them with what was recorded, or writes them as `.rrd`."""
+"""Reproduces recorded episodes: compares them with the recorded values, or writes them as `.rrd`."""
 
 from __future__ import annotations
 
@@ -31,11 +31,10 @@ def print_warning(message: str) -> None:
 def record_episode(
     episode: RecordedEpisode, path: Path, *, title: str, warn: Warn = print_warning, several: bool = False
 ) -> Rollout:
-    """Replay the actions of an episode in a new environment and write what it looks like to `path`, an `.rrd`.
+    """Replay the actions of an episode in a new environment and write the recording to `path`, an `.rrd`.
 
-    `warn` receives how it differs from what was recorded; the file is written all the same. `several`: it is
-    opened together with others. Returns the new rollout.
-    Raises `TaskError` for an episode that failed, and fails again.
+    `warn` receives a difference from the recorded episode; the file is written nevertheless. `several`: it is opened
+    together with others. Returns the new rollout. Raises `TaskError` for an episode that failed, and fails again.
     """
     from rlctl.replaying.rrd import write_rrd
 
@@ -46,7 +45,7 @@ def record_episode(
         choose = recorded_actions(episode, env)
         rollout = play_episode(env, spec, info.seed, choose, policy=info.policy, draw=warn)
     if info.failure:
-        warn(f"warning: {title}: it failed when it was recorded ({info.failure}), and did not fail now")
+        warn(f"warning: {title}: it failed when it was recorded ({info.failure}), but did not fail now")
     elif difference := find_difference(episode, rollout):
         warn(f"warning: {title}: replayed, it differs from the recorded episode; {difference}")
     write_rrd(path, rollout, title=title, warn=warn, several=several)
@@ -54,9 +53,9 @@ def record_episode(
 
 
 def replay_failed(episode: RecordedEpisode) -> None:
-    """Replay the actions of an episode that failed, in a worker as in training: it may hang or end its process.
+    """Replay the actions of an episode that failed, in a worker: the episode may hang or end its process.
 
-    Raises the `TaskError` that it failed with if it fails again.
+    Raises `TaskError` if it fails again.
     """
     with Workers(episode.info.spec, 1) as workers:
         check_actions(episode, workers.info.spaces()[1].shape or ())
@@ -64,9 +63,9 @@ def replay_failed(episode: RecordedEpisode) -> None:
 
 
 def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Rollout, Verification]:
-    """Replay the actions of an episode in a new environment and compare every bit; `path` names it.
+    """Replay the actions of an episode in a new environment and compare every bit; errors mention `path`.
 
-    Raises `UsageError` for an episode of which only the actions are known, because it failed.
+    Raises `UsageError` for an episode that failed, because it contains only actions.
     """
     info, spec = episode.info, episode.info.spec
     if info.failure:

@@ -1,4 +1,4 @@
-"""Writes a rollout as a Rerun recording (`.rrd`), with the layout that the viewer opens it in."""
+"""Writes a rollout as a Rerun recording (`.rrd`), with the layout for the viewer."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from rlctl.run.episode import RecordedEpisode
 from rlctl.storage import files
 
 Followed = tuple[str, BodyMotion] | None
-"""What the camera follows: an entity, and the body that it is of."""
+"""What the camera follows: an entity, and its body."""
 
-_LEVEL_COLORS = {"INFO": 0x3D7DD8FF, "WARN": 0xC06A00FF, "DEBUG": 0x787878FF}  # read on white and on black
+_LEVEL_COLORS = {"INFO": 0x3D7DD8FF, "WARN": 0xC06A00FF, "DEBUG": 0x787878FF}  # readable on white and on black
 _EYE_DIRECTION = np.array([1.0, 0.75, 0.5])  # from the front left, looking down
 _GOAL_MARGIN = 2.5  # distance of the eye in distances of the goal; from 1.9 on it is in a view of 55 degrees
 _PLOT_ROWS = (("reward",), ("action",), ("joints", "observation"))  # by kind; those of a row are tabs
 
 
 def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn, several: bool = False) -> None:
-    """Write a recording, whole or not at all. Opens no port.
+    """Write a recording atomically. Opens no port.
 
     Rows are at the steps of the episode: 0 is the reset; the action, the reward and the state after it have the
-    same number. The same episode always has the same recording id. `warn` receives what cannot be drawn.
-    With `several` recordings to open together, the viewer shows their list.
+    same number. The same episode always has the same recording id. `warn` receives messages about what cannot be drawn.
+    If `several` recordings are opened together, the viewer shows a list of them.
     """
     info = rollout.episode.info
     stream = rr.RecordingStream(
@@ -48,7 +48,7 @@ def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn, several: 
 
     with stream:
         layout = _send(stream, rollout, title, warn, several)
-        # Into memory: where the disk is full, what writes files in Rerun can wait for ever.
+        # Into memory: Rerun's own file writer can hang if the disk is full.
         recording = stream.memory_recording()
         stream.send_blueprint(layout, make_active=False, make_default=True)
         content = recording.drain_as_bytes()
@@ -98,13 +98,13 @@ def _properties(rollout: Rollout) -> rr.AnyValues:
 
 def _send_log(rollout: Rollout, timelines: Timelines) -> None:
     log = rollout.log
-    # All three for every row: the viewer carries a missing level or colour over from another row.
+    # Every row has all three: the viewer takes a missing level or colour from another row.
     columns = rr.TextLog.columns(
-        text=[each.text for each in log],
-        level=[each.level for each in log],
-        color=np.array([_LEVEL_COLORS[each.level] for each in log], np.uint32),
+        text=[entry.text for entry in log],
+        level=[entry.level for entry in log],
+        color=np.array([_LEVEL_COLORS[entry.level] for entry in log], np.uint32),
     )
-    timelines.send("events", [each.step for each in log], columns)
+    timelines.send("events", [entry.step for entry in log], columns)
     if rollout.successes is None:
         return
     style = rr.StateConfiguration(values=["away", "at goal"], colors=[0x8090A0FF, 0x28C85AFF])
@@ -171,7 +171,7 @@ def _world(scene: Scene, followed: Followed) -> rrb.Spatial3DView:
     center, size = (low + high) / 2, float(np.linalg.norm(high - low))
     distances = [1.0, 1.15 * size]
     if body is not None:
-        # What is followed is in the middle of the picture: its feet are far below, and a goal is to one side.
+        # The followed body is in the middle of the picture: leave room for its feet below, and a goal to one side.
         goals = [float(np.linalg.norm(positions[0] - center)) for positions in scene.markers.values()]
         distances = [1.0, 1.5 * size, *(_GOAL_MARGIN * goal for goal in goals)]
     eye = center + max(distances) * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)

@@ -1,6 +1,6 @@
-"""What an episode looks like: the bodies of a PyBullet world, or camera pictures of any other environment.
+"""The scene of an episode: the bodies of a PyBullet world, or camera pictures of any other environment.
 
-Read after every step, drawn when the episode is over.
+It is read after every step and drawn when the episode has ended.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rlctl.task.env import TaskEnv
 Env = gymnasium.Env[Any, Any]
 Array = NDArray[np.float64]
 Warn = Callable[[str], None]
-"""Receives a message for the user: what cannot be drawn as it should be."""
+"""Receives a message for the user, about something that cannot be drawn correctly."""
 
 _GROUND_SIZE = 8.0  # [m]; a body without joints that is wider both ways is the ground
 _INERTIAL_POSE = slice(3, 5)  # of getDynamicsInfo: the centre of mass in the link frame
@@ -59,7 +59,7 @@ class BodyMotion:
     """Shape (T + 1, links, 4)."""
     shapes: list[Shape]
     trunk: int | None
-    """Index in `links` of what moves about: a free base, or what sliding joints without limits carry; else None."""
+    """Index in `links` of the link that travels: a free base, or one on a sliding joint without limits; else None."""
     box: tuple[Array, Array]
     """Lowest and highest corner [m] at the reset."""
 
@@ -80,7 +80,7 @@ class Scene:
 
 
 def find_bounds(bodies: Sequence[Body], markers: Sequence[Array] = ()) -> tuple[Array, Array]:
-    """Return the lowest and the highest corner [m] now of bodies that are not the ground, and of markers."""
+    """Return the lowest and highest corner [m] of the present world: its markers and bodies, without the ground."""
     corners = list(markers)
     for body in bodies:
         boxes = [
@@ -93,7 +93,7 @@ def find_bounds(bodies: Sequence[Body], markers: Sequence[Array] = ()) -> tuple[
 
 
 class SceneReader:
-    """Reads bodies and markers of a task's world; changes nothing."""
+    """Reads bodies and markers of a task's world, without changing it."""
 
     def __init__(self, env: TaskEnv) -> None:
         self._env = env
@@ -102,7 +102,7 @@ class SceneReader:
 
     def read(self, step: int) -> None:
         """Read the world after a step; 0 is the reset."""
-        if step == 0:  # only now: a reset may load the bodies anew
+        if step == 0:  # only now: a reset may load the bodies again
             self._bodies = [_BodyReader(body) for body in self._env.sim.bodies.values()]
             self._markers = {name: [] for name in self._marker_positions()}
         for reader in self._bodies:
@@ -156,7 +156,6 @@ class _BodyReader:
 
     def motion(self) -> BodyMotion:
         body = self.body
-        shapes = self._shapes()
         return BodyMotion(
             name=body.name,
             file=body.file,
@@ -168,7 +167,7 @@ class _BodyReader:
             links=self.links,
             positions=np.array([[pose[0] for pose in poses] for poses in self._poses], np.float64),
             orientations=np.array([[pose[1] for pose in poses] for poses in self._poses], np.float64),
-            shapes=shapes,
+            shapes=self._shapes(),
             trunk=self._trunk(),
             box=self._box,
         )
@@ -192,7 +191,7 @@ class _BodyReader:
         if self.body.file.suffix == ".xml":
             try:
                 return read_shapes(self.body.file)
-            except ValueError:  # PyBullet's reader accepts more; the user is warned that nothing is drawn
+            except ValueError:  # PyBullet's reader accepts more files; a warning says that nothing is drawn
                 return []
         kinds = {getattr(pybullet, f"GEOM_{kind.name}", -1): kind for kind in ShapeKind}
         shapes = []
@@ -205,7 +204,7 @@ class _BodyReader:
 
 
 class Camera:
-    """Takes pictures of an environment, of long episodes only every few steps; one that cannot draw is asked once."""
+    """Takes pictures of an environment, in long episodes only every few steps; stops after the first error."""
 
     def __init__(self, env: Env, warn: Warn) -> None:
         self._env = env
@@ -215,12 +214,12 @@ class Camera:
         self._every = 1
 
     def read(self, step: int) -> None:
-        """Take a picture after a step, if it is one to take."""
+        """Take a picture after every few steps."""
         if not self._works or step % self._every:
             return
         try:
             self._pictures.append((step, encode_jpeg(np.asarray(self._env.render()))))
-        except Exception as error:  # missing pygame, no OpenGL, no picture: the recording goes on without
+        except Exception as error:  # pygame or OpenGL is missing, or it returned no picture
             self._works = False
             no_render = isinstance(error, NotImplementedError)
             why = "the environment does not implement render" if no_render else describe_exception(error)

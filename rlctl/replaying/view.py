@@ -1,4 +1,4 @@
-"""What a camera sees of an environment, without a display: for films, and a few pictures of a recorded episode."""
+"""Camera pictures of an environment without a display: for films, and for pictures of a recorded episode."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ _CLOSEST, _FARTHEST = 0.8, 8.0  # [m]; the renderer draws nothing beyond 10 m
 
 
 def look_at(env: Env, width: int, height: int) -> _World | _Pictures:
-    """Return the view of an environment: a camera in a task's world, or the pictures that it makes itself.
+    """Return the view of an environment: a camera in a task's world, or the environment's own pictures.
 
-    Of a task, pictures have `width` and `height` [pixels].
+    Pictures of a task have `width` and `height` [pixels].
     """
     inner = env.unwrapped
     return _World(inner, width, height) if isinstance(inner, TaskEnv) else _Pictures(env)
 
 
 class _Pictures:
-    """The pictures that an environment makes itself."""
+    """The environment's own pictures."""
 
     def __init__(self, env: Env) -> None:
         self._env = env
 
     def begin(self) -> None:
-        """Look at an episode that begins."""
+        """Prepare for a new episode."""
 
     def draw(self) -> Picture:
         """Return a picture of the present state, shape (height, width, 3)."""
@@ -54,7 +54,7 @@ class _Pictures:
 
 
 class _World:
-    """A task's PyBullet world, seen by a camera that follows the first robot that moves about."""
+    """A task's PyBullet world, seen by a camera that follows the first robot that travels."""
 
     def __init__(self, env: TaskEnv, width: int, height: int) -> None:
         self._env = env
@@ -79,7 +79,9 @@ class _World:
     def draw(self) -> Picture:
         if self._followed is not None:
             body, trunk = self._followed
-            self._target[:2] = body.mass_state(trunk).position[:2]  # its height stays: a gait would shake the film
+            self._target[:2] = body.mass_state(trunk).position[
+                :2
+            ]  # the height is constant: a gait would shake the film
         self._env.move_markers()
         eye = self._target + self._offset
         return self._env.sim.render(
@@ -94,7 +96,7 @@ class PictureStrip:
     pictures: list[tuple[int, bytes]]
     """Step and JPEG file."""
     deepest_contact: float
-    """How far bodies overlapped at most [m]; 0 where they did not, or where there is no world of a task."""
+    """How far bodies overlapped at most [m]; 0 without overlap, or without a task's world."""
 
 
 def take_pictures(episode: RecordedEpisode, count: int) -> PictureStrip:

@@ -13,11 +13,11 @@ from rlctl.errors import TaskError, UsageError
 from rlctl.replaying.recorder import Choose, Rollout, Watch, frame_time, play_episode
 from rlctl.replaying.scene import Env
 
-_DT = 1 / 30  # [s] a step, where an environment does not say
+_DT = 1 / 30  # [s] per step, if an environment gives no time
 
 
 def open_window(spec: EnvSpec) -> Env:
-    """Build an environment that shows itself; raises `UsageError` where there is no display."""
+    """Build an environment with a window; raises `UsageError` without a display."""
     display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if sys.platform == "linux" and not display and not registry.is_task(spec.constructor()):
         raise UsageError("--gui: there is no display, DISPLAY is not set; leave out --gui to write a recording instead")
@@ -38,7 +38,7 @@ def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable
 
 
 def _wait(dt: float) -> Watch:
-    """Return what waits after each step, of `dt` [s], until the simulated time has passed on the clock."""
+    """Return a function that waits after each step of `dt` [s], so that the episode plays in real time."""
     start: list[float] = []
 
     def wait(step: int) -> None:

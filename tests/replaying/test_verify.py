@@ -162,8 +162,8 @@ def test_other_versions_are_named(replay, tampered, episode):
     path = tampered(info={"versions": {**episode.info.versions, "numpy": "1.0", "gone": "3", "torch": "1.0"}})
     done = replay("--verify", path)
     assert done.returncode == 0
-    assert f"recorded with numpy 1.0, here is {np.__version__}" in done.stdout
-    assert "recorded with gone 3, here is none" in done.stdout
+    assert f"recorded with numpy 1.0, now {np.__version__}" in done.stdout
+    assert "recorded with gone 3, now not installed" in done.stdout
     assert "torch" not in done.stdout  # the actions are recorded: no policy acts
 
 

@@ -71,7 +71,7 @@ def test_the_command_that_the_error_names(rlctl, tmp_path):
     mended = rlctl(*command, env={"MENDED": "1"})
     assert mended.returncode == 0, mended.stderr
     assert "it failed when it was recorded (task " in mended.stderr
-    assert "), and did not fail now" in mended.stderr
+    assert "), but did not fail now" in mended.stderr
 
 
 def test_it_is_of_the_stage_it_was_in(fail):
