@@ -36,7 +36,7 @@ class EvalOptions:
     seed: Annotated[int, Option("Seed of the list of episodes.", min=0)] = 0
     stage: Annotated[int | None, Option("Stage of the policy's curriculum.", min=1, default_text="the last")] = None
     """From 1."""
-    deterministic: Annotated[bool, Option("Sample actions instead of taking the mean.", (" /--stochastic",))] = True
+    deterministic: Annotated[bool, Option("Sample actions instead of taking the mean.", ("/--stochastic",))] = True
     n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1)] = None
     limits: Annotated[Path | None, Option("Compare with and without these safety limits (YAML).", metavar="FILE")] = (
         None

@@ -167,7 +167,7 @@ def not_built(task, root, settings):
     ("settings", "message"),
     [
         (["algo=sac", "algo_kwargs.buffer_size=1e12"], "algo_kwargs.buffer_size: 1000000000000 needs 40.0 TB of "),
-        (["algo_kwargs.n_steps=1e9"], "algo_kwargs.n_steps: 1000000000 needs 80.0 GB of memory, and "),
+        (["algo_kwargs.n_steps=1e9"], "algo_kwargs.n_steps: 1000000000 needs 80.0 GB of memory, but only "),
         (["algo=dqn"], "dqn cannot be used here: "),
         (["policy_kwargs.squash_output=true"], "ppo cannot be used here: squash_output=True is only available when"),
     ],

@@ -169,7 +169,9 @@ def test_other_versions_are_named(replay, tampered, episode):
 
 def test_actions_for_another_space(tampered, episode):
     path = tampered(actions=episode.actions[:, :3])
-    with pytest.raises(ArtifactError, match=r"000003\.npz: its actions have shape \(3,\), those of reach have \(7,\)"):
+    with pytest.raises(
+        ArtifactError, match=r"000003\.npz: its actions have shape \(3,\), but those of reach have \(7,\)"
+    ):
         verify_episode(load_episode(path), path)
 
 

@@ -60,7 +60,7 @@ def test_a_wide_terminal_has_folder_time_and_terms(display, tmp_path):
 
 def test_a_resumed_run_shows_its_earlier_curve(display, tmp_path):
     (tmp_path / "metrics.csv").write_text("steps,fps,return,success\n10,1,-2.0,0\n20,1,,\n30,1,4.0,1.0\n")
-    (tmp_path / "evals.csv").write_text("steps,success,return\n20,0.5,3.0\n30,0.25,9.0\n")
+    (tmp_path / "evals.csv").write_text("steps,success,return,episodes\n20,0.5,3.0,100\n30,0.25,9.0,100\n")
     display.run_folder(RunDirectory(tmp_path))
     drawn = draw(display, 80)
     assert "return  ▁█ 4.00" in drawn

@@ -91,5 +91,5 @@ def test_actions_for_another_space(fail):
     file = run.episode_file(0)
     episode = load_episode(file)
     save_episode(file, type(episode)(**{**vars(episode), "actions": episode.actions.repeat(2, axis=1)}))
-    with pytest.raises(ArtifactError, match=r"its actions have shape \(2,\), those of .* have \(1,\)"):
+    with pytest.raises(ArtifactError, match=r"its actions have shape \(2,\), but those of .* have \(1,\)"):
         run_replay(ReplayRequest(str(file)))
