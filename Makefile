@@ -1,7 +1,8 @@
 # `make demo` and `make test` do all set-up on a fresh machine, with Python 3.11 or with uv, which downloads it.
 PYTHON ?= $(shell python3.11 -c 'import sys; print(sys.executable)' 2> /dev/null)
-# `make demo TORCH=cuda` installs PyTorch with CUDA: some gigabytes more.
-TORCH ?= cpu
+# `make demo TORCH_INDEX=ADDRESS` takes PyTorch from the index that its installation page names for the CPU, which saves
+# gigabytes of CUDA where pip's default build has it.
+TORCH_INDEX ?=
 VENV ?= .venv
 BIN := $(VENV)/bin
 # Tests start hundreds of processes, which would each compile all modules where writing them compiled is turned off.
@@ -61,10 +62,9 @@ $(BIN)/python:
 	else \
 		echo "Python 3.11 is missing: install it, or uv (https://docs.astral.sh/uv), and run make again"; exit 1; \
 	fi
-	@echo "installing into $(VENV): about 2.4 GB, of which PyTorch ($(TORCH)) 0.8 GB and Rerun 0.5 GB"
-	@if [ "$(TORCH)" = cpu ]; then $(BIN)/pip install -q --no-deps --retries 1 --timeout 15 -c constraints.txt \
-		--index-url https://download.pytorch.org/whl/cpu torch || \
-		echo "PyTorch for the CPU was not found; pip takes its default, which may bring gigabytes of CUDA"; fi
+	@echo "installing into $(VENV): about 2.4 GB, of which PyTorch for the CPU 0.8 GB and Rerun 0.5 GB"
+	@if [ -n "$(TORCH_INDEX)" ]; then \
+		$(BIN)/pip install -q --no-deps -c constraints.txt --index-url "$(TORCH_INDEX)" torch; fi
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt -e .
