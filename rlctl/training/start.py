@@ -89,7 +89,9 @@ def find_start(request: TrainRequest) -> Start:
 def check_arguments(request: TrainRequest) -> None:
     """Raise `UsageError` for arguments that exclude each other, and for a device that cannot exist."""
     if (request.task is None) == (request.resume is None):
-        raise UsageError("TASK and --resume exclude each other: give a task to train, or a run to resume")
+        both = request.task is not None
+        problem = "TASK and --resume exclude each other" if both else "neither TASK nor --resume is given"
+        raise UsageError(f"{problem}: give a task to train, or a run to resume")
     if not _DEVICE.fullmatch(request.device):  # checked before slow imports
         raise UsageError(f"--device {request.device!r}: no such device; give cpu, cuda, cuda:1, or auto")
     if request.resume is not None:

@@ -113,7 +113,7 @@ def test_no_arguments_show_the_help(rlctl):
         ),
         (["train", "reech"], 2, "error: no task 'reech'. Did you mean 'reach'? Installed: "),
         (["train", ""], 2, "error: no task ''. Installed: "),
-        (["train"], 2, "error: TASK and --resume exclude each other: give a task to train, or a run to resume"),
+        (["train"], 2, "error: neither TASK nor --resume is given: give a task to train, or a run to resume"),
         (["train", "reach", "--algo", "pppo"], 2, "error: algo: expected ppo or a2c or "),
         (["train", "reach", "--set", "n_env=3"], 2, "error: no key 'n_env'. Did you mean 'n_envs'?"),
         (

@@ -37,9 +37,10 @@ def test_a_reward_weight_of_the_other_sign_is_warned_of(train, small_ppo, capsys
 
 
 def test_task_and_resume_exclude_each_other():
-    for request in (TrainRequest(check=False), TrainRequest("reach", resume="latest", check=False)):
-        with pytest.raises(UsageError, match="TASK and --resume exclude each other"):
-            run_training(request)
+    with pytest.raises(UsageError, match="TASK and --resume exclude each other"):
+        run_training(TrainRequest("reach", resume="latest", check=False))
+    with pytest.raises(UsageError, match="neither TASK nor --resume is given"):
+        run_training(TrainRequest(check=False))
 
 
 @pytest.mark.parametrize(
