@@ -1,4 +1,4 @@
-"""Networks that a user writes train, act, resume, and export as built-in ones do; what is wrong with them is said."""
+"""Networks that a user writes train, act, resume, and export as built-in ones do; mistakes in them are named."""
 
 import shutil
 from pathlib import Path
