@@ -1,10 +1,9 @@
-"""The header of a C policy: it documents each element of observation and action, in a comment and as arrays."""
+"""The elements of a C policy's observation and action: names, units and bounds, for comments and for arrays."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from collections.abc import Iterable
 from typing import Any
 
@@ -13,11 +12,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import SINGLE, split_space
-from rlctl.exporting.c_layers import write_array, write_number
-from rlctl.output import format_count
+from rlctl.exporting.c_layers import write_number
 from rlctl.policy.c_policy import action_type, observation_type
 from rlctl.policy.file import PolicyInfo
-from rlctl.version import __version__
 
 _NUMBERS = {"float32": "float", "float64": "double"}
 
@@ -63,10 +60,6 @@ class Layout:
         if joints and len(joints.names) == self.action_size:
             return [Element(name, 1) for name in joints.names]
         return [Element(f"action[{index}]", 1) for index in range(self.action_size)]
-
-    def list_state(self) -> list[str]:
-        """Return the fields of the state that hold earlier observations."""
-        return [f"{self.type} frames[{self.frames * self.size}]; /* oldest first */", "int begun;"]
 
     def describe_observation(self) -> list[str]:
         """Return a line per named part of the observation: its indices, name and unit."""
@@ -132,71 +125,3 @@ def _quote(text: str) -> str:
     """Return a text in UTF-8 as a C string literal."""
     plain = {*range(32, 127)} - set(b'"\\?')  # two question marks start a trigraph
     return '"' + "".join(chr(byte) if byte in plain else f"\\{byte:03o}" for byte in text.encode()) + '"'
-
-
-def write_data(layout: Layout) -> list[str]:
-    """Return the definitions of the header's arrays."""
-    return [
-        write_array(f"const {kind} {layout.name}_{array}", values) for kind, array, _, values in layout.list_arrays()
-    ]
-
-
-def write_header(layout: Layout, members: list[str], prototype: str) -> str:
-    """Return the header; `members` are the fields of the state, `prototype` declares the function that acts."""
-    name, info = layout.name, layout.info
-    upper, control_dt = name.upper(), info.env.control_dt
-    declarations = [_declare_data(layout), f"{prototype};"]
-    if members:
-        reset = f"/* Call this function when an episode begins. */\nvoid {name}_reset({name}_state *state);"
-        fields = "\n".join(f"    {member}" for member in members)
-        declarations[1:1] = [f"typedef struct {{\n{fields}\n}} {name}_state;", reset]
-    sizes = [
-        f"#define {upper}_OBSERVATION_SIZE {layout.size}",
-        f"#define {upper}_OBSERVATION_PARTS {len(layout.observed)} /* named parts */",
-        f"#define {upper}_ACTION_SIZE {layout.action_size}",
-    ]
-    if control_dt is not None:
-        sizes.append(f"#define {upper}_CONTROL_DT {control_dt!r} /* [s] */")
-    blocks = [
-        f"#ifndef {upper}_H\n#define {upper}_H",
-        "\n".join(sizes),
-        '#ifdef __cplusplus\nextern "C" {\n#endif',
-        *declarations,
-        "#ifdef __cplusplus\n}\n#endif",
-        "#endif",
-    ]
-    return "\n\n".join([write_comment(_describe(layout, bool(members))), *blocks]) + "\n"
-
-
-def _describe(layout: Layout, has_state: bool) -> list[str]:
-    name, info = layout.name, layout.info
-    stacked = f"; the function stacks the last {layout.frames} observations itself" if layout.frames > 1 else ""
-    return [
-        f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps. Written by rlctl "
-        f"{__version__}; do not edit.",
-        *([f"Robot: {info.env.robot}."] if info.env.robot else []),
-        *([f"Call {name}_act every {info.env.control_dt!r} s."] if info.env.control_dt is not None else []),
-        "",
-        f"observation, {layout.size} elements, not normalised: the function normalises it{stacked}",
-        *layout.describe_observation(),
-        f"action, {format_count(layout.action_size, 'element')}",
-        *layout.describe_action(),
-        "",
-        f"The function allocates no memory, and calls share no data{' except the state' if has_state else ''}.",
-        "A NaN in the observation gives NaN actions or an arbitrary choice: check sensor values first.",
-    ]
-
-
-def _declare_data(layout: Layout) -> str:
-    upper = layout.name.upper()
-    arrays = [
-        f"extern const {kind} {layout.name}_{array}[{upper}_{size}];" for kind, array, size, _ in layout.list_arrays()
-    ]
-    return "\n".join(['/* The same as arrays; an unknown unit is "", bounds may be infinite. */', *arrays])
-
-
-def write_comment(lines: list[str]) -> str:
-    """Return a C comment; names of a task cannot end it early."""
-    plain = [" ".join(line.split()) if line.lstrip() == line else line for line in lines]
-    safe = [re.sub(r"[\r\n\v\f\0]", " ", line).replace("*/", "* /").replace("/*", "/ *").rstrip("\\") for line in plain]
-    return "/* " + "\n".join(f" * {line}".rstrip() for line in safe)[3:] + "\n */"

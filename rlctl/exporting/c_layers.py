@@ -21,59 +21,6 @@ _ACTIVATIONS = {
     "elu": "elu({x})",
     "silu": "{x} * sigmoid({x})",
 }
-_FUNCTIONS = {
-    # expf is several times as fast as tanhf; the results differ by less than 2e-7.
-    "hyperbolic_tangent": "static float hyperbolic_tangent(float x)\n{\n"
-    "    return 1.0f - 2.0f / (expf(2.0f * x) + 1.0f);\n}\n",
-    "sigmoid": "static float sigmoid(float x)\n{\n    return 1.0f / (1.0f + expf(-x));\n}\n",
-    "relu": "static float relu(float x)\n{\n    return x < 0.0f ? 0.0f : x;\n}\n",
-    "elu": "static float elu(float x)\n{\n    return x < 0.0f ? expm1f(x) : x;\n}\n",
-    # These comparisons are false for NaN: the result is NaN, not a bound.
-    "bound": "static double bound(double x, double low, double high)\n{\n"
-    "    return x < low ? low : x > high ? high : x;\n}\n",
-    "find_largest": """static int find_largest(const float *values, int count)
-{
-    int largest = 0;
-    for (int i = 1; i < count; ++i) {
-        if (values[i] > values[largest]) {
-            largest = i;
-        }
-    }
-    return largest;
-}
-""",
-    # Weights are stored input by input: the sums of the inner loop are independent, so compilers use SIMD.
-    "apply_linear": """static void apply_linear(const float *restrict weight, const float *restrict input, int inputs,
-                         float *restrict output, int outputs)
-{
-    int i = 0;
-    for (; i + 4 <= inputs; i += 4) {
-        const float *row = weight + (long)i * outputs;
-        const float a = input[i], b = input[i + 1], c = input[i + 2], d = input[i + 3];
-        for (int j = 0; j < outputs; ++j) {
-            output[j] += (a * row[j] + b * row[outputs + j]) + (c * row[2 * outputs + j] + d * row[3 * outputs + j]);
-        }
-    }
-    for (; i < inputs; ++i) {
-        const float *row = weight + (long)i * outputs;
-        for (int j = 0; j < outputs; ++j) {
-            output[j] += input[i] * row[j];
-        }
-    }
-}
-""",
-    # The order of the gates is input, forget, cell, output.
-    "apply_gates": """static void apply_gates(const float *gates, int count, float *hidden, float *cell)
-{
-    for (int i = 0; i < count; ++i) {
-        const float remembered = sigmoid(gates[count + i]) * cell[i];
-        cell[i] = remembered + sigmoid(gates[i]) * hyperbolic_tangent(gates[2 * count + i]);
-        hidden[i] = sigmoid(gates[3 * count + i]) * hyperbolic_tangent(cell[i]);
-    }
-}
-""",
-}
-"""C functions; a source file has those that it calls, in this order."""
 
 
 class CWriter:
@@ -85,12 +32,10 @@ class CWriter:
         """Definitions of the arrays that the statements use."""
         self._numbers: Counter[str] = Counter()
 
-    def find_functions(self) -> list[str]:
-        """Return the definitions of the functions that the statements call."""
-        text = "\n".join(self.statements)
-        if "apply_gates(" in text:
-            text += "sigmoid(hyperbolic_tangent("
-        return [function for name, function in _FUNCTIONS.items() if re.search(rf"\b{name}\(", text)]
+    def find_functions(self) -> set[str]:
+        """Return the names of the functions that the statements call."""
+        called = set(re.findall(r"\b(\w+)\(", "\n".join(self.statements)))
+        return called | {"sigmoid", "hyperbolic_tangent"} if "apply_gates" in called else called
 
     def loop(self, count: int, statement: str) -> None:
         """Add a loop of one statement over `i` below `count`."""

@@ -9,17 +9,19 @@ import shlex
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 from gymnasium import spaces
 
 from rlctl.errors import AnswerIsNo, UsageError, short_repr
-from rlctl.exporting.c_header import Layout, write_comment, write_data, write_header
-from rlctl.exporting.c_layers import CWriter
+from rlctl.exporting.c_header import Layout
+from rlctl.exporting.c_layers import CWriter, write_array
 from rlctl.policy import own_modules
 from rlctl.policy.c_policy import LIBRARY_SUFFIX
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.layers import ScaleImage
 from rlctl.policy.network import Network
+from rlctl.version import __version__
 
 LARGEST = 3_000_000
 """Most weights in a C file: about 40 MB of text, for which a compiler needs a minute."""
@@ -37,34 +39,8 @@ class CSource:
     source: str
     prototype: str
     """Declaration of the function that acts."""
-    has_state: bool
-
-    @property
-    def harness(self) -> str:
-        """Return C functions with the same names for every policy, for calls through ctypes."""
-        state = f"({self.name}_state *)state, " if self.has_state else ""
-        size = f"sizeof({self.name}_state)" if self.has_state else "0"
-        return f"""#include <stddef.h>
-#include "{self.name}.h"
-
-size_t rlctl_state_size(void)
-{{
-    return {size};
-}}
-
-void rlctl_act(const void *observation, void *state, void *action)
-{{
-    (void)state;
-    {self.name}_act(observation, {state}action);
-}}
-
-void rlctl_repeat(const void *observation, void *state, void *action, long count)
-{{
-    for (long i = 0; i < count; ++i) {{
-        rlctl_act(observation, state, action);
-    }}
-}}
-"""
+    harness: str
+    """C functions with the same names for every policy, for calls through ctypes."""
 
 
 def write_c(policy: PolicyFile, file_name: str) -> CSource:
@@ -90,56 +66,52 @@ def write_c(policy: PolicyFile, file_name: str) -> CSource:
     if isinstance(layout.action_space, spaces.Box) and layout.action_space.dtype.kind != "f":
         raise UsageError(f"export --c: an action of type {layout.action_space.dtype} cannot be written as C")
     writer = CWriter()
-    writer.statements += _stack_frames(layout)
     value, size = writer.write(network, layout.sizes, "state->frames" if layout.frames > 1 else "observation")
     writer.write_action(network, value, size, layout.action_space, layout.action_type)
-    members = layout.list_state() if layout.frames > 1 else []
+    state = []
+    if layout.frames > 1:
+        state += [f"{layout.type} frames[{layout.frames * layout.size}]; /* oldest first */", "int begun;"]
     if network.lstm is not None:
-        members += [f"float {member}[{network.lstm.state[0].size}];" for member in ("hidden", "cell")]
-    state_argument = f"{name}_state *state, " if members else ""
-    prototype = f"void {name}_act(const {layout.type} *observation, {state_argument}{layout.action_type} *action)"
-    header = write_header(layout, members, prototype)
-    source = _write_source(layout, writer, prototype)
-    return CSource(name, header, source, prototype, bool(members))
+        state += [f"float {member}[{network.lstm.state[0].size}];" for member in ("hidden", "cell")]
+    state_argument = f"{name}_state *state, " if state else ""
+    values: dict[str, Any] = {
+        "name": name,
+        "upper": name.upper(),
+        "version": __version__,
+        "info": policy.info,
+        "layout": layout,
+        "arrays": layout.list_arrays(),
+        "state": state,
+        "prototype": f"void {name}_act(const {layout.type} *observation, {state_argument}{layout.action_type} *action)",
+        "constants": writer.constants,
+        "functions": writer.find_functions(),
+        "statements": writer.statements,
+    }
+    header, source, harness = (_render(file, values) for file in ("policy.h", "policy.c", "harness.c"))
+    return CSource(name, header, source, values["prototype"], harness)
+
+
+def _render(file: str, values: dict[str, Any]) -> str:
+    import jinja2
+
+    environment = jinja2.Environment(
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters["comment"] = _write_comment
+    environment.globals["write_array"] = write_array
+    return environment.from_string(Path(__file__).with_name(f"{file}.jinja").read_text(encoding="utf-8")).render(values)
+
+
+def _write_comment(text: str) -> str:
+    """Return a C comment; names of a task cannot end it early."""
+    plain = [" ".join(line.split()) if line.lstrip() == line else line for line in text.strip().split("\n")]
+    safe = [re.sub(r"[\r\v\f\0]", " ", line).replace("*/", "* /").replace("/*", "/ *").rstrip("\\") for line in plain]
+    return "/* " + "\n".join(f" * {line}".rstrip() for line in safe)[3:] + "\n */"
 
 
 def _make_identifier(text: str) -> str:
     plain = re.sub(r"\W", "_", text, flags=re.ASCII)
     return plain if re.match(r"[A-Za-z]", plain) else f"policy{plain if plain.startswith('_') else f'_{plain}'}"
-
-
-def _write_source(layout: Layout, writer: CWriter, prototype: str) -> str:
-    name, info = layout.name, layout.info
-    reset = f"""void {name}_reset({name}_state *state)
-{{
-    static const {name}_state zeros;
-    *state = zeros;
-}}
-
-"""
-    body = "\n".join(f"    {line}" for line in writer.statements)
-    parts = [
-        f"{write_comment([f'{info.algo} policy for {info.spec.task}; see the header.'])}\n",
-        f'#include <math.h>\n\n#include "{name}.h"\n',
-        *write_data(layout),
-        *writer.constants,
-        *writer.find_functions(),
-        f"{reset if '*state' in prototype else ''}{prototype}\n{{\n{body}\n}}\n",
-    ]
-    return "\n".join(parts)
-
-
-def _stack_frames(layout: Layout) -> list[str]:
-    if layout.frames == 1:
-        return []
-    size, total = layout.size, layout.frames * layout.size
-    return [
-        f"for (int i = 0; i < {total}; ++i) {{ /* the first observation of an episode is copied into all frames */",
-        f"    const int older = state->begun && i < {total - size};",
-        f"    state->frames[i] = older ? state->frames[i + {size}] : observation[i % {size}];",
-        "}",
-        "state->begun = 1;",
-    ]
 
 
 def find_compiler() -> list[str] | None:
