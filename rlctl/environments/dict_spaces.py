@@ -1,7 +1,5 @@
 """Split spaces and observations into parts by key. A Dict space has a part per key, any other space one part."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -9,14 +7,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-Observations = NDArray[Any] | dict[str, NDArray[Any]]
-"""A batch of observations; a row per environment or per step."""
+Observations = NDArray[Any] | dict[str, NDArray[Any]]  # a batch of observations; a row per environment or per step
 
 LARGEST_SPACE = 10_000_000
 """Maximum number of elements of an observation or action space; a full-HD picture has 6 million."""
 
-SINGLE = ""
-"""The key of the only part of a space that is not a Dict."""
+SINGLE = ""  # the key of the only part of a space that is not a Dict
 
 
 def split_space(space: spaces.Space[Any]) -> dict[str, spaces.Space[Any]]:

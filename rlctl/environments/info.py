@@ -15,8 +15,7 @@ from rlctl.environments.dict_spaces import LARGEST_SPACE, format_space
 from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.task.joints import Joints
 
-_ONE_HOT = 10
-"""Each value of a discrete space counts as this many elements of a Box."""
+_ONE_HOT = 10  # each value of a discrete space counts as this many elements of a Box
 
 
 class EnvInfo(pydantic.BaseModel):
@@ -28,18 +27,14 @@ class EnvInfo(pydantic.BaseModel):
     """Size per observation name, in the order of the flat observation; empty if the names are unknown."""
     observation_units: dict[str, str] = {}
     action_meaning: str = ""
-    control_dt: float | None = None
-    """Time between two actions [s]."""
+    control_dt: float | None = None  # time between two actions [s]
     reward_weights: dict[str, float] = {}
-    events: dict[str, bool] = {}
-    """The task's events (random changes), and whether each acts."""
+    events: dict[str, bool] = {}  # the task's events (random changes), and whether each acts
     has_success: bool = False
-    has_compute_reward: bool = False
-    """Whether it has `compute_reward`, which hindsight replay needs."""
+    has_compute_reward: bool = False  # whether it has `compute_reward`, which hindsight replay needs
     max_steps: int | None = None
     robot: str = ""
-    joints: Joints | None = None
-    """The joints that the action moves, if the task describes them."""
+    joints: Joints | None = None  # the joints that the action moves, if the task describes them
 
     def spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
         """Return the observation and the action space."""

@@ -1,7 +1,5 @@
 """Installed tasks: the entry points of the group `rlctl.tasks` in all distributions. Imports no plugin."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import importlib.metadata
@@ -27,12 +25,10 @@ class TaskEntry:
     """An installed task, as its distribution declares it; its code is not imported."""
 
     name: str
-    target: str
-    """`package.module:Class`."""
+    target: str  # `package.module:Class`
     distribution: str
     version: str
-    problem: str | None = None
-    """Why the task cannot be used by its name; None if it can."""
+    problem: str | None = None  # why the task cannot be used by its name; None if it can
 
     @property
     def module_file(self) -> Path | None:

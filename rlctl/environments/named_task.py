@@ -5,8 +5,6 @@ file may come from somebody else, so other functions, scripts and classes are re
 name anything.
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re

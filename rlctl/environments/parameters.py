@@ -1,7 +1,5 @@
 """The parameters of a task's or an environment's constructor, and checks of their values."""
 
-from __future__ import annotations
-
 import inspect
 import math
 from collections.abc import Mapping

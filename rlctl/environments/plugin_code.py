@@ -1,7 +1,5 @@
 """Imports and calls the code of plugins. Any exception from it becomes an error of one line."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.util

@@ -4,8 +4,6 @@ A task is written as an installed name (`reach`), `package.module:Class`, `path/
 (`Pendulum-v1`, `package:Env-v0`).
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import os

@@ -29,22 +29,16 @@ class EnvSpec:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}  # in the models that embed it
 
-    task: str
-    """As the user wrote it; see `rlctl.environments.registry`."""
+    task: str  # as the user wrote it; see `rlctl.environments.registry`
     parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Keyword arguments of the task's constructor."""
-    reward_weights: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Weights that differ from the task's."""
-    randomize: bool = False
-    """Whether all events of the task act."""
+    reward_weights: Mapping[str, float] = dataclasses.field(default_factory=dict)  # weights that differ from the task's
+    randomize: bool = False  # whether all events of the task act
     events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     """Events that act, with the parameters that differ from the task's."""
-    frame_stack: Annotated[int, Ge(1)] = 1
-    """Number of latest observations that are stacked into one."""
-    time_feature: bool = False
-    """Whether the fraction of the episode that is left is observed."""
-    stage: Annotated[int, Ge(0)] = 0
-    """Stage of the curriculum, from 1; 0 without a curriculum."""
+    frame_stack: Annotated[int, Ge(1)] = 1  # number of latest observations that are stacked into one
+    time_feature: bool = False  # whether the fraction of the episode that is left is observed
+    stage: Annotated[int, Ge(0)] = 0  # stage of the curriculum, from 1; 0 without a curriculum
     level: Annotated[float, Ge(0), Le(1)] = 1.0
     """How far ranges written `{from: ..., to: ...}` have widened, from 0 (`from`) to 1 (`to`)."""
     sim: str = "pybullet"

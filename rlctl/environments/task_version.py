@@ -1,7 +1,5 @@
 """The version of a task: that of its distribution, and the sha256 of its source."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Wrappers around an environment: time left as an observation, stacked frames, and time limits found in them."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -14,8 +12,7 @@ from rlctl.environments.dict_spaces import LARGEST_SPACE
 from rlctl.errors import RecipeError
 from rlctl.task.env import TaskEnv
 
-NAME = "time_left"
-"""Name of the added observation."""
+NAME = "time_left"  # name of the added observation
 _KEY = "observation"  # the entry of a Dict space to which it is appended
 
 

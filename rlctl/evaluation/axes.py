@@ -1,7 +1,5 @@
 """The axes of `--vary`: an event or a parameter of a task, and its values."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import typing
@@ -26,8 +24,7 @@ _WIDER = 2.0  # width of an axis of `--vary all`, relative to the event's range
 _FORM = "write NAME=LOWEST:HIGHEST:VALUES, for example --vary mass=0.6:1.4:9"
 
 
-SIM = "sim"
-"""The setting of the axis whose values are MuJoCo's contacts."""
+SIM = "sim"  # the setting of the axis whose values are MuJoCo's contacts
 _SOLREFS = [0.02, 0.01, 0.005]  # [s], from MuJoCo's default to contacts about as stiff as PyBullet's
 
 

@@ -21,10 +21,8 @@ class Spread:
     """How a quantity is distributed over episodes."""
 
     mean: float
-    iqm: float
-    """Interquartile mean: the mean of the middle half, which outliers do not change."""
-    std: float
-    """Sample standard deviation; 0 for one episode."""
+    iqm: float  # interquartile mean: the mean of the middle half, which outliers do not change
+    std: float  # sample standard deviation; 0 for one episode
     min: float
     max: float
 

@@ -36,13 +36,10 @@ from rlctl.rollout.workers import Workers, available_cores
 class Evaluation:
     """The numbers of an evaluation."""
 
-    name: str
-    """The policy's file, or the baseline."""
-    policy: PolicyInfo | None
-    """None for a baseline."""
+    name: str  # the policy's file, or the baseline
+    policy: PolicyInfo | None  # None for a baseline
     spec: EnvSpec
-    events: dict[str, bool]
-    """Whether each event of the task was active."""
+    events: dict[str, bool]  # whether each event of the task was active
     seed: int
     deterministic: bool
     played: list[Episode]
@@ -50,15 +47,12 @@ class Evaluation:
     success_interval: tuple[float, float] | None
     returns: Spread
     lengths: Spread
-    terms: dict[str, float]
-    """Mean over episodes of each weighted term's sum."""
-    metrics: dict[str, float]
-    """Mean per step of each reward term of weight 0, as the task returned it."""
+    terms: dict[str, float]  # mean over episodes of each weighted term's sum
+    metrics: dict[str, float]  # mean per step of each reward term of weight 0, as the task returned it
     final_distance: Spread | None
     max_steps: int | None
     limited_by: Path | None = None
-    unlimited: Evaluation | None = None
-    """The same episodes without limits."""
+    unlimited: Evaluation | None = None  # the same episodes without limits
     action_change: float | None = None
     """Mean of |action - previous action|, over elements and steps; None if it was not measured."""
 

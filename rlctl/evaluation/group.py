@@ -1,7 +1,5 @@
 """The best policies of a group of seeds, evaluated: a score per seed, and how much seeds differ."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -25,11 +23,9 @@ class SeedScore:
     run: str = ""
     algo: str = ""
     steps: int | None = None
-    seconds: float | None = None
-    """Spent training [s]."""
+    seconds: float | None = None  # spent training [s]
     score: MeasuredScore | None = None
-    problem: str = ""
-    """Why there is no score."""
+    problem: str = ""  # why there is no score
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """The players of an evaluation, and the environment that each plays in."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,8 +22,7 @@ class LoadedPolicy:
 
     path: Path
     info: PolicyInfo
-    policy: PolicyFile | None
-    """None for an exported file, which the workers load themselves."""
+    policy: PolicyFile | None  # None for an exported file, which the workers load themselves
 
     @property
     def name(self) -> str:

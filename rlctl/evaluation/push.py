@@ -1,7 +1,5 @@
 """`rlctl eval --push`: the smallest horizontal push at mid-episode at which a policy fails."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -30,13 +28,10 @@ class PushedBody:
 
     body: str
     link: str | None
-    mass: float
-    """Of the whole body [kg]."""
+    mass: float  # of the whole body [kg]
     duration_s: float
-    max_steps: int
-    """Of an episode."""
-    every_s: float
-    """More than half an episode [s], so that an interval event acts once, in its middle."""
+    max_steps: int  # of an episode
+    every_s: float  # more than half an episode [s], so that an interval event acts once, in its middle
 
     def parameters(self, impulse: float) -> dict[str, object]:
         """Return the parameters of the event `push`, in a direction that follows from the episode's seed."""

@@ -1,7 +1,5 @@
 """`rlctl serve --self-test`: does a policy score the same in simulation with and without its server?"""
 
-from __future__ import annotations
-
 import asyncio
 import dataclasses
 import os
@@ -31,12 +29,9 @@ class SelfTest:
     round_trip_p50_s: float
     round_trip_p99_s: float
     requests: int
-    misses: int
-    """Answers that took longer than `control_dt`."""
-    not_running: int
-    """Answers of a server that held or stopped."""
-    load: float
-    """Load average of the last minute, which includes the test."""
+    misses: int  # answers that took longer than `control_dt`
+    not_running: int  # answers of a server that held or stopped
+    load: float  # load average of the last minute, which includes the test
 
     def list_problems(self) -> list[str]:
         """Return why the self-test fails; empty if it passes."""

@@ -1,7 +1,5 @@
 """`rlctl eval --vary` and `--push`: how robust a policy is, with the same episodes in every cell."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import itertools
@@ -31,8 +29,7 @@ from rlctl.run import robustness
 from rlctl.run.robustness import Axis, Cell, Robustness, RobustnessMap
 from rlctl.version import collect_versions
 
-ASK_ABOVE_S = 600.0
-"""rlctl asks before it starts a measurement that takes longer than this [s]."""
+ASK_ABOVE_S = 600.0  # rlctl asks before it starts a measurement that takes longer than this [s]
 
 
 def measure_robustness(

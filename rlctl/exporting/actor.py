@@ -1,7 +1,5 @@
 """Writes a policy as one ONNX graph, from raw observations to actions of the environment's action space."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The elements of a C policy's observation and action: names, units and bounds, for comments and for arrays."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterable
@@ -25,8 +23,7 @@ class Element:
 
     name: str
     size: int
-    unit: str = ""
-    """Empty if unknown."""
+    unit: str = ""  # empty if unknown
 
 
 class Layout:

@@ -1,7 +1,5 @@
 """Writes the layers of a network as statements of a C function for one observation."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -28,8 +26,7 @@ class CWriter:
 
     def __init__(self) -> None:
         self.statements: list[str] = []
-        self.constants: list[str] = []
-        """Definitions of the arrays that the statements use."""
+        self.constants: list[str] = []  # definitions of the arrays that the statements use
         self._numbers: Counter[str] = Counter()
 
     def find_functions(self) -> set[str]:

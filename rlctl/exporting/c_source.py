@@ -1,7 +1,5 @@
 """A policy as C99: a header and a source file without dependencies."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import re
@@ -23,8 +21,7 @@ from rlctl.policy.layers import ScaleImage
 from rlctl.policy.network import Network
 from rlctl.version import __version__
 
-LARGEST = 3_000_000
-"""Most weights in a C file: about 40 MB of text, for which a compiler needs a minute."""
+LARGEST = 3_000_000  # most weights in a C file: about 40 MB of text, for which a compiler needs a minute
 FLAGS = ("-std=c99", "-O3", "-Wall", "-Wextra", "-pedantic")
 _TIMEOUT_S = 300.0  # of a compiler
 
@@ -33,14 +30,11 @@ _TIMEOUT_S = 300.0  # of a compiler
 class CSource:
     """The content of a C header and its source file."""
 
-    name: str
-    """Prefix of all names in the header."""
+    name: str  # prefix of all names in the header
     header: str
     source: str
-    prototype: str
-    """Declaration of the function that acts."""
-    harness: str
-    """C functions with the same names for every policy, for calls through ctypes."""
+    prototype: str  # declaration of the function that acts
+    harness: str  # C functions with the same names for every policy, for calls through ctypes
 
 
 def write_c(policy: PolicyFile, file_name: str) -> CSource:

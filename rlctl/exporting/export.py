@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from rlctl.exporting.c_source import CSource
     from rlctl.policy.torch_policy import TorchPolicy
 
-C_OBSERVATIONS = 2000
-"""Number of observations on which a C function is compared."""
+C_OBSERVATIONS = 2000  # number of observations on which a C function is compared
 
 
 def export_policy(request: ExportRequest) -> list[ExportReport]:

@@ -1,7 +1,5 @@
 """Builds an ONNX graph node by node, from layers with their present weights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -27,12 +25,9 @@ from rlctl.policy.layers import (
 )
 from rlctl.version import __version__
 
-OPSET = 17
-"""onnxruntime 1.12 and newer read it."""
-IR_VERSION = 8
-"""The version of this opset; the onnx package would write its newest one, which older runtimes refuse."""
-BATCH = "batch"
-"""Name of the dynamic dimension."""
+OPSET = 17  # onnxruntime 1.12 and newer read it
+IR_VERSION = 8  # the version of this opset; the onnx package would write its newest one, which older runtimes refuse
+BATCH = "batch"  # name of the dynamic dimension
 
 
 class Graph:

@@ -1,7 +1,5 @@
 """`rlctl export RUN --policy FILE`: the actor only, with its origin and its scores."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -29,8 +27,7 @@ class PolicyFileReport:
     path: Path
     info: PolicyInfo
     provenance: Provenance
-    size: int
-    """[bytes]"""
+    size: int  # [bytes]
 
 
 def export_actor(request: ExportRequest) -> PolicyFileReport:

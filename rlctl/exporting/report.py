@@ -1,7 +1,5 @@
 """The report of an export: the file, its inputs and outputs, and how it was verified."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,21 +18,15 @@ class ExportReport:
     task: str
     algo: str
     training_steps: int
-    size: int
-    """[bytes]"""
-    written: str
-    """Text on the written files."""
-    interface: list[tuple[str, str]]
-    """Inputs and outputs: pairs of a word and a text."""
-    next: str
-    """A command to continue with."""
-    details: Mapping[str, Any]
-    """JSON entries that only this format has."""
+    size: int  # [bytes]
+    written: str  # text on the written files
+    interface: list[tuple[str, str]]  # inputs and outputs: pairs of a word and a text
+    next: str  # a command to continue with
+    details: Mapping[str, Any]  # JSON entries that only this format has
     agreement: Agreement | None = None
     closed_loop: ClosedLoop | None = None
     latency: Latency | None = None
-    not_verified: str = ""
-    """Why it was not verified; empty if it was."""
+    not_verified: str = ""  # why it was not verified; empty if it was
 
     def as_json(self) -> dict[str, Any]:
         """Return the report as plain data."""

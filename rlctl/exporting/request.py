@@ -1,7 +1,5 @@
 """The request of an export."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Literal
@@ -15,16 +13,13 @@ Format = Literal["onnx", "c"]
 class ExportRequest:
     """What to export and where to; raises `UsageError` for a file name with a wrong suffix."""
 
-    run: str | None
-    """A run, a policy file, a task, or None for the latest run."""
+    run: str | None  # a run, a policy file, a task, or None for the latest run
     formats: tuple[Format, ...] = ("onnx",)
     checkpoint: str = "best"
     output: Path | None = None
     """Default: in the run's folder, next to a policy file without a run, or in this folder for a shipped policy."""
-    policy: Path | None = None
-    """Write the actor with its measured score to this file instead, as plugins ship it."""
-    episodes: int = 100
-    """Episodes of that measurement."""
+    policy: Path | None = None  # write the actor with its measured score to this file instead, as plugins ship it
+    episodes: int = 100  # episodes of that measurement
 
     def __post_init__(self) -> None:
         if self.policy is not None and self.policy.suffix != ".safetensors":

@@ -26,13 +26,10 @@ from rlctl.rollout.workers import Workers
 if TYPE_CHECKING:
     from rlctl.policy.torch_policy import TorchPolicy
 
-MAX_DIFFERENCE = 1e-5
-"""Limit of |difference| of an action element; relative for elements larger than 1."""
-MAX_RETURN_DIFFERENCE = 1e-3
-"""Limit of the relative difference of an episode's return."""
+MAX_DIFFERENCE = 1e-5  # limit of |difference| of an action element; relative for elements larger than 1
+MAX_RETURN_DIFFERENCE = 1e-3  # limit of the relative difference of an episode's return
 MIN_OBSERVATIONS = 1000
-EPISODES = 20
-"""Episodes that each of the two policies plays in closed loop."""
+EPISODES = 20  # episodes that each of the two policies plays in closed loop
 _LAST_BITS = 2.0**-21
 """Relative change: the last three bits of a float32, about the effect of another order of additions in a network."""
 _REPETITIONS = 300
@@ -45,10 +42,8 @@ class Agreement:
     """Differences of two policies on the same observations."""
 
     observations: int = 0
-    max_difference: float = 0.0
-    """Largest |difference| of an action element, in the units of the action."""
-    beyond_limit: int = 0
-    """Number of actions that differ by more than the limit; discrete actions that differ at all."""
+    max_difference: float = 0.0  # largest |difference| of an action element, in the units of the action
+    beyond_limit: int = 0  # number of actions that differ by more than the limit; discrete actions that differ at all
     near_ties: int = 0
     """Number of different discrete actions whose logits are equal within the limit: both choices are right."""
     batch_sizes: list[int] = dataclasses.field(default_factory=lambda: [1])
@@ -119,12 +114,9 @@ class ClosedLoop:
     """Comparison of the same episodes, played with both policies."""
 
     episodes: int
-    same_success: int | None
-    """Number of episodes with the same success; None if the task reports no success."""
-    same_length: int
-    """Number of episodes with the same length."""
-    max_return_difference: float
-    """Relative to |return| of the episode or the mean |return|, whichever is larger."""
+    same_success: int | None  # number of episodes with the same success; None if the task reports no success
+    same_length: int  # number of episodes with the same length
+    max_return_difference: float  # relative to |return| of the episode or the mean |return|, whichever is larger
     mean_return: float
     mean_return_exported: float
     magnified: bool = False
@@ -143,8 +135,7 @@ class Latency:
 
     exported_us: float
     """Normalisation, network and bounds: an ONNX file in onnxruntime, called from Python; C without Python."""
-    sb3_us: float
-    """SB3's `policy.predict` of a normalised observation."""
+    sb3_us: float  # SB3's `policy.predict` of a normalised observation
 
     @property
     def speedup(self) -> float:

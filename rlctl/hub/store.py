@@ -4,8 +4,6 @@ A pushed folder has a manifest, `rlctl.json`, with the size and SHA-256 of each 
 types of rlctl are downloaded, and each file is checked before it enters the cache.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import importlib
@@ -34,8 +32,7 @@ _CHUNK = 2**20  # [bytes]
 class StoredFile(pydantic.BaseModel, extra="forbid"):
     """A file of a manifest."""
 
-    size: int = pydantic.Field(ge=0, le=_MAX_SIZE)
-    """[bytes]"""
+    size: int = pydantic.Field(ge=0, le=_MAX_SIZE)  # [bytes]
     sha256: str = pydantic.Field(pattern="^[0-9a-f]{64}$")
 
 

@@ -1,7 +1,5 @@
 """`rlctl runs import`: write a model of Stable-Baselines3 or rl-zoo3 as a policy file."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from pathlib import Path

@@ -4,8 +4,6 @@ A pickle is a program for a stack machine. This machine has the same stack and m
 calls something, the value is a description of that import or call.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import pickletools
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Reads files of Stable-Baselines3 and rl-zoo3, model.zip and vecnormalize.pkl, without unpickling them."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import dataclasses
@@ -23,8 +21,7 @@ from rlctl.importing import pickle_data
 from rlctl.importing.pickle_data import Call, Name, NotPlainData, Persistent, read_array, read_dtype, read_plain
 from rlctl.storage import untrusted
 
-LARGEST_MEMBER = 500_000_000
-"""Limit of the unpacked size of a member of the archive [bytes]."""
+LARGEST_MEMBER = 500_000_000  # limit of the unpacked size of a member of the archive [bytes]
 
 _POLICIES = {
     "stable_baselines3.sac": "sac",
@@ -51,16 +48,12 @@ class SavedModel:
     """A model of Stable-Baselines3 or sb3-contrib."""
 
     algo: str
-    observation_space: spaces.Space[Any]
-    """The network's: images have the channels first."""
+    observation_space: spaces.Space[Any]  # the network's: images have the channels first
     action_space: spaces.Space[Any]
-    policy_kwargs: dict[str, Any]
-    """Plain data; `activation_fn` has its name in recipes."""
-    tensors: dict[str, NDArray[Any]]
-    """The tensors of the policy, with the names of SB3's `state_dict`."""
+    policy_kwargs: dict[str, Any]  # plain data; `activation_fn` has its name in recipes
+    tensors: dict[str, NDArray[Any]]  # the tensors of the policy, with the names of SB3's `state_dict`
     training_steps: int
-    version: str
-    """The version of Stable-Baselines3; empty if unknown."""
+    version: str  # the version of Stable-Baselines3; empty if unknown
 
 
 @dataclasses.dataclass(frozen=True)

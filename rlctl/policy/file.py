@@ -26,12 +26,9 @@ from rlctl.storage import files, untrusted
 FORMAT = 1
 
 SQUASHED_GAUSSIAN = ("sac", "tqc", "crossq")
-DETERMINISTIC = ("td3", "ddpg")
-"""Algorithms whose policy has no distribution to sample from."""
-ACTOR_CRITIC = (*SQUASHED_GAUSSIAN, *DETERMINISTIC)
-"""Algorithms whose policy has a separate `actor`."""
-GRAPH = "graph/actor"
-"""The tensor that holds a user's network, an ONNX graph as bytes; see `rlctl.policy.own_graph`."""
+DETERMINISTIC = ("td3", "ddpg")  # algorithms whose policy has no distribution to sample from
+ACTOR_CRITIC = (*SQUASHED_GAUSSIAN, *DETERMINISTIC)  # algorithms whose policy has a separate `actor`
+GRAPH = "graph/actor"  # the tensor that holds a user's network, an ONNX graph as bytes; see `rlctl.policy.own_graph`
 
 
 class Score(pydantic.BaseModel, extra="forbid"):
@@ -46,24 +43,19 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
 
     format: int = FORMAT
     algo: str
-    policy: str
-    """SB3's name of the policy class: MlpPolicy, CnnPolicy, MultiInputPolicy, MlpLstmPolicy, ..."""
+    policy: str  # SB3's name of the policy class: MlpPolicy, CnnPolicy, MultiInputPolicy, MlpLstmPolicy, ..
     policy_kwargs: dict[str, Any] = {}
     clip_observation: float | None = Field(None, gt=0)
     """Clip of normalised observations; None where observations are not normalised."""
     normalized_keys: list[str] = []
     """Keys of the normalised parts of a dict observation; `""` for any other observation."""
     env: EnvInfo
-    spec: PolicySpec
-    """How to build the environment; for a curriculum, its last stage."""
-    stages: list[PolicySpec] = []
-    """Stages of the curriculum."""
+    spec: PolicySpec  # how to build the environment; for a curriculum, its last stage
+    stages: list[PolicySpec] = []  # stages of the curriculum
     training_steps: int = 0
-    evaluation: Score | None = None
-    """The score that made it the best policy of its run; None for any other policy."""
+    evaluation: Score | None = None  # the score that made it the best policy of its run; None for any other policy
     versions: dict[str, str] = {}
-    provenance: Provenance | None = None
-    """Where an exported policy comes from; None for any other policy."""
+    provenance: Provenance | None = None  # where an exported policy comes from; None for any other policy
 
     def derive_spec(self, task: str | None = None, changes: EnvChanges = UNCHANGED) -> EnvSpec:
         """Return the spec of the environment it was trained in, or of another task, with `changes`."""
@@ -87,8 +79,7 @@ class PolicyFile:
 
     info: PolicyInfo
     tensors: Tensors = dataclasses.field(repr=False)
-    path: Path | None = None
-    """The file that was read."""
+    path: Path | None = None  # the file that was read
 
     @classmethod
     def read(cls, path: Path) -> PolicyFile:

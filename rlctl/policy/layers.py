@@ -20,8 +20,7 @@ Array = NDArray[Any]
 class Layer(abc.ABC):
     """A function of one array."""
 
-    name: str
-    """The layer's name in SB3's `state_dict`, or its function."""
+    name: str  # the layer's name in SB3's `state_dict`, or its function
 
     @abc.abstractmethod
     def __call__(self, value: Any) -> Array:
@@ -43,8 +42,7 @@ def apply(layers: Iterable[Layer], value: Any) -> Array:
 class Linear(Layer):
     """A fully connected layer."""
 
-    weight: Array
-    """Shape (outputs, inputs)."""
+    weight: Array  # shape (outputs, inputs)
     bias: Array
 
     def __call__(self, value: Array) -> Array:
@@ -57,8 +55,7 @@ class Linear(Layer):
 class Convolution(Layer):
     """A 2-D convolution without padding."""
 
-    weight: Array
-    """Shape (outputs, channels, height, width)."""
+    weight: Array  # shape (outputs, channels, height, width)
     bias: Array
     stride: int
 
@@ -94,8 +91,7 @@ class Normalize(Layer):
     mean: Array
     variance: Array
     clip: float
-    epsilon: float = 1e-8
-    """What SB3's VecNormalize adds to the variance."""
+    epsilon: float = 1e-8  # what SB3's VecNormalize adds to the variance
     _deviation: Array = dataclasses.field(init=False)
     _high: Array = dataclasses.field(init=False)
     _low: Array = dataclasses.field(init=False)
@@ -122,8 +118,7 @@ class Normalize(Layer):
 class OneHot(Layer):
     """One-hot encoding of discrete values."""
 
-    sizes: Array
-    """Number of choices of each discrete value; shape () for a single one."""
+    sizes: Array  # number of choices of each discrete value; shape () for a single one
     _offsets: Array = dataclasses.field(init=False)
     _total: int = dataclasses.field(init=False)
 
@@ -202,8 +197,7 @@ class LstmLayer:
 
     of_input: Array
     of_hidden: Array
-    biases: list[Array]
-    """Two, shape (4 x hidden,); or none."""
+    biases: list[Array]  # two, shape (4 x hidden,); or none
 
 
 def _sigmoid(value: Array) -> Array:

@@ -1,7 +1,5 @@
 """Policy files that act in this process with NumPy, bit for bit as in workers. Imports no torch."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

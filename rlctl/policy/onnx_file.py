@@ -9,10 +9,8 @@ from rlctl.storage import files
 if TYPE_CHECKING:
     import onnx
 
-METADATA_KEY = "rlctl"
-"""Metadata key of the policy's description."""
-DIGEST_KEY = "sha256"
-"""Metadata key of the sha256 of the file's bytes, computed with zeros in place of the digest."""
+METADATA_KEY = "rlctl"  # metadata key of the policy's description
+DIGEST_KEY = "sha256"  # metadata key of the sha256 of the file's bytes, computed with zeros in place of the digest
 
 _ZEROS = b"0" * 64
 

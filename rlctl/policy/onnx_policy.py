@@ -23,8 +23,7 @@ SINGLE_INPUT = "obs"
 ACTION = "action"
 STATE_INPUTS = ("state_h", "state_c")
 """LSTM state of a recurrent policy, each of shape (layers, batch, hidden); zeros when an episode begins."""
-STATE_OUTPUTS = ("state_h_out", "state_c_out")
-"""The LSTM state for the next step."""
+STATE_OUTPUTS = ("state_h_out", "state_c_out")  # the LSTM state for the next step
 
 _FATAL_ONLY = 4
 _LARGEST = 2 * 2**30  # [bytes], the limit of the format

@@ -4,8 +4,6 @@ onnxruntime plays it, so acting needs neither torch nor the user's module. The w
 the names of the policy file's tensors: new weights in shared memory take effect at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,8 +17,7 @@ from rlctl.policy.file import GRAPH, Tensors
 from rlctl.policy.layers import Normalize
 from rlctl.policy.onnx_policy import make_options
 
-OBSERVATION = "observation/"
-"""Prefix of the inputs for the parts of an observation; the key of the part follows."""
+OBSERVATION = "observation/"  # prefix of the inputs for the parts of an observation; the key of the part follows
 OUTPUT = "latent"
 
 
@@ -30,8 +27,7 @@ class OwnGraph:
     def __init__(self, tensors: Tensors, normalize: Mapping[str, Normalize]) -> None:
         self.content = np.asarray(tensors[GRAPH], np.uint8).tobytes()
         onnx_file.check(self.content)
-        self.normalize = normalize
-        """By key of the part of an observation."""
+        self.normalize = normalize  # by key of the part of an observation
         try:
             self._session = onnxruntime.InferenceSession(
                 self.content, make_options(), providers=["CPUExecutionProvider"]

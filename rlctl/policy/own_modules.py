@@ -4,8 +4,6 @@ A policy file names the classes of its training. They are imported only if the u
 recipe of a run, or in `$RLCTL_NETWORKS`, a list of files. A policy file alone never causes an import.
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 import sys
@@ -18,8 +16,7 @@ from rlctl.environments.plugin_code import import_file
 from rlctl.errors import ArtifactError, RecipeError, RlctlError
 from rlctl.storage import files
 
-KEYS = ("features_extractor_class", "activation_fn")
-"""The `policy_kwargs` that may name a class."""
+KEYS = ("features_extractor_class", "activation_fn")  # the `policy_kwargs` that may name a class
 VARIABLE = "RLCTL_NETWORKS"
 
 

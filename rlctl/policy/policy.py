@@ -1,7 +1,5 @@
 """What every policy that acts has: an observation in, an action out, both as NumPy arrays."""
 
-from __future__ import annotations
-
 import abc
 from typing import Any
 

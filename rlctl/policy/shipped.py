@@ -3,8 +3,6 @@
 A shipped policy has the actor only; `rlctl export RUN --policy FILE` writes it.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -13,48 +11,36 @@ import pydantic
 from rlctl.environments import installed
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
 
-PRETRAINED = "pretrained"
-"""The word for a task's shipped policy where a command or a function takes `checkpoint`."""
+PRETRAINED = "pretrained"  # the word for a task's shipped policy where a command or a function takes `checkpoint`
 
-Interval = tuple[float, float]
-"""Lower and upper bound of a 95 % interval."""
+Interval = tuple[float, float]  # lower and upper bound of a 95 % interval
 
 
 class MeasuredScore(pydantic.BaseModel, extra="forbid"):
     """The score of a policy or a baseline on episodes that were not used in training."""
 
     episodes: int
-    seed: int
-    """`rlctl eval --episodes N --seed SEED` plays the same episodes."""
+    seed: int  # `rlctl eval --episodes N --seed SEED` plays the same episodes
     mean_return: float
-    return_interval: Interval
-    """For the mean."""
+    return_interval: Interval  # for the mean
     success: float | None
     success_interval: Interval | None
-    mean_length: float
-    """[steps]"""
+    mean_length: float  # [steps]
     ended_early: float | None
     """Fraction of the episodes that ended before the time limit, such as by a fall; None without a time limit."""
-    action_change: float
-    """Mean of |action - previous action|, over elements and steps; 0 for discrete actions."""
+    action_change: float  # mean of |action - previous action|, over elements and steps; 0 for discrete actions
 
 
 class Provenance(pydantic.BaseModel, extra="forbid"):
     """Where an exported policy comes from, and its scores."""
 
-    run: str
-    """`TASK/RUN`, the last two folders of the run's path."""
-    origin: dict[str, str] = {}
-    """Distribution and version of the task that it was measured on."""
-    source_sha256: str | None = None
-    """sha256 of that task's file."""
-    git_commit: str | None = None
-    """Commit of the folder in which it was trained."""
-    recipe: dict[str, Any]
-    """The resolved recipe."""
+    run: str  # `TASK/RUN`, the last two folders of the run's path
+    origin: dict[str, str] = {}  # distribution and version of the task that it was measured on
+    source_sha256: str | None = None  # sha256 of that task's file
+    git_commit: str | None = None  # commit of the folder in which it was trained
+    recipe: dict[str, Any]  # the resolved recipe
     score: MeasuredScore
-    baselines: dict[str, MeasuredScore] = {}
-    """`zero` and `random`, on the same episodes."""
+    baselines: dict[str, MeasuredScore] = {}  # `zero` and `random`, on the same episodes
 
 
 def list_shipped() -> list[str]:

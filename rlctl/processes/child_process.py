@@ -4,8 +4,6 @@ Never forks: a process with PyBullet or torch cannot be forked safely. (Tests fo
 environment: `set_start`.) The caller chooses where a child prints, for example to a `LineReader`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import importlib

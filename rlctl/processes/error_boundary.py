@@ -1,7 +1,5 @@
 """Turns exceptions into messages and exit codes; handles streams that are closed or not UTF-8."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys
@@ -10,10 +8,8 @@ from collections.abc import Callable
 from rlctl.errors import RlctlError, short_repr
 from rlctl.version import __version__
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C."""
-EXIT_S = 10.0
-"""Time limit of exit handlers [s]."""
+INTERRUPTED = 130  # exit code after Ctrl-C
+EXIT_S = 10.0  # time limit of exit handlers [s]
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "can't allocate memory", "not enough memory")
 
 

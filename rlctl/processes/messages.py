@@ -4,8 +4,6 @@ Files and data from a network are never read this way. A child process runs thir
 descriptor, so the reader creates plain data only: it imports no other module and calls no other function.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import io

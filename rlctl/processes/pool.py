@@ -1,7 +1,5 @@
 """A pool of worker processes, which answer each message once."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 import time
@@ -30,12 +28,9 @@ class WorkerException:
     """An exception that a worker answers with."""
 
     message: str
-    kind: str = ""
-    """Name of its class, if it is one of `rlctl.errors`."""
-    details: str | None = None
-    """The traceback of somebody else's code."""
-    where: tuple[int, int, int] | None = None
-    """Environment, episode seed and step, where it was raised in an episode."""
+    kind: str = ""  # name of its class, if it is one of `rlctl.errors`
+    details: str | None = None  # the traceback of somebody else's code
+    where: tuple[int, int, int] | None = None  # environment, episode seed and step, where it was raised in an episode
 
 
 class ProcessPool:
@@ -54,8 +49,7 @@ class ProcessPool:
         pass_fds: Sequence[int] = (),
     ) -> None:
         self._read_progress = read_progress
-        self.waiting_for: set[int] = set()
-        """The workers that have not answered yet."""
+        self.waiting_for: set[int] = set()  # the workers that have not answered yet
         self._processes: list[ChildProcess] = []
         self._printed = LineFilter(on_output)
         self._output = LineReader(self._printed.line, MAX_LINE_BYTES)

@@ -1,7 +1,5 @@
 """Reads the lines that child processes and environments print, limits their rate, and writes them to stderr."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import threading

@@ -1,7 +1,5 @@
 """Plays a list of episodes, each completely inside one worker."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,12 +14,9 @@ from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.workers import Workers
 from rlctl.run.episode import Trajectory
 
-_CONTACTS_MEASURED = 10
-"""The first recorded episodes, in which contacts are measured; it takes about 3 % of a step."""
-MOST_STEPS = 100_000
-"""Steps after which an episode without a time limit is an error: it may never end."""
-_SEGMENT = 1000
-"""Steps after which the main process copies the recorded part of a long episode."""
+_CONTACTS_MEASURED = 10  # the first recorded episodes, in which contacts are measured; it takes about 3 % of a step
+MOST_STEPS = 100_000  # steps after which an episode without a time limit is an error: it may never end
+_SEGMENT = 1000  # steps after which the main process copies the recorded part of a long episode
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,11 +94,9 @@ class _Recorder:
     """Joins the recorded segments of one episode."""
 
     def __init__(self, index: int, record: bool) -> None:
-        self.index = index
-        """Index of the episode in the list."""
+        self.index = index  # index of the episode in the list
         self._record = record
-        self.steps = 0
-        """Number of recorded steps."""
+        self.steps = 0  # number of recorded steps
         self._parts: list[Trajectory] = []
 
     def add(self, workers: Workers, env: int, steps: int) -> None:

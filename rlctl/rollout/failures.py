@@ -1,7 +1,5 @@
 """Failures of environments: the report of a worker, and the error that the main process raises."""
 
-from __future__ import annotations
-
 import shlex
 
 from rlctl import errors

@@ -1,7 +1,5 @@
 """Messages from the main process to a worker, and the worker's answer."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -18,10 +16,8 @@ from rlctl.policy.players.player import Exploration
 class WorkerJob:
     """The environments of a worker: `count` of `total`, beginning with number `first`."""
 
-    memory: int
-    """Descriptor of the file of the shared arrays."""
-    numbers: int
-    """Descriptor of the file of a policy's numbers."""
+    memory: int  # descriptor of the file of the shared arrays
+    numbers: int  # descriptor of the file of a policy's numbers
     first: int
     count: int
     total: int
@@ -56,8 +52,7 @@ class BeginEpisodes:
 
     episodes: dict[int, tuple[int, NDArray[Any]]]
     """Per environment the seed, and the actions so far, shape (steps, ...)."""
-    may_fail: bool = False
-    """Whether a failing episode is reported like one that ended, instead of raising."""
+    may_fail: bool = False  # whether a failing episode is reported like one that ended, instead of raising
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,34 +62,28 @@ class LoadPolicy:
     info: PolicyInfo | None = None
     layout: list[tuple[str, tuple[int, ...], str]] = dataclasses.field(default_factory=list)
     """Name, shape and dtype of each array of numbers."""
-    other: str = ""
-    """An exported file, or a baseline; see `players.named.make_player`."""
+    other: str = ""  # an exported file, or a baseline; see `players.named.make_player`
 
 
 @dataclasses.dataclass(frozen=True)
 class LimitActions:
     """Pass the actions of the loaded policy through a safety filter."""
 
-    limits: dict[str, Any]
-    """A `deploy.Limits`."""
+    limits: dict[str, Any]  # a `deploy.Limits`
 
 
 @dataclasses.dataclass(frozen=True)
 class Play:
     """Play a segment in some environments, one after the other."""
 
-    steps: int
-    """At most so many steps in each environment."""
-    begin: dict[int, int]
-    """Per environment the seed of the episode to begin; negative: the running episode continues."""
+    steps: int  # at most so many steps in each environment
+    begin: dict[int, int]  # per environment the seed of the episode to begin; negative: the running episode continues
     next_episodes: dict[int, int] = dataclasses.field(default_factory=dict)
     """Per environment the number of the training episode that follows when one ends; empty: none follows."""
     run_seed: int = 0
     exploration: Exploration = dataclasses.field(default_factory=Exploration)
-    record: bool = False
-    """Whether to write reward terms."""
-    contacts: bool = False
-    """Whether to measure after every step how far bodies of a task overlap."""
+    record: bool = False  # whether to write reward terms
+    contacts: bool = False  # whether to measure after every step how far bodies of a task overlap
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,8 +91,7 @@ class ComputeRewards:
     """Compute the rewards of goals."""
 
     achieved: NDArray[Any]
-    desired: NDArray[Any]
-    """Both of shape (n, *goal)."""
+    desired: NDArray[Any]  # both of shape (n, *goal)
 
 
 Message = Build | SetEvents | Attach | BeginEpisodes | LoadPolicy | LimitActions | Play | ComputeRewards
@@ -120,12 +108,10 @@ class EpisodeResult:
     success: bool | None
     terms: dict[str, float]
     final_distance: float | None
-    row: int = dataclasses.field(default=-1, compare=False)
-    """The row of the segment in which it ended."""
+    row: int = dataclasses.field(default=-1, compare=False)  # the row of the segment in which it ended
     report: dict[str, Any] = dataclasses.field(default_factory=dict, compare=False)
     """The player's report of the episode; see `Player.report`."""
-    deepest_contact: float | None = None
-    """How far two bodies overlapped at most [m]; None if it was not measured."""
+    deepest_contact: float | None = None  # how far two bodies overlapped at most [m]; None if it was not measured
     acting: float = dataclasses.field(default=0.0, compare=False)
     """Fraction of the episode's time that the policy took; the environment took the rest."""
     metrics: dict[str, float] = dataclasses.field(default_factory=dict)
@@ -140,7 +126,5 @@ class Answer:
     """Episodes that ended while a segment was played."""
     left: list[int] = dataclasses.field(default_factory=list)
     """Environments whose episode ended or failed while its actions were replayed."""
-    info: EnvInfo | None = None
-    """Description of the environments, if it has changed."""
-    rewards: NDArray[np.float64] | None = None
-    """Those of `ComputeRewards`, shape (n,)."""
+    info: EnvInfo | None = None  # description of the environments, if it has changed
+    rewards: NDArray[np.float64] | None = None  # those of `ComputeRewards`, shape (n,)

@@ -1,7 +1,5 @@
 """Checks the values that environments return, so that an error names the wrong value."""
 
-from __future__ import annotations
-
 import math
 import reprlib
 from collections.abc import Mapping

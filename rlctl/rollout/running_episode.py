@@ -1,7 +1,5 @@
 """An environment in a worker, and its running episode."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -19,12 +17,10 @@ class RunningEpisode:
 
     def __init__(self, env: Any, index: int, metrics: Sequence[str] = ()) -> None:
         self.env = env
-        self.index = index
-        """Number of the environment."""
+        self.index = index  # number of the environment
         self._metrics = metrics  # reward terms of weight 0
         self.seed = -1
-        self.step = 0
-        """Steps begun in the episode."""
+        self.step = 0  # steps begun in the episode
         self.acting_s, self.stepping_s = 0.0, 0.0
         """Time that the policy and the environment took in the episode's steps [s]."""
         self._discrete = isinstance(env.action_space, spaces.Discrete)

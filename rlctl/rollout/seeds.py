@@ -1,7 +1,5 @@
 """Episode addresses: (run seed, stream, environment, episode) determines the seed of every episode."""
 
-from __future__ import annotations
-
 import enum
 
 import numpy as np

@@ -17,8 +17,7 @@ from rlctl.environments.info import EnvInfo
 from rlctl.policy.file import PolicyFile
 from rlctl.rollout.messages import EpisodeResult
 
-Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]
-"""Shape and dtype per name."""
+Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]  # shape and dtype per name
 
 _ALIGNMENT = 64  # [bytes], a cache line: two workers never write one
 _ROWS = ("stored", "action", "reward", "terminated", "truncated", "terms")
@@ -98,19 +97,14 @@ class SegmentArrays:
 
     observation: dict[str, NDArray[Any]]
     """The observation before each action, and the one after the last; shape (n_envs, steps + 1, ...)."""
-    final: dict[str, NDArray[Any]]
-    """The last observation of an episode, in the row of its last step."""
-    stored: NDArray[Any]
-    """Actions of the policy before clipping, or scaled to [-1, 1]; shape (n_envs, steps, elements)."""
-    action: NDArray[Any]
-    """Actions that the environments received."""
+    final: dict[str, NDArray[Any]]  # the last observation of an episode, in the row of its last step
+    stored: NDArray[Any]  # actions of the policy before clipping, or scaled to [-1, 1]; shape (n_envs, steps, elements)
+    action: NDArray[Any]  # actions that the environments received
     reward: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
-    terms: NDArray[np.float64]
-    """Raw reward terms, shape (n_envs, steps, terms), if they are recorded."""
-    ended: Sequence[EpisodeResult] = ()
-    """The episodes that ended; only in the result of `first`."""
+    terms: NDArray[np.float64]  # raw reward terms, shape (n_envs, steps, terms), if they are recorded
+    ended: Sequence[EpisodeResult] = ()  # the episodes that ended; only in the result of `first`
 
     @property
     def done(self) -> NDArray[np.bool_]:

@@ -4,8 +4,6 @@ The worker answers each message (`messages.py`) of the main process once. Observ
 policy's parameters are in shared memory.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import itertools

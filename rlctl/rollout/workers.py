@@ -31,8 +31,7 @@ from rlctl.rollout.shared_arrays import PolicyNumbers, SharedArrays
 BUILD_TIMEOUT_S = 300.0
 DEFAULT_TIMEOUT_S = 60.0
 
-RecordedActions = tuple[int, NDArray[Any]]
-"""Seed and actions so far of an episode."""
+RecordedActions = tuple[int, NDArray[Any]]  # seed and actions so far of an episode
 
 
 class Workers:
@@ -55,8 +54,7 @@ class Workers:
     ) -> None:
         self.n_envs = n_envs
         self.timeout_s = timeout_s
-        self.spec = spec
-        """Spec of the environments."""
+        self.spec = spec  # spec of the environments
         n_workers = min(n_envs, n_workers or available_cores())
         bounds = np.linspace(0, n_envs, n_workers + 1).round().astype(int).tolist()
         self._ranges = list(itertools.pairwise(bounds))

@@ -20,10 +20,8 @@ if TYPE_CHECKING:
     from rlctl.recipe.recipe import Recipe
 
 ROOT = Path("runs")
-GROUP_FILE = "group.json"
-"""In the folder of a group, which holds runs of several seeds."""
-TUNE_FILE = "tune.json"
-"""In the folder of a tuning, which holds the runs of its trials."""
+GROUP_FILE = "group.json"  # in the folder of a group, which holds runs of several seeds
+TUNE_FILE = "tune.json"  # in the folder of a tuning, which holds the runs of its trials
 _DIGITS = 18  # of a training step
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 
@@ -49,30 +47,19 @@ class RunDirectory:
     def __repr__(self) -> str:
         return f"RunDirectory({str(self.path)!r})"
 
-    recipe_file = _RunPath("recipe.yaml")
-    """The resolved recipe."""
-    status_file = _RunPath("run.json")
-    """Status, versions, command line, times."""
-    metrics_file = _RunPath("metrics.csv")
-    """A row per update."""
-    evals_file = _RunPath("evals.csv")
-    """A row per evaluation."""
+    recipe_file = _RunPath("recipe.yaml")  # the resolved recipe
+    status_file = _RunPath("run.json")  # status, versions, command line, times
+    metrics_file = _RunPath("metrics.csv")  # a row per update
+    evals_file = _RunPath("evals.csv")  # a row per evaluation
     robustness_file = _RunPath("robustness.json")
     """What `rlctl eval --vary` or `--push` measured last; see `rlctl.run.robustness`."""
-    best_policy = _RunPath("policies/best.safetensors")
-    """The policy of the best evaluation."""
-    last_policy = _RunPath("policies/last.safetensors")
-    """The policy at the end, or at the last checkpoint."""
-    claim_file = _RunPath(".claim")
-    """The token of the process that may write the run."""
-    episodes = _RunPath("episodes")
-    """The folder of recorded episodes and recordings."""
-    tensorboard = _RunPath("tensorboard")
-    """The folder of TensorBoard files."""
-    onnx_file = _RunPath("exports/policy.onnx")
-    """The default file of an export."""
-    replay_segments = _RunPath("checkpoints/replay")
-    """The folder of the replay buffer that checkpoints share."""
+    best_policy = _RunPath("policies/best.safetensors")  # the policy of the best evaluation
+    last_policy = _RunPath("policies/last.safetensors")  # the policy at the end, or at the last checkpoint
+    claim_file = _RunPath(".claim")  # the token of the process that may write the run
+    episodes = _RunPath("episodes")  # the folder of recorded episodes and recordings
+    tensorboard = _RunPath("tensorboard")  # the folder of TensorBoard files
+    onnx_file = _RunPath("exports/policy.onnx")  # the default file of an export
+    replay_segments = _RunPath("checkpoints/replay")  # the folder of the replay buffer that checkpoints share
 
     def checkpoint(self, steps: int) -> Path:
         """Return the folder of the checkpoint at a training step."""
@@ -200,8 +187,7 @@ class RunLock:
     def __init__(self, folder: Path, kind: str = "run") -> None:
         refuse_links_out(folder, kind)
         self._kind = kind
-        self.keeps_out = True
-        """False on a file system without locks, where other processes can write too."""
+        self.keeps_out = True  # false on a file system without locks, where other processes can write too
         self._file = folder / ".lock"
         self._descriptor = self._claim()
 

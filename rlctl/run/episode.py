@@ -1,7 +1,5 @@
 """Recorded episodes: `.npz` files with everything needed to reproduce one, bit for bit."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -24,16 +22,13 @@ class EpisodeInfo(pydantic.BaseModel, extra="forbid"):
     """The environment, the seed and the end of an episode."""
 
     format: int = FORMAT
-    spec: EpisodeSpec
-    """What the environment was made from."""
+    spec: EpisodeSpec  # what the environment was made from
     seed: int = Field(ge=0)
-    policy: str = ""
-    """The policy's file name and training step, as text for people."""
+    policy: str = ""  # the policy's file name and training step, as text for people
     success: bool | None = None
     total_reward: float
     term_names: list[str] = []
-    failure: str = ""
-    """The error with which the environment failed; then only the actions are known."""
+    failure: str = ""  # the error with which the environment failed; then only the actions are known
     versions: dict[str, str] = {}
 
 
@@ -41,14 +36,11 @@ class EpisodeInfo(pydantic.BaseModel, extra="forbid"):
 class Trajectory:
     """The data of T steps of an episode."""
 
-    actions: NDArray[Any]
-    """Shape (T, ...)."""
+    actions: NDArray[Any]  # shape (T, ...)
     observations: Observations
     """The observation before each action, and the last one: shape (T + 1, ...), or a dict of such arrays."""
-    rewards: NDArray[np.float64]
-    """Shape (T,)."""
-    terms: NDArray[np.float64]
-    """Raw reward terms in the order of the task's weights, shape (T, terms)."""
+    rewards: NDArray[np.float64]  # shape (T,)
+    terms: NDArray[np.float64]  # raw reward terms in the order of the task's weights, shape (T, terms)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """A group: the runs of one task with several seeds, in one folder."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path
@@ -13,10 +11,8 @@ from rlctl.run.lookup import find_run, refuse_tuning
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
 
-VERSION = 2
-"""Of the format of `group.json`."""
-_NOT_STORED = {"root", "resume"}
-"""Arguments that are not stored: the runs of a group are always in its folder."""
+VERSION = 2  # of the format of `group.json`
+_NOT_STORED = {"root", "resume"}  # arguments that are not stored: the runs of a group are always in its folder
 _MOST_SEEDS = 1000
 _RANGE = re.compile(r"(\d{1,9})-(\d{1,9})")
 
@@ -27,8 +23,7 @@ class Group:
 
     path: Path
     seeds: list[int]
-    request: TrainRequest
-    """The request of every seed, without the seed."""
+    request: TrainRequest  # the request of every seed, without the seed
 
     @property
     def task(self) -> str:

@@ -1,7 +1,5 @@
 """What is known of a training that a cluster executes: a small file for each in the folder of its group."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,8 +8,7 @@ from typing import Any
 from rlctl.errors import ArtifactError
 from rlctl.storage import files
 
-JOBS = ".jobs"
-"""The folder of these files, in the folder of a group or a tuning."""
+JOBS = ".jobs"  # the folder of these files, in the folder of a group or a tuning
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,15 +17,11 @@ class Job:
 
     seed: int
     task: str
-    state: str
-    """`queued`, `running` or `ended`."""
-    place: str = ""
-    """What the cluster calls it, such as `slurm 123_4`."""
-    host: str = ""
-    """The machine of the last attempt."""
+    state: str  # `queued`, `running` or `ended`
+    place: str = ""  # what the cluster calls it, such as `slurm 123_4`
+    host: str = ""  # the machine of the last attempt
     attempts: int = 0
-    code: int | None = None
-    """The exit code, once it has ended."""
+    code: int | None = None  # the exit code, once it has ended
 
     def describe(self) -> str:
         """Return where it is, in words: `on node7 as slurm 123_4, attempt 2`."""

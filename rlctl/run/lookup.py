@@ -1,7 +1,5 @@
 """Finds the run folder or the policy file that the argument RUN names, with notes about the choice."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import os

@@ -1,7 +1,5 @@
 """The robustness of a policy, measured by `rlctl eval --vary` and `--push`, in its run's `robustness.json`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,10 +18,8 @@ class _Content(pydantic.BaseModel, extra="forbid", frozen=True):
 class Outcome(_Content):
     """The scores of the episodes in one setting."""
 
-    success_rate: float | None
-    """In [0, 1]; None where the task reports no success."""
-    success_interval: Interval | None
-    """95 % interval of the success rate; see `success_interval`."""
+    success_rate: float | None  # in [0, 1]; None where the task reports no success
+    success_interval: Interval | None  # 95 % interval of the success rate; see `success_interval`
     mean_return: float
     return_interval: Interval
     """95 % interval of the mean, by Student's t; for a single episode both ends are its return."""
@@ -32,10 +28,8 @@ class Outcome(_Content):
 class Cell(Outcome):
     """The scores in one cell of a map."""
 
-    values: list[float]
-    """One per axis."""
-    nominal: bool
-    """Whether every value is that of the unchanged world."""
+    values: list[float]  # one per axis
+    nominal: bool  # whether every value is that of the unchanged world
 
     @property
     def score(self) -> tuple[float, float]:
@@ -48,21 +42,17 @@ class Axis(_Content):
 
     name: str
     """As the user names it: an event (`mass`), an event's parameter (`push.force`) or the task's (`tolerance`)."""
-    setting: str
-    """As `--set` names it: `events.mass.factor`, `task.tolerance`."""
+    setting: str  # as `--set` names it: `events.mass.factor`, `task.tolerance`
     values: list[float]
-    nominal: float | None
-    """The value in the unchanged world; None if it is not a single number."""
-    whole: bool = False
-    """Whether only whole numbers are possible."""
+    nominal: float | None  # the value in the unchanged world; None if it is not a single number
+    whole: bool = False  # whether only whole numbers are possible
 
 
 class RobustnessMap(_Content):
     """One or two axes varied together; everything else is nominal."""
 
     axes: list[Axis]
-    cells: list[Cell]
-    """For every combination of the axes' values, that of the last axis changing fastest."""
+    cells: list[Cell]  # for every combination of the axes' values, that of the last axis changing fastest
 
     def name_cell(self, cell: Cell) -> str:
         """Return where a cell is: `mass 0.6, friction 0.2`."""
@@ -76,32 +66,23 @@ class RobustnessMap(_Content):
 class PushLevel(Outcome):
     """The scores with pushes of one impulse."""
 
-    impulse: float
-    """Force times duration [N s]."""
-    held: float
-    """Fraction of the episodes that went well, in [0, 1], as `PushTest.measure` defines it."""
+    impulse: float  # force times duration [N s]
+    held: float  # fraction of the episodes that went well, in [0, 1], as `PushTest.measure` defines it
 
 
 class PushTest(_Content):
     """The smallest horizontal push at mid-episode at which the policy fails."""
 
     body: str
-    link: str | None
-    """None: the base of the body."""
-    duration_s: float
-    """How long a push lasts [s]."""
-    mass: float
-    """Of the whole body [kg]."""
+    link: str | None  # none: the base of the body
+    duration_s: float  # how long a push lasts [s]
+    mass: float  # of the whole body [kg]
     measure: Literal["success", "upright"]
     """What counts as going well: `success`, or `upright`, an episode that lasts until its time limit."""
-    levels: list[PushLevel]
-    """By impulse; the first is without a push."""
-    threshold: float | None
-    """Impulse [N s] at which half of the episodes fail; None: cannot tell."""
-    threshold_interval: Interval | None
-    """95 % interval, by resampling episodes."""
-    verdict: str
-    """The result as a sentence."""
+    levels: list[PushLevel]  # by impulse; the first is without a push
+    threshold: float | None  # impulse [N s] at which half of the episodes fail; None: cannot tell
+    threshold_interval: Interval | None  # 95 % interval, by resampling episodes
+    verdict: str  # the result as a sentence
 
 
 class Robustness(_Content):
@@ -111,21 +92,17 @@ class Robustness(_Content):
     task: str
     parameters: dict[str, Any]
     reward_weights: dict[str, float] = {}
-    events: dict[str, dict[str, Any]] = {}
-    """Events that are active in every cell; see `EnvSpec.events`."""
+    events: dict[str, dict[str, Any]] = {}  # events that are active in every cell; see `EnvSpec.events`
     policy_file: str
     algo: str
     training_steps: int
-    episodes: int
-    """In every cell, with the same seeds."""
+    episodes: int  # in every cell, with the same seeds
     seed: int
     deterministic: bool
-    nominal: Outcome
-    """With nothing varied."""
+    nominal: Outcome  # with nothing varied
     maps: list[RobustnessMap] = []
     push: PushTest | None = None
-    command: str = ""
-    """The command that measured it."""
+    command: str = ""  # the command that measured it
     versions: dict[str, str] = {}
 
     def find_worst(self) -> tuple[RobustnessMap, Cell] | None:

@@ -4,8 +4,6 @@ numpy and torch reserve memory without touching it: an allocation that is too la
 process later.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

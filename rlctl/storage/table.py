@@ -1,7 +1,5 @@
 """CSV files to which a training appends rows."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

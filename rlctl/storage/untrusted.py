@@ -25,8 +25,7 @@ Model = TypeVar("Model", bound="BaseModel")
 
 JSON_LIMIT = 16 * 2**20  # [bytes]
 _ALWAYS_READ = 1_000_000  # [bytes]
-_MEMBERS = 1000
-"""Maximum number of arrays in a file."""
+_MEMBERS = 1000  # maximum number of arrays in a file
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Allowed compressions: those of numpy. With LZMA the file itself would decide how much memory unpacking takes."""
 

@@ -1,7 +1,5 @@
 """Explains pydantic's validation errors: what the JSON schema expects, what was given, the closest name."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -11,8 +9,7 @@ import pydantic
 from rlctl.errors import did_you_mean, short_repr
 
 Schema = dict[str, Any]
-Place = tuple[str | int, ...]
-"""Keys and indices that lead to a value."""
+Place = tuple[str | int, ...]  # keys and indices that lead to a value
 _MOST_LINES = 3
 _ANY = "any value"
 

@@ -1,7 +1,5 @@
 """YAML with the scalars of version 1.2: `3e-4` is a number, `on` is text. Duplicate keys are errors."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Hashable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Computes which next command keeps every limit now and allows the robot to keep it later."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 
@@ -21,30 +19,20 @@ class Bounds:
     move by `x` in a control step; the arrays bound `x`, its change, and where it leads.
     """
 
-    names: list[str]
-    """Of the joints."""
-    dt: float
-    """Control step [s]."""
+    names: list[str]  # of the joints
+    dt: float  # control step [s]
     is_value: bool
-    factor: Array
-    """Change of `x` per 1 of the action."""
-    offset: Array
-    """The value of action 0."""
-    low: Array
-    """Bounds of the command: of a value, or of `x`."""
+    factor: Array  # change of `x` per 1 of the action
+    offset: Array  # the value of action 0
+    low: Array  # bounds of the command: of a value, or of `x`
     high: Array
     position: Array
     """Bounds of the position after `x`, shape (2, count); infinite where unlimited, as in `speed` and `change`."""
-    speed: Array | None
-    """Largest `x`."""
-    change: Array | None
-    """Largest change of `x` from one control step to the next."""
-    precision: float
-    """Relative precision of the action's type."""
-    resolution: Array
-    """Difference between two neighbouring commands near action 1."""
-    position_name: str
-    """Name of the position bounds in events."""
+    speed: Array | None  # largest `x`
+    change: Array | None  # largest change of `x` from one control step to the next
+    precision: float  # relative precision of the action's type
+    resolution: Array  # difference between two neighbouring commands near action 1
+    position_name: str  # name of the position bounds in events
     speed_name: str
 
     def __post_init__(self) -> None:

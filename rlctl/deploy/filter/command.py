@@ -1,7 +1,5 @@
 """Turns a policy's actions into commands within limits: low-pass, blend, and the bounds of motion."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -35,8 +33,7 @@ class Command:
         self, limits: Limits, fitted: FittedLimits, bounds: Bounds, report: Callable[[Intervention], None]
     ) -> None:
         self._bounds, self._report = bounds, report
-        self.names = bounds.names
-        """Of the joints."""
+        self.names = bounds.names  # of the joints
         assert isinstance(fitted.space, spaces.Box)  # what has bounds
         self._space = fitted.space
         self._safe, self._home = fitted.safe, fitted.home
@@ -52,16 +49,11 @@ class Command:
 
     def reset(self) -> None:
         """Begin an episode: the robot's position is unknown."""
-        self.position: Array | None = None
-        """Measured positions of the joints."""
-        self._expected: Array | None = None
-        """Positions that the joints should have reached by the last command."""
-        self._reference: Array | None = None
-        """The last command's value, or the measured positions."""
-        self._before = self._zeros
-        """The motion of the last step."""
-        self._sent: NDArray[Any] | None = None
-        """The last action."""
+        self.position: Array | None = None  # measured positions of the joints
+        self._expected: Array | None = None  # positions that the joints should have reached by the last command
+        self._reference: Array | None = None  # the last command's value, or the measured positions
+        self._before = self._zeros  # the motion of the last step
+        self._sent: NDArray[Any] | None = None  # the last action
         self._smooth: Array | None = None
         self._blend_from: Array | None = None
         self.begin_blend()

@@ -1,7 +1,5 @@
 """Limits as arrays for one policy: joints by index, units of its commands, and a check that it can keep them."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any
@@ -35,16 +33,12 @@ class FittedLimits:
     """The limits of one policy, as arrays."""
 
     layout: ObservationLayout
-    space: spaces.Space[Any]
-    """The action space."""
+    space: spaces.Space[Any]  # the action space
     control_dt: float | None
-    bounds: Bounds | None
-    """None where actions are choices."""
-    measured: slice | None
-    """Where the joints' positions are in the flat observation."""
+    bounds: Bounds | None  # None where actions are choices
+    measured: slice | None  # where the joints' positions are in the flat observation
     home: Array | None
-    safe: Array
-    """The command while holding or stopped, if commands are values."""
+    safe: Array  # the command while holding or stopped, if commands are values
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a later check refuses such numbers

@@ -1,7 +1,5 @@
 """A player in simulation whose actions pass the safety filter."""
 
-from __future__ import annotations
-
 import collections
 from typing import Any
 

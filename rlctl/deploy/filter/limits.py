@@ -1,7 +1,5 @@
 """`limits.yaml`: limits on the commands of a robot, by the names of its joints. Typed, every key checked."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal

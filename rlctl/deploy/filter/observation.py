@@ -1,7 +1,5 @@
 """Converts clients' observations to the form that the policy takes, and checks their values."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -16,8 +14,7 @@ from rlctl.errors import RecipeError, check_name, did_you_mean, short_repr
 
 Array = NDArray[Any]
 
-WHOLE = "observation"
-"""Name of an observation whose parts have no names."""
+WHOLE = "observation"  # name of an observation whose parts have no names
 
 
 class ObservationError(ValueError):
@@ -38,8 +35,7 @@ class ObservationLayout:
             named = len(shape) == 1 and sum(sizes.values()) == shape[0]
             self.shapes = {name: (size,) for name, size in sizes.items()} if named else {WHOLE: shape}
         self._dtypes = {name: np.dtype(parts.get(name, self.space).dtype) for name in self.shapes}
-        self.slices: dict[str, slice] = {}
-        """Place of each named observation in the flat vector, which has no images."""
+        self.slices: dict[str, slice] = {}  # place of each named observation in the flat vector, which has no images
         self.size = 0
         for name, part in self.shapes.items():
             if SINGLE in parts or not _is_image(parts[name]):
@@ -133,8 +129,7 @@ def _is_image(space: spaces.Space[Any]) -> bool:
     return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3
 
 
-Fault = tuple[str, str, float, float]
-"""Kind, name of the observation, value and limit."""
+Fault = tuple[str, str, float, float]  # kind, name of the observation, value and limit
 
 
 class SensorChecks:

@@ -21,8 +21,7 @@ class SafetyEvent:
 
     time_s: float
     kind: Kind
-    name: str
-    """The limit (`elbow.speed`), the kind of fault, or the new state."""
+    name: str  # the limit (`elbow.speed`), the kind of fault, or the new state
     value: float | str = ""
     limit: float | None = None
 
@@ -44,17 +43,12 @@ class Intervention:
     time_s: float
     bounds: Bounds
     limit: str
-    requested: Array
-    """Motion before and after the limit."""
+    requested: Array  # motion before and after the limit
     allowed: Array
-    ends: tuple[Array, Array]
-    """Lower and upper bound of the motion."""
-    before: Array
-    """Motion of the step before."""
-    reference: Array | None
-    """Where the motion began."""
-    acted: NDArray[np.bool_]
-    """Whether the limit changed the motion, per joint."""
+    ends: tuple[Array, Array]  # lower and upper bound of the motion
+    before: Array  # motion of the step before
+    reference: Array | None  # where the motion began
+    acted: NDArray[np.bool_]  # whether the limit changed the motion, per joint
 
     @property
     def names(self) -> Sequence[str]:

@@ -1,7 +1,5 @@
 """The safety filter: between a policy and a robot, the same in simulation, in a server and from Python."""
 
-from __future__ import annotations
-
 import collections
 import math
 import time
@@ -60,11 +58,9 @@ class SafetyFilter:
         self._faults: collections.Counter[str] = collections.Counter()
         self.on_event: Callable[[SafetyEvent | Intervention], None] | None = None
         """Called with each event, those of one limit in a step together."""
-        self.steps = 0
-        """Actions since the filter was created."""
+        self.steps = 0  # actions since the filter was created
         self.state: FilterState = "idle"
-        self.reason = ""
-        """Why it is holding or stopped."""
+        self.reason = ""  # why it is holding or stopped
         self._zeros = np.zeros(math.prod(fitted.space.shape or ()))
         self._all_finite = b"\x01" * len(self._zeros)
         self._fault = ""

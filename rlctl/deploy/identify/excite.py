@@ -1,7 +1,5 @@
 """An informative trajectory within a robot's limits: each action is a sum of sines."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -29,10 +27,8 @@ class Excitation:
     path: Path
     task: str
     seconds: float
-    amplitude: float
-    """Fraction of the action range that it uses."""
-    largest_share: float
-    """Largest used fraction of a joint's range without its margins; 0 if no joint has limits."""
+    amplitude: float  # fraction of the action range that it uses
+    largest_share: float  # largest used fraction of a joint's range without its margins; 0 if no joint has limits
 
 
 def write_excitation(spec: EnvSpec, path: Path, *, seconds: float, seed: int) -> Excitation:

@@ -1,7 +1,5 @@
 """Plays a log's actions in the task's world and compares simulated joint states with the measured ones."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -69,8 +67,7 @@ class Follower:
         self._joints = [find_joints(env)[name] for name in log.joints]
         self._bodies = {body.name: body for body, _ in self._joints}
         steps = max(10, round(WINDOW_S / env.task.control_dt))
-        self.starts = list(range(0, len(log.actions) - 2, steps))
-        """First row of each window."""
+        self.starts = list(range(0, len(log.actions) - 2, steps))  # first row of each window
         self.steps = steps
         self.control_dt = env.task.control_dt
         self._measured = np.concatenate([log.positions, log.velocities], axis=1)

@@ -1,7 +1,5 @@
 """Estimates the physical values of a task's events from a log, each with a confidence interval."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -17,10 +15,8 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo
 from rlctl.rollout.workers import available_cores
 
-CONFIDENCE = 1.96
-"""Standard deviations of a 95 % interval."""
-WIDEST = 0.3
-"""A value is unknown if its interval is wider than this fraction of it, to each side."""
+CONFIDENCE = 1.96  # standard deviations of a 95 % interval
+WIDEST = 0.3  # a value is unknown if its interval is wider than this fraction of it, to each side
 _MIN_COMPONENT = 0.3  # smallest component of a value in a direction, for its name to be listed
 _MIN_WIDTH = 0.02
 """Smallest half width of a training interval, relative to the value: intervals leave out the model's errors."""
@@ -39,8 +35,7 @@ class IdentifiedValue:
     low: float
     high: float
     known: bool
-    note: str = ""
-    """Why the value is unknown: no information, or it is at the end of its search range."""
+    note: str = ""  # why the value is unknown: no information, or it is at the end of its search range
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,13 +48,11 @@ class Identification:
     seconds: float
     values: list[IdentifiedValue]
     delay_event: str
-    delay: int
-    """[control steps]."""
+    delay: int  # [control steps]
     delay_known: bool
     position_error: tuple[float, float]
     """Root mean square of the positions' error [rad or m], with the task's own values and with the identified ones."""
-    velocity_error: tuple[float, float]
-    """[rad/s or m/s]."""
+    velocity_error: tuple[float, float]  # [rad/s or m/s]
     curves: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Of the joint with the largest error: its name, its measured positions, and those simulated before and after."""
 

@@ -1,7 +1,5 @@
 """A recording of a robot: a CSV file with a row per control step, columns by name."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io
@@ -20,10 +18,8 @@ Array = NDArray[np.float64]
 TIME = "time"
 _POSITION, _VELOCITY = "position_", "velocity_"
 _USED = (TIME, "action_", _POSITION, _VELOCITY)
-_MAX_PERIODS = 1.5
-"""A longer time between two rows is a gap; in control periods."""
-_RATE_TOLERANCE = 0.1
-"""Tolerated relative difference between the rows' period and the control period."""
+_MAX_PERIODS = 1.5  # a longer time between two rows is a gap; in control periods
+_RATE_TOLERANCE = 0.1  # tolerated relative difference between the rows' period and the control period
 _MAX_SIZE = 200 * 2**20  # [bytes]
 MIN_ROWS = 20
 
@@ -36,12 +32,9 @@ class Log:
     """
 
     joints: tuple[str, ...]
-    actions: Array
-    """Shape (T, actions)."""
-    positions: Array
-    """[rad or m], shape (T, joints)."""
-    velocities: Array
-    """[rad/s or m/s], shape (T, joints)."""
+    actions: Array  # shape (T, actions)
+    positions: Array  # [rad or m], shape (T, joints)
+    velocities: Array  # [rad/s or m/s], shape (T, joints)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,11 +43,9 @@ class Expected:
 
     joints: Mapping[str, tuple[float, float]]
     """Joints of the world with their limits [rad or m]; a pair with low >= high means no limits."""
-    driven: tuple[str, ...]
-    """Joints in the order of the action, where the task describes them."""
+    driven: tuple[str, ...]  # joints in the order of the action, where the task describes them
     actions: int
-    control_dt: float
-    """[s]."""
+    control_dt: float  # [s]
 
     @property
     def action_columns(self) -> list[str]:

@@ -1,7 +1,5 @@
 """The physical values that a log can determine: those of events that hold for a whole episode, and the delay."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Collection, Mapping
@@ -10,8 +8,7 @@ from rlctl.errors import UsageError, check_name
 from rlctl.task.events import Event, delay, set_color, shift_gravity
 from rlctl.task.events.ranges import Widening
 
-_WIDER = 2.0
-"""Factor by which the search range is wider than the event's range."""
+_WIDER = 2.0  # factor by which the search range is wider than the event's range
 _SMALLEST = 0.01  # of the upper end, where a range begins at 0
 
 
@@ -23,8 +20,7 @@ class Parameter:
     key: str
     low: float
     high: float
-    nominal: float | None = None
-    """Value in the world as the task builds it, if known."""
+    nominal: float | None = None  # value in the world as the task builds it, if known
 
     @property
     def name(self) -> str:
@@ -62,10 +58,8 @@ class Unknowns:
     """The values to estimate."""
 
     parameters: tuple[Parameter, ...]
-    delay: str = ""
-    """The event that delays actions; empty if there is none, or it was not chosen."""
-    longest_delay: int = 0
-    """[control steps]."""
+    delay: str = ""  # the event that delays actions; empty if there is none, or it was not chosen
+    longest_delay: int = 0  # [control steps]
 
     def settings(self, positions: Collection[float]) -> dict[str, dict[str, float]]:
         """Return positions in the ranges as a recipe's `events`."""

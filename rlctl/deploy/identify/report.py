@@ -1,7 +1,5 @@
 """What `rlctl identify` prints."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 

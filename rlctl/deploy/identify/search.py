@@ -21,8 +21,7 @@ from rlctl.rollout.failures import describe_failure, make_error
 _TRIALS = 12  # per unknown, and for one unknown more
 _STARTS = 3
 _EVALUATIONS, _LAST_EVALUATIONS = 12, 25
-_STEP = 0.004
-"""Step of a position in [0, 1] for derivatives: larger than the irregularities of contacts and solvers."""
+_STEP = 0.004  # step of a position in [0, 1] for derivatives: larger than the irregularities of contacts and solvers
 _TOLERANCE = 1e-5
 _MAX_DELAY = 50  # [control steps], beyond which the search does not go
 
@@ -33,12 +32,9 @@ class Fit:
 
     at: Array
     delay: int
-    cost: float
-    """Mean of the squared weighted errors."""
-    information: Array
-    """J'J of the weighted errors, shape (unknowns, unknowns)."""
-    errors: Array
-    """Root mean square per measured position, then velocity, in their units."""
+    cost: float  # mean of the squared weighted errors
+    information: Array  # J'J of the weighted errors, shape (unknowns, unknowns)
+    errors: Array  # root mean square per measured position, then velocity, in their units
     rows_per_window: float
 
 

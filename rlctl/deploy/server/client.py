@@ -1,7 +1,5 @@
 """A client of policy servers, and the player that `rlctl eval TASK --policy ws://...` and the self-test use."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import os
@@ -33,8 +31,7 @@ class PolicyClient:
         self._loop = asyncio.new_event_loop()
         key = os.environ.get(KEY_VARIABLE)
         self._headers = {"Authorization": f"Api-Key {key.strip()}"} if key else {}
-        self.metadata: dict[str, Any] = self._run(self._connect())
-        """The server's description of its policy."""
+        self.metadata: dict[str, Any] = self._run(self._connect())  # the server's description of its policy
 
     def _run(self, call: Any) -> Any:
         return self._loop.run_until_complete(call)

@@ -1,7 +1,5 @@
 """Limits of a server's connections: how many may be open, and how long each may wait for a request."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import resource

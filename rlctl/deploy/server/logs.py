@@ -1,7 +1,5 @@
 """A server's event log as rotated JSON lines, and its Rerun recording."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import logging

@@ -1,7 +1,5 @@
 """Measurements of a server: latency, interventions, control error, processor time and memory."""
 
-from __future__ import annotations
-
 import collections
 import os
 import resource

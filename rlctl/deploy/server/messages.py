@@ -1,7 +1,5 @@
 """Messages of the WebSocket protocol of openpi's policy server: msgpack, with arrays as maps; and JSON for curl."""
 
-from __future__ import annotations
-
 import json
 import math
 from typing import Any

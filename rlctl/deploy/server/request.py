@@ -1,7 +1,5 @@
 """The options of `rlctl serve` as data. Imports nothing heavy."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Annotated
@@ -26,5 +24,4 @@ class ServeRequest:
         Option("File with the key that clients must send; default: the variable RLCTL_API_KEY.", metavar="FILE"),
     ] = None
     max_clients: Annotated[int, Option("Clients that may be connected at once.", min=1)] = 64
-    watchdog: bool = True
-    """Whether silent clients are stopped: off for a simulation, which does not run in real time."""
+    watchdog: bool = True  # whether silent clients are stopped: off for a simulation, which does not run in real time

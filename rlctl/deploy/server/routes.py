@@ -1,7 +1,5 @@
 """The server's HTTP routes: actions as JSON, orders, another policy, metrics, the live page; and the access check."""
 
-from __future__ import annotations
-
 import asyncio
 import hmac
 import re

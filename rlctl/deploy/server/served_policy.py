@@ -1,7 +1,5 @@
 """A policy that is loaded once and acts for many clients, each with its own recurrent state."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -23,10 +21,8 @@ class ServedPolicy:
 
     file: Path
     info: PolicyInfo
-    make_actor: Callable[[], Policy]
-    """Returns the policy of one client, with its own recurrent state."""
-    network: Network | None = None
-    """None for an ONNX file, which outputs only the action."""
+    make_actor: Callable[[], Policy]  # returns the policy of one client, with its own recurrent state
+    network: Network | None = None  # None for an ONNX file, which outputs only the action
 
     def measure_spread(self, observation: Any) -> float | None:
         """Return the mean standard deviation of the stochastic policy's actions; None if the policy has none."""

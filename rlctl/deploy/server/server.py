@@ -1,7 +1,5 @@
 """A policy server: openpi's WebSocket protocol, JSON over HTTP, orders, metrics and a live page, on one port."""
 
-from __future__ import annotations
-
 import asyncio
 import collections
 import dataclasses
@@ -44,16 +42,13 @@ class PolicyServer:
         self._numbers = itertools.count(1)
         self._sessions: dict[int, Session] = {}
         self._earlier_counts: collections.Counter[str] = collections.Counter()
-        self._manual: Any | None = None
-        """The action of an override; None: the policy acts."""
-        self._order: str | None = None
-        """The operator's last order, which later clients get too; None: no order."""
+        self._manual: Any | None = None  # the action of an override; None: the policy acts
+        self._order: str | None = None  # the operator's last order, which later clients get too; None: no order
         self._limits = limits
         numbers = sum(map(math.prod, ObservationLayout(policy.info.env).shapes.values()))
         self.largest_message = 64 * numbers + 64 * 1024  # text with names
         """Largest size of a request [bytes]."""
-        self.posting = self._open_session()
-        """The session of clients that post."""
+        self.posting = self._open_session()  # the session of clients that post
 
     @property
     def metadata(self) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """One client of a server: its episode, its filter, and the answer to each of its requests."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any
@@ -34,10 +32,8 @@ class Session:
         self._watchdog_s = periods * dt if periods and dt else None
         self._last_s: float | None = None
         self._by_watchdog = False
-        self.action: NDArray[Any] | None = None
-        """The last action."""
-        self.observation: Any = None
-        """The last observation, in the policy's form."""
+        self.action: NDArray[Any] | None = None  # the last action
+        self.observation: Any = None  # the last observation, in the policy's form
 
     def check_watchdog(self, now_s: float) -> None:
         """Stop if no observation arrived for too long while running; `now_s` is a `time.monotonic()`."""

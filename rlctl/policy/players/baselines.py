@@ -1,7 +1,5 @@
 """Policies that need no training: zero and random actions, and functions that a user writes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

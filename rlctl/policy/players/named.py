@@ -1,7 +1,5 @@
 """Players by name: zero and random actions, exported files, functions that a user writes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What every player has: an action per step, and noise that depends only on the episode's seed and the step."""
 
-from __future__ import annotations
-
 import abc
 import dataclasses
 from typing import Any
@@ -10,26 +8,20 @@ import numpy as np
 
 from rlctl.policy.layers import Array
 
-_BLOCK = 64
-"""Number of steps whose random numbers are drawn together."""
-_STEP_NOISE = 0
-"""Random stream of the noise of steps."""
+_BLOCK = 64  # number of steps whose random numbers are drawn together
+_STEP_NOISE = 0  # random stream of the noise of steps
 
 
 @dataclasses.dataclass(frozen=True)
 class Exploration:
     """How a policy explores; plain data that is sent to workers with each segment."""
 
-    stochastic: bool = False
-    """Sample from the policy's distribution."""
-    warmup: bool = False
-    """Take uniform actions instead of the policy's."""
-    epsilon: float = 0.0
-    """DQN's probability of a uniform action."""
+    stochastic: bool = False  # sample from the policy's distribution
+    warmup: bool = False  # take uniform actions instead of the policy's
+    epsilon: float = 0.0  # DQN's probability of a uniform action
     action_noise: float = 0.0
     """Standard deviation of the Gaussian noise of off-policy algorithms, on the action in [-1, 1]."""
-    sde_every: int = 0
-    """Steps between gSDE's matrices; 0: a new one for each segment."""
+    sde_every: int = 0  # steps between gSDE's matrices; 0: a new one for each segment
 
 
 class Noise:

@@ -1,7 +1,5 @@
 """Plays a policy with NumPy: its network, and noise that depends only on the episode's seed and the step."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -15,8 +13,7 @@ from rlctl.policy.layers import Array, apply
 from rlctl.policy.network import Network
 from rlctl.policy.players.player import Exploration, Noise, Player, make_generator
 
-_MATRIX = 1
-"""Random stream of gSDE's matrices."""
+_MATRIX = 1  # random stream of gSDE's matrices
 
 
 class PolicyPlayer(Player):
