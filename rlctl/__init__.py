@@ -25,10 +25,12 @@ from rlctl.version import __version__
 if TYPE_CHECKING:
     from rlctl.api import check_env, evaluate, load_policy, train
     from rlctl.environments.spec import make
+    from rlctl.training.callback import Callback
 
-__all__ = ["__version__", "check_env", "evaluate", "load_policy", "make", "train"]
+__all__ = ["Callback", "__version__", "check_env", "evaluate", "load_policy", "make", "train"]
 
 _DEFINED_IN = {
+    "Callback": "rlctl.training.callback",
     "check_env": "rlctl.api",
     "evaluate": "rlctl.api",
     "load_policy": "rlctl.api",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated
+from typing import Annotated, Any
 
 from rlctl.cli.arguments import Json, RecipeFlags, claim_stdout, command
 from rlctl.errors import UsageError
@@ -18,6 +18,16 @@ class TrainFlags(RecipeFlags):
     stop_success: Annotated[
         float | None, Option("Stop after two evaluations in a row at this success rate.", metavar="RATE")
     ] = None
+    callback: Annotated[
+        list[str], Option("Call a class of yours during the training.", ("--callback",), metavar="FILE.py:CLASS")
+    ] = dataclasses.field(default_factory=list)
+
+    def merge(self) -> dict[str, Any]:
+        """Return all keys and values; the named callbacks come after those of `--set`."""
+        settings = super().merge()
+        if names := settings.pop("callback"):
+            settings["callbacks"] = {**settings.get("callbacks", {}), **dict.fromkeys(names)}
+        return settings
 
 
 @command

@@ -14,6 +14,7 @@ from typing import Any
 from rlctl.environments import registry
 from rlctl.environments.plugin_code import import_file
 from rlctl.errors import ArtifactError, RecipeError, RlctlError
+from rlctl.recipe.recipe import Recipe
 from rlctl.storage import files
 
 KEYS = ("features_extractor_class", "activation_fn")  # the `policy_kwargs` that may name a class
@@ -29,14 +30,16 @@ def import_named(policy_kwargs: Mapping[str, Any]) -> dict[str, type]:
     return {key: _import(key, name) for key, name in names.items() if isinstance(name, str) and ":" in name}
 
 
-def locate(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `policy_kwargs` with absolute paths of a user's files, so that a run can be resumed from any folder."""
-    located = dict(policy_kwargs)
-    for key in KEYS:
-        place, _, name = str(located.get(key, "")).rpartition(":")
-        if place.endswith(".py"):
-            located[key] = f"{Path(place).expanduser().resolve()}:{name}"
-    return located
+def locate(recipe: Recipe) -> Recipe:
+    """Return a recipe with absolute paths of a user's files, so that a run can be resumed from any folder."""
+    networks = {key: _locate(value) if key in KEYS else value for key, value in recipe.policy_kwargs.items()}
+    callbacks = {_locate(name): arguments for name, arguments in recipe.callbacks.items()}
+    return recipe.model_copy(update={"policy_kwargs": networks, "callbacks": callbacks})
+
+
+def _locate(value: Any) -> Any:
+    place, _, name = str(value).rpartition(":")
+    return f"{Path(place).expanduser().resolve()}:{name}" if place.endswith(".py") else value
 
 
 def _import(key: str, name: str) -> type:

@@ -125,6 +125,8 @@ class Recipe(Section):
     """Stop after two evaluations in a row at this success rate; null: never."""
     checkpoint: CheckpointSettings = CheckpointSettings()
     """Which checkpoints are kept."""
+    callbacks: dict[str, dict[str, Any] | None] = {}
+    """Callbacks: classes of yours by `FILE.py:CLASS` or `MODULE:CLASS`, and their arguments; see docs/callbacks.md."""
     stages: Annotated[list[Stage], pydantic.AfterValidator(check_promotions)] = []
     """Curriculum: what each stage changes, and when it ends."""
 

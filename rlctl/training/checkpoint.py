@@ -29,6 +29,7 @@ from rlctl.policy.file import PolicyFile
 from rlctl.run.directory import RunDirectory
 from rlctl.storage import files, validation
 from rlctl.training import replay_segments, snapshot
+from rlctl.training.callbacks import Callbacks
 from rlctl.training.curriculum import begin_next_episodes
 from rlctl.training.progress import Progress
 from rlctl.training.replay_segments import ReplaySegments, Segment
@@ -50,6 +51,8 @@ class State(pydantic.BaseModel):
     model: dict[str, Any]
     """Plain data of `snapshot.take`."""
     progress: Progress
+    callbacks: list[dict[str, Any]] = []
+    """Plain data of `Callbacks.take`."""
     segments: list[Segment] = []
     """The segments of the replay buffer."""
     computed_with: dict[str, str]
@@ -74,8 +77,11 @@ class Checkpoint:
 class CheckpointFolders:
     """Writes the checkpoint folders of a run, and restores the training from one."""
 
-    def __init__(self, run: RunDirectory, model: BaseAlgorithm, env: WorkerVecEnv, keep: int) -> None:
+    def __init__(
+        self, run: RunDirectory, model: BaseAlgorithm, env: WorkerVecEnv, callbacks: Callbacks, keep: int
+    ) -> None:
         self._run = run
+        self._callbacks = callbacks
         self._model = model
         self._env = env
         self._keep = keep
@@ -96,7 +102,8 @@ class CheckpointFolders:
     def save(self, policy: PolicyFile, progress: Progress) -> None:
         """Write a checkpoint of the current boundary; raises `OSError` if it cannot be written."""
         tensors, plain = snapshot.take(self._model)
-        tensors |= _environment_tensors(self._env)
+        of_callbacks, plain_of_callbacks = self._callbacks.take()
+        tensors |= of_callbacks | _environment_tensors(self._env)
         segments: list[Segment] = []
         if self._replay is not None:
             segments = self._replay.save(self._added)
@@ -110,6 +117,7 @@ class CheckpointFolders:
             step=self._model.num_timesteps,
             model=plain,
             progress=progress,
+            callbacks=plain_of_callbacks,
             segments=segments,
             computed_with=self.computed_with(),
             sha256={name: files.digest(content) for name, content in contents.items()},

@@ -14,6 +14,7 @@ from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from rlctl.storage import files
 from rlctl.storage.table import Table
+from rlctl.training.callbacks import Callbacks
 from rlctl.training.checkpoint import Checkpoint, CheckpointFolders, find_differences
 from rlctl.training.learner import Learner
 from rlctl.training.snapshot import check_finite
@@ -27,9 +28,10 @@ CHECKPOINT_TIME_SHARE = 0.02
 class Checkpoints:
     """Writes tables, policies and checkpoints. A write that fails causes a warning and is repeated later."""
 
-    def __init__(self, learner: Learner, run: RunDirectory, keep: int, warn: Callable[[str], None]) -> None:
-        """Write into the folder of `run`, keep its newest `keep` checkpoints; `warn` shows a message."""
+    def __init__(self, learner: Learner, run: RunDirectory, callbacks: Callbacks, warn: Callable[[str], None]) -> None:
+        """Write into the folder of `run`; `warn` shows a message."""
         self.run = run
+        self.callbacks = callbacks
         self.metrics = Table(run.metrics_file)
         self.evals = Table(run.evals_file)
         self.saved_step: int | None = None
@@ -37,7 +39,7 @@ class Checkpoints:
         self.problem = ""
         """The last write that failed, and why."""
         self._learner = learner
-        self._folders = CheckpointFolders(run, learner.model, learner.env, keep)
+        self._folders = CheckpointFolders(run, learner.model, learner.env, callbacks, learner.recipe.checkpoint.keep)
         self._warn = warn
         self._next_s = time.monotonic()
         self._uncounted_checkpoints = 1
@@ -106,6 +108,7 @@ class Checkpoints:
         if is_saved:
             self._report_saved_again()
             self.attempt("old checkpoints", self._folders.remove_old)
+            self.callbacks.finish_checkpoint()
         now = time.monotonic()
         self._next_s = now + (1 + self._uncounted_checkpoints) * (now - began) / CHECKPOINT_TIME_SHARE
         self._uncounted_checkpoints = 0
@@ -141,6 +144,7 @@ class Checkpoints:
         mismatch = self._folders.restore(checkpoint)
         inexact = [*changed, *find_differences(checkpoint.state.computed_with, self._folders.computed_with())]
         inexact += [mismatch] if mismatch else []
+        inexact += self.callbacks.restore(checkpoint.tensors, checkpoint.state.callbacks)
         self.saved_step = checkpoint.state.step
         exactness = f"not bit-exact: {'; '.join(inexact)}" if inexact else "bit-exact"
         return f"resuming at step {checkpoint.state.step:,}, {exactness}"

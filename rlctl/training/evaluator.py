@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from rlctl.errors import ArtifactError, RlctlError, TaskError, UsageError
 from rlctl.evaluation.episode_statistics import mean_return, success_rate
@@ -58,11 +59,12 @@ class Evaluator:
         steps, progress = self._learner.steps, self._learner.progress
         return steps >= progress.next_eval or (self._learner.is_at_end and progress.last_eval < steps)
 
-    def evaluate(self, check: Callable[[], None]) -> None:
-        """Play the evaluation episodes, save the best policy, and write the row and the episodes.
+    def evaluate(self, check: Callable[[], None]) -> dict[str, Any]:
+        """Play the evaluation episodes, save the best policy, and write the row and the episodes; return the row.
 
-        If an environment fails, this evaluation is lost and the training continues.
+        If an environment fails, this evaluation is lost, the row is empty and the training continues.
         """
+        row: dict[str, Any] = {}
         steps, progress = self._learner.steps, self._learner.progress
         policy = self._learner.pack()
         self._display.phase("evaluating")
@@ -72,12 +74,13 @@ class Evaluator:
         except (TaskError, UsageError, ArtifactError) as error:  # the last two: files were removed in the meantime
             self._note_failure(error)
         else:
-            self._note(episodes, policy)
+            row = self._note(episodes, policy)
         progress.last_eval = steps
         if not self._learner.is_at_end:  # at the end all findings are printed
             self._report_findings()
         while progress.next_eval <= steps:
             progress.next_eval += self._recipe.eval.every_steps or self._recipe.total_timesteps
+        return row
 
     def _report_findings(self) -> None:
         for finding in diagnose(self._checkpoints.run):
@@ -92,7 +95,7 @@ class Evaluator:
         error = self.episodes.keep_failed(error, self._learner.curriculum.goal_spec, steps)
         self._display.message(f"warning: evaluation at step {steps:,} failed, training continues: {error}")
 
-    def _note(self, episodes: list[Episode], policy: PolicyFile) -> None:
+    def _note(self, episodes: list[Episode], policy: PolicyFile) -> dict[str, Any]:
         learner, steps = self._learner, self._learner.steps
         results = [episode.result for episode in episodes]
         score = _score(episodes)
@@ -111,6 +114,7 @@ class Evaluator:
         self._log(score, sum(result.length for result in results) / len(results))
         self._checkpoints.attempt("episodes", lambda: self.episodes.keep(episodes, steps))
         self._display.evaluation(steps, score.success, score.mean_return, better)
+        return row
 
     def _count_good(self, score: Score) -> None:
         progress, threshold = self._learner.progress, self._recipe.stop_success

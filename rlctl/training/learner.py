@@ -32,8 +32,8 @@ class Learner:
 
     @property
     def is_at_end(self) -> bool:
-        """Whether the recipe's steps are done."""
-        return self.steps >= self.recipe.total_timesteps
+        """Whether the recipe's steps are done, or a callback has ended the training."""
+        return self.steps >= self.recipe.total_timesteps or bool(self.progress.stop_reason)
 
     @property
     def seconds(self) -> float:

@@ -29,6 +29,7 @@ class TrainingLoop:
         self.checkpoints = checkpoints
         self.stop_signal: int | None = None
         """Number of the signal after which to stop at the next boundary."""
+        self.callbacks = checkpoints.callbacks
         self._metrics = Metrics(learner, checkpoints, display)
         self._display = display
         self._stop_announced = False
@@ -61,19 +62,23 @@ class TrainingLoop:
         Raises `ArtifactError` if the final state cannot be saved.
         """
         learner = self.learner
-        self._metrics.collect_finished_episodes()
+        finished = self._metrics.collect_finished_episodes()
         if learner.steps == 0:
             self._begin()
             return False
         stage_is_done = learner.curriculum.is_due(learner.steps)
-        if learner.is_at_end or stage_is_done or self._metrics.is_due():
-            self._metrics.write()
+        row = self._metrics.measure() if learner.is_at_end or stage_is_done or self._metrics.is_due() else {}
+        self.callbacks.finish_segment(row, finished)
+        if row:
+            self._metrics.write(row)
         if stage_is_done:  # also at the end: a resume may make the run longer
             self._display.stage(*learner.begin_next_stage())
         self._stop_if_requested()
         if self.evaluator.is_due():
             self.evaluate()
         if learner.is_at_end or self._success_holds():
+            if learner.progress.stop_reason:
+                self._display.message(f"stopped by a callback: {learner.progress.stop_reason}")
             self.evaluator.compare_best_with_last(self._stop_if_requested)
             self._save_the_end()
             return True
@@ -85,6 +90,7 @@ class TrainingLoop:
     def _begin(self) -> None:
         """Save the initial state now: a folder that cannot be written is reported before the first update."""
         if self.checkpoints.saved_step is None:
+            self.callbacks.start()
             if self.learner.progress.next_eval == 0:
                 self.evaluate()
             self.checkpoints.save()
@@ -92,7 +98,8 @@ class TrainingLoop:
     def evaluate(self) -> None:
         """Evaluate the current policy; the training rate excludes this time."""
         began = time.monotonic()
-        self.evaluator.evaluate(self._stop_if_requested)
+        if row := self.evaluator.evaluate(self._stop_if_requested):
+            self.callbacks.finish_evaluation(row)
         self._metrics.exclude(time.monotonic() - began)
 
     def _success_holds(self) -> bool:
@@ -141,4 +148,6 @@ class TrainingLoop:
                 "run.json", lambda: status.write_end(run, learner.steps, learner.progress, best)
             ):
                 break
-        return self.evaluator.episodes.record(recordings)
+        written = self.evaluator.episodes.record(recordings)
+        self.callbacks.end()
+        return written

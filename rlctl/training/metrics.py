@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 from rlctl.recipe.recipe import ON_POLICY
+from rlctl.rollout.messages import EpisodeResult
 from rlctl.training import measurements
 from rlctl.training.checkpoints import Checkpoints
 from rlctl.training.display import Display
@@ -23,8 +25,8 @@ class Metrics:
         self._display = display
         self._last_row_s, self._last_row_steps = time.monotonic(), learner.steps
 
-    def collect_finished_episodes(self) -> None:
-        """Take finished episodes from the environments; count observations outside their space."""
+    def collect_finished_episodes(self) -> list[EpisodeResult]:
+        """Take finished episodes from the environments and return them; count observations outside their space."""
         env, progress = self._learner.env, self._learner.progress
         finished, env.ended = env.ended, []
         progress.recent += finished
@@ -33,18 +35,19 @@ class Metrics:
             self._display.message(f"warning: {env.outside_message}; such observations are counted and used unchanged")
         progress.observations_outside += env.outside
         env.outside = 0
+        return finished
 
     def is_due(self) -> bool:
         """Return whether to write a row: after every rollout of an on-policy algorithm, else at intervals."""
         steps = self._learner.steps
         return self._learner.recipe.algo in ON_POLICY or steps >= self._learner.progress.next_row
 
-    def write(self) -> None:
-        """Write a row to `metrics.csv` and TensorBoard if there were steps since the last one."""
+    def measure(self) -> dict[str, Any]:
+        """Return the row about the steps since the last one; empty if there were none."""
         learner, progress = self._learner, self._learner.progress
         steps, logger, env = learner.steps, learner.model.logger, learner.env
         if steps <= progress.last_row:
-            return
+            return {}
         check_finite(learner.model, self._checkpoints.run.path)
         now = time.monotonic()
         elapsed_s = max(now - self._last_row_s, 1e-9)
@@ -59,13 +62,20 @@ class Metrics:
             **measurements.measure(learner.model, env, progress.last_row, learner.recipe.total_timesteps),
         }
         self._last_row_s, self._last_row_steps, env.waited_s = now, steps, 0.0
+        return row
+
+    def write(self, row: dict[str, Any]) -> None:
+        """Write a row of `measure`, and what callbacks have logged, to `metrics.csv` and TensorBoard."""
+        learner, progress, logger = self._learner, self._learner.progress, self._learner.model.logger
+        logged, progress.logged = progress.logged, {}
+        row |= logged
         self._checkpoints.row(self._checkpoints.metrics, row)
-        for name, value in measurements.tensorboard_values(row).items():
+        for name, value in (measurements.tensorboard_values(row) | logged).items():
             logger.record(name, value)
         learner.model.dump_logs()
         self._display.metrics(row)
-        progress.last_row = steps
-        progress.next_row = steps + max(1, learner.recipe.total_timesteps // _OFF_POLICY_ROWS)
+        progress.last_row = learner.steps
+        progress.next_row = learner.steps + max(1, learner.recipe.total_timesteps // _OFF_POLICY_ROWS)
 
     def exclude(self, seconds: float) -> None:
         """Exclude the time of an evaluation from the training rate."""

@@ -43,5 +43,13 @@ class Progress:
     """Stage of the curriculum, from 1; 0 where there is none."""
     stage_began: int = 0
     """Environment steps at the start of the stage."""
+    last_segment: int = 0
+    """Step of the last `on_segment` of callbacks."""
+    logged: dict[str, float | None] = dataclasses.field(default_factory=dict)
+    """Numbers of callbacks for the next row of metrics, by column."""
+    parameters: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Parameters of the algorithm that callbacks have changed."""
+    stop_reason: str = ""
+    """Why a callback ended the training."""
     stage_episodes: list[float | None] = dataclasses.field(default_factory=list)
     """Success (0 or 1; None if not reported) or return of the stage's last episodes, as its promotion rule needs."""

@@ -63,7 +63,7 @@ def run_training(request: TrainRequest) -> TrainResult:
 
 def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> TrainResult:
     best = _read_best(run)
-    if run.status().get("status") == "running":  # killed before the end was written
+    if run.status().get("status") != "finished":  # killed before the end was written
         status.write_end(run, start.step, progress, best)
     _raise_if_evaluations_failed(run, progress)
     note = "this run has finished: nothing to do; to train longer, give -n"

@@ -130,15 +130,18 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
 
 def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Checkpoints:
     """Restore the checkpoint, if any, and return the writer of the run folder."""
+    from rlctl.training.callbacks import Callbacks
     from rlctl.training.checkpoints import Checkpoints
     from rlctl.training.tensorboard import list_parameters, make_logger
 
     resumed_at = None if start.run is None else start.step
     learner.model.set_logger(make_logger(run.tensorboard, display.message, resumed_at, list_parameters(start.recipe)))
-    checkpoints = Checkpoints(learner, run, start.recipe.checkpoint.keep, display.message)
+    callbacks = Callbacks(start.callbacks, learner, run.path, display.message)
+    checkpoints = Checkpoints(learner, run, callbacks, display.message)
     for note in start.notes:
         display.message(note)
     if start.checkpoint is not None:
+        callbacks.start(resumed_at=start.step)
         display.message(checkpoints.restore(start.checkpoint, start.inexact))
     for warning in checkpoints.cut_back(start.step) if start.run else ():
         display.message(warning)

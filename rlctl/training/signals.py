@@ -81,7 +81,7 @@ class StopSignals(HandledSignals):
         # No output here: it could interrupt other output.
         if number == signal.SIGHUP:
             output.leave_closed_terminal()
-        if self._done:
+        if self._done and not (self._loop and self._loop.callbacks.running):
             return
         if self._loop is None:
             raise Interrupted("interrupted before the training began", number)
@@ -91,3 +91,5 @@ class StopSignals(HandledSignals):
             raise Interrupted("interrupted again: stopped at once, the last checkpoint is intact", number)
         self._loop.stop_signal = number
         self._received_s = time.monotonic()
+        if self._loop.callbacks.running:  # it may never return
+            raise Interrupted(f"interrupted in {self._loop.callbacks.running}; the last checkpoint is intact", number)

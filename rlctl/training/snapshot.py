@@ -65,7 +65,7 @@ def observation_statistics(normalizer: VecNormalize | None) -> dict[str, Running
 
 def learned_tensors(model: BaseAlgorithm) -> tuple[Tensors, Any]:
     """Return all learned tensors of a model and its normalisation, and the structure of its state dicts."""
-    weights, structure = _flatten(model.get_parameters(), "parameters")
+    weights, structure = flatten(model.get_parameters(), "parameters")
     return {**weights, **_variables(model), **_normalizer_tensors(model)}, structure
 
 
@@ -83,7 +83,7 @@ def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
 def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
     """Restore the state that `take` returned; raises `ArtifactError` if it does not fit the model."""
     try:
-        parameters = _unflatten(plain["parameters"], tensors)
+        parameters = unflatten(plain["parameters"], tensors)
         model.set_parameters(parameters, exact_match=True, device=model.device)
         _restore_variables(model, tensors)
         _restore_normalizer(model, tensors)
@@ -119,33 +119,45 @@ def _array(tensor: torch.Tensor) -> NDArray[Any]:
     return values
 
 
-def _flatten(value: Any, path: str) -> tuple[Tensors, Any]:
-    """Split nested state dicts into tensors by path, and JSON that refers to them."""
+def flatten(value: Any, path: str) -> tuple[Tensors, Any]:
+    """Split nested dicts and lists into tensors by path, and JSON that refers to them.
+
+    Raises `TypeError` for anything that is not plain data.
+    """
     if isinstance(value, torch.Tensor):
         return {path: _array(value)}, {"tensor": path}
-    if isinstance(value, dict):
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        return {path: value.copy()}, {"array": path}
+    if isinstance(value, dict) and all(isinstance(key, str | int) for key in value):
         tensors: Tensors = {}
         entries = []
         for key, item in value.items():
-            below, structure = _flatten(item, f"{path}/{key}")
+            below, structure = flatten(item, f"{path}/{key}")
             tensors.update(below)
             entries.append([key, structure])
         return tensors, {"dict": entries}
     if isinstance(value, list | tuple):
-        below, structure = _flatten(dict(enumerate(value)), path)
+        below, structure = flatten(dict(enumerate(value)), path)
         kind = "list" if isinstance(value, list) else "tuple"
         return below, {kind: [item for _, item in structure["dict"]]}
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is not None and not isinstance(value, bool | int | float | str):
+        raise TypeError(f"{path} is a {type(value).__name__}")
     return {}, {"value": value}
 
 
-def _unflatten(structure: Any, tensors: Tensors) -> Any:
+def unflatten(structure: Any, tensors: Tensors) -> Any:
+    """Return what `flatten` split."""
     ((kind, content),) = structure.items()
+    if kind == "array":
+        return tensors[content].copy()
     if kind == "tensor":
         return torch.from_numpy(tensors[content].copy())
     if kind == "dict":
-        return {key: _unflatten(item, tensors) for key, item in content}
+        return {key: unflatten(item, tensors) for key, item in content}
     if kind in ("list", "tuple"):
-        items = [_unflatten(item, tensors) for item in content]
+        items = [unflatten(item, tensors) for item in content]
         return items if kind == "list" else tuple(items)
     return content
 

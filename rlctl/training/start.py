@@ -21,6 +21,8 @@ from rlctl.recipe.sources import describe_rounding, resolve_with_stages
 from rlctl.run import lookup
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.train_request import TrainRequest
+from rlctl.training.callback import Callback
+from rlctl.training.callbacks import load_callbacks
 from rlctl.training.warm_start import find_source
 
 if TYPE_CHECKING:
@@ -42,6 +44,7 @@ class Start:
     checkpoint: Checkpoint | None = None
     notes: tuple[str, ...] = ()
     """Messages for the user, before the first step."""
+    callbacks: Mapping[str, Callback] = dataclasses.field(default_factory=dict)
     source: Mapping[str, Any] | None = None
     """The policy of `--from`; see `warm_start.find_source`."""
     inexact: tuple[str, ...] = ()
@@ -102,10 +105,11 @@ def _find_new(request: TrainRequest) -> Start:
     task = request.task or ""
     with preserve_process_state():
         recipe = resolve_with_stages(task, request.config, request.settings)
-        recipe = recipe.model_copy(update={"policy_kwargs": own_modules.locate(recipe.policy_kwargs)})
+        recipe = own_modules.locate(recipe)
+        callbacks = load_callbacks(recipe)
     note = describe_rounding(recipe)
     source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
-    return Start(request, task, recipe, notes=(note,) if note else (), source=source)
+    return Start(request, task, recipe, notes=(note,) if note else (), callbacks=callbacks, source=source)
 
 
 def _find_checkpoint(request: TrainRequest) -> Start:
@@ -123,6 +127,8 @@ def _find_checkpoint(request: TrainRequest) -> Start:
         status = run.status()
         task = lookup.locate_task(status["task"], run)
         changes = describe_task_changes(status, task)
+        for name in recipe.callbacks:
+            changes += describe_task_changes(status.get("callbacks", {}).get(name, {}), name)
         if changes and not request.force:
             raise UsageError(f"{run.path}: {'; '.join(changes)}. The policy may no longer fit; --force resumes anyway")
         run.recover()
@@ -138,7 +144,8 @@ def _find_checkpoint(request: TrainRequest) -> Start:
         notes = ["no checkpoint yet: the training starts from step 0"]
         if newest is not None:
             notes = [f"warning: {problem}; resuming from step {newest.state.step:,}" for problem in damage]
-        return Start(request, task, recipe, run, lock, newest, tuple(notes), status.get("from"), tuple(changes))
+        callbacks, source = load_callbacks(recipe), status.get("from")
+        return Start(request, task, recipe, run, lock, newest, tuple(notes), callbacks, source, tuple(changes))
     except BaseException:
         lock.release()
         raise
@@ -158,7 +165,7 @@ def _reopen(newest: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:
     """Mark a finished training as not done if the request asks for more steps."""
     if not newest.progress.done or recipe.total_timesteps <= max(newest.state.step, before.total_timesteps):
         return newest
-    progress = dataclasses.replace(newest.progress, done=False, good_in_a_row=0)
+    progress = dataclasses.replace(newest.progress, done=False, good_in_a_row=0, stop_reason="")
     return dataclasses.replace(newest, state=newest.state.model_copy(update={"progress": progress}))
 
 

@@ -33,6 +33,7 @@ def write_start(run: RunDirectory, start: Start) -> None:
         "error": None,
         "task": start.task,
         **identify_task(start.task),
+        "callbacks": {name: identify_task(name) for name in recipe.callbacks},
         "algo": recipe.algo,
         "seed": recipe.seed,
         "recipe_changes": find_recipe_changes(start.task, recipe),
@@ -88,6 +89,7 @@ def write_end(run: RunDirectory, steps: int, progress: Progress, best: PolicyInf
             "best_return": score.mean_return if score else None,
             "observations_outside": progress.observations_outside,
             "failed_evaluations": progress.failed_evaluations,
+            **({"stop_reason": progress.stop_reason} if progress.stop_reason else {}),
             **({"stage": progress.stage} if progress.stage else {}),
         }
     )

@@ -1,0 +1,142 @@
+"""The callbacks of a training: imports them, calls them, and saves their state."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlctl.environments import registry
+from rlctl.environments.plugin_code import call_plugin
+from rlctl.errors import ArtifactError, RecipeError, RlctlError, TaskError
+from rlctl.recipe.recipe import Recipe
+from rlctl.rollout.messages import EpisodeResult
+from rlctl.training.callback import Callback, Training
+
+if TYPE_CHECKING:
+    from rlctl.training.learner import Learner
+    from rlctl.training.snapshot import Tensors
+
+
+def load_callbacks(recipe: Recipe) -> dict[str, Callback]:
+    """Import and build the callbacks of a recipe, by name.
+
+    Raises `RecipeError` for a name that is no callback, `TaskError` for an exception of its constructor.
+    """
+    return {name: _load(name, arguments or {}) for name, arguments in recipe.callbacks.items()}
+
+
+def _load(name: str, arguments: Mapping[str, Any]) -> Callback:
+    try:
+        if ":" not in name:
+            raise RecipeError("give the class too: FILE.py:CLASS or MODULE:CLASS")
+        constructor = registry.load(name)
+    except RlctlError as error:
+        problem = str(error).removeprefix(f"task {name!r}: ")
+        raise RecipeError(f"callbacks: {name}: {problem}", details=error.details) from None
+    callback: Any = _call(name, lambda: constructor(**arguments))
+    if isinstance(callback, Callback):
+        return callback
+    raise RecipeError(f"callbacks: {name}: not a rlctl.Callback")
+
+
+def _call(name: str, call: Callable[[], Any], doing: str = "") -> Any:
+    try:
+        return call_plugin(name, call, doing)
+    except TaskError as error:
+        raise TaskError(f"callback{str(error).removeprefix('task')}", details=error.details) from error.__cause__
+
+
+class Callbacks:
+    """Calls the callbacks of a training, in the order of the recipe."""
+
+    def __init__(
+        self, callbacks: Mapping[str, Callback], learner: Learner, folder: Path, warn: Callable[[str], None]
+    ) -> None:
+        self.running = ""
+        """Name and moment of the callback that is running."""
+        self._callbacks = callbacks
+        self._training = Training(learner, folder)
+        self._progress = learner.progress
+        self._warn = warn
+        self._reported: set[str] = set()
+
+    def start(self, resumed_at: int | None = None) -> None:
+        """Call `on_start`; a checkpoint of the step `resumed_at` is restored afterwards."""
+        restored = copy.deepcopy(vars(self._progress))
+        self._training.model.num_timesteps = resumed_at or 0
+        self._call("on_start")
+        if resumed_at is not None:
+            vars(self._progress).update(restored)
+
+    def finish_segment(self, row: Mapping[str, Any], episodes: Sequence[EpisodeResult]) -> None:
+        """Call `on_segment`; `row` is the row of metrics that is due."""
+        if self._training.steps > self._progress.last_segment:
+            self._training.metrics, self._training.episodes = row, episodes
+            self._call("on_segment")
+            self._progress.last_segment = self._training.steps
+
+    def finish_evaluation(self, row: Mapping[str, Any]) -> None:
+        """Call `on_evaluation` with the row of `evals.csv`."""
+        self._training.evaluation = row
+        self._call("on_evaluation")
+
+    def finish_checkpoint(self) -> None:
+        """Call `on_checkpoint`."""
+        self._call("on_checkpoint")
+
+    def end(self) -> None:
+        """Call `on_end`."""
+        self._call("on_end")
+
+    def _call(self, moment: str) -> None:
+        for name, callback in self._callbacks.items():
+            self.running = f"callback {name}, {moment}"
+            try:
+                doing = f"{moment} at step {self._training.steps:,}: "
+                _call(name, lambda callback=callback: getattr(callback, moment)(self._training), doing)  # type: ignore[misc]
+            finally:
+                self.running = ""
+
+    def take(self) -> tuple[Tensors, list[dict[str, Any]]]:
+        """Return the state of all callbacks; what is not plain data is left out, with a warning."""
+        from rlctl.training.snapshot import flatten
+
+        tensors: Tensors = {}
+        entries: list[dict[str, Any]] = []
+        for number, (name, callback) in enumerate(self._callbacks.items()):
+            structure, unsaved = {}, []
+            for key, value in _call(name, callback.state_dict, "state_dict: ").items():
+                try:
+                    arrays, structure[key] = flatten(value, f"callbacks/{number}/{key}")
+                    tensors |= arrays
+                except TypeError:
+                    unsaved.append(f"{key} is a {type(value).__name__}")
+            entries.append({"state": structure, "unsaved": unsaved})
+            self._report(_describe_unsaved(name, unsaved))
+        return tensors, entries
+
+    def _report(self, problem: str) -> None:
+        if problem and problem not in self._reported:
+            self._reported.add(problem)
+            self._warn(f"warning: {problem}; a resume will not be bit-exact. Override state_dict and load_state_dict")
+
+    def restore(self, tensors: Tensors, entries: Sequence[Mapping[str, Any]]) -> list[str]:
+        """Restore what `take` returned; return the reasons why the resume is not bit-exact."""
+        from rlctl.training.snapshot import unflatten
+
+        problems = []
+        for (name, callback), entry in zip(self._callbacks.items(), entries, strict=False):
+            try:
+                state = {key: unflatten(structure, tensors) for key, structure in entry["state"].items()}
+                problems.append(_describe_unsaved(name, entry["unsaved"]))
+            except (KeyError, ValueError, TypeError, AttributeError) as error:
+                raise ArtifactError(f"state of callback {name}: damaged: {error!r}") from None
+            _call(name, lambda callback=callback, state=state: callback.load_state_dict(state), "load_state_dict: ")  # type: ignore[misc]
+        self._training.apply_parameters()
+        return [problem for problem in problems if problem]
+
+
+def _describe_unsaved(name: str, unsaved: Sequence[str]) -> str:
+    return f"callback {name}: its {', its '.join(unsaved)}, which a checkpoint does not store" if unsaved else ""

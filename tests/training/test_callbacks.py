@@ -1,0 +1,149 @@
+"""Callbacks read, log, stop and change a training; a resume is exact; a fault in one loses nothing."""
+
+import csv
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from rlctl.errors import Interrupted, RecipeError, TaskError, UsageError
+from rlctl.run.directory import RunDirectory
+from tests.training import own_callbacks
+from tests.training.comparing import Killed, assert_same_run
+from tests.training.conftest import SMALL_PPO
+from tests.training.test_exact_resume import kill_after as kill_after
+from tests.training.test_exact_resume import settings
+
+FILE = Path(own_callbacks.__file__)
+ADAPTIVE = {"callbacks": {f"{FILE}:Adaptive": None}}
+
+
+@pytest.fixture
+def run_of(tmp_path):
+    """Return the newest run, also of a training that raised."""
+
+    def find():
+        return RunDirectory(max((tmp_path / "runs").glob("*/2*"), key=lambda path: path.stat().st_mtime_ns))
+
+    return find
+
+
+def read(table: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(table.open()))
+
+
+def test_a_callback_logs_changes_the_rate_and_stops(train):
+    run = train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:Adaptive": {"rate": 0.1, "stop_after": 128}}}).run
+    rows = read(run.metrics_file)
+    assert [row["steps"] for row in rows] == ["64", "128"]
+    # Half of 0.1 at the start; a segment's change comes after its updates.
+    assert [float(row["learning_rate"]) for row in rows] == pytest.approx([0.05, 0.04], rel=0.13)
+    assert rows[0]["callback/evaluated"] == ""
+    assert float(rows[1]["callback/lengths"]) > 0
+    assert [row["steps"] for row in read(run.evals_file)] == ["128"]
+    assert (run.path / "end.txt").exists()
+    assert run.status()["status"] == "finished"
+    assert run.status()["stop_reason"] == "enough"
+
+
+@pytest.mark.parametrize("algo", ["ppo", "sac"])
+@pytest.mark.usefixtures("every_boundary")
+def test_resume_is_exact_with_a_schedule_that_a_callback_changes(train, resume, kill_after, run_of, capsys, algo):
+    given = {**settings(algo), **ADAPTIVE}
+    whole = train("Line", given).run
+    undo = kill_after(20 if algo == "ppo" else 13)
+    with pytest.raises(Killed):
+        train("Line", given)
+    undo()
+    run = run_of()
+    assert int(run.checkpoints()[-1].name) > 0
+    resume(run)
+    assert ", bit-exact" in capsys.readouterr().err
+    assert_same_run(whole, run)
+    assert (whole.path / "end.txt").read_text() == (run.path / "end.txt").read_text()
+
+
+def test_state_that_is_no_plain_data_is_reported(train, resume, run_of, capsys):
+    with pytest.raises(TaskError):
+        train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:Unsaved": None, f"{FILE}:Raises": None}})
+    problem = "Unsaved: its window is a set, which a checkpoint does not store"
+    assert f"{problem}; a resume will not be bit-exact. Override state_dict" in capsys.readouterr().err
+    with pytest.raises(TaskError):
+        resume(run_of())
+    assert re.search(f"resuming at step 0, not bit-exact: callback .*{problem}", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("moment", ["on_start", "on_segment", "on_evaluation", "on_checkpoint", "on_end"])
+@pytest.mark.usefixtures("every_boundary")
+def test_a_callback_that_raises(train, run_of, moment):
+    arguments = {"moment": moment, "step": 0 if moment == "on_start" else 128}
+    with pytest.raises(TaskError) as caught:
+        train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:Raises": arguments}})
+    step = {"on_start": 0, "on_end": 256}.get(moment, 128)
+    line, *hint = str(caught.value).splitlines()
+    assert line == f"callback '{FILE}:Raises': {moment} at step {step}: KeyError: 'bonus' (own_callbacks.py:59)"
+    assert caught.value.exit_code == 3
+    saved = {"on_start": None, "on_end": 256, "on_checkpoint": 128}.get(moment, 64)
+    assert [int(folder.name) for folder in run_of().checkpoints()][-1:] == ([] if saved is None else [saved])
+    if 0 < (saved or 0) < 256:
+        assert hint == [f"checkpoint at step {saved} is intact; resume with: rlctl train --resume {run_of().path}"]
+    assert run_of().status()["status"] == "failed"
+
+
+@pytest.mark.usefixtures("every_boundary")
+def test_a_callback_that_never_returns_is_interrupted(train, run_of):
+    with pytest.raises(
+        Interrupted, match=r"interrupted in callback .*NeverReturns, on_segment; the last checkpoint is"
+    ):
+        train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:NeverReturns": None}})
+    assert run_of().status()["status"] == "interrupted"
+    assert [int(folder.name) for folder in run_of().checkpoints()] == [0]
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("missing.py:Adaptive", "no file .*missing.py"),
+        (f"{FILE}:Adaptiv", "has no 'Adaptiv'.*Did you mean 'Adaptive'"),
+        ("Adaptive", "give the class too: FILE.py:CLASS or MODULE:CLASS"),
+        (f"{FILE}:make_nothing", "not a rlctl.Callback"),
+        ("json:JSONDecoder", "not a rlctl.Callback"),
+    ],
+)
+def test_a_wrong_name_is_a_recipe_error(train, tmp_path, name, problem):
+    with pytest.raises(RecipeError, match=f"callbacks: .*{problem}"):
+        train("Line", {**SMALL_PPO, "callbacks": {name: None}})
+    assert not (tmp_path / "runs").exists()
+
+
+def test_the_example_of_the_page(train, tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "callbacks.md").read_text()
+    (code,) = re.findall(r"`my\.py`:\n\n```python\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "my.py").write_text(code)
+    given = {**SMALL_PPO, "eval": {"episodes": 1, "every_steps": 64}, "total_timesteps": 1024}
+    run = train("Line", {**given, "callbacks": {f"{tmp_path}/my.py:Patience": {"factor": 0.7}}}).run
+    returns = [float(row["return"]) for row in read(run.evals_file)]
+    rates = {float(row["learning_rate"]) for row in read(run.metrics_file)}
+    best, failures = float("-inf"), 0
+    for value in returns:
+        best, failures = (value, 0) if value > best else (best, failures + 1)
+    assert rates >= {3e-4}
+    assert (failures == 3) == ("stop_reason" in run.status())
+
+
+def test_wrong_arguments_and_parameters_are_named(train):
+    with pytest.raises(TaskError, match=r"callback .*Adaptive': TypeError: .*unexpected keyword argument 'speed'"):
+        train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:Adaptive": {"speed": 1}}})
+    with pytest.raises(TaskError, match=r"on_start at step 0: ValueError: set_parameter\('gamma', 0.5\): set one of"):
+        train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:WrongParameter": None}})
+
+
+def test_a_callback_whose_file_has_changed_needs_force(train, resume, tmp_path, capsys):
+    file = Path(shutil.copy(FILE, tmp_path / "mine.py"))
+    run = train("Line", {**SMALL_PPO, "callbacks": {f"{file}:Adaptive": {"stop_after": 64}}}).run
+    file.write_text(f"{file.read_text()}\n")
+    with pytest.raises(UsageError, match=r"mine.py has changed since the run began.*--force resumes anyway"):
+        resume(run, total_timesteps=320)
+    resume(run, force=True, total_timesteps=320)
+    assert "not bit-exact: " in capsys.readouterr().err
