@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 # Tests start hundreds of processes, which would each compile all modules where writing them compiled is turned off.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-slow test-crash test-all lint format bench train-all clean
+.PHONY: demo test test-slow test-crash test-all lint format bench compare train-all clean
 
 demo: $(VENV)/.installed
 	$(BIN)/rlctl train reach
@@ -44,6 +44,10 @@ format: $(VENV)/.dev
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m tests.benchmarks
+
+# Trains every classic and reach with rlctl, rl-zoo3 and sbx; hours. RLCTL_ZOO and RLCTL_SBX name their Pythons.
+compare: $(VENV)/.dev
+	$(BIN)/python -m tests.benchmarks.compare $(TASKS)
 
 # Trains what is missing of every bundled task, and writes the tables of scores; hours. SEEDS=1-3 by default.
 train-all: $(VENV)/.dev
