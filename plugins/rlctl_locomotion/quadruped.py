@@ -54,6 +54,9 @@ class Quadruped(Legged):
     events = {  # with `randomize: true`
         "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
         "friction": Event("reset", events.set_friction, body="ground", friction=(0.3, 1.5)),
+        "contact_stiffness": Event(
+            "reset", events.set_contact_stiffness, body="ground", stiffness=(1.5e3, 1e5)
+        ),  # [N/m]
         "gravity": Event("reset", events.shift_gravity, change=(-0.5, 0.5)),  # [m/s^2]
         "joint_damping": Event("reset", events.set_joint_damping, body="robot", damping=(0.0, 0.2)),  # [N m s/rad]
         "motor_strength": Event("reset", events.scale_motor_strength, body="robot", factor=(0.8, 1.0)),

@@ -14,6 +14,7 @@ from rlctl.errors import TaskError, check_name
 from rlctl.task.bullet import pybullet
 
 _RAIL = 100.0  # [m]
+_RIGID = 1e12  # [N/m]
 
 
 class _Dynamics(NamedTuple):
@@ -38,7 +39,7 @@ class Properties:
     _links: dict[str, int]
 
     def __init__(self) -> None:
-        self._dynamics_changed = self._damping_changed = self._colors_changed = False
+        self._dynamics_changed = self._damping_changed = self._colors_changed = self._contacts_changed = False
         self.motor_strength: NDArray[np.float64] | None = None
         """Fraction of the commanded force that the motors give, shape (joints,); None: all of it."""
         self._built_strength: NDArray[np.float64] | None = None
@@ -65,6 +66,9 @@ class Properties:
             self._colors_changed = False
             for (link, shape), color in self._colors.items():
                 self._paint(link, shape, color)
+        if self._contacts_changed:
+            self._contacts_changed = False
+            self.set_contact_stiffness(_RIGID)
 
     @cached_property
     def _dynamics(self) -> dict[int, _Dynamics]:
@@ -152,6 +156,19 @@ class Properties:
         self._dynamics_changed = True
         for link in chosen:
             self._change(link, lateralFriction=friction)
+
+    def set_contact_stiffness(self, stiffness: float, links: Sequence[str] = ()) -> None:
+        """Set the stiffness of contacts with the links [N/m], until the next reset.
+
+        Contacts are rigid by default. After the first call they are springs, if very stiff ones: PyBullet cannot
+        return to rigid contacts.
+        """
+        self._contacts_changed = stiffness != _RIGID
+        engine = pybullet.getPhysicsEngineParameters(physicsClientId=self.client)
+        # With this damping a physics step removes a fifth of the overlap, as in rigid contacts.
+        damping = 4.0 * engine["fixedTimeStep"] / engine["numSubSteps"] * stiffness
+        for link in self._select_links(links):
+            self._change(link, contactStiffness=stiffness, contactDamping=damping)
 
     def scale_joint_damping(self, factor: float, joints: Sequence[str] = ()) -> None:
         """Set the joints' damping to `factor` times the built world's values, until the next reset.
