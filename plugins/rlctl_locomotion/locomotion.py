@@ -69,7 +69,7 @@ class Locomotion(Task):
     def build(self, sim: Sim) -> None:
         """Load the floor and the robot, its motors switched off."""
         sim.set_gravity(9.8)
-        sim.set_contact_stiffness(0.9)
+        sim.set_contact_erp(0.9)
         self.floor = sim.load("floor", "plane_stadium.sdf")
         self.floor.set_friction(0.8)  # and no restitution: theirs is multiplied with the robot's, which is 0
         self.body = sim.load("robot", f"mjcf/{self.model}", self_collision=True)

@@ -158,7 +158,7 @@ class Properties:
             self._change(link, lateralFriction=friction)
 
     def set_contact_stiffness(self, stiffness: float, links: Sequence[str] = ()) -> None:
-        """Set the stiffness of contacts with the links [N/m], until the next reset.
+        """Set the stiffness of a contact point of the links [N/m], until the next reset.
 
         Contacts are rigid by default. After the first call they are springs, if very stiff ones: PyBullet cannot
         return to rigid contacts.

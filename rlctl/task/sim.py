@@ -76,7 +76,7 @@ class Sim(Constraints):
         """Set the downward gravity of the built world [m/s^2], by default 9.81. Call it in `build`."""
         pybullet.setGravity(0.0, 0.0, -gravity, physicsClientId=self.client)
 
-    def set_contact_stiffness(self, erp: float) -> None:
+    def set_contact_erp(self, erp: float) -> None:
         """Set the part of a contact's depth that a physics step removes, in (0, 1]: Bullet's error reduction parameter.
 
         The default is 0.2. Call it in `build`: resets keep the value.

@@ -101,7 +101,7 @@ def test_stiffer_contacts(sim):
     ball = sim.load("ball", "sphere_small.urdf")  # of 3 cm
     heights = []
     for erp in (0.2, 0.9):
-        sim.set_contact_stiffness(erp)
+        sim.set_contact_erp(erp)
         ball.set_base((0, 0, 0.02))
         sim.step()
         heights.append(ball.base_position[2])

@@ -231,3 +231,52 @@ def test_reach_with_all_of_its_events_repeats(make):
         episode(used, 100 + seed)
         np.testing.assert_array_equal(episode(used, seed), episode(make(Reach(), randomize=True), seed))
     assert make(Reach()).reset(seed=0)[1] == {}
+
+
+class SoftGround(Task):
+    """A cube of 1 kg lies on ground of 2,000 N/m."""
+
+    control_dt, substeps, episode_s = 1 / 60, 4, 2.0
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+    reward_weights = {"nothing": 0.0}
+    events = {"soft": Event("reset", events.set_contact_stiffness, body="plane", stiffness=(2e3, 2e3))}
+
+    def build(self, sim: Sim) -> None:
+        sim.load("plane", "plane.urdf", fixed=True)
+        self.cube = sim.load("cube", "cube_small.urdf", position=(0.0, 0.0, 0.03), inertia="shape")
+        self.cube.scale_mass(1.0 / self.cube.total_mass())
+
+    def reset(self, rng):
+        pass
+
+    def act(self, action):
+        pass
+
+    def observe(self):
+        return {"height": self.cube.base_position[2:]}
+
+    def rewards(self, action):
+        return {"nothing": 0.0}
+
+
+def test_a_soft_ground_is_a_spring_until_the_next_reset(make):
+    soft, plain = make(SoftGround(), randomize=True), make(SoftGround())
+    resting = []
+    for env in (soft, plain):
+        env.reset(seed=0)
+        for _ in range(120):
+            height = env.step(np.zeros(1))[0][0]
+        resting.append(height)
+    # 1 kg on four corners of 2,000 N/m: 9.81 / 8000 = 1.2 mm
+    assert resting[1] - resting[0] == pytest.approx(9.81 / 8000, rel=0.05)
+    soft.sim.restore()
+    for _ in range(120):
+        soft.sim.step()
+    assert soft.task.cube.base_position[2] == pytest.approx(resting[1], abs=1e-5)
+
+
+def test_stiffness_is_drawn_evenly_in_its_logarithm(make):
+    env = make(SoftGround(), soft={"stiffness": [1e3, 1e5]})
+    drawn = [env.reset(seed=seed)[1]["events"]["soft"]["stiffness"] for seed in range(200)]
+    assert 1e3 <= min(drawn) < 1.2e3 < 8e4 < max(drawn) <= 1e5
+    assert np.mean(np.array(drawn) < 1e4) == pytest.approx(0.5, abs=0.1)

@@ -38,7 +38,8 @@ def set_friction(sim: Sim, rng: Rng, *, body: str, friction: NotNegative, links:
 def set_contact_stiffness(sim: Sim, rng: Rng, *, body: str, stiffness: Positive, links: Sequence[str] = ()) -> Drawn:
     """Set the stiffness of contacts with `links`, or with the whole body [N/m]; its logarithm is drawn uniformly.
 
-    A soft ground prepares a policy for another physics engine: a robot of 10 kg sinks 1 cm into 1e4 N/m.
+    It is that of a contact point: a foot that carries 50 N on one point sinks 5 mm into ground of 1e4 N/m. A policy
+    trained with soft and stiff contacts depends less on the physics engine.
     """
     drawn = float(np.exp(rng.uniform(*np.log(stiffness))))
     sim.body(body).set_contact_stiffness(drawn, links)
