@@ -10,10 +10,11 @@ import re
 import sys
 import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rlctl.errors import UsageError
+from rlctl.errors import TaskError, UsageError
 
 _INSTALL = (
     "pip install setuptools && pip install --no-build-isolation" if sys.version_info >= (3, 12) else "pip install"
@@ -54,6 +55,19 @@ def _import_silently(name: str) -> ModuleType:
 
 pybullet: Any = _LazyModule("pybullet")
 pybullet_data: Any = _LazyModule("pybullet_data")
+
+
+def find_model_file(file: str | Path) -> Path:
+    """Return the path of a model file, which may be a name in `pybullet_data`; raises `TaskError` if it is missing."""
+    path = Path(file)
+    if not path.is_absolute() and not path.is_file():
+        path = Path(pybullet_data.getDataPath()) / file
+    if not path.is_file():  # PyBullet crashes on a folder
+        raise TaskError(
+            f"model file {str(file)!r} not found: neither under {Path.cwd()} nor in pybullet_data; "
+            f"for a file next to your module: Path(__file__).with_name({path.name!r})"
+        )
+    return path
 
 
 def read_complaint(call: Callable[[], object]) -> str:

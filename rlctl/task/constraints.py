@@ -35,7 +35,7 @@ class Attachment:
     @property
     def world_pose(self) -> tuple[Array, Array]:
         """Position [m] and orientation (x, y, z, w) in the world."""
-        if self.index < 0:
+        if self.link == self.body.base_name:
             pose = self.body.base_position, self.body.base_orientation
         else:
             pose = self.body.link_position(self.link), self.body.link_orientation(self.link)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -19,58 +19,65 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_XYZW, _WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
+XYZW, WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
+"""Indices that reorder MuJoCo's quaternions (w, x, y, z) for rlctl, and back."""
 _FRICTION = 0.5  # PyBullet's, of a link whose file gives none
 
 
 def refuse(name: str) -> NoReturn:
     """Raise `UsageError` for a feature without an equivalent in MuJoCo."""
-    raise UsageError(f"--sim mujoco does not support {name}: this task runs in PyBullet only")
+    raise UsageError(f"{name}: not in MuJoCo; this task runs in PyBullet only")
 
 
 class MujocoBody:
-    """The methods of `Body`, for a body in MuJoCo."""
+    """The methods of `Body`, for a body in MuJoCo; `child` is the `MjSpec` of its file."""
 
-    def __init__(self, sim: MujocoSim, name: str, file: Path, fixed: bool, base: str) -> None:
-        self._sim, self.name, self.file, self.fixed, self.base_name = sim, name, file, fixed, base
+    def __init__(self, sim: MujocoSim, name: str, file: Path, fixed: bool, child: Any) -> None:
+        self._sim, self.name, self.file, self.fixed = sim, name, file, fixed
+        self.base_name: str = child.worldbody.first_body().name
         self.terrain = None
+        self.geom_links: list[str] = [geom.parent.name for geom in child.geoms]
+        """By geom."""
+        self.moving: set[str] = set()
+        """Links that are not fixed to the world."""
+        for link in child.bodies[1:]:  # a parent comes before its children
+            if not fixed or link.joints or link.parent.name in self.moving:
+                self.moving.add(link.name)
         root = ElementTree.fromstring(file.read_bytes().strip())
-        self._limits = {joint.get("name"): _read_limits(joint) for joint in root.findall("joint")}
-        self.friction = {str(link.get("name")): _read_friction(link) for link in root.findall("link")}
+        self._joints = {str(joint.get("name")): joint for joint in root.findall("joint")}
+        links = {str(link.get("name")): link for link in root.findall("link")}
+        # MuJoCo ignores PyBullet's `contact` tags.
+        self.friction = {
+            link: _read(part, "contact/lateral_friction", default=_FRICTION) for link, part in links.items()
+        }
         """By link."""
+        self.spin = {link: _read(part, "contact/spinning_friction") for link, part in links.items()}
+        """Spinning friction by link [m]."""
+        speeds = [_read(self._joints[joint.name], "limit", "velocity") for joint in child.joints]
+        self._speed_cap = max(speeds) if fixed and speeds and min(speeds) > 0 else np.inf
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        if name not in _BOUND or self._sim.is_compiled:
-            refuse(name)
-        _ = self._sim.model  # a task may ask a body for its joints as soon as it is loaded
-        return self.__dict__[name]
+        refuse(name)
 
     def bind(self, model: Any) -> None:
-        """Look up joints, links and geoms in a compiled model."""
-        prefix = f"{self.name}/"
-        joints = [
-            joint
-            for joint in range(model.njnt)
-            if model.joint(joint).name.startswith(prefix) and int(model.jnt_type[joint]) >= 2
-        ]
-        self.joint_names = [model.joint(joint).name.removeprefix(prefix) for joint in joints]
+        """Look up joints and links in a compiled model."""
+        prefix, slide = f"{self.name}/", int(self._sim.mujoco.mjtJoint.mjJNT_SLIDE)
+        names = {joint: model.joint(joint).name for joint in range(model.njnt) if model.jnt_type[joint] >= slide}
+        names = {joint: name.removeprefix(prefix) for joint, name in names.items() if name.startswith(prefix)}
+        self.joint_names, joints = list(names.values()), list(names)
         self._positions, self._velocities = model.jnt_qposadr[joints].astype(int), model.jnt_dofadr[joints].astype(int)
-        limited = model.jnt_limited[joints].astype(bool)
-        self.joint_low = np.where(limited, model.jnt_range[joints, 0], -np.inf)
-        self.joint_high = np.where(limited, model.jnt_range[joints, 1], np.inf)
-        limits = [self._limits.get(name, {}) for name in self.joint_names]
-        self.joint_max_force = np.array([limit.get("effort", 0.0) for limit in limits])
-        self.joint_max_speed = np.array([limit.get("velocity", 0.0) for limit in limits])
-        names = {body: model.body(body).name for body in range(model.nbody)}
-        self.links = {name.removeprefix(prefix): body for body, name in names.items() if name.startswith(prefix)}
+        limited, limits = model.jnt_limited[joints][:, None], model.jnt_range[joints]
+        self.joint_low, self.joint_high = np.where(limited, limits, (-np.inf, np.inf)).T
+        elements = [self._joints[name] for name in self.joint_names]
+        self.joint_max_force = np.array([_read(joint, "limit", "effort") for joint in elements])
+        self.joint_max_speed = np.array([_read(joint, "limit", "velocity") for joint in elements])
+        bodies = {body: model.body(body).name for body in range(model.nbody)}
+        self.links = {name.removeprefix(prefix): body for body, name in bodies.items() if name.startswith(prefix)}
         self.link_names = {body: name for name, body in self.links.items()}
-        geoms = [geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in self.link_names]
-        self.geoms = {geom: self.link_names[int(model.geom_bodyid[geom])] for geom in geoms}
         self.save()
-        if self.fixed and self.joint_max_speed.size and (self.joint_max_speed > 0).all():
-            self.cap_joint_speed(float(self.joint_max_speed.max()))
+        self.cap_joint_speed(self._speed_cap)
 
     def save(self) -> None:
         """Save the present friction as that of the built world, with full motor strength."""
@@ -118,14 +125,14 @@ class MujocoBody:
 
     def link_orientation(self, link: str) -> Array:
         """As `Body.link_orientation`."""
-        return self._sim.forward().xquat[self.find_link(link)][_XYZW]  # type: ignore[no-any-return]
+        return self._sim.forward().xquat[self.find_link(link)][XYZW]  # type: ignore[no-any-return]
 
     def mass_state(self, link: str) -> MassState:
         """As `Body.mass_state`, at the end of the last physics step."""
         mujoco, data, number, velocity = self._sim.mujoco, self._sim.forward(), self.find_link(link), np.zeros(6)
         mujoco.mj_objectVelocity(self._sim.model, data, mujoco.mjtObj.mjOBJ_BODY, number, velocity, 0)
         # MuJoCo's own inertial frame may have its axes in another order than the file.
-        frame = data.xquat[number][_XYZW]
+        frame = data.xquat[number][XYZW]
         return MassState(*(tuple(part.tolist()) for part in (data.xipos[number], frame, velocity[3:], velocity[:3])))
 
     @property
@@ -137,6 +144,17 @@ class MujocoBody:
     def base_orientation(self) -> Array:
         """As `Body.base_orientation`."""
         return self.link_orientation(self.base_name)
+
+    def add_force_sensor(self, joint: str) -> None:
+        """As `Body.add_force_sensor`."""
+        check_name(joint, self._joints, f"{self.file.name} has no joint", TaskError)
+        link = self._joints[joint].find("child").get("link")  # type: ignore[union-attr]
+        self._sim.add_force_sensor(f"{self.name}/{joint}", f"{self.name}/{link}")
+
+    def joint_reaction(self, joint: str) -> Array:
+        """As `Body.joint_reaction`, for a joint without a motor."""
+        start = self._sim.model.sensor(f"{self.name}/{joint}").adr[0]
+        return self._sim.data.sensordata[start : start + 6].copy()  # type: ignore[no-any-return]
 
     def links_touching(self, other: MujocoBody) -> set[str]:
         """As `Body.links_touching`."""
@@ -151,7 +169,7 @@ class MujocoBody:
     def set_base(self, position: Sequence[float], orientation: Sequence[float] = (0, 0, 0, 1)) -> None:
         """As `Body.set_base`: `position` is that of the centre of mass."""
         data, model, number = self._sim.touch(), self._sim.model, self.find_link(self.base_name)
-        turn, offset = np.array(orientation, float)[_WXYZ], np.zeros(3)
+        turn, offset = np.array(orientation, float)[WXYZ], np.zeros(3)
         self._sim.mujoco.mju_rotVecQuat(offset, model.body_ipos[number], turn)
         if self.fixed:
             model.body_pos[number], model.body_quat[number] = np.array(position) - offset, turn
@@ -214,8 +232,7 @@ class MujocoBody:
 
     def cap_joint_speed(self, speed: float) -> None:
         """As `Body.cap_joint_speed`, but only for the joints."""
-        _ = self.joint_names  # compiles
-        self._sim.velocity_cap[self._velocities] = speed
+        self._sim.velocity_cap[self._velocities] = self._speed_cap = speed
 
     def set_friction(self, friction: float, links: Sequence[str] = ()) -> None:
         """As `Body.set_friction`."""
@@ -238,18 +255,6 @@ class MujocoBody:
     describe_joints: Any = Motors.describe_joints
 
 
-_BOUND = (
-    "joint_names", "joint_low", "joint_high", "joint_max_force", "joint_max_speed", "links", "link_names", "geoms",
-    "_positions", "_velocities", "_strength",
-)  # fmt: skip
-
-
-def _read_limits(joint: ElementTree.Element) -> Mapping[str, float]:
-    limit = joint.find("limit")
-    return {} if limit is None else {name: float(value) for name, value in limit.attrib.items()}
-
-
-def _read_friction(link: ElementTree.Element) -> float:
-    # MuJoCo ignores PyBullet's `contact` tags.
-    friction = link.find("contact/lateral_friction")
-    return _FRICTION if friction is None else float(friction.get("value", _FRICTION))
+def _read(element: ElementTree.Element, path: str, name: str = "value", default: float = 0.0) -> float:
+    part = element.find(path)
+    return default if part is None else float(part.get(name, default))

@@ -8,6 +8,7 @@ not defined here or in `MujocoBody`; using one raises `UsageError`.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, UsageError, check_name
-from rlctl.task.bullet import pybullet_data
-from rlctl.task.mujoco_body import MujocoBody, refuse
+from rlctl.task.bullet import find_model_file
+from rlctl.task.constraints import Attachment, Joined
+from rlctl.task.mujoco_body import WXYZ, MujocoBody, refuse
 
 Array = NDArray[np.float64]
 
-_WXYZ = [3, 0, 1, 2]
-_NO_FRICTION = 1e-3  # MuJoCo takes the larger value of two geoms
-_CHANGEABLE = ("body_mass", "body_inertia", "body_pos", "body_quat", "geom_friction", "dof_damping")
+_RIGID = (0.9999, 0.9999, 0.001, 0.5, 2)  # impedance of motors and constraints: as stiff as PyBullet's
+_CHANGEABLE = ("body_mass", "body_inertia", "body_pos", "body_quat")
 
 
 def read_solref(sim: str) -> float | None:
@@ -45,7 +46,7 @@ def read_solref(sim: str) -> float | None:
 
 
 class MujocoSim:
-    """The methods of `Sim`, for a world in MuJoCo. The model is compiled when the world is first read or moved."""
+    """The methods of `Sim`, for a world in MuJoCo. The model is compiled again after every change of its structure."""
 
     def __init__(self, *, control_dt: float, substeps: int, solref: float) -> None:
         try:
@@ -54,13 +55,13 @@ class MujocoSim:
             raise UsageError("--sim mujoco needs MuJoCo: pip install mujoco") from None
         self.mujoco = mujoco
         self._control_dt, self._substeps, self._solref = control_dt, substeps, solref
-        self._begin()
+        self.clear()
 
-    def _begin(self) -> None:
+    def clear(self) -> None:
+        """As `Sim.clear`."""
         self.bodies: dict[str, MujocoBody] = {}
         self._pushes: list[tuple[int, Array, list[int]]] = []
-        self._model: Any = None
-        self._dirty = True
+        self._pairs: list[tuple[MujocoBody, str, MujocoBody, str]] = []
         self._spec = self.mujoco.MjSpec()
         option = self._spec.option
         option.timestep = self._control_dt / self._substeps
@@ -68,6 +69,8 @@ class MujocoSim:
         option.integrator = self.mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         option.cone = self.mujoco.mjtCone.mjCONE_ELLIPTIC
         option.impratio = 10.0  # otherwise feet that stand slide slowly
+        self.model: Any = self._spec.compile()
+        self.data: Any = self.mujoco.MjData(self.model)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -76,7 +79,7 @@ class MujocoSim:
 
     def set_gravity(self, gravity: float) -> None:
         """As `Sim.set_gravity`."""
-        self._spec.option.gravity = [0.0, 0.0, -gravity]
+        self._spec.option.gravity = self.model.opt.gravity[:] = [0.0, 0.0, -gravity]
 
     def load(
         self,
@@ -90,57 +93,73 @@ class MujocoSim:
         self_collision: bool = False,
         inertia: Literal["file", "shape"] = "file",
     ) -> MujocoBody:
-        """As `Sim.load`, for URDF files; `flags` and `inertia` have no effect."""
-        path = Path(file)
-        if not path.is_absolute() and not path.is_file():
-            path = Path(pybullet_data.getDataPath()) / file
-        if path.suffix != ".urdf":
-            refuse(f"{path.name}, which is not a URDF file")
+        """As `Sim.load`, for URDF files without `self_collision`; `flags` and `inertia` have no effect."""
+        path = find_model_file(file)
+        if path.suffix != ".urdf" or self_collision:
+            refuse("self_collision" if self_collision else f"{path.name}, which is not a URDF file")
         child = self.mujoco.MjSpec.from_file(str(path))
         child.compiler.fusestatic = False  # links on fixed joints keep their names
-        base = child.worldbody.first_body().name
-        bit = 1 << len(self.bodies)
-        for geom in child.geoms:
-            # Links of one body do not collide with each other without `self_collision`.
-            geom.contype, geom.conaffinity = bit, 0x3FFFFFFF if self_collision else 0x3FFFFFFF & ~bit
-            geom.condim = 3
-            geom.solref[0] = self._solref
-        frame = self._spec.worldbody.add_frame(pos=list(position), quat=[orientation[part] for part in _WXYZ])
+        for number, geom in enumerate(child.geoms):
+            geom.name, geom.contype, geom.conaffinity = str(number), 0, 0  # only the pairs of `_add_pairs` collide
+        body = MujocoBody(self, name, path, fixed or not any(link.mass > 0 for link in child.bodies), child)
+        frame = self._spec.worldbody.add_frame(pos=list(position), quat=[orientation[part] for part in WXYZ])
         self._spec.attach(child, prefix=f"{name}/", frame=frame)
-        fixed = fixed or not any(body.mass > 0 for body in child.bodies)
-        if not fixed:
-            self._spec.body(f"{name}/{base}").add_freejoint(name=f"{name}/free")
-        body = self.bodies[name] = MujocoBody(self, name, path, fixed, base)
-        self._model = None
+        if not body.fixed:
+            self._spec.body(f"{name}/{body.base_name}").add_freejoint(name=f"{name}/free")
+        for other in self.bodies.values():
+            self._add_pairs(body, other)
+        self.bodies[name] = body
+        self._compile()
         return body
+
+    def _add_pairs(self, first: MujocoBody, second: MujocoBody) -> None:
+        for (one, link), (two, other) in itertools.product(enumerate(first.geom_links), enumerate(second.geom_links)):
+            if link in first.moving or other in second.moving:
+                names = {"geomname1": f"{first.name}/{one}", "geomname2": f"{second.name}/{two}"}
+                self._spec.add_pair(**names, condim=4, solref=[self._solref, 1.0])
+                self._pairs.append((first, link, second, other))
+
+    def connect_gear(
+        self, body: MujocoBody, driver: str, driven: str, *, ratio: float, max_force: float = 0, stiffness: float = 0
+    ) -> None:
+        """As `Sim.connect_gear`; `max_force` and `stiffness` have no effect."""
+        names = {"name1": f"{body.name}/{driven}", "name2": f"{body.name}/{driver}"}
+        self._add_equality(self.mujoco.mjtEq.mjEQ_JOINT, data=[0.0, ratio, *[0.0] * 10], **names)
+
+    def connect_point(self, first: Attachment, second: Attachment, *, max_force: float = 0) -> Joined:
+        """As `Sim.connect_point`; `max_force` has no effect."""
+        names = {"name1": self._add_site(first), "name2": self._add_site(second)}
+        self._add_equality(self.mujoco.mjtEq.mjEQ_CONNECT, objtype=self.mujoco.mjtObj.mjOBJ_SITE, **names)
+        return Joined(first, second)
+
+    def _add_equality(self, kind: Any, **values: Any) -> None:
+        solref = [2 * self._control_dt / self._substeps, 1.0]
+        self._spec.add_equality(type=kind, solref=solref, solimp=_RIGID, **values)
+        self._compile()
+
+    def _add_site(self, end: Attachment) -> str:
+        name, link = f"site {len(self._spec.sites)}", self._spec.body(f"{end.body.name}/{end.link}")
+        origin = link.ipos if end.link == end.body.base_name else np.zeros(3)
+        link.add_site(name=name, pos=origin + end.position)
+        return name
+
+    def add_force_sensor(self, joint: str, link: str) -> None:
+        """Measure force and torque of a joint at the centre of mass of its `link`; both names with that of the body."""
+        part, kinds = self._spec.body(link), self.mujoco.mjtSensor
+        part.add_site(name=joint, pos=part.ipos)
+        for name, kind in ((joint, kinds.mjSENS_FORCE), (f"{joint} torque", kinds.mjSENS_TORQUE)):
+            self._spec.add_sensor(name=name, type=kind, objtype=self.mujoco.mjtObj.mjOBJ_SITE, objname=joint)
+        self._compile()
 
     def body(self, name: str) -> MujocoBody:
         """As `Sim.body`."""
         check_name(name, self.bodies, "no body", TaskError, listed="Loaded")
         return self.bodies[name]
 
-    @property
-    def is_compiled(self) -> bool:
-        """Whether the compiled model contains all bodies."""
-        return self._model is not None
-
-    @property
-    def model(self) -> Any:
-        """The `mujoco.MjModel`, compiled again if bodies were loaded."""
-        if self._model is None:
-            self._compile()
-        return self._model
-
-    @property
-    def data(self) -> Any:
-        """The `mujoco.MjData` of the model."""
-        _ = self.model
-        return self._data
-
     def _compile(self) -> None:
-        model = self._model = self._spec.compile()
-        self._data = self.mujoco.MjData(model)
-        model.dof_solimp[:] = (0.9999, 0.9999, 0.001, 0.5, 2)  # motors are as stiff as PyBullet's
+        self.model, self.data = self._spec.recompile(self.model, self.data)  # keeps the state
+        model = self.model
+        model.dof_solimp[:] = _RIGID
         model.jnt_actfrclimited[:] = 0
         self._positions = np.zeros(model.nv, int)  # index in qpos, by degree of freedom
         self._positions[model.jnt_dofadr] = model.jnt_qposadr
@@ -152,27 +171,24 @@ class MujocoSim:
         self.spread_friction()
 
     def _forget_motors(self) -> None:
-        count = self._model.nv
+        count = self.model.nv
         self.target, self.speed = np.full(count, np.nan), np.full(count, np.nan)  # of position, of velocity motors
         self.gain, self.top_speed = np.zeros(count), np.full(count, np.inf)
         self.force, self.torque, self.applied = np.zeros(count), np.zeros(count), np.zeros(count)
 
     def spread_friction(self) -> None:
-        """Give the geoms of moving bodies the product of their friction and the ground's, as PyBullet computes it."""
-        fixed = [body for body in self.bodies.values() if body.fixed and not body.joint_names]
-        ground = max((friction for body in fixed for friction in body.friction.values()), default=1.0)
-        for body in self.bodies.values():
-            for geom, link in body.geoms.items():
-                moving = body.friction[link] * ground
-                self.model.geom_friction[geom, 0] = _NO_FRICTION if body in fixed else moving
+        """Give contacts the product of the frictions of their links, as PyBullet computes it."""
+        for pair, (first, link, second, other) in enumerate(self._pairs):
+            one, two = first.friction[link], second.friction[other]
+            spin = first.spin[link] * two + second.spin[other] * one
+            self.model.pair_friction[pair, :3] = np.maximum((one * two, one * two, spin), self.mujoco.mjMINMU)
 
     def forward(self) -> Any:
         """Return the data after computing everything that depends on the positions."""
-        data = self.data
         if self._dirty:
-            self.mujoco.mj_step1(self._model, data)
+            self.mujoco.mj_step1(self.model, self.data)
             self._dirty = False
-        return data
+        return self.data
 
     def touch(self) -> Any:
         """Return the data for a change of positions or velocities."""
@@ -209,16 +225,15 @@ class MujocoSim:
 
     def save(self) -> None:
         """As `Sim.save`."""
-        data = self.data
-        self._saved = data.qpos.copy(), data.qvel.copy()
-        self._gravity = self._model.opt.gravity.copy()
-        self.nominal = {name: getattr(self._model, name).copy() for name in _CHANGEABLE}
+        self._saved = self.data.qpos.copy(), self.data.qvel.copy()
+        self._gravity = self.model.opt.gravity.copy()
+        self.nominal = {name: getattr(self.model, name).copy() for name in _CHANGEABLE}
         for body in self.bodies.values():
             body.save()
 
     def restore(self) -> None:
         """As `Sim.restore`; bit for bit."""
-        model, data = self.model, self.data
+        model, data = self.model, self.touch()
         model.dof_frictionloss[:] = 0
         self.mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:] = self._saved
@@ -227,13 +242,9 @@ class MujocoSim:
             getattr(model, name)[:] = values
         self._forget_motors()
         self._pushes.clear()
-        self._dirty = True
         for body in self.bodies.values():
             body.restore()
-
-    def clear(self) -> None:
-        """As `Sim.clear`."""
-        self._begin()
+        self.spread_friction()
 
     def shift_gravity(self, change: float) -> None:
         """As `Sim.shift_gravity`."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body
-from rlctl.task.bullet import check_display, pybullet, pybullet_data, read_complaint
+from rlctl.task.bullet import check_display, find_model_file, pybullet, pybullet_data, read_complaint
 from rlctl.task.constraints import Constraints
 
 
@@ -103,14 +103,7 @@ class Sim(Constraints):
         shapes and the file's masses.
         """
         self._check_new(name)
-        path = Path(file)
-        if not path.is_absolute() and not path.is_file():
-            path = Path(pybullet_data.getDataPath()) / file
-        if not path.is_file():  # PyBullet crashes on a folder
-            raise TaskError(
-                f"model file {str(file)!r} not found: neither under {Path.cwd()} nor in pybullet_data; "
-                f"for a file next to your module: Path(__file__).with_name({path.name!r})"
-            )
+        path = find_model_file(file)
         if path.suffix == ".urdf":
             _check_joint_names(path)
         if path.suffix == ".urdf" and inertia == "file":

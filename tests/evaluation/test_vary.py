@@ -261,7 +261,7 @@ def test_the_same_episodes_in_mujoco(rlctl):
 def test_the_worst_contacts_are_gated(rlctl):
     pytest.importorskip("mujoco")
     options = ("--episodes", "2", "--sim", "mujoco:0.02", "--min-success", "0.9")
-    done = rlctl("eval", "biped", "--pretrained", *options)
+    done = rlctl("eval", "biped-3d", "--pretrained", *options)
     assert done.returncode == 1
     assert "gate missed in the worst cell, mujoco solref 0.02" in done.stderr
     assert "--sim mujoco:0.02 --set randomize=false" in done.stdout
@@ -269,6 +269,7 @@ def test_the_worst_contacts_are_gated(rlctl):
 
 def test_what_mujoco_has_not_is_said_before_an_episode_is_played(rlctl):
     pytest.importorskip("mujoco")
-    done = rlctl("eval", "gear-arm", "--pretrained", "--sim", "mujoco")
+    done = rlctl("eval", "kuka-grasp", "--pretrained", "--sim", "mujoco")
     assert done.returncode == 2
-    assert done.stderr.endswith("error: --sim mujoco does not support connect_gear: this task runs in PyBullet only\n")
+    file = "kuka_with_gripper2.sdf, which is not a URDF file"
+    assert done.stderr.endswith(f"error: {file}: not in MuJoCo; this task runs in PyBullet only\n")

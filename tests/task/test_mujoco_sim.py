@@ -9,11 +9,13 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.task.env import TaskEnv
 from rlctl.task.mujoco_sim import MujocoSim, read_solref
+from rlctl.task.sim import Sim
+from rlctl_manipulation.peg_insert import SCARA
 from tests.task.tasks import Cart
 
 pytest.importorskip("mujoco")
 
-TASKS = ["reach", "reach-sparse", "quadruped", "biped", "biped-3d"]
+TASKS = ["reach", "reach-sparse", "quadruped", "biped", "biped-3d", "peg-insert", "screw-drive", "gear-arm"]
 
 
 def play(env, steps: int = 40):
@@ -76,13 +78,38 @@ def test_frictions_are_multiplied_and_restored():
     with closing(TaskEnv(Cart(), sim="mujoco")) as env:
         cube, plane = env.task.cube, env.task.plane
         env.reset(seed=0)
-        (geom,) = cube.geoms
-        nominal = float(env.sim.model.geom_friction[geom, 0])
+        nominal = env.sim.model.pair_friction.copy()
         plane.set_friction(0.5)
         cube.set_friction(0.8)
-        assert env.sim.model.geom_friction[geom, 0] == pytest.approx(0.4)
+        assert env.sim.model.pair_friction[0, :2] == pytest.approx(0.4)
         env.reset(seed=0)
-        assert env.sim.model.geom_friction[geom, 0] == pytest.approx(nominal)
+        assert np.array_equal(env.sim.model.pair_friction, nominal)
+
+
+@pytest.mark.parametrize("world", [Sim, MujocoSim])
+def test_a_force_sensor_measures_what_hangs_from_it(world):
+    options = {"solref": 0.02} if world is MujocoSim else {}
+    with closing(world(control_dt=1 / 60, substeps=4, **options)) as sim:
+        arm = sim.load("arm", SCARA, fixed=True)
+        arm.add_force_sensor("sensor")
+        sim.save()
+        arm.drive_at(np.zeros(4))
+        for _ in range(10):
+            sim.step()
+        force = arm.joint_reaction("sensor")[:3]
+    # Peg and tip, below the sensor, weigh 51 g.
+    assert force == pytest.approx([0.0, 0.0, 9.81 * 0.051], abs=0.01)
+
+
+def test_gears_and_a_linkage_hold():
+    with closing(EnvSpec("gear-arm", sim="mujoco").make()) as env:
+        play(env)
+        task = env.unwrapped.task
+        positions = dict(zip(task.arm.joint_names, task.arm.joint_positions, strict=True))
+        assert task.linkage.gap < 2e-3
+    for joint in ("turn", "shoulder", "crank"):
+        assert positions[joint] == pytest.approx(positions[f"{joint}_motor"] / 3, abs=0.02)
+    assert positions["wrist"] == pytest.approx(-positions["crank"], abs=0.01)
 
 
 def test_events_act_in_mujoco_too():
@@ -95,13 +122,17 @@ def test_events_act_in_mujoco_too():
 
 
 @pytest.mark.parametrize(
-    ("task", "missing"), [("gear-arm", "connect_gear"), ("peg-insert", "add_force_sensor"), ("ant", "")]
+    ("task", "parameters", "missing"),
+    [("biped", {"roughness": 0.03}, "add_height_field"), ("ant", {}, "set_contact_erp")],
 )
-def test_what_mujoco_has_not_is_named(task, missing):
-    with pytest.raises(
-        UsageError, match=f"^--sim mujoco does not support .*{missing}.*: this task runs in PyBullet only"
-    ):
-        EnvSpec(task, sim="mujoco").make()
+def test_what_mujoco_has_not_is_named(task, parameters, missing):
+    with pytest.raises(UsageError, match=f"^{missing}: not in MuJoCo; this task runs in PyBullet only$"):
+        EnvSpec(task, parameters, sim="mujoco").make()
+
+
+def test_only_urdf_files_are_loaded(weightless_arm):
+    with pytest.raises(UsageError, match=r"^ant.xml, which is not a URDF file: not in MuJoCo"):
+        weightless_arm[0].load("ant", "mjcf/ant.xml")
 
 
 def test_engines():
