@@ -1,9 +1,8 @@
 """The world of a task in MuJoCo instead of PyBullet, with the same methods: to test if a policy depends on the engine.
 
 Models are the same URDF files. Motors work as in PyBullet: a row of the solver demands a velocity with a bounded force.
-Two things differ: contacts are soft, with the time constant `solref` [s] of at least two physics steps; and a joint's
-damping acts after its motor, so that a light joint with high damping lags. Methods without an equivalent in MuJoCo are
-not defined here or in `MujocoBody`; using one raises `UsageError`.
+Contacts differ: they are soft, with the time constant `solref` [s] of at least two physics steps. Methods without an
+equivalent in MuJoCo are not defined here or in `MujocoBody`; using one raises `UsageError`.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ class MujocoSim:
         option = self._spec.option
         option.timestep = self._control_dt / self._substeps
         option.gravity = [0.0, 0.0, -9.81]
-        option.integrator = self.mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        option.disableflags = int(self.mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
         option.cone = self.mujoco.mjtCone.mjCONE_ELLIPTIC
         option.impratio = 10.0  # otherwise feet that stand slide slowly
         self.model: Any = self._spec.compile()
@@ -102,6 +101,9 @@ class MujocoSim:
         for number, geom in enumerate(child.geoms):
             geom.name, geom.contype, geom.conaffinity = str(number), 0, 0  # only the pairs of `_add_pairs` collide
         body = MujocoBody(self, name, path, fixed or not any(link.mass > 0 for link in child.bodies), child)
+        for joint in child.joints:
+            # Implicit damping, in the form that constraints take part in: m (v' - v) = dt (f - d v').
+            joint.armature = joint.damping[0] * self._spec.option.timestep
         frame = self._spec.worldbody.add_frame(pos=list(position), quat=[orientation[part] for part in WXYZ])
         self._spec.attach(child, prefix=f"{name}/", frame=frame)
         if not body.fixed:
