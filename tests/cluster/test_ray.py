@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from rlctl.cluster.executors import choose_executor
-from rlctl.cluster.ray_trainings import connect
+from rlctl.cluster.ray_connection import connect
 from rlctl.errors import TaskError
 from rlctl.run.job import read_job
 from rlctl.training.request import run_training
