@@ -42,7 +42,7 @@ EnvTimeout = Annotated[
 ]
 On = Annotated[
     str | None,
-    Option("Where runs train: local, slurm, ray, ray:auto, ray:HOST:PORT.", metavar="WHERE", default_text="local"),
+    Option("Where to compute: local, slurm, ray, ray:auto, ray:HOST:PORT.", metavar="WHERE", default_text="local"),
 ]
 Cluster = Annotated[
     Path | None, Option("Settings for slurm and ray.", ("--cluster",), metavar="FILE", default_text="cluster.yaml")

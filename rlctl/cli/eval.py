@@ -11,6 +11,7 @@ import typer
 from rlctl.cli.arguments import Json, Pretrained, Set, choose_checkpoint, claim_stdout, command, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.request import EvalOptions, EvalRequest
+from rlctl.options import Cluster, On
 
 
 @command
@@ -40,6 +41,8 @@ def evaluate(
         typer.Option(metavar="mujoco[:SOLREF]", help="Play in MuJoCo too, with soft, medium and stiff contacts."),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a long --vary.")] = False,
+    on: On = None,
+    cluster: Cluster = None,
     json: Json = None,
 ) -> None:
     """Evaluate a policy: success rate with its interval, returns, reward terms."""
@@ -56,11 +59,15 @@ def evaluate(
         if request.baseline is not None or request.limits is not None:
             option = "--limits" if request.baseline is None else "--policy"
             raise UsageError(f"{option} cannot be combined with --vary, --push or --sim")
+        from rlctl.cluster.executors import choose_cell_player
         from rlctl.evaluation.vary import check_gates, measure_robustness
 
-        robustness = measure_robustness(request, vary, push=push, sim=sim, yes=yes, gates=gates)
+        play = choose_cell_player(on, cluster)
+        robustness = measure_robustness(request, vary, push=push, sim=sim, yes=yes, gates=gates, play_cells=play)
         show_robustness(robustness, json)
         return check_gates(robustness, gates)
+    if on is not None:
+        raise UsageError("--on plays the cells of a map: give --vary or --sim too")
     if request.run is not None and request.baseline is None and is_group(folder := Path(request.run)):
         from rlctl.evaluation.group import evaluate_group
 

@@ -1,4 +1,4 @@
-"""`--on`: which executor runs the trainings of a group."""
+"""`--on`: where the trainings of a group and the cells of a robustness map run."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ from pathlib import Path
 
 from rlctl.cluster.settings import read_settings
 from rlctl.errors import UsageError
+from rlctl.evaluation.vary import PlayCells
 from rlctl.training.trainings import MakeTrainings, make_local_trainings
 
 VARIABLE = "RLCTL_ON"
 """Environment variable that replaces the default, `local`."""
+_NOT_ON_SLURM = {
+    "tune": "each trial depends on the results of earlier ones",
+    "eval": "a cell takes seconds, a job of SLURM waits longer",
+}
 
 
 def choose_executor(
@@ -21,20 +26,36 @@ def choose_executor(
 
     Raises `UsageError` for any other value, and `RecipeError` for an invalid `cluster.yaml`.
     """
-    on = on or os.environ.get(VARIABLE) or "local"
-    kind, _, address = on.partition(":")
+    kind, address = _parse(on, verb)
     if detach and kind != "slurm":
         raise UsageError(f"--detach is for --on slurm: trainings on {kind} end with this process")
-    if on == "local":
+    if kind == "local":
         return make_local_trainings
-    if on == "slurm" and verb == "tune":
-        raise UsageError("tune --on slurm: each trial depends on the results of earlier ones; give ray or local")
-    if on == "slurm":
+    if kind == "slurm":
         from rlctl.cluster.slurm import SlurmTrainings
 
         return functools.partial(SlurmTrainings, settings=read_settings(cluster), detach=detach)
-    if kind == "ray" and (on == "ray" or address):
-        from rlctl.cluster.ray_trainings import RayTrainings
+    from rlctl.cluster.ray_trainings import RayTrainings
 
-        return functools.partial(RayTrainings, address, settings=read_settings(cluster))
+    return functools.partial(RayTrainings, address, settings=read_settings(cluster))
+
+
+def choose_cell_player(on: str | None, cluster: Path | None = None) -> PlayCells | None:
+    """Return what plays the cells of a robustness map, None for this machine; raises as `choose_executor`."""
+    kind, address = _parse(on, "eval")
+    if kind == "local":
+        return None
+    from rlctl.cluster.ray_cells import RayCells
+
+    return RayCells(address, read_settings(cluster))
+
+
+def _parse(on: str | None, verb: str) -> tuple[str, str]:
+    """Return the executor's kind and its address."""
+    on = on or os.environ.get(VARIABLE) or "local"
+    kind, _, address = on.partition(":")
+    if on == "slurm" and verb in _NOT_ON_SLURM:
+        raise UsageError(f"{verb} --on slurm: {_NOT_ON_SLURM[verb]}; give ray or local")
+    if on in ("local", "slurm", "ray") or (kind == "ray" and address):
+        return kind, address
     raise UsageError(f"--on {on}: give local, slurm, ray, ray:auto or ray:HOST:PORT")

@@ -12,8 +12,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from rlctl.cluster.slurm import STOP_FILE
+from rlctl.cluster.slurm import BEAT_FILE, STOP_FILE
 from rlctl.cluster.work import PREEMPTED, TAKEN, Work, execute
+from rlctl.processes.child_process import Standstill
 from rlctl.run.job import Job, job_file, read_job, write_job
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
@@ -30,13 +31,28 @@ class _NodeTrainings(Trainings):
 
     def train_work(self, receive: Callable[[str], None]) -> int:
         """Execute the work; return its exit code."""
-        stop = self._work.folder / STOP_FILE
+        folder, lease_s = self._work.folder, self._work.settings["lease_s"]
+        beat = Standstill(lambda: _read(folder / BEAT_FILE))
+
+        def must_stop() -> bool:
+            if (folder / BEAT_FILE).exists() and beat.seconds() > lease_s:
+                receive(f"error: the driver has not answered for {lease_s:g} s; --detach submits runs that need none")
+                return True
+            return (folder / STOP_FILE).exists()
+
         with HandledSignals(self._pass_on):
-            code = self.train(TrainRequest.from_json(self._work.request), receive, stop.exists)
+            code = self.train(TrainRequest.from_json(self._work.request), receive, must_stop)
         return code if self.stopped_by is None or code else PREEMPTED  # a signal came before the training began
 
     def _execute(self, request: TrainRequest, receive: Callable[[str], None], next_signal: NextSignal) -> int:
         return execute(self._work, receive, next_signal)
+
+
+def _read(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except OSError:
+        return ""
 
 
 def run(works: Path, index: int) -> int:

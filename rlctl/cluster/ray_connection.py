@@ -1,23 +1,27 @@
 """The connection to a Ray cluster, or to a Ray that is started on this machine."""
 
-from __future__ import annotations
-
 import atexit
 import os
 import secrets
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
+from rlctl.environments import registry
 from rlctl.errors import TaskError, UsageError, explain_missing_package
+from rlctl.rollout.workers import available_cores
 
 
-def connect(address: str) -> Any:
+def connect(address: str, task: str, cpus: int) -> Any:
     """Connect to Ray at an address, or start it on this machine if the address is empty; return the module `ray`.
 
+    Nodes get a copy of the current folder if `is_copied(task)`. A Ray on this machine has at least `cpus` cores.
     Raises `UsageError` if Ray is not installed, and `TaskError` if it cannot be reached.
     """
+    if (started := sys.modules.get("ray")) is not None and started.is_initialized():
+        return started
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_DEDUP_LOGS", "0")
     if not address:
@@ -38,10 +42,14 @@ def connect(address: str) -> Any:
         import ray
     except ModuleNotFoundError as error:
         raise UsageError(explain_missing_package("--on ray", error.name, "cluster")) from None
-    if ray.is_initialized():
-        return ray
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-    options |= {"address": address} if address else {"include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+    if address:
+        options["address"] = address
+    else:
+        cores = max(cpus, available_cores())
+        options |= {"include_dashboard": False, "_node_ip_address": "127.0.0.1", "num_cpus": cores}
+    if is_copied(task):
+        options["runtime_env"] = {"working_dir": os.getcwd(), "excludes": ["/runs", ".*"]}
     try:
         ray.init(**options)
     except Exception as error:  # ConnectionError, ValueError or RuntimeError
@@ -49,3 +57,19 @@ def connect(address: str) -> Any:
             f"--on ray:{address or 'local'}: cannot be reached: {str(error).partition(chr(10))[0]}"
         ) from None
     return ray
+
+
+def is_copied(task: str) -> bool:
+    """Return whether nodes get a copy of the current folder: the task is a file or module in it."""
+    place = task.rpartition(":")[0]
+    source = registry.find_source_file(task) if place and not Path(place).is_absolute() else None
+    return source is not None and source.resolve().is_relative_to(Path.cwd())
+
+
+def describe_slots(ray: Any, cpus: int, most: int) -> tuple[str, int]:
+    """Return as text how many of `most` run at a time with `cpus` cores each, and their number."""
+    cores = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
+    slots = min(most, sum(int(count // cpus) for count in cores))
+    if not slots:
+        return f"on Ray: waiting for a machine with {cpus} cores (cpus in cluster.yaml); it has none", 0
+    return f"on Ray, {slots} at a time: {cpus} of its {sum(cores):g} cores each", slots

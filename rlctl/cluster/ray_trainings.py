@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rlctl.cluster.ray_connection import connect
+from rlctl.cluster.ray_connection import connect, describe_slots, is_copied
 from rlctl.cluster.settings import ClusterSettings
 from rlctl.cluster.work import PREEMPTED, TAKEN, Work, execute, make_work, mark_shared_folder
 from rlctl.run.job import Job, read_job, write_job
@@ -107,28 +107,26 @@ def train_on_node(mailbox: Any, content: dict[str, Any]) -> int:
 class RayTrainings(Trainings):
     """Trains on Ray; as many at a time as its cores allow."""
 
-    def __init__(self, address: str, folder: Path, waiting: int, jobs: int | None, settings: ClusterSettings) -> None:
+    def __init__(
+        self, address: str, folder: Path, task: str, waiting: int, jobs: int | None, settings: ClusterSettings
+    ) -> None:
         super().__init__(min(jobs or _MOST_AT_ONCE, max(waiting, 1), _MOST_AT_ONCE))
         self.resume_options = f" --on ray{f':{address}' if address else ''}"
-        self._ray, self._settings, self._folder = connect(address), settings, folder
+        self._ray, self._settings, self._folder = connect(address, task, settings.cpus), settings, folder
         self._token = mark_shared_folder(folder)
         self._mailbox = _make_mailbox(self._ray)
         self._task = self._ray.remote(num_cpus=settings.cpus, max_retries=settings.retries)(train_on_node)
 
     def describe(self) -> str:
         """Describe where the runs train, and how many at a time."""
-        cores = self._ray.cluster_resources().get("CPU", 0)
-        at_once = int(cores // self._settings.cpus)
-        if not at_once:
-            needed = self._settings.cpus
-            return f"on Ray, whose {cores:g} cores are fewer than a run needs: {needed} (cpus in cluster.yaml)"
-        return f"on Ray, {min(at_once, self._jobs)} at a time: {self._settings.cpus} of its {cores:g} cores each"
+        return describe_slots(self._ray, self._settings.cpus, self._jobs)[0]
 
     def _prepare_thread(self) -> None:
         """The driver only waits."""
 
     def _execute(self, request: TrainRequest, receive: Callable[[str], None], next_signal: NextSignal) -> int:
         work = make_work(request, self._token, self._settings)
+        work = dataclasses.replace(work, has_copy=is_copied(work.task))
         job = Job(work.seed, work.task, "queued", "ray")
         write_job(self._folder, job)
         reference = self._task.remote(self._mailbox, dataclasses.asdict(work))

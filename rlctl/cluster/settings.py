@@ -23,7 +23,7 @@ class ClusterSettings(pydantic.BaseModel, extra="forbid"):
     retries: int = Field(3, ge=0, le=1000)
     """How often a run is retried after its machine was lost or it was preempted."""
     lease_s: float = Field(60.0, gt=0)
-    """A run on Ray ends itself if the driver has not answered for this time [s]."""
+    """A run ends itself if the driver has not answered for this time [s]; not with `--detach`."""
     sbatch: list[str] = []
     """Options for `sbatch`, such as `--time=04:00:00`."""
     setup: list[str] = []

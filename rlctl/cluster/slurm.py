@@ -1,8 +1,9 @@
 """Trainings as an array of SLURM jobs: a script for `sbatch`, and a small file per seed that shows the job's state.
 
 A node starts or resumes a run (`rlctl.cluster.node`). A run that is preempted, out of time or warned saves a checkpoint
-and ends with 143; the script then requeues the job. The array continues without the driver, and a new driver follows
-it again.
+and ends with 143; the script then requeues the job. The driver regularly writes a file; without it, runs save a
+checkpoint and end after `lease_s`. With `--detach` there is no such file, and the array needs no driver. A new driver
+follows an array again.
 """
 
 from __future__ import annotations
@@ -31,8 +32,14 @@ from rlctl.training.trainings import Detached, NextSignal, Trainings
 
 STOP_FILE = f"{JOBS}/stop"
 """When this file exists, nodes save a checkpoint and stop their training."""
+BEAT_FILE = f"{JOBS}/beat"
+"""If it exists and does not change for `lease_s`, nodes do the same: the driver was killed."""
 _POLL_S = 0.5
+_BEATS_PER_LEASE = 6
 _ASK_QUEUE_S = 15.0
+_ASK_AT_THE_END_S = 2.0
+_GONE_S = 120.0
+"""`squeue` may fail for this time, for example while the controller restarts."""
 _SCRIPT = """\
 #!/bin/bash
 #SBATCH --job-name={name} --array={array} --requeue --open-mode=append
@@ -57,7 +64,14 @@ class SlurmTrainings(Trainings):
     resume_options = " --on slurm"
 
     def __init__(
-        self, folder: Path, waiting: int, jobs: int | None, settings: ClusterSettings, *, detach: bool = False
+        self,
+        folder: Path,
+        task: str,
+        waiting: int,
+        jobs: int | None,
+        settings: ClusterSettings,
+        *,
+        detach: bool = False,
     ) -> None:
         """`waiting` runs in the folder of a group; `jobs` has no meaning here, as SLURM decides how many run."""
         super().__init__(max(waiting, 1))
@@ -67,8 +81,8 @@ class SlurmTrainings(Trainings):
         self._works: list[Work] = []
         self._ready = threading.Barrier(self._jobs, action=self._submit)
         self._queue_lock = threading.Lock()
-        self._queue_s, self._queue = 0.0, ""
-        self._queue = self._ask_queue()
+        self._queue_s, self._queue, self._beat_s = 0.0, "", 0.0
+        self._queue, self._answered_s = self._ask_queue(), time.monotonic()
 
     def describe(self) -> str:
         """Describe where the runs train."""
@@ -92,6 +106,7 @@ class SlurmTrainings(Trainings):
             self._ready.abort()
             raise
         if self._detach:
+            files.remove(self._folder / BEAT_FILE)
             return 0
         return self._follow(work.seed, log, receive, next_signal)
 
@@ -139,6 +154,7 @@ class SlurmTrainings(Trainings):
         """Pass on the lines of a node's log until its job has ended; return the exit code."""
         position = 0
         while True:
+            self._beat()
             time.sleep(_POLL_S)
             job = read_job(self._folder, seed)
             position = _forward_lines(log, position, receive)
@@ -156,6 +172,12 @@ class SlurmTrainings(Trainings):
                     receive(f"error: {place} left SLURM's queue without a result; see {self._folder / JOBS}")
                 return TAKEN if self.stopped_by is None else 128 + self.stopped_by
 
+    def _beat(self) -> None:
+        with self._queue_lock:
+            if time.monotonic() - self._beat_s > self._settings.lease_s / _BEATS_PER_LEASE:
+                self._beat_s = time.monotonic()
+                files.write_text(self._folder / BEAT_FILE, uuid.uuid4().hex)
+
     def _cancel_waiting(self) -> None:
         """Cancel the jobs that have not started."""
         for job in list_jobs(self._folder):
@@ -165,8 +187,12 @@ class SlurmTrainings(Trainings):
     def _is_queued(self, job: Job) -> bool:
         """Return whether SLURM still has a job; SLURM is asked four times a minute."""
         with self._queue_lock:
-            if time.monotonic() - self._queue_s > _ASK_QUEUE_S or self.stopped_by is not None:
-                self._queue = self._ask_queue()
+            if time.monotonic() - self._queue_s > (_ASK_QUEUE_S if self.stopped_by is None else _ASK_AT_THE_END_S):
+                try:
+                    self._queue, self._answered_s = self._ask_queue(), time.monotonic()
+                except TaskError:
+                    if time.monotonic() - self._answered_s > _GONE_S:
+                        raise
                 self._queue_s = time.monotonic()
             elif not self._queue:
                 return True

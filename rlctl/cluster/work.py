@@ -10,7 +10,7 @@ import os
 import platform
 import sys
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,8 @@ class Work:
     """Hash of the task's file on the driver."""
     settings: dict[str, Any]
     """`ClusterSettings`."""
+    has_copy: bool = False
+    """Whether nodes start in a copy of the driver's current folder, and use it."""
 
     @property
     def folder(self) -> Path:
@@ -65,11 +67,14 @@ def make_work(request: TrainRequest, token: str, settings: ClusterSettings) -> W
     run = RunDirectory(Path(request.resume)) if request.resume is not None else None
     seed = int(run.recipe().seed if run is not None else request.settings["seed"])
     task = locate_task(run.status()["task"], run) if run is not None else str(request.task)
+    root = request.root.absolute()
+    # A node may be in a copy of the current folder, which has no runs.
+    resume, policy = _make_absolute(request.resume), _make_absolute(request.initial_policy)
     return Work(
         seed=seed,
         task=task,
-        request=request.to_json(),
-        root=os.path.abspath(request.root),
+        request=dataclasses.replace(request, root=root, resume=resume, initial_policy=policy).to_json(),
+        root=str(root),
         cwd=os.getcwd(),
         command=sys.argv,
         token=token,
@@ -77,6 +82,10 @@ def make_work(request: TrainRequest, token: str, settings: ClusterSettings) -> W
         source_sha256=identify_task(task)["source_sha256"],
         settings=settings.model_dump(),
     )
+
+
+def _make_absolute(path: str | None) -> str | None:
+    return os.path.abspath(path) if path and os.sep in path and os.path.exists(path) else path
 
 
 def mark_shared_folder(folder: Path) -> str:
@@ -97,20 +106,21 @@ def execute(work: Work, receive: Callable[[str], None], next_signal: NextSignal)
     """
     try:
         _enter_folder(work)
-        for warning in _compare_versions(work):
+        for warning in compare_versions(work.task, work.versions, work.source_sha256):
             receive(warning)
         request = _bind(work)
     except RlctlError as error:
         receive(f"error: {error}")
         return error.exit_code
-    env = {"RLCTL_CORES": str(work.settings["cpus"])}
+    env = {"RLCTL_CORES": str(work.settings["cpus"])} | ({"RLCTL_FOLDER": work.cwd} if work.has_copy else {})
     return train_in_child(request, receive, next_signal, command=work.command, env=env)
 
 
 def _enter_folder(work: Work) -> None:
     """Change to the driver's folder; raise `ArtifactError` if the group's folder is not the driver's here."""
     try:
-        os.chdir(work.cwd)
+        if not work.has_copy:
+            os.chdir(work.cwd)
         is_same = (work.folder / _TOKEN_FILE).read_text() == work.token
     except OSError:
         is_same = False
@@ -121,19 +131,20 @@ def _enter_folder(work: Work) -> None:
         )
 
 
-def _compare_versions(work: Work) -> list[str]:
-    """Return warnings for different library versions; raise `ArtifactError` for a different rlctl or task."""
+def compare_versions(task: str, versions: Mapping[str, str], source_sha256: str | None) -> list[str]:
+    """Compare this machine's rlctl, task and libraries with the driver's; return warnings for different libraries.
+
+    Raises `ArtifactError` for a different rlctl or task file.
+    """
     here, node = collect_versions(), platform.node()
-    if here["rlctl"] != work.versions["rlctl"]:
-        versions = here["rlctl"], work.versions["rlctl"]
-        raise ArtifactError("{}: rlctl {}, and {} on the driver: install the same version".format(node, *versions))
-    if identify_task(work.task)["source_sha256"] != work.source_sha256:
-        raise ArtifactError(
-            f"{node}: the file of task {work.task!r} differs from the driver's: install the same version"
-        )
+    if here["rlctl"] != versions["rlctl"]:
+        both = here["rlctl"], versions["rlctl"]
+        raise ArtifactError("{}: rlctl {}, and {} on the driver: install the same version".format(node, *both))
+    if identify_task(task)["source_sha256"] != source_sha256:
+        raise ArtifactError(f"{node}: the file of task {task!r} differs from the driver's: install the same version")
     return [
         f"warning: not bit-equal: {name} {version} on the driver, {here.get(name, 'none')} on {node}"
-        for name, version in work.versions.items()
+        for name, version in versions.items()
         if here.get(name) != version
     ]
 

@@ -2,12 +2,13 @@
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import json
 import shlex
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from rlctl import output
@@ -26,10 +27,12 @@ from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
 from rlctl.run import robustness
-from rlctl.run.robustness import Axis, Cell, Robustness, RobustnessMap
+from rlctl.run.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.version import collect_versions
 
 ASK_ABOVE_S = 600.0  # rlctl asks before it starts a measurement that takes longer than this [s]
+PlayCells = Callable[[LoadedPolicy, EvalRequest, Sequence[EnvSpec]], Iterator[tuple[int, Outcome]]]
+"""Plays the episodes of a request in each setting; yields the index and the scores of each, in any order."""
 
 
 def measure_robustness(
@@ -40,12 +43,14 @@ def measure_robustness(
     sim: str | None = None,
     yes: bool = False,
     gates: Gates = NO_GATES,
+    play_cells: PlayCells | None = None,
 ) -> Robustness:
     """Measure a policy in every cell of the maps of `vary`, and with pushes, and store the result in its run.
 
     `vary` is `NAME=LOWEST:HIGHEST:VALUES`, one or two, or `all`. `sim` is `mujoco`, or `mujoco:SOLREF` with a time
-    constant of contacts [s]: the same episodes in another physics engine. `yes` starts a long
-    measurement without asking. Domain randomization is off, unless the request's own changes turn it on.
+    constant of contacts [s]: the same episodes in another physics engine. `yes` starts a long measurement without
+    asking; so does `play_cells`, which plays the cells elsewhere. Domain randomization is off, unless the request's own
+    changes turn it on.
     """
     if request.changes.randomize is None:
         request = dataclasses.replace(request, changes=dataclasses.replace(request.changes, randomize=False))
@@ -62,10 +67,10 @@ def measure_robustness(
         episodes = player.play(spec)
         nominal = summarize(episodes)
         gates.check_possible(nominal.success_rate is not None)
-        _ask(cells, time.monotonic() - start, yes)
-        with output.show_progress("varying", cells) as show:
-            done = itertools.count(1)
-            measured = [_play_map(player, spec, axes, lambda: show(next(done))) for axes in maps]
+        if play_cells is None:
+            _ask(cells, time.monotonic() - start, yes)
+        play = player.play_cells if play_cells is None else functools.partial(play_cells, policy, request)
+        measured = _play_maps(maps, spec, play) if maps else []
         pushed = measure_push(spec, episodes, lambda force: player.play(spec, force)) if push else None
     result = Robustness(
         task=spec.task,
@@ -109,19 +114,31 @@ class CellPlayer:
             workers.set_events(spec, push)
         return [episode.result for episode in play_episodes(workers, self._seeds, self._exploration)]
 
+    def play_cells(self, specs: Sequence[EnvSpec]) -> Iterator[tuple[int, Outcome]]:
+        """Play all episodes in each setting; yield its index and scores."""
+        for index in order_cells(specs):
+            yield index, summarize(self.play(specs[index]))
 
-def _play_map(player: CellPlayer, spec: EnvSpec, axes: list[Axis], on_cell: Callable[[], None]) -> RobustnessMap:
-    combinations = list(itertools.product(*(axis.values for axis in axes)))
-    specs = [_apply(axes, values, spec) for values in combinations]
+
+def order_cells(specs: Sequence[EnvSpec]) -> list[int]:
+    """Return the indices of settings, those with equal task parameters next to each other: others need a new world."""
+    return sorted(range(len(specs)), key=lambda index: sorted(specs[index].parameters.items(), key=repr))
+
+
+def _play_maps(
+    maps: Sequence[list[Axis]], spec: EnvSpec, play: Callable[[Sequence[EnvSpec]], Iterator[tuple[int, Outcome]]]
+) -> list[RobustnessMap]:
+    places = [(axes, values) for axes in maps for values in itertools.product(*(axis.values for axis in axes))]
     cells: dict[int, Cell] = {}
-    # Each value of a task parameter needs a new world, so cells with equal parameters are played one after another.
-    for index in sorted(range(len(combinations)), key=lambda index: sorted(specs[index].parameters.items(), key=repr)):
-        outcome = summarize(player.play(specs[index]))
-        cells[index] = Cell(
-            **outcome.model_dump(), values=list(combinations[index]), nominal=_is_nominal(axes, combinations[index])
-        )
-        on_cell()
-    return RobustnessMap(axes=axes, cells=[cells[index] for index in range(len(combinations))])
+    with output.show_progress("varying", len(places)) as show:
+        for index, outcome in play([_apply(axes, values, spec) for axes, values in places]):
+            axes, values = places[index]
+            cells[index] = Cell(**outcome.model_dump(), values=list(values), nominal=_is_nominal(axes, values))
+            show(len(cells))
+    return [
+        RobustnessMap(axes=axes, cells=[cells[index] for index in range(len(places)) if places[index][0] is axes])
+        for axes in maps
+    ]
 
 
 def _apply(axes: Sequence[Axis], values: Sequence[float], spec: EnvSpec) -> EnvSpec:

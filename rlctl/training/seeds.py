@@ -80,7 +80,7 @@ def _train(
 ) -> SeedsResult:
     """Train the unfinished seeds of a group; `resume` has the arguments that change."""
     requests = {seed: _make_request(group, seed, resume) for seed in group.seeds if _is_waiting(group, seed, resume)}
-    trainings = make_trainings(group.path, len(requests), jobs)
+    trainings = make_trainings(group.path, str(group.request.task), len(requests), jobs)
     _print_start(group, len(requests), trainings)
     calls = [
         functools.partial(trainings.train, request_of_seed, functools.partial(_print_line, seed))

@@ -50,7 +50,7 @@ def write_start(run: RunDirectory, start: Start) -> None:
         changes |= {
             "id": uuid.uuid4().hex,
             "started": _now(),
-            "folder": os.getcwd(),  # a task's path may be relative to it
+            "folder": os.environ.get("RLCTL_FOLDER") or os.getcwd(),  # a task's path may be relative to it
         }
         if start.source is not None:
             changes["from"] = start.source

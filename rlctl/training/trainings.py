@@ -119,11 +119,11 @@ class Trainings:
         self._signals.append(number)
 
 
-MakeTrainings = Callable[[Path, int, int | None], Trainings]
-"""Takes the folder of the runs, the number of trainings, and `--jobs`."""
+MakeTrainings = Callable[[Path, str, int, int | None], Trainings]
+"""Takes the folder of the runs, their task, the number of trainings, and `--jobs`."""
 
 
-def make_local_trainings(folder: Path, waiting: int, jobs: int | None) -> Trainings:
+def make_local_trainings(folder: Path, task: str, waiting: int, jobs: int | None) -> Trainings:
     """Return trainings on this machine."""
     return Trainings(choose_jobs(jobs, waiting))
 

@@ -115,20 +115,20 @@ def _search(tuning: Tuning, jobs: int | None, make_trainings: MakeTrainings) -> 
     resume_command = f"rlctl tune --resume {shlex.quote(str(tuning.path))}"
     with preserve_process_state():
         recipe = resolve_with_stages(tuning.task, tuning.config, tuning.settings)
-    trainings = make_trainings(tuning.path, tuning.trials_per_step, jobs)
+    trainings = make_trainings(tuning.path, tuning.task, tuning.trials_per_step, jobs)
     output.print_notes([_describe(tuning, recipe, trainings.describe()), *_warn_of_long_rollouts(recipe)])
     if not tuning.trials:
         tuning.trials.append(Trial(0, 0, {}))
     first = tuning.trials[0]
     if first.state in ("begun", "failed"):
-        trainings = make_trainings(tuning.path, 1, 1)
+        trainings = make_trainings(tuning.path, tuning.task, 1, 1)
         trainings.run([lambda: train(tuning, first, trainings)], resume_command)
         tuning.save()
         if first.score is None:
             raise TaskError(f"{tuning.path}: the unchanged recipe failed: {first.problem}\nto retry: {resume_command}")
     content = recipe.model_dump(mode="json", by_alias=True) | {"algo_kwargs": fill_parameters(recipe)}
     for number in range(1, len(tuning.steps) + 1):
-        trainings = make_trainings(tuning.path, tuning.trials_per_step, jobs)
+        trainings = make_trainings(tuning.path, tuning.task, tuning.trials_per_step, jobs)
         step = StepSearch(tuning, number, content, trainings)
         trainings.run([step.run_next] * step.count_waiting(), resume_command)
     return tuning

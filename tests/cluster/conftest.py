@@ -1,12 +1,22 @@
 import os
+import time
 
 import pytest
 
 from rlctl.run.train_request import TrainRequest
 from tests.cluster import fake_slurm
+from tests.evaluation.conftest import block_run as block_run
 from tests.training.conftest import ENVS, TINY
 
 LINE = f"{ENVS}:Line"
+
+
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not (result := condition()):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return result
 
 
 @pytest.fixture

@@ -1,102 +1,252 @@
-"""Trainings on a real Ray: a head without cores and two nodes of this machine, of which one is lost."""
+"""Trainings and cells on a real Ray: a head and a node of this machine, which is lost."""
 
 import concurrent.futures
 import contextlib
 import dataclasses
+import functools
 import importlib.util
+import json
 import os
-import threading
+import signal
 import time
+from pathlib import Path
 
 import psutil
 import pytest
 
-from rlctl.cluster.executors import choose_executor
+from rlctl.cluster.executors import choose_cell_player, choose_executor
 from rlctl.cluster.ray_connection import connect
 from rlctl.errors import TaskError
+from rlctl.evaluation.request import EvalRequest
+from rlctl.evaluation.vary import measure_robustness
 from rlctl.run.job import read_job
+from rlctl.run.train_request import TrainRequest
 from rlctl.training.request import run_training
 from rlctl.training.seeds import train_seeds
-from tests.cluster.conftest import LINE
+from tests.cluster.conftest import LINE, wait_for
+from tests.cluster.driver import STOPS, Driver, assert_it_resumes, has_ended
 from tests.training.comparing import assert_same_run
+from tests.training.conftest import ENVS
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs ray, the extra rlctl[cluster]"),
-]
+slow = pytest.mark.slow
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs ray, the extra rlctl[cluster]")
 MEMORY = 80 * 2**20
+NODE = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "object_store_memory": MEMORY}
+TOY = """
+import os, pathlib, time
+here = pathlib.Path(__file__).parent
+with (here / "pids").open("a") as file:
+    print(os.getpid(), file=file)
+while not (here / "go").exists():
+    time.sleep(0.05)
+"""
 
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    """A head and two nodes of one core, which listen on 127.0.0.1."""
-    folder = tmp_path_factory.mktemp("r")
-    os.environ.update(
-        {
-            "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
-            "RAY_TMPDIR": "/tmp",
-            "RAY_AUTH_TOKEN_PATH": str(folder / "token"),
-            "RAY_USAGE_STATS_ENABLED": "0",
-            "RAY_health_check_period_ms": "1000",
-            "RAY_health_check_failure_threshold": "5",
-        }
-    )
+    """A head of one core, which listens on 127.0.0.1; the driver is connected."""
+    before = dict(os.environ)
+    os.environ |= {
+        "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+        "RAY_TMPDIR": "/tmp",
+        "RAY_AUTH_TOKEN_PATH": str(tmp_path_factory.mktemp("r") / "token"),
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_health_check_period_ms": "1000",
+        "RAY_health_check_failure_threshold": "5",
+    }
     from ray.cluster_utils import Cluster
 
-    head = {"num_cpus": 0, "include_dashboard": False, "node_ip_address": "127.0.0.1", "object_store_memory": MEMORY}
-    cluster = Cluster(initialize_head=True, head_node_args=head)
-    for _ in range(2):
-        cluster.add_node(num_cpus=1, node_ip_address="127.0.0.1", object_store_memory=MEMORY)
-    ray = connect(cluster.address)
+    cluster = Cluster(initialize_head=True, head_node_args={**NODE, "include_dashboard": False})
+    ray = connect(cluster.address, "reach", 1)
     yield cluster
     ray.shutdown()
     with contextlib.suppress(ValueError):
         cluster.shutdown()
+    os.environ.clear()
+    os.environ.update(before)
 
 
-def test_a_lost_node_costs_an_attempt_and_no_bit(cluster, request_of_line, tmp_path, capsys):
-    (tmp_path / "cluster.yaml").write_text("cpus: 1\n")
-    request = dataclasses.replace(request_of_line, settings={**request_of_line.settings, "total_timesteps": 25_600})
-    done = []
-    make_trainings = choose_executor(f"ray:{cluster.address}")
-    thread = threading.Thread(
-        target=lambda: done.append(train_seeds(request, "0-1", episodes=2, make_trainings=make_trainings))
-    )
-    thread.start()
-    deadline = time.monotonic() + 100
-    while not (checkpoints := list(tmp_path.glob("runs/Line/*_seeds/*_s*/checkpoints/0*"))):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    folder = checkpoints[0].parents[2]
-    pid = int((checkpoints[0].parents[1] / "run.json").read_text().partition('"pid": ')[2].partition(",")[0])
-    ancestors = {process.pid for process in psutil.Process(pid).parents()}
-    node = next(node for node in cluster.worker_nodes if _raylet(node) in ancestors)
+@pytest.fixture
+def node(cluster, tmp_path, monkeypatch):
+    """A second node of one core; runs and cells take one core each."""
+    monkeypatch.chdir(tmp_path)
+    Path("cluster.yaml").write_text("cpus: 1\n")
+    node = cluster.add_node(**NODE)
+    yield node
+    if node in cluster.worker_nodes:
+        cluster.remove_node(node, allow_graceful=False)
+
+
+def is_on(node, pid):
+    raylet = node.all_processes["raylet"][0].process.pid
+    return raylet in {process.pid for process in psutil.Process(pid).parents()}
+
+
+def lose(cluster, node, pid):
+    """Kill a node and wait for the end of a process."""
     cluster.remove_node(node, allow_graceful=False)
-    gone = time.monotonic()
-    while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
-        assert time.monotonic() < gone + 10
-        time.sleep(0.05)
-    thread.join(200)
-    (result,) = done
+    wait_for(lambda: has_ended(pid), 10)
+
+
+def test_cells_are_equal_and_a_lost_node_is_no_end(cluster, node, block_run, tmp_path, capsys):
+    """One test, because each process of the test run would start a cluster of its own."""
+    request, vary = EvalRequest(str(block_run.path), episodes=3), ["push=0:3:3", "limit=0.1:9:2"]
+    on_ray = measure_robustness(request, vary, play_cells=choose_cell_player(f"ray:{cluster.address}"))
+    assert on_ray.maps == measure_robustness(request, vary).maps
+    assert "6 cells, on Ray, 2 at a time: 1 of its 2 cores each" in capsys.readouterr().err
+    lines, codes = train_toys_and_lose_a_node(cluster, node, tmp_path)
+    assert codes == [2, 2]  # there is no class Toy, which is no reason to retry
+    assert len((tmp_path / "pids").read_text().split()) == 3
+    assert sorted(read_job(tmp_path / "runs", seed).attempts for seed in (0, 1)) == [1, 2]
+    assert any(line.startswith("attempt 2 on ") and line.endswith(": the previous attempt was lost") for line in lines)
+
+
+def train_toys_and_lose_a_node(cluster, node, tmp_path):
+    """Start a child on each of two nodes, kill a node, let the others end; return their lines and codes."""
+    toy, lines = tmp_path / "toy.py", []
+    toy.write_text(TOY)
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    trainings = choose_executor(f"ray:{cluster.address}")(runs, f"{toy}:Toy", 2, None)
+    calls = [
+        functools.partial(trainings.train, TrainRequest(f"{toy}:Toy", settings={"seed": seed}, root=runs), lines.append)
+        for seed in (0, 1)
+    ]
+
+    def read():
+        return [int(line) for line in (tmp_path / "pids").read_text().split()]
+
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        codes = pool.submit(trainings.run, calls, "resume")
+        wait_for((tmp_path / "pids").exists)
+        wait_for(lambda: len(read()) == 2)
+        (there,) = (pid for pid in read() if is_on(node, pid))
+        lose(cluster, node, there)
+        (tmp_path / "go").touch()
+        return lines, codes.result(60)
+
+
+@slow
+def test_a_lost_node_costs_an_attempt_and_no_bit(cluster, node, request_of_line, tmp_path, capsys):
+    request = dataclasses.replace(request_of_line, settings={**request_of_line.settings, "total_timesteps": 25_600})
+    make_trainings = choose_executor(f"ray:{cluster.address}")
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        training = pool.submit(train_seeds, request, "0-1", episodes=2, make_trainings=make_trainings)
+
+        def find_pid():
+            for file in tmp_path.glob("runs/Line/*_seeds/*_s*/checkpoints/0*"):
+                pid = json.loads((file.parents[1] / "run.json").read_text())["pid"]
+                if is_on(node, pid):
+                    return pid
+            return None
+
+        lose(cluster, node, wait_for(find_pid, 100))
+        result = training.result(200)
     assert result.failed == {}
-    jobs = [read_job(folder, seed) for seed in (0, 1)]
-    assert {job.state for job in jobs} == {"ended"}
-    assert max(job.attempts for job in jobs) >= 2
+    jobs = [read_job(result.score.group.path, seed) for seed in (0, 1)]
+    assert [job.state for job in jobs] == ["ended", "ended"]
+    assert sorted(job.attempts for job in jobs) == [1, 2]
     for seed in (0, 1):
         local = run_training(dataclasses.replace(request, settings={**request.settings, "seed": seed}))
         assert_same_run(result.score.group.find_run(seed), local.run)
     assert "the previous attempt was lost" in capsys.readouterr().err
 
 
-def _raylet(node):
-    return node.all_processes["raylet"][0].process.pid
+@slow
+def test_cells_of_a_lost_node_are_played_again(cluster, node, block_run, capsys):
+    request, vary = EvalRequest(str(block_run.path), episodes=100), ["mass=1:3:5", "limit=0.1:9:4"]
+    play = choose_cell_player(f"ray:{cluster.address}")
+
+    def lose_the_node(*arguments):
+        cells = play(*arguments)
+        yield next(cells)
+        actor = wait_for(lambda: [pid for pid in find_processes("ray::CellActor") if is_on(node, pid)])[0]
+        lose(cluster, node, actor)
+        yield from cells
+
+    on_ray = measure_robustness(request, vary, play_cells=lose_the_node)
+    assert on_ray.maps == measure_robustness(request, vary, yes=True).maps
+    assert "a node was lost; its cell is played again" in capsys.readouterr().err
 
 
+def find_processes(name):
+    processes = psutil.process_iter(["cmdline"])
+    return [process.pid for process in processes if name in " ".join(process.info["cmdline"] or [])]
+
+
+@slow
+@pytest.mark.parametrize(("number", "code"), STOPS)
+def test_a_driver_that_ends(cluster, node, installed_rlctl, tmp_path, number, code):
+    on = f"ray:{cluster.address}"
+    driver = Driver(tmp_path, "--on", on)
+    run, pid = driver.wait_for_checkpoint()
+    ended, printed = driver.end(number)
+    assert ended == code
+    wait_for(lambda: has_ended(pid), 5)
+    status = json.loads((run / "run.json").read_text())["status"]
+    if number == signal.SIGINT:
+        assert status == "interrupted"
+        assert printed.strip().endswith(
+            f"resume with: rlctl train --resume {run.parent.relative_to(tmp_path)} --on {on}"
+        )
+    assert_it_resumes(installed_rlctl, run, on)
+
+
+@slow
+def test_a_driver_that_does_not_answer(cluster, node, tmp_path):
+    """As seen from a node that is cut off: the messages of its attempt get no answer."""
+    Path("cluster.yaml").write_text("cpus: 1\nlease_s: 3\n")
+    driver = Driver(tmp_path, "--on", f"ray:{cluster.address}", steps=400_000)
+    _, pid = driver.wait_for_checkpoint()
+    (mailbox,) = find_processes("ray::Mailbox")
+    os.kill(mailbox, signal.SIGSTOP)
+    wait_for(lambda: has_ended(pid), 15)
+    os.kill(mailbox, signal.SIGCONT)
+    code, printed = driver.end()
+    assert code == 75
+    assert "1 of 1 seeds failed: seed 3 with exit code 75" in printed
+
+
+@slow
+def test_a_run_is_given_up_after_its_retries(cluster, node, tmp_path):
+    Path("cluster.yaml").write_text("cpus: 1\nretries: 0\n")
+    lines, codes = train_toys_and_lose_a_node(cluster, node, tmp_path)
+    assert sorted(codes) == [2, 75]
+    assert any(line.startswith("error: lost on Ray after 0 retries: ") for line in lines)
+
+
+@slow
+def test_no_machine_has_enough_cores(cluster, node, tmp_path):
+    Path("cluster.yaml").write_text("cpus: 64\n")
+    driver = Driver(tmp_path, "--on", f"ray:{cluster.address}")
+    wait_for(lambda: list(tmp_path.glob("runs/*/*_seeds/.jobs/3.json")))
+    code, printed = driver.end(signal.SIGINT)
+    assert code == 130
+    assert "1 seed, on Ray: waiting for a machine with 64 cores (cpus in cluster.yaml); it has none" in printed
+
+
+@slow
+def test_nodes_get_a_copy_of_the_task(cluster, node, rlctl, tmp_path):
+    source = "import sys; print('imported', __file__, file=sys.stderr)\n"
+    (tmp_path / "line.py").write_text(source + ENVS.read_text())
+    driver = Driver(tmp_path, "--on", f"ray:{cluster.address}", task="line.py:Line", steps=128)
+    code, printed = driver.end()
+    assert code == 0, printed
+    (remote,) = {line.split()[-1] for line in printed.splitlines() if line.startswith("seed 3: imported")}
+    assert "/_ray_pkg_" in remote
+    (run,) = tmp_path.glob("runs/*/*_seeds/*_s3")
+    status = json.loads((run / "run.json").read_text())
+    assert (status["task"], status["folder"]) == ("line.py:Line", str(tmp_path))
+    assert rlctl("eval", run, "--episodes", 1, cwd=tmp_path.parent).returncode == 0
+
+
+@slow
 def test_a_cluster_that_is_not_there(tmp_path):
     with pytest.raises(TaskError, match="cannot be reached"):
-        choose_executor("ray:127.0.0.1:1")(tmp_path, 1, None)
+        choose_executor("ray:127.0.0.1:1")(tmp_path, LINE, 1, None)
 
 
+@slow
 def test_a_ray_of_its_own_trains_and_listens_on_loopback_alone(installed_rlctl, tmp_path):
     """In processes of their own: Ray's environment variables would stay in this one."""
     options = ["--set", "n_envs=2", "--set", "algo_kwargs.n_steps=32", "--set", "algo_kwargs.batch_size=32"]
@@ -126,6 +276,7 @@ def _connections(process):
         return []
 
 
+@slow
 def test_a_tuning_on_ray(installed_rlctl, tmp_path):
     options = ["--set", "n_envs=2", "--set", "algo_kwargs.n_steps=32", "--set", "algo_kwargs.batch_size=32"]
     search = ["--search", "algo_kwargs.learning_rate=1e-4:1e-2", "--trials", "3"]

@@ -1,6 +1,8 @@
 """Arrays on a real SLURM of this machine: requeue, preemption, stop. Skipped where SLURM is not installed."""
 
 import dataclasses
+import json
+import signal
 import subprocess
 import threading
 
@@ -11,7 +13,8 @@ from rlctl.run.job import read_job
 from rlctl.training.request import run_training
 from rlctl.training.seeds import train_seeds
 from tests.cluster import real_slurm
-from tests.cluster.test_slurm import wait_for
+from tests.cluster.conftest import wait_for
+from tests.cluster.driver import STOPS, Driver, assert_it_resumes, has_ended
 from tests.training.comparing import assert_same_run
 
 LONG = {"total_timesteps": 12_800}
@@ -21,7 +24,7 @@ pytestmark = [
 ]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def slurm(tmp_path_factory):
     with real_slurm.running_slurm(tmp_path_factory.mktemp("slurm")):
         yield
@@ -77,3 +80,36 @@ def test_a_job_that_loses_its_node_resumes_to_the_same_bit(begin, request_of_lin
     local = run_training(dataclasses.replace(request_of_line, settings={**request_of_line.settings, **LONG, "seed": 3}))
     assert_same_run(remote, local.run)
     assert run("squeue", "-h") == ""
+
+
+@pytest.mark.parametrize(("number", "code"), STOPS)
+def test_a_driver_that_ends(slurm, installed_rlctl, tmp_path, number, code):
+    (tmp_path / "cluster.yaml").write_text("cpus: 1\nlease_s: 4\n")
+    driver = Driver(tmp_path, "--on", "slurm")
+    run_folder, pid = driver.wait_for_checkpoint()
+    ended, printed = driver.end(number)
+    assert ended == code
+    wait_for(lambda: has_ended(pid), 60)
+    wait_for(lambda: run("squeue", "-h") == "")
+    assert json.loads((run_folder / "run.json").read_text())["status"] == "interrupted"
+    if number == signal.SIGINT:
+        group = run_folder.parent.relative_to(tmp_path)
+        assert printed.strip().endswith(f"resume with: rlctl train --resume {group} --on slurm")
+    else:
+        log = (run_folder.parent / ".jobs" / "3.log").read_text()
+        assert "error: the driver has not answered for 4 s; --detach submits runs that need none" in log
+    assert_it_resumes(installed_rlctl, run_folder, "slurm")
+
+
+def test_a_detached_group_needs_no_driver(slurm, installed_rlctl, tmp_path):
+    (tmp_path / "cluster.yaml").write_text("cpus: 1\nlease_s: 1\n")
+    driver = Driver(tmp_path, "--on", "slurm", "--detach", steps=6400)
+    code, printed = driver.end()
+    assert code == 0
+    assert "submitted to SLURM; to follow the runs: rlctl train --resume runs/" in printed
+    assert "queued" in installed_rlctl("runs").stdout or list(tmp_path.glob("runs/*/*_seeds/*_s3"))
+    wait_for(lambda: run("squeue", "-h") == "", 150)
+    (group,) = tmp_path.glob("runs/*/*_seeds")
+    done = installed_rlctl("train", "--resume", group, "--on", "slurm")
+    assert done.returncode == 0, done.stderr
+    assert "1 seed, all done: nothing to train" in done.stderr

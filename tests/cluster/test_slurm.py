@@ -3,7 +3,6 @@
 import dataclasses
 import signal
 import threading
-import time
 
 import pytest
 
@@ -16,17 +15,10 @@ from rlctl.training.request import run_training as train_run
 from rlctl.training.seeds import train_seeds
 from rlctl.training.trainings import Detached
 from tests.cluster import fake_slurm
+from tests.cluster.conftest import wait_for
 from tests.training.comparing import assert_same_run
 
 LONG = {"total_timesteps": 6400}
-
-
-def wait_for(condition, seconds=60):
-    deadline = time.monotonic() + seconds
-    while not (result := condition()):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    return result
 
 
 @pytest.fixture
@@ -96,6 +88,47 @@ def test_a_folder_that_is_not_shared_is_named_and_not_tried_again(train, slurm, 
     assert result.failed == {0: 5}
     assert "this node has a different folder there, or none" in capsys.readouterr().err
     assert read_job(result.score.group.path, 0).attempts == 1
+
+
+@pytest.mark.slow
+def test_a_full_disk_on_a_node_is_an_error_of_its_run(train, slurm, tmp_path, capsys):
+    """As on a node with a full disk, no file can grow beyond a few kB."""
+    (tmp_path / "cluster.yaml").write_text("setup: [ulimit -f 8]\n")
+    result = train("0", LONG)
+    assert result.failed == {0: 5}
+    assert "could not be saved" in capsys.readouterr().err
+    job = read_job(result.score.group.path, 0)
+    assert job.attempts == 1
+    (tmp_path / "cluster.yaml").write_text("cpus: 1\n")
+    request = TrainRequest(resume=str(result.score.group.path), root=tmp_path / "runs")
+    assert train_seeds(request, None, episodes=2, make_trainings=choose_executor("slurm")).failed == {}
+
+
+@pytest.mark.slow
+def test_a_driver_whose_slurm_is_gone_and_runs_whose_driver_is_gone(train, slurm, tmp_path, monkeypatch):
+    (tmp_path / "cluster.yaml").write_text("lease_s: 2\n")
+    monkeypatch.setattr("rlctl.cluster.slurm._ASK_QUEUE_S", 0.5)
+    monkeypatch.setattr("rlctl.cluster.slurm._GONE_S", 3.0)
+    failures = []
+
+    def follow():
+        with pytest.raises(TaskError) as caught:
+            train("0", {"total_timesteps": 640_000})
+        failures.append(str(caught.value))
+
+    thread = threading.Thread(target=follow)
+    thread.start()
+    wait_for(lambda: list(tmp_path.glob("runs/Line/*_seeds/*_s0/checkpoints/0*")))
+    (slurm / "bin" / "squeue").write_text(
+        "#!/bin/sh\necho 'squeue: error: Unable to contact slurm controller' >&2; exit 1"
+    )
+    thread.join(60)
+    assert failures == ["--on slurm: squeue failed: squeue: error: Unable to contact slurm controller"]
+    (folder,) = tmp_path.glob("runs/Line/*_seeds")
+    job = wait_for(lambda: (job := read_job(folder, 0)) and job.state == "ended" and job)
+    assert (job.code, job.attempts) == (130, 1)
+    assert "error: the driver has not answered for 2 s" in (folder / ".jobs" / "0.log").read_text()
+    assert read_group(folder).find_run(0).status()["status"] == "interrupted"
 
 
 def test_errors_of_slurm(train, slurm, tmp_path, monkeypatch):
