@@ -49,7 +49,7 @@ def connect(address: str, task: str, cpus: int) -> Any:
         cores = max(cpus, available_cores())
         options |= {"include_dashboard": False, "_node_ip_address": "127.0.0.1", "num_cpus": cores}
     if is_copied(task):
-        options["runtime_env"] = {"working_dir": os.getcwd(), "excludes": ["/runs", ".*"]}
+        options["runtime_env"] = {"working_dir": os.getcwd(), "excludes": ["/runs"]}
     try:
         ray.init(**options)
     except Exception as error:  # ConnectionError, ValueError or RuntimeError

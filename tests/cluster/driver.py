@@ -16,7 +16,7 @@ OPTIONS = ["--no-check", "--set", "n_envs=2", "--set", "algo_kwargs.n_steps=32",
 class Driver:
     """`rlctl train --seeds 3` in a folder."""
 
-    def __init__(self, folder, *arguments, task=LINE, steps=25_600):
+    def __init__(self, folder, *arguments, task=LINE, steps=12_800):
         command = ["train", task, "--seeds", "3", "-n", str(steps), *OPTIONS, *arguments]
         self.folder = folder
         self.process = subprocess.Popen(
@@ -25,8 +25,12 @@ class Driver:
 
     def wait_for_checkpoint(self):
         """Return the run's folder and its process, once it has saved a checkpoint."""
-        (checkpoint, *_) = wait_for(lambda: list(self.folder.glob("runs/*/*_seeds/*_s3/checkpoints/0*")), 150)
-        run = checkpoint.parents[1]
+
+        def find_checkpoints():
+            checkpoints = self.folder.glob("runs/*/*_seeds/*_s3/checkpoints/0*")
+            return [folder for folder in checkpoints if folder.name.isdecimal() and int(folder.name)]
+
+        run = wait_for(find_checkpoints, 150)[0].parents[1]
         return run, json.loads((run / "run.json").read_text())["pid"]
 
     def end(self, number=0):

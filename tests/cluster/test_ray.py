@@ -154,7 +154,7 @@ def test_a_lost_node_costs_an_attempt_and_no_bit(cluster, node, request_of_line,
 
 @slow
 def test_cells_of_a_lost_node_are_played_again(cluster, node, block_run, capsys):
-    request, vary = EvalRequest(str(block_run.path), episodes=100), ["mass=1:3:5", "limit=0.1:9:4"]
+    request, vary = EvalRequest(str(block_run.path), episodes=20), ["mass=1:3:4", "limit=0.1:9:2"]
     play = choose_cell_player(f"ray:{cluster.address}")
 
     def lose_the_node(*arguments):

@@ -1,6 +1,7 @@
 """`rlctl eval --vary`: maps over events and parameters, with the same episodes in every cell."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,9 +21,10 @@ BLOCK = EnvSpec(f"{ENVS}:Block")
 
 
 @pytest.fixture(scope="module")
-def measured(block_run):
-    """The block's chance to stay, over the force of pushes and its mass."""
-    request = EvalRequest(str(block_run.path), episodes=5)
+def measured(tmp_path_factory):
+    """The block's chance to stay, over the force of pushes and its mass; in a run of its own."""
+    run = write_run(tmp_path_factory.mktemp("measured") / "run", f"{ENVS}:Block")
+    request = EvalRequest(str(run.path), episodes=5)
     return measure_robustness(request, ["push=0:3:3", "mass=1:3:2"])
 
 
@@ -57,11 +59,12 @@ def test_interval_of_the_mean_by_hand():
     assert mean_interval(returns[:1]) == (1.0, 1.0)
 
 
-def test_it_is_kept_with_the_run(block_run, measured):
-    assert read(block_run.robustness_file) == measured
-    block_run.robustness_file.write_text('{"format": 1, "task": 3}')
+def test_it_is_kept_with_the_run(measured):
+    file = Path(measured.policy_file).parents[1] / "robustness.json"
+    assert read(file) == measured
+    file.write_text('{"format": 1, "task": 3}')
     with pytest.raises(ArtifactError, match=r"robustness\.json: damaged: task"):
-        read(block_run.robustness_file)
+        read(file)
 
 
 def test_parameters_of_the_task_are_varied_too(block_run):
