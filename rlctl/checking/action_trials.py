@@ -66,7 +66,6 @@ class Trials:
 
     def __init__(self, context: Context, instance: Instance) -> None:
         self.instance = instance
-        self.deadline = context.budget.deadline
         self._plain: dict[tuple[int, int], list[Frame]] = {}
 
     def require_repeatable(self) -> None:
@@ -116,7 +115,7 @@ class Trials:
 
     def play(self, seed: int, chosen: Sequence[Any], after_reset: Callable[[], None] = lambda: None) -> list[Frame]:
         """Play an episode with given actions, to its end at most; the first frame is that of reset."""
-        episode = EpisodePlayer(self.instance, seed, given=chosen, max_steps=len(chosen), deadline=self.deadline)
+        episode = EpisodePlayer(self.instance, seed, given=chosen, max_steps=len(chosen))
         frames = []
         for moment in episode:
             frames.append(_to_frame(moment))

@@ -185,6 +185,8 @@ def _findings(rule: str, records: Records) -> list[RuleFinding]:
         findings += check.run(records)
     if experiment is not None and not findings:
         _require_complete(records, experiment, rule)
+    if not findings or (check is not None and check.of_absence):
+        records.require_whole(*families.find_needs([rule]))
     return findings
 
 

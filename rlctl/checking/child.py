@@ -61,6 +61,7 @@ def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> 
             yield Skipped(experiment.name, "its action space is not a Gymnasium space")
         elif started > end:
             yield Skipped(experiment.name, f"the experiments before it took the {seconds:g} s there are")
+            yield Finished(experiment.name, 0.0, is_complete=False, is_cut=True)
         else:
             context.budget = Budget(started + (end - started) * experiment.share / shares)
             yield from _run(experiment, context)
@@ -89,4 +90,4 @@ def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
         raise
     except Exception:  # what the environment raises was caught at the call, so this is a bug of rlctl
         is_complete, crash = False, traceback.format_exc()
-    yield Finished(experiment.name, time.monotonic() - started, is_complete, crash)
+    yield Finished(experiment.name, time.monotonic() - started, is_complete, context.budget.was_cut, crash)

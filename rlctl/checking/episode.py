@@ -60,16 +60,16 @@ class EpisodePlayer:
         number: int = 0,
         action_seed: int | None = None,
         max_steps: int = 10_000,
-        deadline: float = float("inf"),
+        longest_s: float = float("inf"),
         given: Iterable[Any] | None = None,
     ) -> None:
         """`actions` is a kind (see `draw_actions`), drawn with `action_seed`, else with `seed`; or the name of
-        those that are `given`. `deadline` is on `read_clock`'s clock [s]."""
+        those that are `given`. It ends after `longest_s`, or when the experiment's time is over."""
         self.instance = instance
         self.seed = seed
         self.number = number
         self.max_steps = max_steps
-        self.deadline = deadline
+        self._deadline = min(instance.context.budget.deadline, read_clock() + longest_s)
         self.steps = 0
         self.ended = ""
         """`terminated`, `truncated`, `both`, `raised`, or what cut it: `steps`, `time`; empty while it goes on."""
@@ -119,8 +119,8 @@ class EpisodePlayer:
             self.ended = "both" if terminated and truncated else "terminated" if terminated else "truncated"
         elif self.steps >= self.max_steps:
             self.ended = "steps"
-        elif read_clock() > self.deadline:
-            self.ended = "time"
+        elif read_clock() > self._deadline:
+            self.ended, self.instance.context.budget.was_cut = "time", True
         return moment
 
     def _read(self, action: Any, returned: Any) -> Moment:

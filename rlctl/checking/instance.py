@@ -29,28 +29,30 @@ class Budget:
     deadline: float  # On `read_clock`'s clock [s]
     bytes_left: int = 48 * 2**20
     failures: int = 0
+    was_cut: bool = False  # The clock ended something before it had its number of steps or resets
 
     @property
     def seconds_left(self) -> float:
         """How much time there is [s]."""
-        return self.deadline - read_clock()
+        return max(0.0, self.deadline - read_clock())
 
-    @property
+    def is_over(self) -> bool:
+        """Say whether there is no more time; what asks ends then, so the experiment was cut."""
+        is_over = read_clock() > self.deadline
+        self.was_cut |= is_over
+        return is_over
+
     def why_spent(self) -> str:
-        """What there is no more of; empty while there is some of everything."""
+        """Return what there is no more of; empty while there is some of everything."""
         if self.failures >= MOST_FAILURES:
             return f"{self.failures} of them raised"
-        return "time was over" if self.seconds_left <= 0 else "memory was over" if self.bytes_left <= 0 else ""
-
-    def end_within(self, seconds: float) -> float:
-        """Return when something that may take so long ends at the latest, on the same clock [s]."""
-        return min(read_clock() + seconds, self.deadline)
+        return "memory was over" if self.bytes_left <= 0 else "time was over" if self.is_over() else ""
 
 
 class Instance:
     """One environment, and how it is called."""
 
-    def __init__(self, env: Any, progress: CallProgress) -> None:
+    def __init__(self, env: Any, context: Context) -> None:
         """Raises `TaskError` where its observation space cannot be read."""
         try:
             self.leaves = find_leaves(getattr(env, "observation_space", None))
@@ -59,7 +61,8 @@ class Instance:
         self.env = env
         self.action_leaves = find_leaves(getattr(env, "action_space", None))
         self.accepts_seed, self.accepts_options = (_accepts(env, name) for name in ("seed", "options"))
-        self.progress = progress
+        self.context = context
+        self.progress = context.progress
         self.timers: Mapping[str, Timer] = {}  # by the name of the call they time
 
     @property
@@ -109,16 +112,16 @@ class Context:
         self.generators = GeneratorWatch()
         self._instance: Instance | None = None
 
-    def build(self, render_mode: Literal["rgb_array"] | None = None) -> Instance:
+    def build(self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None) -> Instance:
         """Return a new instance; what its import or constructor raises is an `EnvironmentRaised`."""
         try:
             # Loaded before it is built, to distinguish an import error from a constructor's.
             self.progress.enter("load")
             registry.load(self.spec.task)
             self.progress.enter("build")
-            env = self.spec.make(render_mode)
+            env = (spec or self.spec).make(render_mode)
             self.progress.leave()
-            return Instance(env, self.progress)
+            return Instance(env, self)
         except BaseException as error:
             raise EnvironmentRaised("build") from error
 
@@ -135,9 +138,9 @@ class Context:
         return self._instance is not None
 
     @contextlib.contextmanager
-    def fresh(self, render_mode: Literal["rgb_array"] | None = None) -> Iterator[Instance]:
+    def fresh(self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None) -> Iterator[Instance]:
         """A new instance for one experiment, closed after it; what its close raises is not this experiment's matter."""
-        instance = self.build(render_mode)
+        instance = self.build(render_mode, spec)
         try:
             yield instance
         finally:

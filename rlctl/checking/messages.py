@@ -168,6 +168,7 @@ class Finished:
     experiment: str
     seconds: float
     is_complete: bool
+    is_cut: bool = False  # by the clock: what happens later is not known
     crash: str = ""  # The traceback of a bug of the experiment
 
 

@@ -62,11 +62,6 @@ class Recording:
         """How many steps were taken."""
         return len(self._rewards)
 
-    @property
-    def was_cut(self) -> bool:
-        """Whether the episode was left before its end, for steps or time."""
-        return self._ended in ("steps", "time")
-
     def messages(self) -> list[CheckedEpisode | CallFailure]:
         """Return what to send: the trajectory, and the failure that ended it, if one did."""
         return [self.trajectory, *([self.failure] if self.failure else [])]

@@ -97,6 +97,12 @@ class Records:
             raise NotJudged(self.why_missing(experiment))
         return self.facts[experiment]
 
+    def require_whole(self, *experiments: str) -> None:
+        """Raise `NotJudged` if the clock cut one of some experiments: what never happened may have happened later."""
+        cut = [name for name in experiments if name in self.finished and self.finished[name].is_cut]
+        if cut:
+            raise NotJudged(self.skipped.get(cut[0], f"time ran out in the experiment {cut[0]!r}"))
+
     def why_missing(self, experiment: str) -> str:
         """Return why an experiment has not come to its end."""
         if experiment in self.skipped:
@@ -128,6 +134,7 @@ class Check:
     rule: str
     run: Callable[[Records], Iterable[RuleFinding]]
     needs: tuple[str, ...]  # The experiments that record what it reads
+    of_absence: bool = False  # it judges what never happened, so it needs them to the end
 
 
 def experiment(
@@ -142,11 +149,13 @@ def experiment(
     return decorate
 
 
-def check(rule: str, *needs: str) -> Callable[[Callable[[Records], Iterable[RuleFinding]]], Check]:
+def check(
+    rule: str, *needs: str, of_absence: bool = False
+) -> Callable[[Callable[[Records], Iterable[RuleFinding]]], Check]:
     """Make the check of a rule of a function; by default it reads the recorded episodes."""
 
     def decorate(run: Callable[[Records], Iterable[RuleFinding]]) -> Check:
         assert rule in RULES
-        return Check(rule, run, needs or RECORDING)
+        return Check(rule, run, needs or RECORDING, of_absence)
 
     return decorate

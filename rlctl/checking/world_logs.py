@@ -113,11 +113,11 @@ class WorldLogger:
         moving = [world for world in self._worlds.values() if any(log.moves for log in world.logs)]
         return moving or list(self._worlds.values())
 
-    def play(self, number: int, kind: str, steps: int, deadline: float) -> None:
+    def play(self, number: int, kind: str, steps: int) -> None:
         """Log an episode. If the environment raises, the log keeps what came before."""
         seed = FIRST_SEED + number
         logs: list[WorldLog] = []
-        for moment in EpisodePlayer(self.instance, seed, kind, number=number, max_steps=steps, deadline=deadline):
+        for moment in EpisodePlayer(self.instance, seed, kind, number=number, max_steps=steps):
             place = {"seed": seed, "episode": number, "actions": kind, "step": moment.step}
             logs = logs if moment.step else self._begin()
             logs = [log for log in logs if log.look(place, moment.observation)]
@@ -149,9 +149,9 @@ class WorldLogger:
             own = [bullet_worlds.read_world(id) for id in ids]
         return [world for world in own if world.bodies][:MOST_WORLDS]
 
-    def simulate_alone(self, number: int, deadline: float) -> None:
+    def simulate_alone(self, number: int) -> None:
         """Reset, and simulate every world without the environment, which leaves them unusable."""
-        self.play(number, "none", 0, deadline)
+        self.play(number, "none", 0)
         for logged in self._worlds.values():
             with contextlib.suppress(bullet_worlds.bullet().error):
                 if not any(logged.gravity):

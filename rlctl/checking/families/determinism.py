@@ -23,7 +23,7 @@ from rlctl.checking.instance import Context, Instance
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import Check, Records, check, experiment
 
-COMPARED_STEPS = 300  # How far comparisons go
+COMPARED_STEPS = 200  # How far comparisons go
 DIRTY_STEPS = 37  # longest unfinished episode before a repetition
 KEPT_STEPS = 10  # So many steps are between two resets whose attributes are compared
 LATE = 20  # a later difference is a residue, not the episode's start [steps]
@@ -32,26 +32,28 @@ MOST_KEPT = 3
 NEARLY = 1e-5  # relative to the value or to 1: a smaller first difference is a numerical residue
 
 
-@experiment("comparisons", share=6.0)
+@experiment("comparisons", share=4.0)
 def compare_repetitions(context: Context) -> Iterator[messages.ChildMessage]:
     """Play the first episode again: at once, after an unfinished other one, and with another seed."""
     instance, budget = context.instance, context.budget
-    longest_s = budget.seconds_left / 4
-    steps, first = COMPARED_STEPS, messages.FIRST_SEED
+    longest_s, steps, first = budget.seconds_left / 4, COMPARED_STEPS, messages.FIRST_SEED
     for number, role in enumerate(("alone", "reused", "dirty", "seeds")):
         instance.progress.phase(role)
         if role == "dirty":
             unfinished = min(DIRTY_STEPS, max(1, steps // 2))
-            deadline = budget.end_within(1.0)
-            other = EpisodePlayer(instance, messages.SECOND_SEED, "extreme", max_steps=unfinished, deadline=deadline)
+            other = EpisodePlayer(instance, messages.SECOND_SEED, "extreme", max_steps=unfinished)
             Recording(role, other, budget).run()
-        if budget.seconds_left < 0:
+        if budget.is_over():
             yield messages.Skipped(role, "the first comparisons took all the time there is for them")
             continue
         seed = messages.SECOND_SEED if role == "seeds" else first
-        episode = EpisodePlayer(instance, seed, number=number, action_seed=first, max_steps=COMPARED_STEPS)
-        episode.deadline = budget.end_within(longest_s)
-        recording = Recording(role, episode, budget)
+        recording = Recording(
+            role,
+            EpisodePlayer(
+                instance, seed, number=number, action_seed=first, max_steps=COMPARED_STEPS, longest_s=longest_s
+            ),
+            budget,
+        )
         yield from recording.run()
         steps = min(steps, recording.steps)
     yield messages.Fact("kept", _find_kept(instance))

@@ -42,7 +42,7 @@ def _leaves(records: Records, kinds: str = "f") -> Iterator[tuple[int, Leaf]]:
             yield index, leaf
 
 
-@check("RL110", *WITH_SEARCH)
+@check("RL110", *WITH_SEARCH, of_absence=True)
 def _find_constant_elements(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     names: list[str] = []

@@ -31,7 +31,7 @@ FEWEST_STEPS = 500  # Steps of them: less is what raises, or ends, at once
 OTHER_NAMES = ("success", "succeeded", "goal_reached", "is_goal")
 
 
-@check("RL604", *rewards.WITH_SEARCH)
+@check("RL604", *rewards.WITH_SEARCH, of_absence=True)
 def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
     episodes = rewards.require_rewarded(records)
     if not any(episode.terminated.any() for episode in episodes):
@@ -78,7 +78,7 @@ def _severity_of_end(
     return Severity.INFO if as_good_as >= LIKE_ANY else Severity.WARNING
 
 
-@check("RL606", *rewards.WITH_SEARCH)
+@check("RL606", *rewards.WITH_SEARCH, of_absence=True)
 def _find_paid_idleness(records: Records) -> Iterator[RuleFinding]:
     compared = [episode for episode in rewards.require_rewarded(records) if episode.role in ("episodes", "search")]
     idle = [episode for episode in compared if episode.actions == "zero"]
@@ -124,14 +124,14 @@ def _bonus(idle: Sequence[CheckedEpisode]) -> tuple[str | None, float]:
 def record_starts(context: Context) -> Iterator[ChildMessage]:
     """Reset with many seeds, and take the same few steps with the zero action after each."""
     for number in range(STARTS):
-        if context.budget.why_spent:
-            yield Skipped("starts", f"only {number} of {STARTS} starts were made: {context.budget.why_spent}")
+        if why := context.budget.why_spent():
+            yield Skipped("starts", f"only {number} of {STARTS} starts were made: {why}")
             return
         episode = EpisodePlayer(context.instance, FIRST + number, "zero", number=number, max_steps=START_STEPS)
         yield from Recording("starts", episode, context.budget).run()
 
 
-@check("RL609", *rewards.WITH_SEARCH)
+@check("RL609", *rewards.WITH_SEARCH, of_absence=True)
 def _find_unreported_success(records: Records) -> Iterator[RuleFinding]:
     episodes = rewards.require_readable(records)
     if rewards.reports_success(episodes):
@@ -159,7 +159,7 @@ def _find_success_at_start(records: Records) -> Iterator[RuleFinding]:
         yield RuleFinding("RL610", message, at_once[0].at(1, value=share, expected=f"up to {MANY_AT_START}"))
 
 
-@check("RL611", *rewards.WITH_SEARCH)
+@check("RL611", *rewards.WITH_SEARCH, of_absence=True)
 def _find_no_success(records: Records) -> Iterator[RuleFinding]:
     episodes = rewards.require_readable(records)
     if not rewards.reports_success(episodes):

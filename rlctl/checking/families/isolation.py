@@ -49,8 +49,8 @@ def compare_instances(context: Context) -> Iterator[ChildMessage]:
 
     def begin(instance: Instance, role: str, seed: int) -> Recording:
         progress.phase(role)
-        deadline = budget.end_within(longest_s)
-        episode = EpisodePlayer(instance, seed, number=seed - FIRST_SEED, max_steps=COMPARED_STEPS, deadline=deadline)
+        number = seed - FIRST_SEED
+        episode = EpisodePlayer(instance, seed, number=number, max_steps=COMPARED_STEPS, longest_s=longest_s)
         return Recording(role, episode, budget)
 
     progress.phase("alone")
@@ -62,7 +62,7 @@ def compare_instances(context: Context) -> Iterator[ChildMessage]:
     progress.phase("fresh instance")
     neighbour = context.build()
     yield from begin(neighbour, "fresh instance", FIRST_SEED).run()
-    if budget.seconds_left < 0:
+    if budget.is_over():
         for left_out in ("interleaved", "interleaved second", "after close", "RL404"):
             yield Skipped(left_out, "building and stepping the first two instances took all the time there is for them")
         yield from context.close(neighbour)
@@ -207,7 +207,7 @@ def count_after_resets(context: Context) -> Iterator[ChildMessage]:
     instance, budget = context.instance, context.budget
     gc.freeze()  # what there is already need not be looked through again and again
     try:
-        while counts.resets < MOST_RESETS and budget.seconds_left > 0:
+        while counts.resets < MOST_RESETS and not budget.is_over():
             for _ in EpisodePlayer(instance, FIRST_SEED + counts.resets, number=counts.resets, max_steps=1):
                 pass
             counts.count()

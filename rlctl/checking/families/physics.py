@@ -52,16 +52,16 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
         yield from _model_faults(instance.env)
         logger = WorldLogger(instance, older, calls)
         for number, (kind, steps) in enumerate(EPISODES):
-            if number and (context.budget.seconds_left < 0 or not logger.worlds):
+            if number and (not logger.worlds or context.budget.is_over()):
                 break
             try:
-                logger.play(number, kind, steps, context.budget.deadline)
+                logger.play(number, kind, steps)
             except EnvironmentRaised as error:
                 yield describe_failure(error, context.progress)
         yield from find_misuses(logger.worlds, calls)
-        if logger.worlds and context.budget.seconds_left > 0:
+        if logger.worlds and not context.budget.is_over():
             with contextlib.suppress(EnvironmentRaised):  # its resets were logged by now
-                logger.simulate_alone(len(EPISODES), context.budget.deadline)
+                logger.simulate_alone(len(EPISODES))
     if not logger.resets:
         raise NotJudged("no episode could be logged")
     if not logger.worlds:

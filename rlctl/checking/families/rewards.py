@@ -138,7 +138,7 @@ def find_not_finite(records: Records) -> Iterator[RuleFinding]:
             return
 
 
-@check("RL602", *WITH_SEARCH)
+@check("RL602", *WITH_SEARCH, of_absence=True)
 def _find_constant_reward(records: Records) -> Iterator[RuleFinding]:
     episodes = require_rewarded(records)
     constant = float(episodes[0].rewards[0])
@@ -175,7 +175,7 @@ def _find_badly_scaled(records: Records) -> Iterator[RuleFinding]:
     yield RuleFinding("RL603", message, evidence, Severity.INFO if records.normalizes("reward") else Severity.WARNING)
 
 
-@check("RL612", *WITH_SEARCH)
+@check("RL612", *WITH_SEARCH, of_absence=True)
 def _find_constant_penalty(records: Records) -> Iterator[RuleFinding]:
     episodes = [episode for episode in require_rewarded(records) if has_terms(episode)]
     if not episodes:
@@ -243,7 +243,7 @@ def recompute_rewards(context: Context) -> Iterator[ChildMessage]:
     leaves = {leaf.path for leaf in instance.leaves}
     if not callable(compute) or not leaves >= {(name,) for name in GOALS}:
         raise NotApplicable("no compute_reward, or no goals in the observation that are arrays")
-    episode = EpisodePlayer(instance, FIRST_SEED, max_steps=STEPS, deadline=context.budget.deadline)
+    episode = EpisodePlayer(instance, FIRST_SEED, max_steps=STEPS)
     taken = [moment for moment in episode if moment.step and moment.is_readable]
     if not taken:
         raise NotJudged("no step could be taken")

@@ -23,7 +23,7 @@ UNSEEDED_RESETS, UNSEEDED_STEPS = 2, 20  # Of two discrete starts one may be the
 FEWEST_SEEDS = 4
 
 
-@check("RL306", "comparisons", "episodes")
+@check("RL306", "comparisons", "episodes", of_absence=True)
 def _compare_seeds(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     trajectory, difference = compare(records, "alone", "seeds")
@@ -51,19 +51,18 @@ def compare_unseeded(context: Context) -> Iterator[ChildMessage]:
     with context.fresh() as first, context.fresh() as second:
         if not first.accepts_seed:
             raise NotJudged("reset takes no seed (RL202)")
-        deadline = context.budget.deadline
-        if _differing(*(_play(instance, deadline, seed=FIRST_SEED) for instance in (first, second))):
+        if _differing(*(_play(instance, seed=FIRST_SEED) for instance in (first, second))):
             raise NotJudged("equal seeds and actions give unequal episodes (RL3)")
-        values = _differing(*(_play(instance, deadline) for instance in (first, second)))
+        values = _differing(*(_play(instance) for instance in (first, second)))
     if values:
         message = f"reset with one seed, and then without: {values[0]:.6g} in an observation, in another instance "
         evidence = {"seed": FIRST_SEED, "value": values[1], "expected": values[0]}
         yield RuleFinding("RL308", f"{message}{values[1]:.6g}", evidence)
 
 
-def _play(instance: Instance, deadline: float, **seed: int) -> NDArray[np.float64]:
+def _play(instance: Instance, **seed: int) -> NDArray[np.float64]:
     """Reset with a seed and then a few times as given; return the numbers of these and of some more observations."""
-    episode = EpisodePlayer(instance, FIRST_SEED, max_steps=UNSEEDED_STEPS, deadline=deadline)
+    episode = EpisodePlayer(instance, FIRST_SEED, max_steps=UNSEEDED_STEPS)
     episode.reset()
     starts = [instance.call("reset", instance.env.reset, **seed) for _ in range(UNSEEDED_RESETS)]
     observations = [start[0] if isinstance(start, tuple) else start for start in starts]
@@ -83,7 +82,7 @@ def _differing(one: NDArray[np.float64], two: NDArray[np.float64]) -> list[float
 def compare_generators(context: Context) -> Iterator[ChildMessage]:
     """Play the beginning of an episode, and say which generators of the whole process it moves, and where first."""
     moved: set[str] = set()
-    episode = EpisodePlayer(context.instance, FIRST_SEED, max_steps=WATCHED_STEPS, deadline=context.budget.deadline)
+    episode = EpisodePlayer(context.instance, FIRST_SEED, max_steps=WATCHED_STEPS)
     before = _read_generators()
     for moment in episode:
         after = _read_generators()

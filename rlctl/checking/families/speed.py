@@ -58,15 +58,14 @@ def measure_speed(context: Context) -> Iterator[ChildMessage]:
     instance, seconds = context.instance, min(LONGEST_S, context.budget.seconds_left)
     steps, resets = Stopwatch(), Stopwatch()
     stopwatches = {"step": steps, "reset": resets}
-    deadline = read_clock() + seconds / 2
-    _play(instance, stopwatches, TIMED_STEPS, deadline)
-    _play(instance, stopwatches, TIMED_RESETS, deadline, only_reset=True)
+    _play(instance, stopwatches, TIMED_STEPS, seconds / 2)
+    _play(instance, stopwatches, TIMED_RESETS, seconds / 4, only_reset=True)
     profilers = {"step": cProfile.Profile(), "reset": cProfile.Profile()}
     timers = {call: profiler.runcall for call, profiler in profilers.items()}
     with visible_to_profilers():
         for only_reset in (False, True):
-            deadline = read_clock() + min(seconds / 4, PROFILED_S)
-            _play(instance, timers, MOST_STEPS, deadline, only_reset=only_reset)
+            _play(instance, timers, MOST_STEPS, min(seconds / 4, PROFILED_S), only_reset=only_reset)
+    context.budget.was_cut = False  # it lasts as long as it should
     is_own = find_own_code(instance.env)
     in_step, in_reset = (Profile(profiler, is_own) for profiler in profilers.values())
     yield Fact(
@@ -85,16 +84,15 @@ def measure_speed(context: Context) -> Iterator[ChildMessage]:
 
 
 def _play(
-    instance: Instance, timers: Mapping[str, Timer], calls: int, deadline: float, *, only_reset: bool = False
+    instance: Instance, timers: Mapping[str, Timer], calls: int, longest_s: float, *, only_reset: bool = False
 ) -> None:
     instance.timers = timers
-    number = 0
+    number, deadline = 0, read_clock() + longest_s
     try:
-        while calls > 0 and read_clock() < deadline:
+        while calls > 0 and (left_s := deadline - read_clock()) > 0:
             steps = 0 if only_reset else calls
-            episode = EpisodePlayer(
-                instance, FIRST_SPEED_SEED + number, number=number, max_steps=steps, deadline=deadline
-            )
+            seed = FIRST_SPEED_SEED + number
+            episode = EpisodePlayer(instance, seed, number=number, max_steps=steps, longest_s=left_s)
             for _ in episode:
                 pass
             number += 1

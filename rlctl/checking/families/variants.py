@@ -90,21 +90,20 @@ def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[RuleFindin
 
 
 def _play(context: Context, spec: EnvSpec) -> bool:
-    with Context(spec, context.progress).fresh() as instance:
-        episodes = [_record(context, instance) for _ in range(2)]
+    with context.fresh(spec=spec) as instance:
+        episodes = [_record(instance) for _ in range(2)]
     shortest = min(len(episode) for episode in episodes)  # where time was up
     return bool(np.array_equal(episodes[0][:shortest], episodes[1][:shortest]))
 
 
 def _describe(context: Context, spec: EnvSpec) -> EnvInfo:
-
-    with Context(spec, context.progress).fresh() as instance:
-        _record(context, instance)
+    with context.fresh(spec=spec) as instance:
+        _record(instance)
         return info.describe(instance.env)
 
 
-def _record(context: Context, instance: Instance) -> NDArray[np.float64]:
-    episode = EpisodePlayer(instance, FIRST_SEED, max_steps=STEPS, deadline=context.budget.deadline)
+def _record(instance: Instance) -> NDArray[np.float64]:
+    episode = EpisodePlayer(instance, FIRST_SEED, max_steps=STEPS)
     return np.concatenate([flatten_numbers(moment.observation) for moment in episode])
 
 
