@@ -1,7 +1,7 @@
 """Writes docs/rules.md and a page for each rule of check-env, from their texts and the twins that the tests run.
 
 `python docs/make_rules.py` writes all pages and keeps what rlctl printed; with `--run` it checks the broken twins again
-(minutes). Run it in the root of the repository.
+(minutes), with `--run RL405 RL108` those of some rules. Run it in the root of the repository.
 """
 
 from __future__ import annotations
@@ -11,10 +11,13 @@ import inspect
 import re
 import sys
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rlctl.checking.check import check
 from rlctl.checking.finding import FAMILIES, RULES, Rule
+from rlctl.environments.spec import EnvSpec
 
 ROOT = Path(__file__).parent.parent
 TESTS = ROOT / "tests" / "checking"
@@ -52,13 +55,19 @@ def read_printed() -> dict[str, str]:
     return {rule: match[1] for rule, match in texts.items() if match}
 
 
-def run_cases() -> dict[str, str]:
-    """Check the broken twin of each rule, and return what rlctl prints of it."""
-    from tests.checking.judging import verdict_of
+def run_cases(rules: Sequence[str]) -> dict[str, str]:
+    """Check the broken twins of some rules, or of all, and return what rlctl prints of them."""
+    from tests.checking.judging import IN_PROCESSES, verdict_of
 
     printed = {}
     for rule, case in _find_cases().items():
-        for finding in verdict_of(case.broken, *case.rules).findings:
+        if rules and rule not in rules:
+            continue
+        if case in IN_PROCESSES:
+            verdict = check(EnvSpec(f"{TESTS}/{case.broken}"), env_timeout_s=2.0, rules=[rule]).verdict
+        else:
+            verdict = verdict_of(case.broken, *case.rules)
+        for finding in verdict.findings:
             if finding.rule == rule and rule not in printed:
                 lines = [f"{finding.severity} {rule}  {finding.name}", f"  {finding.message}"]
                 printed[rule] = "\n".join(lines).replace(f"{TESTS}/", "") + "\n"
@@ -72,7 +81,9 @@ def _find_cases() -> dict[str, Any]:
         for case in getattr(importlib.import_module(f"tests.checking.{file.stem}"), "CASES", []):
             for rule in case.rules if ".py:" in case.broken else ():
                 cases.setdefault(rule, case)
-    return cases
+    from tests.checking.judging import IN_PROCESSES
+
+    return cases | {case.rules[0]: case for case in IN_PROCESSES}
 
 
 def _render_index() -> str:
@@ -97,7 +108,10 @@ def _render_page(rule: Rule, case: Any, printed: str) -> str:
             parts.append(f"rlctl prints:\n\n{FENCE}text\n{printed}{FENCE}\n")
         if right:
             parts.append(f"Without the mistake:\n\n{FENCE}python\n{right}{FENCE}\n")
-    parts += [f"**What to do.** {rule.fix}\n", "[All rules](../rules.md)\n"]
+    parts.append(f"**What to do.** {rule.fix}\n")
+    if rule.task_fix != rule.fix:
+        parts.append(f"**In a task of rlctl.** {rule.task_fix}\n")
+    parts.append("[All rules](../rules.md)\n")
     return "\n".join(parts)
 
 
@@ -144,7 +158,9 @@ def _shorten(source: str) -> str:
 
 def main() -> None:
     """Write the pages."""
-    printed = run_cases() if "--run" in sys.argv else read_printed()
+    printed = read_printed()
+    if "--run" in sys.argv:
+        printed |= run_cases(sys.argv[2:])
     PAGES.mkdir(exist_ok=True)
     for file, text in render_all(printed).items():
         file.write_text(text, encoding="utf-8")

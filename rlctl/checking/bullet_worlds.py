@@ -195,6 +195,12 @@ def read_gravity(client: int) -> list[float]:
     return [float(parameters[f"gravityAcceleration{axis}"]) for axis in "XYZ"]
 
 
+def read_time_step(client: int) -> float:
+    """Return how long one step of the physics of a client is [s]."""
+    parameters = ClientCalls(client).getPhysicsEngineParameters()
+    return float(parameters["fixedTimeStep"]) / max(1, int(parameters["numSubSteps"]))
+
+
 def read_contacts(client: int) -> dict[Pair, float]:
     """Return the deepest distance per pair of links that touch [m]; below zero they are inside each other."""
     deepest: dict[Pair, float] = {}

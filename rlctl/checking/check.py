@@ -23,6 +23,7 @@ from rlctl.recipe import sources
 
 METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6": "step", "RL7": "step"}
 """The method that the findings of a family are about, where nothing more is known."""
+SLOW_CALL_S = 5.0  # After so long a call is mentioned [s]
 LOADING = ("RL0", "RL216")  # judged even if no instance could be built
 
 
@@ -133,15 +134,20 @@ def _normalizes(task: str, what: str) -> bool:
 
 
 @contextlib.contextmanager
-def _status(task: str, wanted: bool) -> Iterator[Callable[[Position], None]]:
+def _status(task: str, wanted: bool) -> Iterator[Callable[[Position, float, float], None]]:
     from rlctl import output
 
-    console = output.err()
-    if not wanted or not console.is_terminal:
-        yield lambda position: None
-        return
-    with console.status(f"checking {task}") as status:
-        yield lambda position: status.update(f"checking {task}: {position.phase}")
+    console, noted = output.err(), set[str]()
+
+    def say(position: Position, waited_s: float, limit_s: float) -> None:
+        status.update(f"checking {task}: {position.phase}")
+        if waited_s > SLOW_CALL_S and position.call and position.call not in noted:
+            noted.add(position.call)
+            console.print(f"{position.call} takes long; the check waits for it up to {limit_s:g} s (--env-timeout)")
+
+    status = console.status(f"checking {task}")
+    with status if wanted and console.is_terminal else contextlib.nullcontext():
+        yield say if wanted else lambda *_: None
 
 
 def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> CheckVerdict:
@@ -150,6 +156,9 @@ def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> CheckVerdi
     for rule in rules:
         _apply(rule, records, verdict)
     if records.built is not None:
+        for finding in verdict.findings if records.built.is_task else ():
+            if finding.fix == (general := RULES[finding.rule]).fix:
+                finding.fix = general.task_fix
         _waive(verdict, records.built.waivers)
         for leaf in records.built.leaves:
             if not leaf.supported:

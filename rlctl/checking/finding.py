@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ class Rule:
     severity: Severity  # Of a finding, unless the check gives it another one
     meaning: str  # What it means and why it matters
     fix: str
+    task_fix: str  # The same for a task of rlctl
 
 
 def _load() -> tuple[dict[str, str], dict[str, Rule]]:
@@ -43,8 +45,8 @@ def _load() -> tuple[dict[str, str], dict[str, Rule]]:
     rules = {}
     for key, text in content["rules"].items():
         (rule_id, severity), name = key.partition(": ")[0].split(), key.partition(": ")[2]
-        meaning, fix = (" ".join(part.split()) for part in text.split("\nfix: "))
-        rules[rule_id] = Rule(rule_id, name, Severity(severity), meaning, fix)
+        meaning, fix, *task = (" ".join(part.split()) for part in re.split(r"\n(?:fix|task): ", text))
+        rules[rule_id] = Rule(rule_id, name, Severity(severity), meaning, fix, task[0] if task else fix)
     return content["families"], rules
 
 
@@ -117,7 +119,7 @@ def find_rule(code: str) -> Rule:
         if code.upper() == rule.id or code == rule.name:
             return rule
     family = [rule for rule in RULES if rule.startswith(code.upper())]
-    hint = f" The family has: {', '.join(family)}." if family else did_you_mean(code.upper(), RULES)
+    hint = f" The family has: {', '.join(family)}." if family else did_you_mean(code.upper().replace("O", "0"), RULES)
     raise UsageError(f"no rule {code!r}.{hint} rlctl check-env --list shows all.")
 
 
@@ -125,6 +127,6 @@ def _codes(texts: Sequence[str], option: str) -> list[str]:
     codes = [code.strip().upper() for text in texts for code in text.split(",") if code.strip()]
     for code in codes:
         if not any(rule.startswith(code) for rule in RULES):
-            closest = did_you_mean(code, RULES) or did_you_mean(code, FAMILIES)
+            closest = did_you_mean(code.replace("O", "0"), RULES) or did_you_mean(code, FAMILIES)
             raise UsageError(f"{option} {code}: no such rule.{closest} rlctl check-env --list shows all.")
     return codes

@@ -44,6 +44,11 @@ class Built:
     line: int | None = None
 
     @property
+    def is_task(self) -> bool:
+        """Whether it is a task of rlctl: those name what they observe."""
+        return bool(self.names)
+
+    @property
     def parts(self) -> dict[str, slice]:
         """The parts of a flat observation by name; empty where names are not known."""
         ends = list(itertools.accumulate(self.names.values()))

@@ -20,7 +20,7 @@ from rlctl.processes.printed_lines import LineReader
 
 AT_ONCE = 2
 BUILD_TIMEOUT_S = 60.0  # How long importing and building may take, unless a step may take longer
-FIRST_CALL_TIMEOUT_S = 30.0  # first reset or step, which may compile or load [s]
+FIRST_CALLS = 3.0  # So many times longer than others the first reset or step may take: it may compile or load
 IDLE_TIMEOUT_S = 300.0  # outside of the environment: loading libraries [s]
 _POLL_S = 0.1
 _KEPT_LINES = 8
@@ -65,10 +65,9 @@ class Child:
         """Where it is."""
         return self._progress.read()
 
-    def hangs(self, env_timeout_s: float) -> str | None:
-        """Say so if the call that the child is in takes longer than it may."""
-        limit_s = _limit_s(self.position, env_timeout_s)  # first: if the call ends now, nothing stands still
-        return f"did not come back in {limit_s:g} s" if self._standstill.seconds() > limit_s else None
+    def wait_s(self) -> float:
+        """Return for how long it has been in the same call [s]."""
+        return self._standstill.seconds()
 
     def fail(self, kind: str, error: str) -> CallFailure:
         """Return the failure that ends it, with the last lines that it has printed."""
@@ -94,7 +93,7 @@ class Child:
 def _limit_s(position: Position, env_timeout_s: float) -> float:
     call = position.call
     if position.is_first and call in ("reset", "step"):
-        return max(FIRST_CALL_TIMEOUT_S, env_timeout_s)
+        return FIRST_CALLS * env_timeout_s
     if call in ("load", "build"):
         return max(BUILD_TIMEOUT_S, env_timeout_s)
     return env_timeout_s if call else IDLE_TIMEOUT_S
@@ -116,20 +115,23 @@ class Supervisor:
         self._started_again: set[str] = set()
         self.children: list[Child] = []  # Those that were started, the first process first
 
-    def run(self, experiments: Mapping[str, Sequence[str]], on_poll: Callable[[Position], None]) -> None:
-        """Run each process with some experiments, and come back when all are done, dead or ended."""
+    def run(self, experiments: Mapping[str, Sequence[str]], on_poll: Callable[[Position, float, float], None]) -> None:
+        """Run each process with some experiments, and come back when all are done, dead or ended.
+
+        `on_poll` is called with the position of each, for how long it has been there and how long it may be [s].
+        """
         self._waiting = {process: list(names) for process, names in experiments.items()}
         self._start()
         while self._active:
             for ready in wait(list(self._active), timeout=_POLL_S):
                 self._read(self._active[ready])  # type: ignore[index]
             for child in list(self._active.values()):
-                is_active = child.process.connection in self._active  # not ended because of another
-                if is_active and (why := child.hangs(self._env_timeout_s)):
-                    self._end(child, child.fail("hung", why))
+                position = child.position
+                limit_s = _limit_s(position, self._env_timeout_s)  # first: if the call ends now, nothing stands still
+                on_poll(position, waited_s := child.wait_s(), limit_s)
+                if waited_s > limit_s:
+                    self._end(child, child.fail("hung", f"did not come back in {limit_s:g} s"))
             self._start()
-            if self._active:
-                on_poll(next(iter(self._active.values())).position)
 
     def close(self) -> None:
         """End what still runs."""
@@ -166,7 +168,8 @@ class Supervisor:
     def _end(self, child: Child, failure: CallFailure | None = None, grace_s: float = 0.0) -> None:
         if failure is not None:
             self._receive(failure)
-            self._start_again(child)
+            if failure.kind == "died" or not child.position.is_first:  # a first call would hang again
+                self._start_again(child)
         if not self._has_built:
             self._waiting.clear()  # what cannot be built here cannot be built there
         del self._active[child.process.connection]

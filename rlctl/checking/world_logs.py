@@ -89,6 +89,7 @@ class LoggedWorld:
 
     world: World
     gravity: list[float]  # The strongest [m/s^2]
+    time_step: float  # At the last reset [s]
     logs: list[WorldLog] = dataclasses.field(default_factory=list)
     jumps: list[Jump] = dataclasses.field(default_factory=list)
     weight_matters: bool | None = None  # tested if gravity is zero
@@ -134,7 +135,8 @@ class WorldLogger:
         logs = []
         for i, world in enumerate(self._read()):
             gravity = bullet_worlds.read_gravity(world.client)
-            logged = self._worlds.setdefault(i, LoggedWorld(world, gravity))
+            logged = self._worlds.setdefault(i, LoggedWorld(world, gravity, 0.0))
+            logged.time_step = bullet_worlds.read_time_step(world.client)
             logged.gravity = max(logged.gravity, gravity, key=np.linalg.norm)
             if world.key == logged.world.key:
                 logged.world = world

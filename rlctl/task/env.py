@@ -63,7 +63,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.level = self._episode_level = 1.0
         self.sim = _make_world(task, sim, render_mode)
         self._step = 0
-        self._running = False
+        self._running = self._closed = False
         self._streams: Streams = {}
         self._markers: dict[str, int] = {}
         try:
@@ -134,6 +134,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode; equal seeds give equal episodes, whatever was simulated before."""
         super().reset(seed=seed)
+        if self._closed:
+            raise TaskError(f"{self.name}: reset() after close(); make a new environment")
         if self.task.fast_reset:
             self.sim.restore()
         else:
@@ -161,7 +163,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Advance one control step of `control_dt` seconds."""
         if not self._running:
-            raise TaskError(f"{self.name}: step() before reset(), or after the episode's end")
+            raise TaskError(f"{self.name}: step() before reset(), after the episode's end, or after close()")
         task = self.task
         action = self._check_action(action)
         task.act(self._signals.act(action))
@@ -200,9 +202,12 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def _read_flag(self, method: str) -> bool:
         flag = getattr(self.task, method)()
         try:
-            return bool(flag)
-        except ValueError:  # of an array
-            raise TaskError(f"{self.name}: {method}() returned {short_repr(flag)}, not True or False") from None
+            is_flag = flag in (None, False, True)
+        except ValueError:  # an array
+            is_flag = False
+        if not is_flag:
+            raise TaskError(f"{self.name}: {method}() returned {short_repr(flag)}, not True or False")
+        return bool(flag)
 
     def _check_action(self, action: Any) -> Any:
         space = self.action_space
@@ -236,6 +241,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 
     def close(self) -> None:
         """End the simulation."""
+        self._running, self._closed = False, True
         self.sim.close()
 
 

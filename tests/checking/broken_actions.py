@@ -85,6 +85,22 @@ class CopiedAction(OneAxis):
         return np.concatenate([self.position, self.last])
 
 
+class OnlyCosts(CostlyAction):
+    """Actions cost, and move nothing."""
+
+    def move(self, action):
+        self.cost = 0.1 * float(np.square(action).sum())
+        self.position = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+
+class OnlyCopies(CopiedAction):
+    """Actions are observed, and do nothing else."""
+
+    def move(self, action):
+        self.last = action
+        self.position = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+
 class DeadChoice(Clean):
     def __init__(self):
         super().__init__()

@@ -209,6 +209,11 @@ class NoneInfo(Clean):
         return None
 
 
+class SuccessIsADistance(Clean):
+    def info(self):
+        return {"is_success": float(np.linalg.norm(self.position))}
+
+
 class Raises(Clean):
     def move(self, action):
         if self.steps == 7:
@@ -235,6 +240,11 @@ class Hangs(Clean):
         if self.steps == 7:
             time.sleep(1e6)
         super().move(action)
+
+
+class HangsAtOnce(Clean):
+    def move(self, action):
+        time.sleep(1e6)
 
 
 class Prints(Clean):
@@ -264,6 +274,11 @@ class Endless(Clean):
 class EndsAtOnce(Clean):
     def is_terminated(self):
         return True
+
+
+class EndsAtStepTwo(Clean):
+    def is_truncated(self):
+        return self.steps >= 2
 
 
 class NanReward(Clean):

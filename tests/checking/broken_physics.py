@@ -144,6 +144,12 @@ class StartsInTheFloor(Cart):
     height = -0.02
 
 
+class LongPhysicsSteps(Cart):
+    def vary(self):
+        p.setTimeStep(0.25, physicsClientId=self.client)
+        p.setPhysicsEngineParameter(numSubSteps=0, physicsClientId=self.client)
+
+
 class ForgetsClient(Cart):
     def read(self):
         p.getNumBodies()

@@ -1,6 +1,7 @@
 """Environments that do not repeat, and instances that disturb each other."""
 
 import random
+import time
 
 import numpy as np
 import pybullet
@@ -162,3 +163,28 @@ class OnlyOne(Clean):
 
     def close(self):
         pass
+
+
+class NothingHappens(Clean):
+    """No number changes, and an episode ends by its time only."""
+
+    def observe(self):
+        return np.zeros(2, np.float32)
+
+    def reward(self):
+        return -1.0
+
+    def is_terminated(self):
+        return super().is_truncated()
+
+    def is_truncated(self):
+        return False
+
+    def info(self):
+        return {"is_success": False, "reward_terms": {"effort": -1.0}}
+
+
+class NothingHappensSlowly(NothingHappens):
+    def observe(self):
+        time.sleep(0.002)
+        return super().observe()

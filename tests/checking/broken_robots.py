@@ -297,3 +297,9 @@ class CrawlerOtherFloor(Crawler):
 class CrawlerFloor(Crawler):
     def reward(self):
         return super().reward() + 0.1 * self.touches(0)
+
+
+class ArmLongPhysicsSteps(Arm):
+    def __init__(self):
+        super().__init__()
+        p.setTimeStep(1 / 30, physicsClientId=self.client)

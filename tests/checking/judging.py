@@ -40,6 +40,17 @@ def case(broken: str, *expected: tuple[str, str], **settings: Any) -> Case:
     return Case(broken, frozenset(expected), **settings)
 
 
+IN_PROCESSES = [
+    case("broken_envs.py:ExitsWhenBuilt", ("RL004", "error")),
+    case("broken_envs.py:Segfaults", ("RL208", "error")),
+    case("broken_envs.py:Hangs", ("RL209", "error")),
+    case("broken_envs.py:Prints", ("RL211", "warning")),
+    case("broken_interface.py:Gui", ("RL216", "error")),
+    case("broken_repeats.py:HashOrder", ("RL305", "error")),
+]
+"""What only shows with real child processes: tested in test_processes.py, and RL216 in test_interface.py."""
+
+
 def records_of(task, *experiments):
     """What some experiments find out, or all."""
     records = Records(_path(task))

@@ -15,6 +15,8 @@ CASES = [
     case(f"{FILE}:DeadChoice", ("RL701", "error"), twin=f"{FILE}:Choice"),
     case(f"{FILE}:CostlyAction", ("RL701", "warning"), twin=f"{FILE}:HiddenAction"),
     case(f"{FILE}:CopiedAction", ("RL701", "info")),
+    case(f"{FILE}:OnlyCosts", ("RL701", "error"), twin=f"{FILE}:Switch"),
+    case(f"{FILE}:OnlyCopies", ("RL701", "error"), twin=f"{FILE}:Switch"),
 ]
 CLEAN = [f"{FILE}:Switch"]
 
@@ -43,8 +45,7 @@ def the_finding(name, rule):
 def test_dead_actions_are_named():
     finding = the_finding("DeadAction", "RL701")
     assert finding.message == (
-        "action[1] without any effect: at its lowest and highest value, over 60 steps from two seeds, no observation, "
-        "reward or end changes"
+        "action[1] changes nothing: at its lowest and highest value, over 60 steps from two seeds"
     )
     assert finding.evidence == {
         "value": ["action[1]"],
@@ -52,7 +53,7 @@ def test_dead_actions_are_named():
         "seeds": [1000, 1001],
         "steps": 60,
     }
-    assert the_finding("NoAction", "RL701").message.startswith("no action has any effect: at its lowest")
+    assert the_finding("NoAction", "RL701").message.startswith("no element of the action changes anything: at its")
 
 
 def test_a_first_episode_unlike_the_others_hides_nothing():
@@ -61,7 +62,7 @@ def test_a_first_episode_unlike_the_others_hides_nothing():
 
 def test_rewards_that_actions_change_in_a_series_are_worth_knowing():
     finding = the_finding("Watched", "RL701")
-    assert finding.message.startswith("action[0], action[1] changes nothing but its own step's reward")
+    assert finding.message.startswith("no element of the action changes anything but its own step's reward")
     assert finding.severity == "info"
 
 

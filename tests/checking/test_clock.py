@@ -5,7 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from rlctl.checking import child
+from rlctl.checking.check import judge
 from rlctl.checking.progress import INTERVAL_S, read_clock, read_clock_of
+from rlctl.checking.records import Records
+from rlctl.environments.spec import EnvSpec
+from tests.checking.judging import FOLDER, found
 
 LINUX = pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="only Linux counts it")
 
@@ -23,3 +28,16 @@ def test_waiting_for_a_processor_does_not_count(busy):
     time.sleep(0.6)
     spent = [read_clock_of(child.pid) - then for child, then in zip(busy, before, strict=True)]
     assert sum(spent) < 2 * (time.monotonic() - begun)  # one processor for three: each has a third of it, or less
+
+
+def test_what_the_clock_cut_off_is_not_judged():
+    """As in `NothingHappens`, what never happened is a finding only of experiments that came to their end."""
+    of_absence = {"RL110", "RL501", "RL611", "RL612"}
+    assert {rule for rule, _ in found("broken_repeats.py:NothingHappens", *of_absence)} == of_absence
+    records = Records("slow")
+    for message in child.run("probe", EnvSpec(f"{FOLDER}/broken_repeats.py:NothingHappensSlowly"), None, 0.5):
+        records.add(message)
+    verdict = judge(records)
+    assert not {finding.rule for finding in verdict.findings} & of_absence
+    assert of_absence <= verdict.not_judged.keys()
+    assert "time" in verdict.not_judged["RL611"]

@@ -230,6 +230,7 @@ def test_command_explains_a_rule_without_a_task():
     assert run.stdout.startswith("RL304  a new instance differs\nerror, determinism\n")
     assert "fix: " in run.stdout
     assert rlctl("--explain", "RL9999").returncode == 2
+    assert "Did you mean 'RL301'?" in rlctl("--explain", "RL3O1").stderr
     assert rlctl().returncode == 2
 
 

@@ -15,6 +15,7 @@ CASES = [
     case("broken_physics.py:InTheFloor", ("RL803", "warning"), twin=CART),
     case("broken_physics.py:BeyondLimits", ("RL804", "warning"), twin=CART),
     case("broken_physics.py:Explodes", ("RL805", "warning"), twin=CART),
+    case("broken_physics.py:LongPhysicsSteps", ("RL813", "warning"), twin=CART),
     case("broken_physics.py:StartsInTheFloor", ("RL807", "warning"), twin=CART),
     case("broken_models.py:TipOfAKilogram", ("RL809", "warning"), twin="broken_models.py:CartTask"),
     case("broken_models.py:HeavyInertia", ("RL809", "warning"), twin="broken_models.py:CartTask"),

@@ -74,6 +74,13 @@ def test_hang_is_a_finding_after_the_timeout(in_root):
     assert report.exit_code == 1
 
 
+def test_a_first_call_that_hangs_ends_the_process_once(in_root):
+    report = check(EnvSpec(f"{BROKEN}:HangsAtOnce"), env_timeout_s=0.2)
+    (finding,) = report.verdict.findings
+    assert (finding.rule, finding.message) == ("RL209", "step 1 did not come back in 0.6 s")
+    assert [failure.process for failure in report.records.failures] == ["probe", "instances"]
+
+
 def test_printing_is_worth_knowing_and_does_not_reach_the_result(in_root):
     run = rlctl(f"{BROKEN}:Prints", "--select", "RL211", "--json", "-")
     content = json.loads(run.stdout)

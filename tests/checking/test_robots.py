@@ -41,6 +41,7 @@ CASES = [
     broken("CrawlerOrder", "RL811", "error", "Crawler"),
     broken("ArmTouchesNothing", "RL812", "warning", "ArmTouches"),
     broken("CrawlerOtherFloor", "RL812", "warning", "CrawlerFloor"),
+    broken("ArmLongPhysicsSteps", "RL813", "warning", "Arm"),
 ]
 
 

@@ -161,6 +161,7 @@ def test_a_parameter_of_a_class_that_forgot_it(write_module, tmp_path, monkeypat
         ("rewards", {"one": np.zeros(2)}, "Odd: reward term 'one' is array([0., 0.]) at step 1, not a number"),
         ("rewards", {"one": None}, "Odd: reward term 'one' is None at step 1, not a number"),
         ("is_success", np.array([True, False]), "Odd: is_success() returned array([ True, False]), not True or False"),
+        ("is_success", 0.37, "Odd: is_success() returned 0.37, not True or False"),
     ],
 )
 def test_a_value_of_a_wrong_type_is_named(method, value, message):

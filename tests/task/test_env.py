@@ -99,7 +99,7 @@ def test_an_end_at_the_time_limit_is_the_tasks_own(make):
 
 def test_no_step_before_a_reset_or_after_the_end(make):
     env = make(Slider())
-    message = r"^Slider: step\(\) before reset\(\), or after the episode's end$"
+    message = r"^Slider: step\(\) before reset\(\), after the episode's end, or after close\(\)$"
     with pytest.raises(TaskError, match=message):
         env.step(np.zeros(2))
     env.reset(seed=0)
@@ -107,6 +107,12 @@ def test_no_step_before_a_reset_or_after_the_end(make):
         env.step(np.zeros(2))
     with pytest.raises(TaskError, match=message):
         env.step(np.zeros(2))
+    env.reset(seed=0)
+    env.close()
+    with pytest.raises(TaskError, match=message):
+        env.step(np.zeros(2))
+    with pytest.raises(TaskError, match=r"^Slider: reset\(\) after close\(\); make a new environment$"):
+        env.reset(seed=0)
 
 
 @pytest.mark.parametrize(

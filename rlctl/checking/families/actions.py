@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -23,7 +23,9 @@ DELAY_STEPS = 4  # Over so many steps the effect of the first action is looked f
 NAN_STEPS = 4  # Of an episode whose first action is NaN
 LONGEST_DELAY = 4  # steps; for earlier actions in observations and for penalties on changes
 MOST_NAMES = 8  # So many dimensions are named in a message
-Effect = Literal["lasting", "cost", "copy", "none"]  # cost: in its own reward; copy: in the observation
+Effect = Literal["lasting", "reward", "cost", "copy", "none"]
+"""Of a number of the action: on what follows; only on its step's reward, up or, as a cost, down; only on its own copy
+in the observation; or nothing."""
 
 
 @experiment("action effects", "RL701", "RL115", "RL616", share=4.0)
@@ -41,6 +43,9 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
             yield from _late_effects(trials, every)
             for dimension in every[:MOST_DIMENSIONS]:
                 effects[dimension.name] = _find_effect(trials, dimension)
+            if "lasting" not in effects.values():
+                costly = [dimension for dimension in every if effects.get(dimension.name) == "reward"]
+                effects |= {dimension.name: "cost" for dimension in costly if _only_costs(trials, dimension)}
         except action_trials.OutOfTime:
             why = "there was no time for more"
         if not effects:
@@ -115,10 +120,10 @@ def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:
             if action_trials.observations_differ(plain, played, copies):
                 return "lasting"
             if action_trials.find_other_rewards(plain, played):
-                effect = "cost"
+                effect = "reward"
             elif effect == "none" and action_trials.observations_differ(plain, played):
                 effect = "copy"
-    return "lasting" if effect == "cost" and _lasts(trials, dimension) else effect
+    return "lasting" if effect == "reward" and _lasts(trials, dimension) else effect
 
 
 def _lasts(trials: Trials, dimension: ActionNumber) -> bool:
@@ -133,23 +138,31 @@ def _lasts(trials: Trials, dimension: ActionNumber) -> bool:
     return False
 
 
+def _only_costs(trials: Trials, dimension: ActionNumber) -> bool:
+    """Say whether zero always earns as much as both ends: a cost for acting, not a choice."""
+    seed, steps = STAGES[1]
+    low, high = dimension.ends
+    zero = trials.with_values(seed, steps, {dimension: min(max(0, low), high)})
+    ends = [trials.with_values(seed, steps, {dimension: end}) for end in dimension.ends]
+    return all(a[REWARD] >= b[REWARD] for end in ends for a, b in zip(zero, end, strict=False))
+
+
 def _without_effect(effects: Mapping[str, Effect], total: int, left_out: str) -> Iterator[RuleFinding]:
-    kinds = ("none", "cost", "copy")
-    dead, costly, copied = ([name for name, effect in effects.items() if effect == kind] for kind in kinds)
-    if dead:
-        what = "no action has" if len(dead) == total else f"{list_names(dead, MOST_NAMES)} without"
-        how = f"at its lowest and highest value, over {STAGES[-1][1]} steps from two seeds"
-        message = f"{what} any effect: {how}, no observation, reward or end changes{left_out}"
-        yield _finding(dead, message, Severity.ERROR if len(dead) == total else Severity.WARNING)
-    if costly:
+    names = {kind: [name for name, effect in effects.items() if effect == kind] for kind in get_args(Effect)}
+    others_last, is_useless = bool(names["lasting"]), not names["lasting"] and not names["reward"]
+    for kind, what, severity in (
+        ("none", "", Severity.WARNING),
+        ("cost", " but its own step's reward, a cost for acting", Severity.WARNING),
         # If no action moves anything, it is a bandit, or a series that is only watched.
-        others_last = "lasting" in effects.values()
-        what = f"its own step's reward{', a cost for doing nothing' if others_last else ''}"
-        message = f"{list_names(costly, MOST_NAMES)} changes nothing but {what}{left_out}"
-        yield _finding(costly, message, Severity.WARNING if others_last else Severity.INFO)
-    if copied:
-        message = f"{list_names(copied, MOST_NAMES)} changes nothing but its own copy in the observation{left_out}"
-        yield _finding(copied, message, Severity.INFO)
+        ("reward", " but its own step's reward", Severity.WARNING if others_last else Severity.INFO),
+        ("copy", " but its own copy in the observation", Severity.INFO),
+    ):
+        if names[kind]:
+            is_all = len(names[kind]) == total
+            shown = "no element of the action" if is_all else list_names(names[kind], MOST_NAMES)
+            how = f"at its lowest and highest value, over {STAGES[-1][1]} steps from two seeds"
+            message = f"{shown} changes {'anything' if is_all else 'nothing'}{what}: {how}{left_out}"
+            yield _finding(names[kind], message, Severity.ERROR if is_useless and not left_out else severity)
 
 
 def _finding(names: list[str], message: str, severity: Severity) -> RuleFinding:

@@ -23,6 +23,7 @@ ENDLESS_STEPS = 3_000  # After so many steps an episode without an end is left
 LATER_ENDLESS_STEPS = 500  # The same, once one had no end
 FEWEST_EPISODES = 5
 SHORTEST_LIMIT = 5  # shorter games with one length have no time limit [steps]
+LONGEST_AT_ONCE = 4  # so short episodes are no robot's [steps]
 FEWEST_TIES = 4
 FEWEST_LENGTHS = 2  # With fewer different lengths it may be one that is unlike the others
 SHORTEST_TIE = 20  # The same, where only some episodes end together [steps]
@@ -168,9 +169,12 @@ def _find_endless(records: Records) -> Iterator[RuleFinding]:
 @check("RL504", "episodes")
 def _find_end_at_once(records: Records) -> Iterator[RuleFinding]:
     episodes = _require_episodes(records)
-    if len(episodes) >= FEWEST_EPISODES and all(episode.has_ended and episode.steps == 1 for episode in episodes):
-        message = f"all {len(episodes)} episodes end on step 1"
-        yield RuleFinding("RL504", message, {"step": 1, "episodes": len(episodes)})
+    built, longest = records.require_built(), max(episode.steps for episode in episodes)
+    is_robot = all(leaf.kind == "Box" and "float" in leaf.dtype for leaf in (*built.leaves, *built.action_leaves))
+    all_ended = len(episodes) >= FEWEST_EPISODES and all(episode.has_ended for episode in episodes)
+    if all_ended and longest <= (LONGEST_AT_ONCE if is_robot else 1):
+        message = f"all {len(episodes)} episodes end on step 1" + f" to {longest}" * (longest > 1)
+        yield RuleFinding("RL504", message, {"step": longest, "episodes": len(episodes)})
 
 
 @check("RL506", "episodes", "search", of_absence=True)

@@ -12,7 +12,7 @@ import numpy as np
 from rlctl.checking import failures
 from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, CallFailure, CheckedEpisode, ChildMessage, Form
+from rlctl.checking.messages import FIRST_SEED, SUCCESS, CallFailure, CheckedEpisode, ChildMessage, Form
 from rlctl.checking.records import RECORDING, Records, check, experiment
 from rlctl.errors import RecipeError
 
@@ -60,6 +60,14 @@ def _find_wrong_types(records: Records) -> Iterator[RuleFinding]:
         yield _of_form("RL204", message, trajectory, form, "float", Severity.INFO if is_number else None)
     for trajectory, form in _first_forms(records, "info", "dict"):
         yield _of_form("RL204", f"info is {_a(form.type)} at step {form.step}", trajectory, form, "dict")
+    for trajectory in records.require_alone():
+        if (success := trajectory.infos.get(SUCCESS)) and not np.isin(success.values, (0, 1)).all():
+            at = int(np.isin(success.values, (0, 1)).argmin())
+            value, step = float(success.values[at]), int(success.steps[at])
+            evidence = trajectory.at(step, element=SUCCESS, value=value, expected="true or false")
+            message, fix = f"{SUCCESS} is {value:.4g} at step {step}", f"Report bool(...) as info['{SUCCESS}']."
+            yield RuleFinding("RL204", message, evidence, Severity.WARNING, fix)
+            return
 
 
 def _first_forms(records: Records, what: str, *fine: str) -> Iterator[tuple[CheckedEpisode, Form]]:

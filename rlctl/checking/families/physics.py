@@ -33,11 +33,12 @@ FASTEST_SLIDE = 50.0  # [m/s]
 FASTEST_MEANT = 100.5  # somebody raised the limit of 100, as for wheels: only NONSENSE counts
 NONSENSE = 5_000.0
 FASTEST_JUMP = 1.0  # above falling, 0.1 s after a reset: ten times gravity [m/s]
+LONGEST_TIME_STEP = 0.02  # PyBullet's own is 1/240 [s]
 MOST_NAMES = 3
 MOST_CALLS = 20  # Calls that a finding's evidence has
 
 
-@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, 8, 9, 10, 11, 12)), share=4.0)
+@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13)), share=4.0)
 def watch_worlds(context: Context) -> Iterator[ChildMessage]:
     """Log the worlds of an instance through a few episodes, then let them fall alone, which changes them."""
     if "pybullet" not in sys.modules:
@@ -92,6 +93,9 @@ def _model_faults(env: Any) -> Iterator[ChildMessage]:
 
 def _judge(world: LoggedWorld) -> Iterator[ChildMessage]:
     yield from _gravity(world)
+    if world.time_step > LONGEST_TIME_STEP:
+        evidence = {"value": world.time_step, "expected": f"up to {LONGEST_TIME_STEP:g}"}
+        yield RuleFinding("RL813", f"a step of the physics takes {world.time_step:.4g} s", evidence)
     explosions = list(_explosion(world))
     yield from explosions
     if explosions:

@@ -178,4 +178,6 @@ def explain(code: str) -> None:
     out.print(Text(f"{rule.severity}, {FAMILIES[rule.id[:3]]}", STYLES[rule.severity]))
     out.print("\n" + textwrap.fill(rule.meaning, 100))
     out.print(f"\nfix: {textwrap.fill(rule.fix, 100)}")
+    if rule.task_fix != rule.fix:
+        out.print(f"in a task of rlctl: {textwrap.fill(rule.task_fix, 100)}")
     out.print(f'waive: rlctl_ignore = {{"{rule.id}": "why this is meant"}} on the class', style="dim")
