@@ -86,7 +86,9 @@ def _make_console(stream: TextIO | None) -> Console:
     terminal = (stream or sys.stderr).isatty()
     width = None if terminal else _PIPED_WIDTH
     # No markup and no emoji: "car.py:Car:" contains an emoji name, and "joint[left]" a markup tag.
-    options: dict[str, Any] = {"markup": False, "highlight": False, "emoji": False, "soft_wrap": not terminal}
+    # Results have no hard line breaks: commands in them can be copied.
+    soft_wrap = not terminal or stream is not None
+    options: dict[str, Any] = {"markup": False, "highlight": False, "emoji": False, "soft_wrap": soft_wrap}
     return SafeConsole(file=stream, stderr=stream is None, width=width, **options)
 
 
@@ -171,7 +173,7 @@ def _measure_columns(table: Sequence[Sequence[Text]]) -> list[int]:
     return [max(cell.cell_len for cell in column if cell is not None) for column in itertools.zip_longest(*table)]
 
 
-_FOLDED_TEXT = 30
+_FOLDED_TEXT = 24
 """Width to which texts may be folded before columns are dropped."""
 
 
@@ -195,7 +197,7 @@ def _print_folded(table: list[list[Text]], names: list[str], left: Collection[st
         folded.add_column(justify=justify, overflow="fold", no_wrap=fits and not is_text)
     for row in table:
         folded.add_row(*row)
-    out().print(folded)
+    out().print(folded, soft_wrap=False)
 
 
 def _print_lines(table: list[list[Text]], names: list[str], left: Collection[str], gap: str) -> None:
@@ -212,7 +214,7 @@ def _print_lines(table: list[list[Text]], names: list[str], left: Collection[str
             line.append(gap)
         line.rstrip()
         lines.append_text(line.append("\n"))
-    out().print(lines, end="", soft_wrap=True)
+    out().print(lines, end="")
 
 
 def present(content: Any, json_target: str | None) -> bool:

@@ -51,8 +51,11 @@ def show_run(run: Run = None, json: Json = None) -> None:
 @app.command("report")
 def report_runs(
     runs: Annotated[
-        list[str], typer.Argument(metavar="RUN", help="Runs, groups, globs or folders of runs, all of one task.")
-    ],
+        list[str] | None,
+        typer.Argument(
+            metavar="[RUN]", help="Runs, groups, globs or folders of runs, all of one task.", show_default="latest"
+        ),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="Default: report.html; md goes to stdout.")
     ] = None,
@@ -61,7 +64,8 @@ def report_runs(
         bool, typer.Option("--pictures/--no-pictures", help="Replay episodes to draw pictures.")
     ] = True,
     episodes: Annotated[
-        int, typer.Option(help="Episodes that each run plays to compare recipes; 0: do not compare.", min=0)
+        int,
+        typer.Option(help="Episodes that each run plays to compare recipes; 0: do not compare.", min=0, max=1_000_000),
     ] = 100,
 ) -> None:
     """Write the result of runs as one file: verdict, curves, evaluations, diagnosis, pictures, how to reproduce it."""
@@ -69,7 +73,7 @@ def report_runs(
     from rlctl import output as streams
     from rlctl.runs.report.write import write_report
 
-    if (path := write_report(runs, format, output, pictures=pictures, episodes=episodes)) is not None:
+    if (path := write_report(runs or ["latest"], format, output, pictures=pictures, episodes=episodes)) is not None:
         streams.out().print(f"report: {path}")
 
 
@@ -79,7 +83,7 @@ def compare_runs(
         list[str],
         typer.Argument(metavar="RUN", help="Runs, groups, globs or folders of runs; the first is the baseline."),
     ],
-    episodes: Annotated[int, typer.Option(help="Episodes that each run plays.", min=2)] = 100,
+    episodes: Annotated[int, typer.Option(help="Episodes that each run plays.", min=2, max=1_000_000)] = 100,
     seed: EpisodeSeed = 0,
     task: Annotated[str | None, typer.Option(help="Evaluate all on this task.")] = None,
     settings: Set = [],

@@ -19,7 +19,7 @@ def serve(
     self_test: Annotated[
         bool, Option("Play the task through the server in simulation, and print the scores.", ("--self-test",))
     ] = False,
-    episodes: Annotated[int, Option("Episodes of the self-test.", min=1)] = 100,
+    episodes: Annotated[int, Option("Episodes of the self-test.", min=1, max=1_000_000)] = 100,
     json: Json = None,
 ) -> None:
     """Serve a policy to robots: WebSocket and HTTP, with limits, watchdog, log and a live page."""
@@ -30,6 +30,8 @@ def serve(
 
     policy = find_policy(run, choose_checkpoint(checkpoint, pretrained))
     output.print_notes(policy.notes)
+    if request.limits is None:
+        output.print_notes(["warning: no --limits FILE: only the policy's own bounds of actions limit the robot"])
     if self_test:
         from rlctl.evaluation import self_test as test
         from rlctl.evaluation.request import EvalRequest

@@ -47,6 +47,10 @@ def load(task: str) -> Callable[..., Any]:
             f"{task} is a folder, not a task: pip install -e {task} installs a plugin; or name a class: "
             f"{task}/FILE.py:CLASS"
         )
+    for name in (f"{task}.py", f"{task.lower()}.py"):
+        if task.isidentifier() and Path(name).is_file() and (classes := _list_classes(Path(name))):
+            own = task if task in classes else classes[0]
+            raise UsageError(f"no task {task!r} is installed; to name the class in {name}: {name}:{own}")
     names = [entry.name for entry in installed.list_installed()]
     raise UsageError(
         f"no task {task!r}.{did_you_mean(task, names)} Installed: {', '.join(dict.fromkeys(names)) or 'none'}. "
@@ -120,6 +124,18 @@ def _load_target(task: str, target: str) -> Callable[..., Any]:
     if not callable(constructor):
         raise NoSuchClassError(f"{target}: {attribute} is a {type(constructor).__name__}, not a class or a function")
     return constructor  # type: ignore[no-any-return]
+
+
+def may_make_environments(constructor: Any) -> bool:
+    """Return whether to call it: a class with reset and step, or a function whose file mentions Gymnasium or rlctl."""
+    if inspect.isclass(constructor):
+        return hasattr(constructor, "reset") and hasattr(constructor, "step")
+    function = inspect.unwrap(getattr(constructor, "func", constructor))  # of a partial
+    try:
+        source = Path(inspect.getfile(function if inspect.isfunction(function) else type(function))).read_bytes()
+    except (TypeError, OSError):  # not written in Python
+        return False
+    return re.search(rb"gym|rlctl", source) is not None
 
 
 def _load_gymnasium(task: str) -> Callable[..., Any]:

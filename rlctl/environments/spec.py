@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NoReturn
 
 from annotated_types import Ge, Le
 from pydantic import AfterValidator, PlainSerializer
@@ -13,7 +13,7 @@ from pydantic import AfterValidator, PlainSerializer
 from rlctl.environments import named_task
 from rlctl.environments.parameters import check_fields, check_keywords
 from rlctl.environments.plugin_code import call_plugin
-from rlctl.environments.registry import is_task, load, make_slug
+from rlctl.environments.registry import is_task, load, make_slug, may_make_environments
 from rlctl.errors import RecipeError, TaskError
 
 if TYPE_CHECKING:
@@ -98,6 +98,9 @@ class EnvSpec:
         import gymnasium
 
         parameters = dict(self.parameters)
+        if not may_make_environments(constructor):
+            hint = "\nit was not called: its source file mentions neither gymnasium nor rlctl"
+            self._refuse(constructor, "" if isinstance(constructor, type) else hint)
         check_keywords(self.task, constructor, parameters)
         if render_mode is not None:
             if render_mode == "rgb_array" and not os.environ.get("DISPLAY"):
@@ -114,11 +117,14 @@ class EnvSpec:
                 "give a single environment; rlctl itself runs n_envs of them in parallel"
             )
         if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):
-            raise TaskError(
-                f"{self.task}: {type(env).__name__} is neither a Gymnasium environment (reset, step, spaces) "
-                "nor a subclass of rlctl.task.Task"
-            )
+            self._refuse(type(env))
         return env
+
+    def _refuse(self, what: Any, hint: str = "") -> NoReturn:
+        raise TaskError(
+            f"{self.task}: {getattr(what, '__name__', what)} is neither a Gymnasium environment (reset, step, spaces) "
+            f"nor a subclass of rlctl.task.Task{hint}"
+        )
 
 
 @dataclasses.dataclass(frozen=True)

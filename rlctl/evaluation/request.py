@@ -32,7 +32,7 @@ class EvalOptions:
         ),
     ] = None
     """What to play instead of a trained policy."""
-    episodes: Annotated[int, Option("Episodes, each with its own seed.", min=1)] = 100
+    episodes: Annotated[int, Option("Episodes, each with its own seed.", min=1, max=1_000_000)] = 100
     seed: Annotated[int, Option("Seed of the list of episodes.", min=0)] = 0
     stage: Annotated[int | None, Option("Stage of the policy's curriculum.", min=1, default_text="the last")] = None
     """From 1."""

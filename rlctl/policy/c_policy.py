@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from rlctl.environments.dict_spaces import SINGLE, split, split_space
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.policy import Policy
+from rlctl.storage import files
 
 LIBRARY_SUFFIX = ".so"
 
@@ -58,7 +58,7 @@ class CPolicy(Policy):
     def load(cls, path: Path) -> CPolicy:
         """Load a library with the JSON description next to it; raises `ArtifactError` if it does not load."""
         try:
-            info = PolicyInfo.model_validate(json.loads(path.with_suffix(".json").read_text()))
+            info = PolicyInfo.model_validate(files.read_json(path.with_suffix(".json")))
             return cls(info, ctypes.CDLL(str(path)))
         except OSError as error:
             raise ArtifactError(f"{path}: the compiled policy does not load: {error}") from None

@@ -10,6 +10,7 @@ from rlctl.version import __version__
 
 INTERRUPTED = 130  # exit code after Ctrl-C
 EXIT_S = 10.0  # time limit of exit handlers [s]
+_LONGEST_LINE = 1500  # [characters] of an error message
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "can't allocate memory", "not enough memory")
 
 
@@ -89,17 +90,20 @@ def report(error: RlctlError) -> int:
 
     if error.details:
         print(escape_controls(error.details.rstrip()), file=sys.stderr)
-    first, *rest = escape_controls(str(error)).split("\n")
+    # A file may contain a number of hundreds of digits, which the message repeats.
+    first, *rest = (short_repr(line, _LONGEST_LINE) for line in escape_controls(str(error)).split("\n"))
     print(f"error: {first}", *rest, sep="\n", file=sys.stderr)
     return error.exit_code
 
 
 def report_unexpected(error: Exception) -> int:
     """Print any other exception; return the exit code."""
-    usage, show = getattr(error, "exit_code", None), getattr(error, "show", None)
-    if usage is not None and show is not None:  # Typer's own usage errors
-        show()
-        return int(usage)
+    if (format_message := getattr(error, "format_message", None)) is not None:  # Typer's own usage errors
+        command = getattr(getattr(error, "ctx", None), "command_path", "rlctl")
+        is_help = type(error).__name__ == "NoArgsIsHelpError"
+        text = f"error: {short_repr(format_message(), _LONGEST_LINE)}\n{command} --help lists what it takes"
+        print(format_message() if is_help else text, file=sys.stderr)
+        return 2
     if _is_out_of_memory(error):
         text = short_repr(str(error), 120)
         print(f"error: not enough memory ({_read_limit()}){text and f': {text}'}", file=sys.stderr)

@@ -55,11 +55,6 @@ def _render(node: Any, indent: str = "", *, expand: bool = False) -> str:
     return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
 
 
-def format_editor_line(schema: Path | str = FILE) -> str:
-    """Return the first line of a recipe, a comment from which editors find the schema."""
-    return f"# yaml-language-server: $schema={schema}\n"
-
-
 def _convert(node: Any) -> Any:
     """Return part of a schema with standard keywords only, and with numbers that may have grouped digits."""
     if isinstance(node, list):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from rlctl.storage import yaml_text
 _PRESETS = Path(__file__).with_name("presets")
 """Preset recipes: `--config presets/NAME`."""
 _DEEPEST_KEY = 20
+_FEWEST_EVALUATIONS = 5
+_WITH_UNIT = re.compile(r"([\d.]+)([kKmM])")
 _DEFAULT_ROLLOUT = 4096  # [steps], all environments together
 _OF_THE_ENVIRONMENT = ("task", "reward_weights", "randomize", "events")
 _OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "n_envs", "total_timesteps")
@@ -46,7 +49,12 @@ def resolve(
     merged = merge(packaged, overrides)
     if stages and "stages" not in merged:
         merged["stages"] = validate({"stages": list(stages)}, f"class of {task}").model_dump(by_alias=True)["stages"]
-    return fill_defaults(validate(merged, *sources))
+    recipe = fill_defaults(validate(merged, *sources))
+    if "total_timesteps" in overrides and "every_steps" not in (overrides.get("eval") or {}):
+        # The packaged interval is for the packaged length.
+        every = min(recipe.eval.every_steps or 1, max(1, recipe.total_timesteps // _FEWEST_EVALUATIONS))
+        recipe = recipe.model_copy(update={"eval": recipe.eval.model_copy(update={"every_steps": every})})
+    return recipe
 
 
 def resolve_with_stages(task: str, config: Path | None, settings: Mapping[str, Any]) -> Recipe:
@@ -163,8 +171,10 @@ def check_changes(values: Mapping[str, Any], source: str) -> EnvChanges:
 
 
 def merge_flags(settings: list[str], **flags: Any) -> dict[str, Any]:
-    """Return the settings of `--set`, overridden by the flags that are not None."""
+    """Return the settings of `--set`, overridden by the flags that are not None; `-n 20k` and `-n 1.5M` are numbers."""
     values = parse_settings(settings)
+    if (match := _WITH_UNIT.fullmatch(flags.get("total_timesteps") or "")) is not None:
+        flags["total_timesteps"] = f"{match[1]}e{3 if match[2] in 'kK' else 6}"
     for name, value in flags.items():
         if value is not None:
             values[name] = yaml_text.load(value, name) if isinstance(value, str) else value

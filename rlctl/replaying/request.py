@@ -32,7 +32,8 @@ class ReplayRequest:
         ),
     ] = None
     episodes: Annotated[
-        int | None, Option("Episodes to roll out, or to choose from.", min=1, default_text="1; 100 to choose from")
+        int | None,
+        Option("Episodes to roll out, or to choose from.", min=1, max=1_000_000, default_text="1; 100 to choose from"),
     ] = None
     worst: Annotated[
         int | None, Option("Only the N worst of --episodes; N is 1 if left out.", metavar="[N]", min=1)

@@ -98,9 +98,7 @@ class RunDirectory:
 
     def write_recipe(self, recipe: Recipe) -> None:
         """Write the resolved recipe with its SHA-256, which reveals later changes."""
-        from rlctl.recipe.json_schema import format_editor_line
-
-        files.write_sealed(self.recipe_file, format_editor_line() + recipe.to_yaml())
+        files.write_sealed(self.recipe_file, recipe.to_yaml())
 
     def status(self) -> dict[str, Any]:
         """Read `run.json`."""

@@ -108,7 +108,7 @@ def read_group(path: Path) -> Group:
             raise ValueError
         seeds = content["seeds"]
         request = TrainRequest.from_json({**content["request"], "root": str(path)})
-        if request.task is None or not all(type(seed) is int and seed >= 0 for seed in seeds):
+        if request.task is None or not all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds):
             raise ValueError
         if len(set(seeds)) != len(seeds):
             raise ValueError

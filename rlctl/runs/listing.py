@@ -10,7 +10,7 @@ from typing import Any
 
 from rlctl import output
 from rlctl.environments import registry
-from rlctl.errors import ArtifactError, UsageError, did_you_mean, short_repr
+from rlctl.errors import ArtifactError, did_you_mean, short_repr
 from rlctl.run.directory import ROOT, RunDirectory, is_group
 from rlctl.run.group import find_group, read_group
 from rlctl.run.lookup import describe_source_change, find_run
@@ -24,9 +24,10 @@ _SORT_KEYS = {
 }
 _COLUMNS = ("run", "algo", "seed", "state", "steps", "minutes", "success", "return", "differs from the recipe")
 _LEFT = ("run", "algo", "state", "differs from the recipe")
-_DROP = ("minutes", "differs from the recipe", "algo", "seed", "return", "steps")
+_DROP = ("minutes", "algo", "seed", "steps", "return", "success", "differs from the recipe")
 """Columns that a narrow terminal omits, in this order."""
 _CHANGES_SHOWN = 4
+_WIDE = 100  # columns; a narrower table has no reason of a failure
 _STATE_SHOWN = 44  # characters; `rlctl runs show` has the whole error
 
 
@@ -40,7 +41,7 @@ def list_runs(
 ) -> list[RunSummary]:
     """Return the runs of a task, or all, best or newest first; with `waiting` also those a cluster has not begun.
 
-    Raises `UsageError` for a task without runs; the error suggests similar tasks and `commands`.
+    Raises `ArtifactError` for a task without runs; the error suggests similar tasks and `commands`.
     """
     runs = [*(summarize(path) for path in find_runs(root)), *(list_waiting(root) if waiting else ())]
     if task is not None:
@@ -49,7 +50,9 @@ def list_runs(
         if not named:
             names = sorted({run.task for run in runs})
             close = did_you_mean(task, [*names, *commands])
-            raise UsageError(f"no run of {task!r} under {root.resolve()}, and rlctl runs has no such command.{close}")
+            raise ArtifactError(
+                f"no run of {task!r} under {root.resolve()}, and rlctl runs has no such command.{close}"
+            )
         runs = named
     return sorted(runs, key=_SORT_KEYS[sort], reverse=True)
 
@@ -104,12 +107,13 @@ def _find_source_changes(runs: list[RunSummary]) -> dict[str, list[str]]:
 def _cells(run: RunSummary) -> list[Any]:
     from rich.text import Text
 
+    state = run.state_text if output.out().width >= _WIDE else run.state
     styles = {"done": "green", "queued": "cyan", "running": "cyan", "failed": "red", "damaged": "red"}
     return [
         run.name,
         run.algo,
         "" if run.seed is None else str(run.seed),
-        Text(short_repr(run.state_text, _STATE_SHOWN), style=styles.get(run.state, "")),
+        Text(short_repr(state, _STATE_SHOWN), style=styles.get(run.state, "")),
         "" if run.steps is None else f"{run.steps:,}",
         "" if run.seconds is None else f"{run.seconds / 60:.1f}",
         "" if run.best_success is None else f"{run.best_success:.1%}",
@@ -121,7 +125,12 @@ def _cells(run: RunSummary) -> list[Any]:
 def format_changes(changes: dict[str, Any]) -> str:
     """Return recipe changes as `key=value`, the first few of them."""
     first = list(changes.items())[:_CHANGES_SHOWN]
-    shown = [f"{len(value)} stages" if key == "stages" and value else f"{key}={value}" for key, value in first]
+    shown = [
+        f"{len(value)} stages"
+        if key == "stages" and value
+        else f"{key.removeprefix('algo_kwargs.').removeprefix('policy_kwargs.')}={value}"
+        for key, value in first
+    ]
     more = len(changes) - len(shown)
     return " ".join(shown) + (f" and {more} more" if more > 0 else "")
 

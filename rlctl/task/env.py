@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from rlctl.errors import RecipeError, TaskError, UsageError, check_name, did_you_mean, short_repr
+from rlctl.errors import RecipeError, TaskError, UsageError, check_name, short_repr
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
 from rlctl.task.joints import Joints
@@ -283,7 +283,9 @@ def _not_a_number(task: str, raw: Mapping[str, Any], step: int) -> TaskError:
 
 
 def _term_mismatch(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:
-    if extra := [name for name in raw if name not in weights]:
-        return TaskError(f"{task}: reward term {extra[0]!r} has no weight.{did_you_mean(extra[0], weights)}")
-    missing = next(name for name in weights if name not in raw)
-    return TaskError(f"{task}: rewards() returned no term {missing!r}, which reward_weights names")
+    extra, missing = (
+        [name for name in ours if name not in theirs] for ours, theirs in ((raw, weights), (weights, raw))
+    )
+    problems = [f"rewards() returns {extra[0]!r}, which has no weight"] if extra else []
+    problems += [f"reward_weights names {missing[0]!r}, which rewards() does not return"] if missing else []
+    return TaskError(f"{task}: {'; '.join(problems)}")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import os
+import signal
 import sys
 import time
 from collections import deque
@@ -112,8 +114,14 @@ class Display:
         self.message(_format_evaluation(steps, success, mean_return, best))
 
     def message(self, text: str) -> None:
-        """Show a warning, or output of an environment."""
-        print(text, file=sys.stderr, flush=True)
+        """Show a warning, or output of an environment; if stderr was closed (`| head`), interrupt the training."""
+        try:
+            print(text, file=sys.stderr, flush=True)
+        except BrokenPipeError:
+            with open(os.devnull, "w") as nowhere:
+                os.dup2(nowhere.fileno(), sys.stderr.fileno())
+            if callable(stop := signal.getsignal(signal.SIGTERM)):
+                stop(signal.SIGPIPE, None)
 
 
 def _format_stage(title: str, why: str) -> str:

@@ -16,7 +16,7 @@ from rlctl.checking.finding import Severity
 from rlctl.environments import registry
 from rlctl.environments.named_task import RUN
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import AnswerIsNo
+from rlctl.errors import AnswerIsNo, TaskError
 from rlctl.output import format_count
 from rlctl.recipe.recipe import ON_POLICY
 from rlctl.rollout.workers import Workers, available_cores
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 _CHECK_BUDGET_S = 2.0
 """Time for playing episodes [s], without importing and building the environment."""
+_FAILURES = ("RL104", "RL207", "RL208", "RL209", "RL601")
+"""Rules of an environment that raises, crashes, hangs or returns NaN, which ends a training with the same exit code."""
 _EXPERIMENTS = ("build", "comparisons", "episodes")
 """What one child process can do in that time."""
 
@@ -172,7 +174,7 @@ def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[CheckReport]:
 
 
 def _refuse_errors(report: CheckReport, display: Display) -> None:
-    """Raise `AnswerIsNo` if the check found an error, and show its warnings."""
+    """Raise `AnswerIsNo` if the check found an error, `TaskError` if the environment failed; show the warnings."""
     if report.records.built is None:
         return  # the workers build it too, and report the error
     task, findings = shlex.quote(report.task), report.verdict.findings
@@ -182,7 +184,8 @@ def _refuse_errors(report: CheckReport, display: Display) -> None:
     if errors:
         text = "; ".join(f"{finding.rule} {finding.name} ({finding.message})" for finding in errors)
         count = format_count(len(errors), "error")
-        raise AnswerIsNo(
+        failed = any(finding.rule in _FAILURES for finding in errors)
+        raise (TaskError if failed else AnswerIsNo)(
             f"the check before training found {count}: {text}\n"
             f"rlctl check-env {task} shows details; --no-check trains anyway."
         )

@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 import shlex
+from collections.abc import Mapping
 from typing import Any
 
 from rlctl import output
 from rlctl.runs.summary import RunSummary, summarize
+from rlctl.tuning.space import get_value, list_values
 from rlctl.tuning.tuning import Trial, Tuning
 
 
@@ -21,9 +23,10 @@ def show(tuning: Tuning, json: str | None) -> None:
     keys = list(dict.fromkeys(dimension.key for step in tuning.steps for dimension in step))
     columns = ("trial", *(key.rpartition(".")[2] for key in keys), "return", "success", "min", "")
     ranked = sorted(tuning.trials, key=_rank, reverse=True)
+    own = list_values(tuning.resolve_recipe())
     out.print(f"{tuning.task}: {tuning.path}, by {tuning.metric}; means over the last third of the evaluations")
     output.print_table(
-        columns, [_list_cells(tuning, trial, keys, runs.get(trial.number)) for trial in ranked], left=("",)
+        columns, [_list_cells(tuning, trial, keys, own, runs.get(trial.number)) for trial in ranked], left=("",)
     )
     best = tuning.best
     assert best is not None
@@ -37,8 +40,7 @@ def show(tuning: Tuning, json: str | None) -> None:
         f"Each trial had one seed, so the best of {len(tuning.trials)} looks better than it is. Compare on new seeds:\n"
         f"  rlctl train {task} --config {file} --seeds {seeds}\n"
         f"  rlctl train {task} --seeds {seeds}\n"
-        "then give both groups to rlctl runs compare",
-        soft_wrap=True,
+        "then give both groups to rlctl runs compare"
     )
 
 
@@ -46,7 +48,9 @@ def _rank(trial: Trial) -> tuple[bool, float]:
     return trial.state == "done", -math.inf if trial.score is None else trial.score
 
 
-def _list_cells(tuning: Tuning, trial: Trial, keys: list[str], run: RunSummary | None) -> tuple[str, ...]:
+def _list_cells(
+    tuning: Tuning, trial: Trial, keys: list[str], own: Mapping[str, Any], run: RunSummary | None
+) -> tuple[str, ...]:
     notes = {
         "done": "",
         "failed": f"failed: {trial.problem}",
@@ -56,7 +60,7 @@ def _list_cells(tuning: Tuning, trial: Trial, keys: list[str], run: RunSummary |
     seconds = None if run is None else run.seconds
     return (
         str(trial.number),
-        *(str(trial.values.get(key, "-")) for key in keys),
+        *(str(trial.values.get(key, get_value(own, key))) for key in keys),
         "-" if total is None else f"{total:.4g}",
         "-" if success is None else f"{success:.1%}",
         "-" if seconds is None else f"{seconds / 60:.1f}",

@@ -124,6 +124,11 @@ def list_usual_steps(recipe: Recipe) -> list[list[Dimension]]:
     ]
 
 
+def list_values(recipe: Recipe) -> dict[str, Any]:
+    """Return the keys and values of a recipe as plain data, with the defaults of its algorithm."""
+    return recipe.model_dump(mode="json", by_alias=True) | {"algo_kwargs": fill_parameters(recipe)}
+
+
 def fill_parameters(recipe: Recipe) -> dict[str, Any]:
     """Return the parameters of a recipe's algorithm, with the defaults of those that it leaves out."""
     return ALGORITHM_PARAMETERS[recipe.algo].model_validate(recipe.algo_kwargs).model_dump()

@@ -21,9 +21,9 @@ from rlctl.recipe.sources import find_config, resolve_with_stages
 from rlctl.run.directory import RunLock, create_group_folder
 from rlctl.training.start import preserve_process_state
 from rlctl.training.trainings import MakeTrainings, make_local_trainings
-from rlctl.tuning.space import Dimension, fill_parameters, list_usual_steps, nest, parse_search
+from rlctl.tuning.space import Dimension, fill_parameters, list_usual_steps, list_values, nest, parse_search
 from rlctl.tuning.tune_request import TuneRequest
-from rlctl.tuning.tuning import Trial, Tuning, load
+from rlctl.tuning.tuning import Trial, Tuning, find, load
 
 _FEWEST_EVALUATIONS = 6
 _EVALUATIONS = 10
@@ -42,7 +42,7 @@ def tune(
         raise UsageError("TASK and --resume exclude each other: give a task to tune, or --resume FOLDER")
     _require_optuna()
     # Read twice: first to refuse a folder that is no tuning before locking it, then again under the lock.
-    tuning = _begin(request, request.task or "") if request.resume is None else load(request.resume)
+    tuning = _begin(request, request.task or "") if request.resume is None else find(request.resume, request.root)
     with RunLock(tuning.path, "tuning"):
         return _search(load(tuning.path), jobs, make_trainings)
 
@@ -114,7 +114,7 @@ def _search(tuning: Tuning, jobs: int | None, make_trainings: MakeTrainings) -> 
 
     resume_command = f"rlctl tune --resume {shlex.quote(str(tuning.path))}"
     with preserve_process_state():
-        recipe = resolve_with_stages(tuning.task, tuning.config, tuning.settings)
+        recipe = tuning.resolve_recipe()
     trainings = make_trainings(tuning.path, tuning.task, tuning.trials_per_step, jobs)
     output.print_notes([_describe(tuning, recipe, trainings.describe()), *_warn_of_long_rollouts(recipe)])
     if not tuning.trials:
@@ -126,10 +126,9 @@ def _search(tuning: Tuning, jobs: int | None, make_trainings: MakeTrainings) -> 
         tuning.save()
         if first.score is None:
             raise TaskError(f"{tuning.path}: the unchanged recipe failed: {first.problem}\nto retry: {resume_command}")
-    content = recipe.model_dump(mode="json", by_alias=True) | {"algo_kwargs": fill_parameters(recipe)}
     for number in range(1, len(tuning.steps) + 1):
         trainings = make_trainings(tuning.path, tuning.task, tuning.trials_per_step, jobs)
-        step = StepSearch(tuning, number, content, trainings)
+        step = StepSearch(tuning, number, list_values(recipe), trainings)
         trainings.run([step.run_next] * step.count_waiting(), resume_command)
     return tuning
 
@@ -147,8 +146,10 @@ def _warn_of_long_rollouts(recipe: Recipe) -> list[str]:
 
 def _describe(tuning: Tuning, recipe: Recipe, where: str) -> str:
     names = "; then ".join(" and ".join(dimension.name for dimension in step) for step in tuning.steps)
+    trials, several = tuning.trials_per_step, len(tuning.steps) > 1
     return (
-        f"{tuning.path}: {names}; at most {output.format_count(tuning.trials_per_step, 'trial')} "
-        f"{'each, ' if len(tuning.steps) > 1 else ''}of {recipe.total_timesteps:,} steps, {where}; "
+        f"{tuning.path}: {names}; at most {output.format_count(trials, 'trial')} "
+        f"{f'each, {trials * len(tuning.steps):,} trainings in all, ' if several else ''}"
+        f"of {recipe.total_timesteps:,} steps, {where}; "
         "-n changes their length, --trials their number"
     )

@@ -17,7 +17,9 @@ class TuneRequest:
     """The arguments of `rlctl tune`; either `task` or `resume` is given."""
 
     task: OptionalTask = None
-    resume: Annotated[Path | None, Option("Resume a tuning that was interrupted.", metavar="FOLDER")] = None
+    resume: Annotated[
+        str | None, Option("Resume a tuning: its folder, a task's name, or latest.", metavar="FOLDER")
+    ] = None
     search: Annotated[
         list[str],
         Option(

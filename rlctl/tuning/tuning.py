@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import glob
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import pydantic
 
+from rlctl.environments import registry
 from rlctl.environments.spec import merge
-from rlctl.errors import ArtifactError, UsageError
-from rlctl.recipe.sources import read
+from rlctl.errors import ArtifactError
+from rlctl.recipe.recipe import Recipe
+from rlctl.recipe.sources import read, resolve_with_stages
 from rlctl.run.directory import TUNE_FILE, RunDirectory
 from rlctl.run.group import find_run_of_seed
 from rlctl.runs.summary import list_points, read_table
@@ -56,6 +59,10 @@ class Tuning:
     storage: str | None = None
     """URL of Optuna's storage, for its dashboard and for other tuners with an equal search."""
     trials: list[Trial] = dataclasses.field(default_factory=list)
+
+    def resolve_recipe(self) -> Recipe:
+        """Return the unchanged recipe; its task is imported."""
+        return resolve_with_stages(self.task, self.config, self.settings)
 
     @property
     def best_file(self) -> Path:
@@ -108,11 +115,18 @@ def find_best(trials: list[Trial]) -> Trial | None:
     return max(done)[2] if done else None
 
 
+def find(text: str, root: Path) -> Tuning:
+    """Read a tuning: its folder, the newest one of a task, or `latest`. Raises `ArtifactError` as `load` does."""
+    task = "*" if text == "latest" else glob.escape(registry.make_slug(text))
+    tunings = sorted(root.glob(f"{task}/*/{TUNE_FILE}"), key=lambda file: file.parent.name)
+    return load(Path(text) if Path(text).is_dir() or not tunings else tunings[-1].parent)
+
+
 def load(folder: Path) -> Tuning:
-    """Read the folder of a tuning; raises `UsageError` if it is not one, `ArtifactError` if damaged."""
+    """Read the folder of a tuning; raises `ArtifactError` if it is not one or damaged."""
     file = folder / TUNE_FILE
     if not file.is_file():
-        raise UsageError(f"{folder}: not the folder of a tuning: it has no {TUNE_FILE}")
+        raise ArtifactError(f"{folder}: not the folder of a tuning: it has no {TUNE_FILE}")
     content = files.read_json(file)
     try:
         return pydantic.TypeAdapter(Tuning).validate_python({**content, "path": folder})

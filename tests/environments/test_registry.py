@@ -245,7 +245,10 @@ def test_make_randomises_when_it_is_asked_to(my_env):
         ),
         ("import os; os._exit(7)", "import failed: SystemExit: os._exit(7)"),
         ("x = = 1", "import failed: SyntaxError: invalid syntax (broken.py, line 1)"),
-        ("class E:\n    def __init__(self): 1 / 0", "ZeroDivisionError: division by zero (broken.py:2)"),
+        (
+            "class E:\n    def __init__(self): 1 / 0\n    reset = step = None",
+            "ZeroDivisionError: division by zero (broken.py:2)",
+        ),
     ],
 )
 def test_a_plugin_that_raises(write_module, source, message):
@@ -319,3 +322,12 @@ def test_folder_names_of_tasks():
 def test_where_a_task_comes_from():
     assert registry.find_origin("reach") == {"distribution": "rlctl", "version": rlctl.__version__}
     assert registry.find_origin("Pendulum-v1") == {}
+
+
+@pytest.mark.parametrize("name", ["launch", "Launch"])
+def test_what_is_no_environment_is_not_called(write_module, tmp_path, name):
+    source = "def launch():\n    open('launched', 'w')\nclass Launch:\n    def __init__(self):\n        launch()\n"
+    write_module("rocket.py", source)
+    assert f"{name} is neither a Gymnasium environment" in error(TaskError, f"rocket.py:{name}")
+    assert "getcwd is neither a Gymnasium environment" in error(TaskError, "os:getcwd")
+    assert not (tmp_path / "launched").exists()

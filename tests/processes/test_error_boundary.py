@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from rlctl import output
+from rlctl.errors import UsageError
 from rlctl.processes import error_boundary
 
 RLCTL = f"{sys.executable} -m rlctl"
@@ -25,6 +26,15 @@ def test_a_terminal_that_is_not_utf8(encoding):
     done = shell(f'{sys.executable} -c "{code}"', PYTHONIOENCODING=encoding, PYTHONUTF8="0")
     assert done.stderr.endswith(b"[0, 0, 5]\n"), done.stderr
     assert b"Traceback" not in done.stderr
+
+
+def test_a_message_of_any_length_is_short(capsys):
+    assert error_boundary.run(_raise_long_error) == 2
+    assert len(capsys.readouterr().err) < 1600
+
+
+def _raise_long_error():
+    raise UsageError(f"seed {10**4000}")
 
 
 def test_what_others_named_is_printed_as_it_is(capsys):

@@ -47,12 +47,11 @@ def test_the_command(rlctl):
     assert rlctl("recipe").stderr == "error: give a task, such as rlctl recipe reach, or --schema\n"
 
 
-def test_recipes_name_their_schema(tmp_path):
-    from rlctl.recipe.json_schema import FILE
+def test_a_recipe_has_no_path_of_this_machine(tmp_path):
     from rlctl.recipe.recipe import Recipe
     from rlctl.run.directory import RunDirectory
 
     run = RunDirectory(tmp_path)
     run.write_recipe(Recipe())
-    assert run.recipe_file.read_text().startswith(f"# yaml-language-server: $schema={FILE}\n")
+    assert "$schema" not in run.recipe_file.read_text()
     assert run.recipe() == Recipe()

@@ -270,3 +270,15 @@ def test_every_mistake_is_named_up_to_three(packaged, tmp_path):
         f"{file}:1: n_envs:",
         "seed:",
     ]
+
+
+def test_units_of_the_number_of_steps():
+    for text, steps in (("20k", 20_000), ("1.5M", 1_500_000), ("1e4", 10_000)):
+        assert resolve("reach", None, sources.merge_flags([], total_timesteps=text)).total_timesteps == steps
+
+
+def test_a_shorter_training_is_evaluated_as_often():
+    assert resolve("reach", None, {}).eval.every_steps == 40_000
+    assert resolve("reach", None, {"total_timesteps": 20_000}).eval.every_steps == 4_000
+    chosen = {"total_timesteps": 20_000, "eval": {"every_steps": 10_000}}
+    assert resolve("reach", None, chosen).eval.every_steps == 10_000

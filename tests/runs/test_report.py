@@ -106,6 +106,7 @@ def test_a_band_per_recipe(group):
     page = write(*group, episodes=0)
     assert page.count(">learning_rate 0.001</text>") == 3  # legends of return and success, title of its terms
     assert "learning_rate 0.002: In the evaluation that selected it" in page
+    assert "In the charts of return and success a colour is a recipe" in page
     assert "Mean of 1 to 2 trainings each, from the lowest to the highest." in page
     assert "not compared: learning_rate 0.002: a single run cannot be compared" in write(*group)
 

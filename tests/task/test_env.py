@@ -119,9 +119,12 @@ def test_no_step_before_a_reset_or_after_the_end(make):
     ("fault", "message"),
     [
         ("nan term", "Slider: reward term 'effort' is nan at step 3"),
-        ("missing term", "Slider: rewards() returned no term 'effort', which reward_weights names"),
+        ("missing term", "Slider: reward_weights names 'effort', which rewards() does not return"),
         ("one reward", "Slider: rewards() returned 1.0, not a dict of values by name: {'speed': ...}"),
-        ("unknown term", "Slider: reward term 'efort' has no weight. Did you mean 'effort'?"),
+        (
+            "unknown term",
+            "Slider: rewards() returns 'efort', which has no weight",
+        ),
         ("nan observation", "Slider: observation 'place' is not finite at step 3: [nan]"),
         ("shape", "Slider: observation 'place' has shape (3,) at step 3, (1,) at the first observation"),
     ],

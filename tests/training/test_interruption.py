@@ -56,14 +56,14 @@ def start(tmp_path):
     """Start a long training in a folder."""
     started = []
 
-    def begin(folder: Path, *arguments: str, stdout: int | None = None) -> Training:
+    def begin(folder: Path, *arguments: str, stdout: int | None = None, stderr: int | None = None) -> Training:
         files = [tmp_path / name for name in ("stdout", "stderr")]
         with files[0].open("wb") as out, files[1].open("wb") as err:
             process = fork_server.for_commands().start(
                 [*COMMAND, f"{ENVS}:Line", "-n", "1e8", *SMALL, *arguments],
                 cwd=folder,
                 stdout=out.fileno() if stdout is None else stdout,
-                stderr=err.fileno(),
+                stderr=err.fileno() if stderr is None else stderr,
             )
         started.append(process)
         return Training(process, *files)
@@ -180,6 +180,20 @@ def test_a_full_disk_costs_warnings_and_an_exit_code(start, rlctl, small_disk):
     assert done.returncode == 0, done.stderr
     assert ", bit-exact" in done.stderr
     assert "Traceback" not in stderr
+
+
+def test_a_reader_that_leaves_interrupts_the_training(start, tmp_path):
+    """As `rlctl train ... 2>&1 | head -1` does."""
+    read_end, write_end = os.pipe()
+    training = start(tmp_path, "--set", "eval.every_steps=64", stderr=write_end)
+    os.close(write_end)
+    assert os.read(read_end, 5) == b"train"
+    os.close(read_end)
+    assert training.wait()[0] == 141
+    (run,) = tmp_path.glob("runs/Line/*")
+    status = json.loads((run / "run.json").read_text())
+    assert (status["status"], status["error"].partition(" at ")[0]) == ("interrupted", "interrupted")
+    assert list(run.glob("checkpoints/0*"))
 
 
 def test_stdout_closed_early_is_silent(start, tmp_path):

@@ -20,6 +20,19 @@ def test_an_error_refuses_before_a_run_begins(train, runs, small_ppo):
     assert runs() == []
 
 
+def test_an_environment_that_raises_has_the_exit_code_of_a_failed_task(train, runs, small_ppo, write_module):
+    source = """
+        from tests.training.envs import Line
+
+        class Broken(Line):
+            def step(self, action):
+                raise OSError("no rlctl arm")
+    """
+    with pytest.raises(TaskError, match="the check before training found 1 error: RL207 raises"):
+        train("Broken", small_ppo, envs=write_module("broken.py", source), check=True)
+    assert runs() == []
+
+
 def test_without_the_check_it_trains(train, runs, small_ppo):
     assert train("Unseeded", small_ppo, check=False).steps == 256
     assert len(runs()) == 1

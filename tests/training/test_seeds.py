@@ -251,9 +251,10 @@ def test_a_group_of_another_version(tmp_path):
         read_group(tmp_path)
 
 
-def test_a_group_with_a_seed_twice_is_damaged(tmp_path):
+@pytest.mark.parametrize("seeds", [[0, 0], [10**400], [-1]])
+def test_a_group_with_wrong_seeds_is_damaged(tmp_path, seeds):
     group = create_group(TrainRequest(LINE, settings=TINY, root=tmp_path), [0])
     file = group.path / "group.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), "seeds": [0, 0]}))
+    file.write_text(json.dumps({**json.loads(file.read_text()), "seeds": seeds}))
     with pytest.raises(ArtifactError, match=r"group\.json: damaged"):
         read_group(group.path)

@@ -5,7 +5,10 @@ Trainings are played by a function that writes what a run would; one test trains
 
 import json
 import signal
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
 
 import optuna
@@ -14,7 +17,7 @@ import yaml
 
 from rlctl.errors import ArtifactError, Interrupted, RecipeError, TaskError, UsageError
 from rlctl.run import directory
-from rlctl.run.directory import RunDirectory
+from rlctl.run.directory import RunDirectory, is_being_written
 from rlctl.run.group import read_group
 from rlctl.run.lookup import find_run
 from rlctl.runs.listing import list_runs
@@ -87,7 +90,7 @@ def begin(tmp_path, *search, jobs=1, **options):
 
 
 def resume(folder, jobs=None):
-    return tune(TuneRequest(resume=folder), jobs=jobs)
+    return tune(TuneRequest(resume=str(folder)), jobs=jobs)
 
 
 def test_the_best_of_all_trials_is_a_recipe(played, tmp_path, rlctl):
@@ -106,10 +109,12 @@ def test_the_best_of_all_trials_is_a_recipe(played, tmp_path, rlctl):
         "learning_rate": best.values["algo_kwargs.learning_rate"],
     }
     assert recipe.keys() == {"algo_kwargs", "n_envs"}  # neither how long nor how often evaluated
-    shown = rlctl("tune", "--resume", tuning.path)  # nothing is left to train
+    shown = rlctl("tune", "--resume", "latest", "-o", tmp_path / "runs")  # nothing is left to train
     assert shown.returncode == 0
     assert f"best: trial {best.number}, in {tuning.best_file}" in shown.stdout
     assert shown.stdout.splitlines()[2].split()[0] == str(best.number)
+    (unchanged,) = [line.split() for line in shown.stdout.splitlines() if line.endswith("recipe")]
+    assert unchanged[:2] == ["0", "0.0003"]
 
 
 def test_too_few_evaluations_are_named(played, tmp_path, capsys):
@@ -293,7 +298,7 @@ def test_what_cannot_be_searched(search, error, message, tmp_path):
 
 
 def test_a_damaged_tuning(tmp_path):
-    with pytest.raises(UsageError, match=r"not the folder of a tuning: it has no tune\.json"):
+    with pytest.raises(ArtifactError, match=r"not the folder of a tuning: it has no tune\.json"):
         resume(tmp_path)
     (tmp_path / "tune.json").write_text('{"task": 3}')
     with pytest.raises(ArtifactError, match="damaged"):
@@ -304,6 +309,31 @@ def test_without_optuna(monkeypatch, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "optuna", None)
     with pytest.raises(UsageError, match="rlctl tune needs optuna: pip install 'optuna"):
         begin(tmp_path, RATES)
+
+
+@pytest.mark.slow
+def test_a_tuning_whose_process_was_killed_is_resumed(tmp_path, rlctl):
+    """Its training ends with it, keeps its checkpoints, and is resumed."""
+    options = ["-n", "20000", "--n-envs", "8", "--set", "eval.episodes=1", "--search", "algo_kwargs.gamma=0.5,0.99"]
+    command = [sys.executable, "-m", "rlctl", "tune", LINE, *options, "--trials", "2", "--jobs", "1", "-o", tmp_path]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as parent:
+        wait_for(lambda: list(tmp_path.glob("*/*_tune/*/checkpoints/0*/*")))
+        parent.kill()
+    (run,) = (RunDirectory(file.parent) for file in tmp_path.glob("*/*_tune/*/run.json"))
+    wait_for(lambda: not is_being_written(run.path))
+    assert run.checkpoints()
+    assert run.status()["status"] != "finished"
+    result = rlctl("tune", "--resume", run.path.parent, "--jobs", "1", "--json", "-")
+    assert result.returncode == 0, result.stderr
+    assert [trial["state"] for trial in json.loads(result.stdout)["trials"]] == ["done", "done"]
+    assert run.status()["status"] == "finished"
+
+
+def wait_for(condition, timeout_s=120.0):
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 def test_trainings_that_are_real(rlctl):

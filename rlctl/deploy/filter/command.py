@@ -171,6 +171,8 @@ class Command:
     def _as_action(self, command: Array) -> NDArray[Any]:
         """Return the action of a command, of the space's shape and type."""
         action = command if self._is_action else (command - self._bounds.offset) / self._bounds.factor
+        if self._space.dtype.kind != "f":
+            action = np.rint(action)
         action = action.astype(self._space.dtype).reshape(self._space.shape)
         if self._is_action:
             return action

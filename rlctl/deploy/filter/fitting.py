@@ -95,8 +95,11 @@ def _make_bounds(
         raise RecipeError(f"limits: offset: with command: {limits.command} action 0 must be no motion; leave it out")
     factor = scale * (dt if limits.command == "speed" else 1.0)
     largest, digits = _describe_numbers(space.dtype)
-    low = offset + factor * np.maximum(np.maximum(space.low.ravel(), -largest), _gather(joints, "action", -np.inf, 0))
-    high = offset + factor * np.minimum(np.minimum(space.high.ravel(), largest), _gather(joints, "action", np.inf, 1))
+    low = np.maximum(np.maximum(space.low.ravel(), -largest), _gather(joints, "action", -np.inf, 0))
+    high = np.minimum(np.minimum(space.high.ravel(), largest), _gather(joints, "action", np.inf, 1))
+    if space.dtype.kind != "f":
+        low, high = np.ceil(low), np.floor(high)
+    low, high = offset + factor * low, offset + factor * high
     position = np.array([_gather(joints, "position", -np.inf, 0), _gather(joints, "position", np.inf, 1)])
     if is_value:
         torque = np.array([joint.torque or np.inf for joint in joints])

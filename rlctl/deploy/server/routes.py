@@ -5,6 +5,7 @@ import hmac
 import re
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -15,7 +16,7 @@ from rlctl.deploy.server import messages
 from rlctl.deploy.server.connections import Connections, Handler
 from rlctl.deploy.server.request import LOOPBACK
 from rlctl.deploy.server.server import PolicyServer
-from rlctl.errors import RlctlError
+from rlctl.errors import RlctlError, did_you_mean
 
 _MAX_POLICY_SIZE = 64 * 2**20  # [bytes]
 _BODY_TIMEOUT_S = 10.0
@@ -57,9 +58,16 @@ class _Routes:
         """Refuse requests without the key (`Authorization: Api-Key KEY`) and requests from other sites' pages."""
         problem = _find_problem(request, self.server.request.host in LOOPBACK, self.server.api_key)
         if problem is None:
-            return await handler(request)
+            try:
+                return await handler(request)
+            except web.HTTPClientError as error:  # an unknown path, another method, too long a body
+                known = [resource.canonical for resource in request.app.router.resources()]
+                hint = (
+                    f"{did_you_mean(request.path, known)} There are: {', '.join(known)}" if error.status == 404 else ""
+                )
+                return _refuse(error.status, f"{request.method} {request.path}: {error.reason}.{hint}", error.headers)
         self.server.measurements.refused += 1
-        return web.Response(status=problem[0], text=f"{problem[1]}\n")
+        return _refuse(*problem)
 
     async def _watch(self, app: web.Application) -> Any:
         work = (self.server.check_watchdogs(), self.server.write_recording(), self.connections.close_slow())
@@ -150,8 +158,9 @@ async def _read_body(request: web.Request, max_size: int) -> bytes:
         raise web.HTTPRequestTimeout from None
 
 
-def _refuse(status: int, text: str) -> web.Response:
-    return web.json_response({"error": text}, status=status)
+def _refuse(status: int, text: str, headers: Mapping[str, str] | None = None) -> web.Response:
+    allowed = {name: value for name, value in (headers or {}).items() if name == "Allow"}
+    return web.json_response({"error": text}, status=status, headers=allowed)
 
 
 def _find_problem(request: web.Request, is_local: bool, key: str | None) -> tuple[int, str] | None:

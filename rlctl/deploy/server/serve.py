@@ -17,9 +17,12 @@ from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.deploy.server.request import KEY_VARIABLE, LOOPBACK, ServeRequest
 from rlctl.deploy.server.served_policy import load_served_policy
 from rlctl.errors import ArtifactError, RlctlError, UsageError, explain_missing_package
+from rlctl.storage import untrusted
 
 if TYPE_CHECKING:
     from rlctl.deploy.server.server import PolicyServer
+
+_LONGEST_KEY = 4096  # [bytes]
 
 
 def make_server(file: Path, request: ServeRequest) -> PolicyServer:
@@ -47,9 +50,9 @@ def _read_key(file: Path | None) -> str | None:
         key = os.environ.get(KEY_VARIABLE)
         return key.strip() if key else None
     try:
-        key = file.read_text().strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ArtifactError(f"{file}: the key cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        key = untrusted.read_bytes(file, _LONGEST_KEY).decode().strip()
+    except UnicodeDecodeError as error:
+        raise ArtifactError(f"{file}: the key cannot be read: {error}") from None
     if not key or not key.isprintable():
         raise UsageError(f"--key-file {file}: the file contains no key; write the key as one line of text")
     return key

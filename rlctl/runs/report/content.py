@@ -227,7 +227,9 @@ def list_commands(report: RunReport) -> list[str]:
 
 def choose_episodes(report: RunReport) -> list[tuple[str, RecordedEpisode]]:
     """Return the best and the worst recorded episode of the best run's last evaluation, with captions."""
-    episodes = max(report.runs, key=lambda run: run.summary.score).episodes
+    pairs = ((recipe, run) for recipe in report.recipes for run in recipe.runs)
+    recipe, best = max(pairs, key=lambda pair: pair[1].summary.score)
+    episodes, of_recipe = best.episodes, f" of {recipe.name}" if recipe.name else ""
     steps = max((_trained_steps(episode) for episode in episodes), default=-1)
     last = [episode for episode in episodes if _trained_steps(episode) == steps]
     if not last:
@@ -235,7 +237,8 @@ def choose_episodes(report: RunReport) -> list[tuple[str, RecordedEpisode]]:
     ordered = sorted(last, key=lambda episode: (episode.info.success is True, episode.info.total_reward))
     named = [("best", ordered[-1]), ("worst", ordered[0])] if len(ordered) > 1 else [("one", ordered[0])]
     return [
-        (f"The {name} recorded episode of the last evaluation: {_outcome(episode)}", episode) for name, episode in named
+        (f"The {name} recorded episode of the last evaluation{of_recipe}: {_outcome(episode)}", episode)
+        for name, episode in named
     ]
 
 

@@ -153,7 +153,10 @@ def _describe_bands(report: RunReport) -> str:
     counts = [len(recipe.runs) for recipe in report.recipes]
     of_recipes = ""
     if len(counts) > 1:
-        of_recipes = "Each colour is a recipe: lines are training episodes, points are evaluations. "
+        of_recipes = (
+            "In the charts of return and success a colour is a recipe; lines are training episodes, points are "
+            "evaluations. "
+        )
     if max(counts) == 1:
         return of_recipes
     count = str(counts[0]) if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"

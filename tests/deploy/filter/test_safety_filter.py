@@ -295,3 +295,11 @@ def test_values_keep_every_limit(steps, command):
         assert (out <= (1.8 if command == "torque" else 2.0) + 1e-6).all()
         assert (np.abs(out - before) <= 0.5 + 1e-6).all()  # 5 per second over 0.1 s
         before = out
+
+
+def test_whole_numbers_are_rounded_and_stay_within_their_limits(arm):
+    space = space_to_json(spaces.Box(-5, 5, (2,), np.int64))
+    info = arm.model_copy(update={"action_space": space})
+    safety = make_filter(info, command="action", limits={"all": {"action": [-2.5, 2.5]}}, blend_in_s=0)
+    assert run_filter(safety, REST, [0.9, -0.9]).tolist() == [1, -1]
+    assert run_filter(safety, REST, [5.0, -5.0]).tolist() == [2, -2]

@@ -153,6 +153,16 @@ def test_a_key(serve, tmp_path, monkeypatch):
         assert client.act(OBSERVATION)["state"] == "running"
 
 
+def test_an_unknown_path_is_refused_with_a_hint(serve):
+    server = serve()
+    status, text = server.post("/resme")
+    assert (status, json.loads(text)["error"].partition(" There are")[0]) == (
+        404,
+        "POST /resme: Not Found. Did you mean '/resume'?",
+    )
+    assert server.get("/stop")[0] == 405
+
+
 def test_pages_of_other_sites_are_refused(serve):
     server = serve()
     assert server.post("/stop", headers={"Origin": "http://evil.example"})[0] == 403
@@ -164,7 +174,7 @@ def test_others_reach_a_server_with_a_key_only(tmp_path):
     file = write_policy(tmp_path / "policy.safetensors")
     with pytest.raises(UsageError, match="set a key"):
         make_server(file, ServeRequest(host="0.0.0.0"))
-    with pytest.raises(ArtifactError, match="the key cannot be read"):
+    with pytest.raises(ArtifactError, match="no such file"):
         make_server(file, ServeRequest(host="0.0.0.0", key_file=tmp_path / "none"))
 
 
