@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import output
-from rlctl.cluster.ray_connection import connect, describe_slots, is_copied
+from rlctl.cluster.ray_connection import Pulse, connect, describe_slots, is_copied
 from rlctl.cluster.settings import ClusterSettings
 from rlctl.cluster.work import compare_versions
 from rlctl.environments.spec import EnvSpec
@@ -29,6 +29,7 @@ from rlctl.run.robustness import Outcome
 from rlctl.version import collect_versions
 
 _CLOSE_S = 5.0
+_POLL_S = 5.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,6 +127,7 @@ class _Actors:
         self._idle: list[Any] = []
         self._calls: dict[Any, tuple[Any, int | None]] = {}
         """Per call in progress its actor and the index of its cell, None for the start."""
+        self._pulse = Pulse(ray)
         self._lost: Counter[int | None] = Counter()
 
     def add(self) -> None:
@@ -154,7 +156,9 @@ class _Actors:
     def _wait(self) -> tuple[int | None, Any]:
         """Wait for a call to end; return the index of its cell, and its answer or the error of a lost actor."""
         exceptions = self._ray.exceptions
-        (reference,), _ = self._ray.wait(list(self._calls))
+        while not (done := self._ray.wait(list(self._calls), timeout=_POLL_S)[0]):
+            self._pulse.check()
+        reference = done[0]
         actor, index = self._calls.pop(reference)
         try:
             answer = self._ray.get(reference)

@@ -4,14 +4,18 @@ import atexit
 import os
 import secrets
 import shutil
+import socket
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
 from rlctl.environments import registry
 from rlctl.errors import TaskError, UsageError, explain_missing_package
 from rlctl.rollout.workers import available_cores
+
+_ASK_S, _GONE_S = 5.0, 30.0
 
 
 def connect(address: str, task: str, cpus: int) -> Any:
@@ -57,6 +61,27 @@ def connect(address: str, task: str, cpus: int) -> Any:
             f"--on ray:{address or 'local'}: cannot be reached: {str(error).partition(chr(10))[0]}"
         ) from None
     return ray
+
+
+class Pulse:
+    """Raises an error if the cluster is gone: Ray itself would end this process after 60 s without a line of rlctl."""
+
+    def __init__(self, ray: Any, hint: str = "") -> None:
+        host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
+        self._address, self._hint = (host, int(port)), hint
+        self._asked_s = self._answered_s = time.monotonic()
+
+    def check(self) -> None:
+        """Ask every few seconds whether the cluster is there; raise `TaskError` after `_GONE_S` without an answer."""
+        if time.monotonic() - self._asked_s < _ASK_S:
+            return
+        self._asked_s = time.monotonic()
+        try:
+            socket.create_connection(self._address, _ASK_S).close()
+            self._answered_s = time.monotonic()
+        except OSError:
+            if time.monotonic() - self._answered_s > _GONE_S:
+                raise TaskError(f"--on ray: the cluster has not answered for {_GONE_S:g} s{self._hint}") from None
 
 
 def is_copied(task: str) -> bool:

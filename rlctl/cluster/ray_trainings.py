@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rlctl.cluster.ray_connection import connect, describe_slots, is_copied
+from rlctl.cluster.ray_connection import Pulse, connect, describe_slots, is_copied
 from rlctl.cluster.settings import ClusterSettings
 from rlctl.cluster.work import PREEMPTED, TAKEN, Work, execute, make_work, mark_shared_folder
 from rlctl.run.job import Job, read_job, write_job
@@ -113,6 +113,7 @@ class RayTrainings(Trainings):
         super().__init__(min(jobs or _MOST_AT_ONCE, max(waiting, 1), _MOST_AT_ONCE))
         self.resume_options = f" --on ray{f':{address}' if address else ''}"
         self._ray, self._settings, self._folder = connect(address, task, settings.cpus), settings, folder
+        self._pulse = Pulse(self._ray, f"; resume with --resume {folder}")
         self._token = mark_shared_folder(folder)
         self._mailbox = _make_mailbox(self._ray)
         self._task = self._ray.remote(num_cpus=settings.cpus, max_retries=settings.retries)(train_on_node)
@@ -149,6 +150,7 @@ class RayTrainings(Trainings):
         ray = self._ray
         while True:
             done, _ = ray.wait([reference], timeout=_POLL_S)
+            self._pulse.check()
             lines, host, attempts = ray.get(self._mailbox.take.remote(work.seed))
             for line in lines:
                 receive(line)

@@ -32,14 +32,6 @@ slow = pytest.mark.slow
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs ray, the extra rlctl[cluster]")
 MEMORY = 80 * 2**20
 NODE = {"num_cpus": 1, "node_ip_address": "127.0.0.1", "object_store_memory": MEMORY}
-TOY = """
-import os, pathlib, time
-here = pathlib.Path(__file__).parent
-with (here / "pids").open("a") as file:
-    print(os.getpid(), file=file)
-while not (here / "go").exists():
-    time.sleep(0.05)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -88,41 +80,34 @@ def lose(cluster, node, pid):
     wait_for(lambda: has_ended(pid), 10)
 
 
-def test_cells_are_equal_and_a_lost_node_is_no_end(cluster, node, block_run, tmp_path, capsys):
+def test_cells_are_equal_and_a_lost_node_is_no_end(cluster, node, block_run, toy, tmp_path, capsys):
     """One test, because each process of the test run would start a cluster of its own."""
     request, vary = EvalRequest(str(block_run.path), episodes=3), ["push=0:3:3", "limit=0.1:9:2"]
     on_ray = measure_robustness(request, vary, play_cells=choose_cell_player(f"ray:{cluster.address}"))
     assert on_ray.maps == measure_robustness(request, vary).maps
     assert "6 cells, on Ray, 2 at a time: 1 of its 2 cores each" in capsys.readouterr().err
-    lines, codes = train_toys_and_lose_a_node(cluster, node, tmp_path)
+    lines, codes = train_toys_and_lose_a_node(cluster, node, toy, tmp_path / "runs")
     assert codes == [2, 2]  # there is no class Toy, which is no reason to retry
-    assert len((tmp_path / "pids").read_text().split()) == 3
+    assert len(toy.read_pids()) == 3
     assert sorted(read_job(tmp_path / "runs", seed).attempts for seed in (0, 1)) == [1, 2]
     assert any(line.startswith("attempt 2 on ") and line.endswith(": the previous attempt was lost") for line in lines)
 
 
-def train_toys_and_lose_a_node(cluster, node, tmp_path):
+def train_toys_and_lose_a_node(cluster, node, toy, runs):
     """Start a child on each of two nodes, kill a node, let the others end; return their lines and codes."""
-    toy, lines = tmp_path / "toy.py", []
-    toy.write_text(TOY)
-    runs = tmp_path / "runs"
+    lines = []
     runs.mkdir()
-    trainings = choose_executor(f"ray:{cluster.address}")(runs, f"{toy}:Toy", 2, None)
+    trainings = choose_executor(f"ray:{cluster.address}")(runs, toy.task, 2, None)
     calls = [
-        functools.partial(trainings.train, TrainRequest(f"{toy}:Toy", settings={"seed": seed}, root=runs), lines.append)
+        functools.partial(trainings.train, TrainRequest(toy.task, settings={"seed": seed}, root=runs), lines.append)
         for seed in (0, 1)
     ]
-
-    def read():
-        return [int(line) for line in (tmp_path / "pids").read_text().split()]
-
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         codes = pool.submit(trainings.run, calls, "resume")
-        wait_for((tmp_path / "pids").exists)
-        wait_for(lambda: len(read()) == 2)
-        (there,) = (pid for pid in read() if is_on(node, pid))
+        wait_for(lambda: len(toy.read_pids()) == 2)
+        (there,) = (pid for pid in toy.read_pids() if is_on(node, pid))
         lose(cluster, node, there)
-        (tmp_path / "go").touch()
+        toy.go()
         return lines, codes.result(60)
 
 
@@ -208,9 +193,9 @@ def test_a_driver_that_does_not_answer(cluster, node, tmp_path):
 
 
 @slow
-def test_a_run_is_given_up_after_its_retries(cluster, node, tmp_path):
+def test_a_run_is_given_up_after_its_retries(cluster, node, toy, tmp_path):
     Path("cluster.yaml").write_text("cpus: 1\nretries: 0\n")
-    lines, codes = train_toys_and_lose_a_node(cluster, node, tmp_path)
+    lines, codes = train_toys_and_lose_a_node(cluster, node, toy, tmp_path / "runs")
     assert sorted(codes) == [2, 75]
     assert any(line.startswith("error: lost on Ray after 0 retries: ") for line in lines)
 
@@ -238,6 +223,21 @@ def test_nodes_get_a_copy_of_the_task(cluster, node, rlctl, tmp_path):
     status = json.loads((run / "run.json").read_text())
     assert (status["task"], status["folder"]) == ("line.py:Line", str(tmp_path))
     assert rlctl("eval", run, "--episodes", 1, cwd=tmp_path.parent).returncode == 0
+
+
+@slow
+def test_a_cluster_that_is_gone(cluster, tmp_path):
+    """The last test of this cluster: it ends."""
+    (tmp_path / "cluster.yaml").write_text("cpus: 1\n")
+    driver = Driver(tmp_path, "--on", f"ray:{cluster.address}", "--set", "eval.every_steps=640", steps=400_000)
+    run, pid = driver.wait_for_checkpoint()
+    for kind in ("gcs_server", "raylet"):
+        cluster.head_node.all_processes[kind][0].process.kill()
+    code, printed = driver.end()
+    assert code == 3
+    group = run.parent.relative_to(tmp_path)
+    assert f"error: --on ray: the cluster has not answered for 30 s; resume with --resume {group}" in printed
+    assert has_ended(pid)
 
 
 @slow

@@ -1,5 +1,6 @@
 """Arrays of jobs on a fake SLURM: requeue, resume, retries, a driver that comes back, and what it says of errors."""
 
+import concurrent.futures
 import dataclasses
 import signal
 import threading
@@ -30,11 +31,33 @@ def train(request_of_line, slurm):
     return run
 
 
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.slow), signal.SIGUSR1])
+def test_a_preempted_job_is_requeued(toy, slurm, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cluster.yaml").write_text("cpus: 1\nsbatch: [--time=1:00:00]\nsetup: [export SET_UP=1]\n")
+    runs, lines = tmp_path / "runs", []
+    runs.mkdir()
+    trainings = choose_executor("slurm")(runs, toy.task, 1, None)
+    request = TrainRequest(toy.task, settings={"seed": 3}, root=runs)
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        codes = pool.submit(trainings.run, [lambda: trainings.train(request, lines.append)], "resume")
+        wait_for(toy.read_pids)
+        fake_slurm.preempt(slurm, "1_0", signal.SIGUSR1)
+        wait_for(lambda: len(toy.read_pids()) == 2)
+        toy.go()
+        assert codes.result(60) == [2]  # there is no class Toy, which is no reason to retry
+    job = read_job(runs, 3)
+    assert (job.state, job.code, job.attempts, job.place) == ("ended", 2, 2, "slurm 1_0")
+    assert "error: interrupted before the training began" in lines
+    assert trainings.describe() == "on SLURM, 1 core each"
+    assert "--time=1:00:00" in (slurm / "1.submitted").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
 def test_a_preempted_job_is_requeued_and_its_run_is_equal_to_a_local_one(
     train, request_of_line, slurm, tmp_path, capsys, number
 ):
-    (tmp_path / "cluster.yaml").write_text("cpus: 1\nsbatch: [--time=1:00:00]\nsetup: [export SET_UP=1]\n")
+    (tmp_path / "cluster.yaml").write_text("cpus: 1\n")
     done = []
     thread = threading.Thread(target=lambda: done.append(train("3", LONG)))
     thread.start()
@@ -52,7 +75,6 @@ def test_a_preempted_job_is_requeued_and_its_run_is_equal_to_a_local_one(
     stderr = capsys.readouterr().err
     assert "1 seed, on SLURM, 1 core each" in stderr
     assert "seed 3: error: interrupted at step " in stderr
-    assert "--time=1:00:00" in (slurm / "1.submitted").read_text()
 
 
 @pytest.mark.slow
@@ -96,7 +118,7 @@ def test_a_full_disk_on_a_node_is_an_error_of_its_run(train, slurm, tmp_path, ca
     (tmp_path / "cluster.yaml").write_text("setup: [ulimit -f 8]\n")
     result = train("0", LONG)
     assert result.failed == {0: 5}
-    assert "could not be saved" in capsys.readouterr().err
+    assert "seed 0: error: File too large" in capsys.readouterr().err
     job = read_job(result.score.group.path, 0)
     assert job.attempts == 1
     (tmp_path / "cluster.yaml").write_text("cpus: 1\n")
@@ -138,16 +160,3 @@ def test_errors_of_slurm(train, slurm, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(UsageError, match="squeue is not installed on this machine; use a login node"):
         train("0-1")
-
-
-@pytest.mark.parametrize(
-    ("on", "options", "message"),
-    [
-        ("sge", {}, "--on sge: give local, slurm, ray, ray:auto or ray:HOST:PORT"),
-        ("local", {"detach": True}, "--detach is for --on slurm"),
-        ("slurm", {"verb": "tune"}, "tune --on slurm: each trial depends on the results of earlier ones"),
-    ],
-)
-def test_executors_that_do_not_exist(on, options, message):
-    with pytest.raises(UsageError, match=message):
-        choose_executor(on, **options)
