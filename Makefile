@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 # Tests start hundreds of processes, which would each compile all modules where writing them compiled is turned off.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-slow test-crash test-all lint format bench compare train-all clean
+.PHONY: demo test test-slow test-crash test-all lint format docs bench compare train-all clean
 
 demo: $(VENV)/.installed
 	$(BIN)/rlctl train reach
@@ -41,6 +41,11 @@ lint: $(VENV)/.dev
 format: $(VENV)/.dev
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
+
+docs: $(VENV)/.docs
+	$(BIN)/python docs/make_site.py
+	$(BIN)/python -m zensical build --strict --clean
+	@echo "open build/site/index.html; for the search: $(BIN)/python -m http.server -d build/site"
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m tests.benchmarks
@@ -76,4 +81,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt -e '.[dev]'
+	touch $(VENV)/.installed $@
+
+$(VENV)/.docs: pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
 	touch $(VENV)/.installed $@
