@@ -9,7 +9,6 @@ import math
 import signal
 import sys
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import optuna
@@ -211,10 +210,15 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
     run = tuning.find_run(trial)
     if trainings.stopped_by is not None and not (code == 0 and _has_finished(run)):
         return
-    with _claim(run) as problem:
-        if problem or code in (_KILLED, RunTaken.exit_code):
+    try:
+        lock = contextlib.nullcontext() if run is None else run.lock()
+    except RunTaken as error:
+        trial.problem = str(error)
+        return
+    with lock:
+        if code in (_KILLED, RunTaken.exit_code):
             # The result is unknown: `tune --resume` trains it again.
-            trial.problem = problem or ("killed by SIGKILL" if code == _KILLED else "another process trained it")
+            trial.problem = "killed by SIGKILL" if code == _KILLED else "another process trained it"
             return
         _note_end(tuning, trial, run, code, lines, pruned=pruning is not None and pruning.decided)
         if run is not None:
@@ -224,21 +228,6 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
 
 def _has_finished(run: RunDirectory | None) -> bool:
     return run is not None and run.status().get("status") == "finished"
-
-
-@contextlib.contextmanager
-def _claim(run: RunDirectory | None) -> Iterator[str]:
-    """Hold the lock of a run, if any; yield an error message if another process holds it."""
-    if run is None:
-        yield ""
-        return
-    try:
-        lock = run.lock()
-    except RunTaken as error:
-        yield str(error)
-        return
-    with lock:
-        yield ""
 
 
 def _note_end(

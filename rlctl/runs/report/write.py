@@ -67,15 +67,11 @@ def _escape_html(value: Any) -> Any:
 def _values(report: RunReport, is_html: bool, pictures: bool, episodes: int) -> dict[str, Any]:
     first = report.runs[0]
     verdicts, notes = _compare(report, episodes)
-    several = len(report.recipes) > 1
     values = {
         "title": report.title,
         "verdicts": verdicts,
         "results": [
-            f"{recipe.name}: {content.summarize_result(recipe.runs)}"
-            if several
-            else content.summarize_result(recipe.runs)
-            for recipe in report.recipes
+            ": ".join(filter(None, (recipe.name, content.summarize_result(recipe.runs)))) for recipe in report.recipes
         ],
         "facts": content.list_facts(report),
         "notes": [*notes, *report.notes],
