@@ -135,7 +135,7 @@ def format_count(count: int, noun: str) -> str:
 def print_notes(notes: Iterable[str]) -> None:
     """Print lines to stderr."""
     for note in notes:
-        err().print(note, style="dim")
+        err().print(note, style="dim", soft_wrap=True)  # commands can be copied
 
 
 Cells = Sequence["str | Text"]

@@ -14,7 +14,7 @@ from rlctl.checking.finding import choose_rules
 from rlctl.checking.formats.structured import read_baseline
 from rlctl.checking.records import Check, Records
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import UsageError
+from rlctl.errors import ArtifactError, UsageError
 from tests import fork_server
 
 FOLDER = Path(__file__).parent
@@ -156,7 +156,7 @@ def test_command_of_a_broken_environment(tmp_path):
 
 
 def test_a_baseline_that_is_a_device_is_refused():
-    with pytest.raises(UsageError, match="not a file"):
+    with pytest.raises(ArtifactError, match="not a file"):
         read_baseline(Path("/dev/zero"))
 
 
@@ -167,7 +167,7 @@ def test_findings_of_the_baseline_fail_nothing(tmp_path):
     assert run.returncode == 0
     assert "no findings, 1 known from the baseline" in run.stdout
     run = rlctl(task, "--select", "RL2", "--baseline", str(tmp_path / "none.json"))
-    assert (run.returncode, run.stdout) == (2, "")
+    assert (run.returncode, run.stdout) == (5, "")
 
 
 def test_command_shows_the_worst_first_with_numbers_and_fix():

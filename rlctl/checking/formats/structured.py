@@ -17,7 +17,8 @@ from rlctl.checking.finding import RuleFinding
 from rlctl.checking.leaves import Leaf, name_leaf
 from rlctl.checking.messages import Built
 from rlctl.checking.records import Records
-from rlctl.errors import UsageError
+from rlctl.errors import ArtifactError
+from rlctl.storage import files
 from rlctl.version import __version__
 
 SCHEMA = Path(__file__).parent.parent / "report.schema.json"
@@ -59,17 +60,14 @@ def content(report: CheckReport) -> dict[str, Any]:
 
 
 def read_baseline(file: Path) -> set[str]:
-    """Return the fingerprints of all findings of a JSON report; raises `UsageError` for another file."""
+    """Return the fingerprints of all findings of a JSON report; raises `ArtifactError` for another file."""
     try:
-        if file.exists() and not file.is_file():
-            raise UsageError(f"--baseline {file}: not a file")
-        report = json.loads(file.read_text(encoding="utf-8"))
+        report = files.read_json(file)
         return {finding["fingerprint"] for part in ("findings", "known") for finding in report[part]}
-    except OSError as error:
-        hint = f"write one with rlctl check-env TASK --json {file}"
-        raise UsageError(f"--baseline {file}: {error.strerror}; {hint}") from None
-    except (ValueError, KeyError, TypeError):
-        raise UsageError(f"--baseline {file} is no report of rlctl check-env --json") from None
+    except ArtifactError as error:
+        raise ArtifactError(f"--baseline {error}; write one with rlctl check-env TASK --json {file}") from None
+    except (KeyError, TypeError):
+        raise ArtifactError(f"--baseline {file} is no report of rlctl check-env --json") from None
 
 
 def _describe(report: CheckReport, finding: RuleFinding) -> dict[str, Any]:
