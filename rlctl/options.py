@@ -34,7 +34,19 @@ class Argument(Option):
 
 TASK_FORMS = "Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id."
 
+TaskName = Annotated[str, Argument(TASK_FORMS, metavar="TASK", completes="task")]
 OptionalTask = Annotated[str | None, Argument(TASK_FORMS, metavar="TASK", completes="task")]
+RunName = Annotated[
+    str | None, Argument("Run folder, policy file, task name, or latest.", completes="run", default_text="latest")
+]
+Checkpoint = Annotated[str, Option("Which policy of the run.", metavar="best|last|STEP")]
+Pretrained = Annotated[bool, Option("The policy that ships with the task.", ("--pretrained",))]
+Settings = Annotated[
+    list[str], Option("Set a key, e.g. task.tolerance=0.02, randomize=true.", ("--set",), metavar="KEY=VALUE")
+]
+EpisodeSeed = Annotated[int, Option("Seed of the list of episodes.", min=0)]
+Json = Annotated[str | None, Option("Write JSON too; - for stdout, alone.", metavar="FILE")]
+Yes = Annotated[bool, Option("Do not ask.", ("--yes",))]
 Config = Annotated[Path | None, Option("Recipe that overrides the task's own, or presets/NAME.", metavar="FILE")]
 RunsFolder = Annotated[Path, Option("Where run folders go.", ("--output", "-o"), metavar="FOLDER")]
 EnvTimeout = Annotated[

@@ -10,36 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlctl import output
 from rlctl.cli import completion
-from rlctl.options import TASK_FORMS as TASK_FORMS
-from rlctl.options import Argument, Option
+from rlctl.options import Argument, Option, Settings
 
 if TYPE_CHECKING:
     from rlctl.environments.spec import EnvChanges
-
-OptionalTask = Annotated[
-    str | None, typer.Argument(metavar="TASK", help=TASK_FORMS, autocompletion=completion.complete_task)
-]
-Run = Annotated[
-    str | None,
-    typer.Argument(
-        help="Run folder, policy file, task name, or latest.",
-        show_default="latest",
-        autocompletion=completion.complete_run,
-    ),
-]
-Set = Annotated[
-    list[str], typer.Option("--set", metavar="KEY=VALUE", help="Set a key, e.g. task.tolerance=0.02, randomize=true.")
-]
-Json = Annotated[str | None, typer.Option("--json", metavar="FILE", help="Write JSON too; - for stdout, alone.")]
-EpisodeSeed = Annotated[int, typer.Option(help="Seed of the list of episodes.", min=0)]
-EnvTimeout = Annotated[
-    float, typer.Option(metavar="SECONDS", help="How long a step or reset may take.", min=0.1, max=1e6)
-]
-NEnvs = Annotated[int | None, typer.Option(help="Environments stepped side by side.", min=1)]
-Checkpoint = Annotated[str, typer.Option(metavar="best|last|STEP", help="Which policy of the run.")]
-
-Pretrained = Annotated[bool, typer.Option("--pretrained", help="The policy that ships with the task.")]
 
 _COMPLETIONS = {
     "task": completion.complete_task,
@@ -52,9 +28,7 @@ _COMPLETIONS = {
 class RecipeFlags:
     """Recipe keys from the command line; a flag overrides `--set`."""
 
-    settings: Annotated[
-        list[str], Option("Set a key, e.g. task.tolerance=0.02, randomize=true.", ("--set",), metavar="KEY=VALUE")
-    ] = dataclasses.field(default_factory=list)
+    settings: Settings = dataclasses.field(default_factory=list)
     algo: Annotated[
         str | None, Option("ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.", completes="algorithm")
     ] = None
@@ -97,6 +71,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         requests[parameter.name] = (request, {field.name: _turns_off(hints[field.name]) for field in fields})
 
     def run(**values: Any) -> None:
+        output.results()  # reserves stdout for the result: plugins print to stderr from now on
         for name, (request, fields) in requests.items():
             # A flag that turns a field off is True where the field is to be False.
             arguments = {field: values.pop(field) != turns_off for field, turns_off in fields.items() if turns_off}
@@ -155,13 +130,6 @@ def choose_checkpoint(checkpoint: str, pretrained: bool) -> str:
     if checkpoint not in ("best", PRETRAINED):
         raise UsageError(f"--pretrained and --checkpoint exclude each other: leave out --checkpoint {checkpoint}")
     return PRETRAINED
-
-
-def claim_stdout() -> None:
-    """Reserve stdout for the result; print output of plugins to stderr from now on."""
-    from rlctl import output
-
-    output.results()
 
 
 def parse_changes(settings: list[str]) -> EnvChanges:

@@ -7,37 +7,34 @@ from typing import Annotated, Literal
 
 import typer
 
-from rlctl.cli.arguments import EnvTimeout, Json, OptionalTask, Set, claim_stdout, parse_changes
+from rlctl.cli.arguments import command, parse_changes
 from rlctl.errors import UsageError
+from rlctl.options import EnvTimeout, Json, Option, OptionalTask, Settings
 
 
+@command
 def check_env(
     task: OptionalTask = None,
-    settings: Set = [],
-    select: Annotated[list[str], typer.Option(metavar="RULES", help="Judge only these: RL3,RL501.")] = [],
-    ignore: Annotated[list[str], typer.Option(metavar="RULES", help="Leave these out: RL106.")] = [],
-    strict: Annotated[bool, typer.Option("--strict", help="Exit 1 for warnings too.")] = False,
+    settings: Settings = [],
+    select: Annotated[list[str], Option("Judge only these: RL3,RL501.", metavar="RULES")] = [],
+    ignore: Annotated[list[str], Option("Leave these out: RL106.", metavar="RULES")] = [],
+    strict: Annotated[bool, Option("Exit 1 for warnings too.", ("--strict",))] = False,
     form: Annotated[
         Literal["text", "json", "sarif", "github"] | None,
-        typer.Option("--format", help="Form of the report.", show_default="text"),
+        Option("Form of the report.", ("--format",), default_text="text"),
     ] = None,
     output: Annotated[
-        str | None, typer.Option("--output", "-o", metavar="FILE", help="Where the report goes.", show_default="stdout")
+        str | None, Option("Where the report goes.", ("--output", "-o"), metavar="FILE", default_text="stdout")
     ] = None,
     json: Json = None,
     baseline: Annotated[
-        str | None,
-        typer.Option(metavar="FILE", help="A report of --json: what it has is known and fails nothing."),
+        str | None, Option("A report of --json: what it has is known and fails nothing.", metavar="FILE")
     ] = None,
     env_timeout: EnvTimeout = 10.0,
-    list_rules: Annotated[bool, typer.Option("--list", help="List all rules, and do nothing else.")] = False,
-    explain: Annotated[
-        str | None,
-        typer.Option(metavar="RULE", help="Say what a rule, or a finding as Q10, means."),
-    ] = None,
+    list_rules: Annotated[bool, Option("List all rules, and do nothing else.", ("--list",))] = False,
+    explain: Annotated[str | None, Option("Say what a rule, or a finding as Q10, means.", metavar="RULE")] = None,
 ) -> None:
     """Find what is wrong with an environment before hours of training do."""
-    claim_stdout()
     from rlctl.checking import formats
     from rlctl.checking.check import check
     from rlctl.checking.finding import choose_rules

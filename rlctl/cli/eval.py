@@ -6,47 +6,40 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from rlctl.cli.arguments import Json, Pretrained, Set, choose_checkpoint, claim_stdout, command, parse_changes
+from rlctl.cli.arguments import choose_checkpoint, command, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.request import EvalOptions, EvalRequest
-from rlctl.options import Cluster, On
+from rlctl.options import Cluster, Json, On, Option, Pretrained, Settings, Yes
 
 
 @command
 def evaluate(
     options: EvalOptions,
     pretrained: Pretrained = False,
-    settings: Set = [],
-    min_success: Annotated[
-        float | None, typer.Option(metavar="RATE", help="Gate: exit 1 below this success rate.")
-    ] = None,
+    settings: Settings = [],
+    min_success: Annotated[float | None, Option("Gate: exit 1 below this success rate.", metavar="RATE")] = None,
     min_success_lower: Annotated[
-        float | None, typer.Option(metavar="RATE", help="Gate: exit 1 if the 95 % interval begins below this rate.")
+        float | None, Option("Gate: exit 1 if the 95 % interval begins below this rate.", metavar="RATE")
     ] = None,
-    min_return: Annotated[
-        float | None, typer.Option(metavar="RETURN", help="Gate: exit 1 below this mean return.")
-    ] = None,
+    min_return: Annotated[float | None, Option("Gate: exit 1 below this mean return.", metavar="RETURN")] = None,
     vary: Annotated[
         list[str],
-        typer.Option(
+        Option(
+            "Vary an event or parameter of the task, e.g. mass=0.6:1.4:9; give it twice for a 2-D map.",
             metavar="NAME=LOW:HIGH:COUNT|all",
-            help="Vary an event or parameter of the task, e.g. mass=0.6:1.4:9; give it twice for a 2-D map.",
         ),
     ] = [],
-    push: Annotated[bool, typer.Option("--push", help="Find the smallest push at which it fails.")] = False,
+    push: Annotated[bool, Option("Find the smallest push at which it fails.", ("--push",))] = False,
     sim: Annotated[
         str | None,
-        typer.Option(metavar="mujoco[:SOLREF]", help="Play in MuJoCo too, with soft, medium and stiff contacts."),
+        Option("Play in MuJoCo too, with soft, medium and stiff contacts.", metavar="mujoco[:SOLREF]"),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a long --vary.")] = False,
+    yes: Yes = False,
     on: On = None,
     cluster: Cluster = None,
     json: Json = None,
 ) -> None:
     """Evaluate a policy: success rate with its interval, returns, reward terms."""
-    claim_stdout()
     from rlctl.evaluation.evaluate import Gates, run_evaluation
     from rlctl.evaluation.report import show, show_group, show_robustness
     from rlctl.run.directory import is_group

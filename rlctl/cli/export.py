@@ -5,33 +5,30 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from rlctl.cli.arguments import Checkpoint, Json, Pretrained, Run, choose_checkpoint, claim_stdout
+from rlctl.cli.arguments import choose_checkpoint, command
 from rlctl.errors import UsageError
 from rlctl.exporting.request import ExportRequest, Format
+from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName
 
 
+@command
 def export(
-    run: Run = None,
-    onnx: Annotated[bool, typer.Option("--onnx", help="Write an ONNX file (the default without --c).")] = False,
-    c: Annotated[bool, typer.Option("--c", help="Write a C99 header and source file without dependencies.")] = False,
+    run: RunName = None,
+    onnx: Annotated[bool, Option("Write an ONNX file (the default without --c).", ("--onnx",))] = False,
+    c: Annotated[bool, Option("Write a C99 header and source file without dependencies.", ("--c",))] = False,
     policy: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Write the actor with its measured score instead, as plugins ship it: .safetensors."
-        ),
+        Option("Write the actor with its measured score instead, as plugins ship it: .safetensors.", metavar="FILE"),
     ] = None,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE", help="Default: exports/policy.onnx, or .c, of the run."),
+        Option("Default: exports/policy.onnx, or .c, of the run.", ("--output", "-o"), metavar="FILE"),
     ] = None,
     json: Json = None,
 ) -> None:
     """Write a policy as a self-contained ONNX file or C source, and verify that it acts the same."""
-    claim_stdout()
     checkpoint = choose_checkpoint(checkpoint, pretrained)
     if policy is not None and (output is not None or onnx or c):
         raise UsageError("--policy FILE writes only that file: leave out --output, --onnx and --c")

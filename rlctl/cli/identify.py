@@ -5,37 +5,28 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from rlctl.cli import completion
-from rlctl.cli.arguments import TASK_FORMS, Json, Set, claim_stdout, parse_changes
+from rlctl.cli.arguments import command, parse_changes
+from rlctl.options import Json, Option, Settings, TaskName
 
 
+@command
 def identify(
-    task: Annotated[str, typer.Argument(metavar="TASK", help=TASK_FORMS, autocompletion=completion.complete_task)],
+    task: TaskName,
     log: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="CSV of the robot: time, action_..., position_JOINT, velocity_JOINT; a row per action.",
-        ),
+        Option("CSV of the robot: time, action_..., position_JOINT, velocity_JOINT; a row per action.", metavar="FILE"),
     ] = None,
-    excite: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Instead, write a safe trajectory to play and log.")
-    ] = None,
+    excite: Annotated[Path | None, Option("Instead, write a safe trajectory to play and log.", metavar="FILE")] = None,
     events: Annotated[
         list[str],
-        typer.Option("--event", metavar="NAME", help="Estimate the values of this event only; repeatable."),
+        Option("Estimate the values of this event only; repeatable.", ("--event",), metavar="NAME"),
     ] = [],
-    seconds: Annotated[
-        float, typer.Option(help="Length of the trajectory of --excite [s].", min=1.0, max=3600.0)
-    ] = 10.0,
-    settings: Set = [],
-    seed: Annotated[int, typer.Option(help="Seed of the search, or of the trajectory.", min=0)] = 0,
+    seconds: Annotated[float, Option("Length of the trajectory of --excite [s].", min=1.0, max=3600.0)] = 10.0,
+    settings: Settings = [],
+    seed: Annotated[int, Option("Seed of the search, or of the trajectory.", min=0)] = 0,
     json: Json = None,
 ) -> None:
     """Estimate the physical values with which the simulation follows a log of the robot."""
-    claim_stdout()
     from rlctl import output
     from rlctl.deploy.identify import report
     from rlctl.deploy.identify.excite import write_excitation

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
-
-from rlctl.cli import completion
-from rlctl.cli.arguments import TASK_FORMS, claim_stdout
+from rlctl.cli.arguments import command
 from rlctl.errors import UsageError
+from rlctl.options import Option, OptionalTask
 
 
+@command
 def recipe(
-    task: Annotated[
-        str | None, typer.Argument(metavar="TASK", help=TASK_FORMS, autocompletion=completion.complete_task)
-    ] = None,
-    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of recipes, for editors.")] = False,
+    task: OptionalTask = None,
+    schema: Annotated[bool, Option("Print the JSON schema of recipes, for editors.", ("--schema",))] = False,
 ) -> None:
     """Print the complete recipe of a task, or the JSON schema of recipes."""
-    claim_stdout()
     from rlctl import output
 
     if schema:

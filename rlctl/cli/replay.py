@@ -10,7 +10,8 @@ from typing import Any
 
 from typer.core import TyperCommand
 
-from rlctl.cli.arguments import Json, Pretrained, choose_checkpoint, claim_stdout, command
+from rlctl.cli.arguments import choose_checkpoint, command
+from rlctl.options import Json, Pretrained
 from rlctl.replaying.request import ReplayRequest
 
 _BY_OUTCOME = ("--worst", "--best", "--failures")
@@ -35,7 +36,6 @@ def _fill_counts(arguments: Iterable[str]) -> Iterator[str]:
 @command
 def replay(request: ReplayRequest, pretrained: Pretrained = False, json: Json = None) -> None:
     """Show what a policy does: rollouts as Rerun recordings, without a display."""
-    claim_stdout()
     from rlctl.replaying.replay import run_replay
     from rlctl.replaying.report import show
 

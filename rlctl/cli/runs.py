@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal
 import typer
 from typer.core import TyperGroup
 
-from rlctl.cli.arguments import TASK_FORMS, EpisodeSeed, Json, Run, Set, claim_stdout, parse_changes
+from rlctl.cli.arguments import command, parse_changes
+from rlctl.options import TASK_FORMS, Argument, EpisodeSeed, Json, Option, RunName, Settings, Yes
 
 
 class _RunsGroup(TyperGroup):
@@ -20,16 +21,16 @@ class _RunsGroup(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-Yes = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Only list what would be removed.")]
+DryRun = Annotated[bool, Option("Only list what would be removed.", ("--dry-run",))]
 
 app = typer.Typer(cls=_RunsGroup, help="List runs, show one, report and compare them, remove what is not needed.")
 
 
 @app.command("list")
+@command
 def list_runs(
-    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="Only the runs of this task.")] = None,
-    sort: Annotated[Literal["newest", "score", "steps", "minutes"], typer.Option(help="Order.")] = "newest",
+    task: Annotated[str | None, Argument("Only the runs of this task.", metavar="[TASK]")] = None,
+    sort: Annotated[Literal["newest", "score", "steps", "minutes"], Option("Order.")] = "newest",
     json: Json = None,
 ) -> None:
     """List every run below ./runs. `rlctl runs` alone does the same."""
@@ -40,7 +41,8 @@ def list_runs(
 
 
 @app.command("show")
-def show_run(run: Run = None, json: Json = None) -> None:
+@command
+def show_run(run: RunName = None, json: Json = None) -> None:
     """Show a run: its recipe, curve, evaluations, warnings and files."""
     from rlctl.run.lookup import find_run
     from rlctl.runs.show import RunDescription, show
@@ -49,27 +51,23 @@ def show_run(run: Run = None, json: Json = None) -> None:
 
 
 @app.command("report")
+@command
 def report_runs(
     runs: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[RUN]", help="Runs, groups, globs or folders of runs, all of one task.", show_default="latest"
-        ),
-    ] = None,
+        list[str],
+        Argument("Runs, groups, globs or folders of runs, all of one task.", metavar="RUN", default_text="latest"),
+    ] = [],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Default: report.html; md goes to stdout.")
+        Path | None, Option("Default: report.html; md goes to stdout.", ("--output", "-o"), metavar="FILE")
     ] = None,
-    format: Annotated[Literal["html", "md"], typer.Option(help="A page, or text for pull requests.")] = "html",
-    pictures: Annotated[
-        bool, typer.Option("--pictures/--no-pictures", help="Replay episodes to draw pictures.")
-    ] = True,
+    format: Annotated[Literal["html", "md"], Option("A page, or text for pull requests.")] = "html",
+    pictures: Annotated[bool, Option("Do not replay episodes to draw pictures.", ("/--no-pictures",))] = True,
     episodes: Annotated[
         int,
-        typer.Option(help="Episodes that each run plays to compare recipes; 0: do not compare.", min=0, max=1_000_000),
+        Option("Episodes that each run plays to compare recipes; 0: do not compare.", min=0, max=1_000_000),
     ] = 100,
 ) -> None:
     """Write the result of runs as one file: verdict, curves, evaluations, diagnosis, pictures, how to reproduce it."""
-    claim_stdout()
     from rlctl import output as streams
     from rlctl.runs.report.write import write_report
 
@@ -78,24 +76,23 @@ def report_runs(
 
 
 @app.command("compare")
+@command
 def compare_runs(
     runs: Annotated[
-        list[str],
-        typer.Argument(metavar="RUN", help="Runs, groups, globs or folders of runs; the first is the baseline."),
+        list[str], Argument("Runs, groups, globs or folders of runs; the first is the baseline.", metavar="RUN")
     ],
-    episodes: Annotated[int, typer.Option(help="Episodes that each run plays.", min=2, max=1_000_000)] = 100,
+    episodes: Annotated[int, Option("Episodes that each run plays.", min=2, max=1_000_000)] = 100,
     seed: EpisodeSeed = 0,
-    task: Annotated[str | None, typer.Option(help="Evaluate all on this task.")] = None,
-    settings: Set = [],
+    task: Annotated[str | None, Option("Evaluate all on this task.")] = None,
+    settings: Settings = [],
     threshold: Annotated[
-        float | None, typer.Option(help="Report the steps to this success rate (or return); 0.9 if success is known.")
+        float | None, Option("Report the steps to this success rate (or return); 0.9 if success is known.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Compare even if the task has changed.")] = False,
-    gate: Annotated[Literal["not-worse"] | None, typer.Option(help="Exit 1 if one is worse than the first.")] = None,
+    force: Annotated[bool, Option("Compare even if the task has changed.", ("--force",))] = False,
+    gate: Annotated[Literal["not-worse"] | None, Option("Exit 1 if one is worse than the first.")] = None,
     json: Json = None,
 ) -> None:
     """Test whether a policy, or a recipe trained with several seeds, is better than another."""
-    claim_stdout()
     from rlctl.evaluation.request import EvalRequest
     from rlctl.runs.comparison import compare
     from rlctl.runs.comparison_report import show
@@ -110,22 +107,20 @@ def compare_runs(
 
 
 @app.command("import")
+@command
 def import_run(
-    model: Annotated[Path, typer.Argument(metavar="MODEL.zip", help="Model of Stable-Baselines3 or rl-zoo3.")],
-    task: Annotated[str, typer.Option(metavar="TASK", help=f"The task it was trained on. {TASK_FORMS}")],
-    vecnormalize: Annotated[
-        Path | None, typer.Option(metavar="FILE.pkl", help="Its normalisation, if it has one.")
-    ] = None,
-    algo: Annotated[str | None, typer.Option(help="Its algorithm, if the file does not name it.")] = None,
-    settings: Set = [],
+    model: Annotated[Path, Argument("Model of Stable-Baselines3 or rl-zoo3.", metavar="MODEL.zip")],
+    task: Annotated[str, Option(f"The task it was trained on. {TASK_FORMS}", metavar="TASK")],
+    vecnormalize: Annotated[Path | None, Option("Its normalisation, if it has one.", metavar="FILE.pkl")] = None,
+    algo: Annotated[str | None, Option("Its algorithm, if the file does not name it.")] = None,
+    settings: Settings = [],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE", help="Policy file to write. Default: MODEL.safetensors."),
+        Option("Policy file to write. Default: MODEL.safetensors.", ("--output", "-o"), metavar="FILE"),
     ] = None,
     json: Json = None,
 ) -> None:
     """Convert a model of Stable-Baselines3 to a policy file. Nothing in the model is unpickled."""
-    claim_stdout()
     from rlctl.importing.import_model import import_model, show
 
     changes = parse_changes(settings)
@@ -133,13 +128,14 @@ def import_run(
 
 
 @app.command("rm")
+@command
 def remove_runs(
-    runs: Annotated[list[str] | None, typer.Argument(metavar="RUN", help="Folders of runs.")] = None,
+    runs: Annotated[list[str], Argument("Folders of runs.", metavar="RUN")] = [],
     keep_best: Annotated[
         int | None,
-        typer.Option(
+        Option(
+            "Keep the N best runs of each task, remove the other finished or failed ones; groups stay.",
             metavar="N",
-            help="Keep the N best runs of each task, remove the other finished or failed ones; groups stay.",
             min=0,
         ),
     ] = None,
@@ -149,19 +145,19 @@ def remove_runs(
     """Remove runs, never one that is being trained."""
     from rlctl.runs.removal import plan_removal, remove_with_report
 
-    remove_with_report(plan_removal(runs or [], keep_best=keep_best), yes=yes, dry_run=dry_run)
+    remove_with_report(plan_removal(runs, keep_best=keep_best), yes=yes, dry_run=dry_run)
 
 
 @app.command("prune")
+@command
 def prune_runs(
     runs: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="RUN", help="Runs, groups, globs or folders of runs.", show_default="all"),
-    ] = None,
+        list[str], Argument("Runs, groups, globs or folders of runs.", metavar="RUN", default_text="all")
+    ] = [],
     yes: Yes = False,
     dry_run: DryRun = False,
 ) -> None:
     """Remove the checkpoints of finished runs, which are needed only to train longer."""
     from rlctl.runs.removal import plan_prune, remove_with_report
 
-    remove_with_report(plan_prune(runs or []), yes=yes, dry_run=dry_run)
+    remove_with_report(plan_prune(runs), yes=yes, dry_run=dry_run)

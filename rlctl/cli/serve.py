@@ -5,15 +5,15 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated
 
-from rlctl.cli.arguments import Checkpoint, Json, Pretrained, Run, choose_checkpoint, claim_stdout, command
+from rlctl.cli.arguments import choose_checkpoint, command
 from rlctl.deploy.server.request import ServeRequest
-from rlctl.options import Option
+from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName
 
 
 @command
 def serve(
     request: ServeRequest,
-    run: Run = None,
+    run: RunName = None,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,
     self_test: Annotated[
@@ -23,7 +23,6 @@ def serve(
     json: Json = None,
 ) -> None:
     """Serve a policy to robots: WebSocket and HTTP, with limits, watchdog, log and a live page."""
-    claim_stdout()
     from rlctl import output
     from rlctl.deploy.server.serve import make_server, run_server
     from rlctl.run.lookup import find_policy

@@ -6,17 +6,18 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli import completion
-from rlctl.cli.arguments import TASK_FORMS, Json, claim_stdout
+from rlctl.cli.arguments import command
 from rlctl.errors import UsageError
+from rlctl.options import Argument, Json, Option, TaskName
 
 app = typer.Typer()
 
 
 @app.callback(invoke_without_command=True)
+@command
 def tasks(
     context: typer.Context,
-    check: Annotated[bool, typer.Option("--check", help="Import each task in a child process.")] = False,
+    check: Annotated[bool, Option("Import each task in a child process.", ("--check",))] = False,
     json: Json = None,
 ) -> None:
     """List the installed tasks; show one, or create your own."""
@@ -30,12 +31,9 @@ def tasks(
 
 
 @app.command("show")
-def show_task(
-    task: Annotated[str, typer.Argument(metavar="TASK", help=TASK_FORMS, autocompletion=completion.complete_task)],
-    json: Json = None,
-) -> None:
+@command
+def show_task(task: TaskName, json: Json = None) -> None:
     """Show a task's observations, actions, rewards, events, parameters and recipe."""
-    claim_stdout()
     from rlctl.tasks.description import describe
     from rlctl.tasks.show import show
 
@@ -43,9 +41,9 @@ def show_task(
 
 
 @app.command("new")
+@command
 def new_task(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the task: letters, digits, - and _.")],
-    json: Json = None,
+    name: Annotated[str, Argument("Name of the task: letters, digits, - and _.", metavar="NAME")], json: Json = None
 ) -> None:
     """Create a starter plugin in a folder NAME: a task that trains in seconds, its recipe and tests."""
     from rlctl.tasks.new import create, show

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated, Any
 
-from rlctl.cli.arguments import Json, RecipeFlags, claim_stdout, command
+from rlctl.cli.arguments import RecipeFlags, command
 from rlctl.errors import UsageError
-from rlctl.options import Cluster, Jobs, On, Option
+from rlctl.options import Cluster, Jobs, Json, On, Option
 from rlctl.run.train_request import TrainRequest
 
 
@@ -42,7 +42,6 @@ def train(
     json: Json = None,
 ) -> None:
     """Train a policy, evaluate during the training, and save the best and the last policy."""
-    claim_stdout()
     from rlctl.run.group import find_group
 
     group_folder = find_group(request.resume, request.root) if request.resume is not None else None

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated
 
-from rlctl.cli.arguments import Json, RecipeFlags, claim_stdout, command
-from rlctl.options import Cluster, Jobs, On, Option
+from rlctl.cli.arguments import RecipeFlags, command
+from rlctl.options import Cluster, Jobs, Json, On, Option
 from rlctl.tuning.tune_request import TuneRequest
 
 
@@ -25,7 +25,6 @@ def tune(
     flags: TuneFlags, request: TuneRequest, jobs: Jobs = None, on: On = None, cluster: Cluster = None, json: Json = None
 ) -> None:
     """Find hyperparameters: the learning rate, then rollout and minibatch, then the discount, with Optuna."""
-    claim_stdout()
     from rlctl.cluster.executors import choose_executor
     from rlctl.tuning import report
     from rlctl.tuning.tune import tune as run_tuning

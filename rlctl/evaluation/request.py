@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rlctl.options import Argument, Option
+from rlctl.options import Checkpoint, EnvTimeout, EpisodeSeed, Option, RunName
 
 if TYPE_CHECKING:
     from rlctl.environments.spec import EnvChanges, EnvSpec
@@ -16,13 +16,10 @@ if TYPE_CHECKING:
 class EvalOptions:
     """The arguments of `rlctl eval` that choose the policy and its episodes."""
 
-    run: Annotated[
-        str | None,
-        Argument("Run folder, policy file, task name, or latest.", completes="run", default_text="latest"),
-    ] = None
+    run: RunName = None
     """With `baseline`, the name of a task."""
     task: Annotated[str | None, Option("Evaluate on this task instead of the one it was trained on.")] = None
-    checkpoint: Annotated[str, Option("Which policy of the run.", metavar="best|last|STEP")] = "best"
+    checkpoint: Checkpoint = "best"
     baseline: Annotated[
         str | None,
         Option(
@@ -33,7 +30,7 @@ class EvalOptions:
     ] = None
     """What to play instead of a trained policy."""
     episodes: Annotated[int, Option("Episodes, each with its own seed.", min=1, max=1_000_000)] = 100
-    seed: Annotated[int, Option("Seed of the list of episodes.", min=0)] = 0
+    seed: EpisodeSeed = 0
     stage: Annotated[int | None, Option("Stage of the policy's curriculum.", min=1, default_text="the last")] = None
     """From 1."""
     deterministic: Annotated[bool, Option("Sample actions instead of taking the mean.", ("/--stochastic",))] = True
@@ -42,9 +39,7 @@ class EvalOptions:
         None
     )
     """Limits on the policy's actions; it is also evaluated without them."""
-    env_timeout_s: Annotated[
-        float, Option("Time limit of a step or reset.", ("--env-timeout",), metavar="SECONDS", min=0.1, max=1e6)
-    ] = 60.0
+    env_timeout_s: EnvTimeout = 60.0
 
 
 def _change_nothing() -> EnvChanges:

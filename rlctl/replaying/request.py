@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from rlctl.errors import UsageError
-from rlctl.options import Argument, Option
+from rlctl.options import Argument, Checkpoint, EpisodeSeed, Option, Settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,12 +42,10 @@ class ReplayRequest:
     failures: Annotated[
         int | None, Option("Only N failed episodes of --episodes, the worst first.", metavar="[N]", min=1)
     ] = None
-    seed: Annotated[int, Option("Seed of the list of episodes.", min=0)] = 0
-    checkpoint: Annotated[str, Option("Which policy of the run.", metavar="best|last|STEP")] = "best"
+    seed: EpisodeSeed = 0
+    checkpoint: Checkpoint = "best"
     task: Annotated[str | None, Option("Roll out on this task instead of the one it was trained on.")] = None
-    settings: Annotated[
-        list[str], Option("Set a key, e.g. task.tolerance=0.02, randomize=true.", ("--set",), metavar="KEY=VALUE")
-    ] = dataclasses.field(default_factory=list)
+    settings: Settings = dataclasses.field(default_factory=list)
     verify: Annotated[
         Path | None, Option("Replay a recorded episode; exit 1 unless it is identical.", metavar="EPISODE")
     ] = None
