@@ -5,6 +5,8 @@ PYTHON ?= $(shell python3.11 -c 'import sys; print(sys.executable)' 2> /dev/null
 TORCH_INDEX ?=
 VENV ?= .venv
 BIN := $(VENV)/bin
+# uv installs in parallel. Modules are compiled when they are first imported: most are never used.
+INSTALL ?= $(if $(shell command -v uv),uv pip install --quiet --python $(BIN)/python,$(BIN)/pip install -q --no-compile)
 # Tests start hundreds of processes, which would each compile all modules where writing them compiled is turned off.
 export PYTHONDONTWRITEBYTECODE =
 
@@ -64,25 +66,25 @@ clean:
 $(BIN)/python:
 	@if [ -n "$(PYTHON)" ]; then \
 		$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] > (3, 11))' || \
-			echo "PyBullet has no wheels for this Python: tasks that need it, as the one of make demo, are left out"; \
+			echo "PyBullet has no wheels for Python 3.12 and newer, so it is left out; make demo and most bundled tasks need" \
+				"it: use Python 3.11, or build it afterwards (CONTRIBUTING.md). Nothing else is built"; \
 		$(PYTHON) -m venv $(VENV); \
 	elif command -v uv > /dev/null; then \
 		uv venv --quiet --seed --python 3.11 $(VENV); \
 	else \
 		echo "Python 3.11 is missing: install it, or uv (https://docs.astral.sh/uv), and run make again"; exit 1; \
 	fi
-	@echo "installing into $(VENV): about 2.4 GB, of which PyTorch for the CPU 0.8 GB and Rerun 0.5 GB"
-	@if [ -n "$(TORCH_INDEX)" ]; then \
-		$(BIN)/pip install -q --no-deps -c constraints.txt --index-url "$(TORCH_INDEX)" torch; fi
+	@echo "installing into $(VENV): 2.1 GB, of which PyTorch for the CPU 0.7, Rerun 0.7, PyBullet 0.3 and SciPy 0.1 GB"
+	@if [ -n "$(TORCH_INDEX)" ]; then $(INSTALL) --no-deps -c constraints.txt --index-url "$(TORCH_INDEX)" torch; fi
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/pip install -q -c constraints.txt -e .
+	$(INSTALL) -c constraints.txt -e .
 	touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/pip install -q -c constraints.txt -e '.[dev]'
+	$(INSTALL) -c constraints.txt -e '.[dev]'
 	touch $(VENV)/.installed $@
 
 $(VENV)/.docs: pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/pip install -q -c constraints.txt -e '.[docs]'
+	$(INSTALL) -c constraints.txt -e '.[docs]'
 	touch $(VENV)/.installed $@

@@ -65,8 +65,8 @@ def find_runs_of(text: str) -> list[RunDirectory]:
             raise ArtifactError(f"{text}: no run matches")
         return runs
     path = Path(text)
-    if not is_group(path) and (runs := [RunDirectory(file.parent) for file in sorted(path.glob("*/run.json"))]):
-        return runs
+    if not is_group(path) and not (path / "run.json").exists() and (files := sorted(path.rglob("run.json"))):
+        return [RunDirectory(file.parent) for file in files]  # `latest` is a link, so its run is there only once
     if (folder := find_group(text)) is None:
         return [find_run(text)]
     group = read_group(folder)

@@ -93,6 +93,13 @@ def test_a_folder_whose_name_looks_like_a_glob(write_run):
     assert [found.path for found in find_runs_of(str(run))] == [run]
 
 
+def test_the_folder_of_all_runs_has_each_run_once(write_run, tmp_path):
+    runs = [write_run(f"before/reach/2026-01-01_00-00-00_s{seed}") for seed in range(2)]
+    folder = runs[0].parent.parent
+    (folder / "latest").symlink_to(runs[1])
+    assert [run.path for run in find_runs_of(str(folder))] == runs
+
+
 def test_refusals(root, write_run):
     one, _ = sorted((root / "0.9/Line").iterdir())
     with pytest.raises(UsageError, match="two or more"):
