@@ -82,16 +82,16 @@ def test_what_an_extra_needs_is_named_without_an_index_that_has_rlctl():
     assert explain_missing_package("rlctl fly", "wings", "fly") == "rlctl fly needs wings: pip install wings"
 
 
-def make_environment(folder: Path, **programs: str) -> subprocess.CompletedProcess[str]:
-    """Run the rule that makes `.venv`, where nothing but the shell and these programs is found."""
+def make_environment(folder: Path, target: str = "bin/python", **programs: str) -> subprocess.CompletedProcess[str]:
+    """Run a rule for a file in `.venv`, where nothing but the shell and these programs is found."""
     tools = folder / "bin"
     tools.mkdir()
-    for name in ("sh", "mkdir", "cat", "chmod"):
+    for name in ("sh", "mkdir", "cat", "chmod", "touch"):
         (tools / name).symlink_to(shutil.which(name))
     for name, script in programs.items():
         (tools / name).write_text(f"#!/bin/sh\n{script}\n")
         (tools / name).chmod(0o755)
-    command = [shutil.which("make"), "-f", ROOT / "Makefile", ".venv/bin/python", "SHELL=/bin/sh"]
+    command = [shutil.which("make"), "-f", ROOT / "Makefile", f".venv/{target}", "SHELL=/bin/sh"]
     return subprocess.run(command, cwd=folder, env={"PATH": str(tools)}, capture_output=True, text=True, check=False)
 
 
@@ -116,4 +116,12 @@ def test_make_uses_uv_where_python_is_missing(tmp_path):
     assert done.returncode == 0, done.stderr
     first, size = done.stdout.splitlines()
     assert first == "uv venv --quiet --seed --python 3.11 .venv"
-    assert size == "installing into .venv: about 2.4 GB, of which PyTorch for the CPU 0.8 GB and Rerun 0.5 GB"
+    assert size.startswith("installing into .venv: 2.1 GB, of which PyTorch for the CPU 0.7, Rerun 0.7,")
+
+
+def test_make_installs_with_uv_if_it_is_there(tmp_path):
+    for name in ("pyproject.toml", "constraints.txt"):
+        (tmp_path / name).touch()
+    done = make_environment(tmp_path, ".installed", uv=f'echo "uv $@"; {INSTALL}')
+    assert done.returncode == 0, done.stderr
+    assert "uv pip install --quiet --python .venv/bin/python -c constraints.txt -e .\n" in done.stdout
