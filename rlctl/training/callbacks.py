@@ -36,9 +36,13 @@ def _load(name: str, arguments: Mapping[str, Any]) -> Callback:
         problem = str(error).removeprefix(f"task {name!r}: ")
         raise RecipeError(f"callbacks: {name}: {problem}", details=error.details) from None
     callback: Any = _call(name, lambda: constructor(**arguments))
+    if "stable_baselines3.common.callbacks" in (base.__module__ for base in type(callback).__mro__):
+        from rlctl.training.sb3_callback import Sb3Callback
+
+        return Sb3Callback(callback)
     if isinstance(callback, Callback):
         return callback
-    raise RecipeError(f"callbacks: {name}: not a rlctl.Callback")
+    raise RecipeError(f"callbacks: {name}: neither a rlctl.Callback nor a BaseCallback of Stable-Baselines3")
 
 
 def _call(name: str, call: Callable[[], Any], doing: str = "") -> Any:
@@ -120,7 +124,7 @@ class Callbacks:
     def _report(self, problem: str) -> None:
         if problem and problem not in self._reported:
             self._reported.add(problem)
-            self._warn(f"warning: {problem}; a resume will not be bit-exact. Override state_dict and load_state_dict")
+            self._warn(f"warning: {problem}; a resume will not be bit-exact; see docs/callbacks.md")
 
     def restore(self, tensors: Tensors, entries: Sequence[Mapping[str, Any]]) -> list[str]:
         """Restore what `take` returned; return the reasons why the resume is not bit-exact."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
@@ -24,7 +24,7 @@ _BINS = 40
 _COMPARED = ("eval/success_rate", "eval/mean_reward", "eval/mean_ep_length")
 
 
-class _EventFile(KVWriter):
+class _EventFile(TensorBoardOutputFormat):
     """Writes each event immediately; errors of TensorBoard's own writer, which uses a thread, cannot be caught.
 
     After a write that failed it starts a new file.

@@ -5,7 +5,9 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from rlctl.errors import Interrupted, RecipeError, TaskError, UsageError
 from rlctl.run.directory import RunDirectory
@@ -16,6 +18,7 @@ from tests.training.test_exact_resume import kill_after as kill_after
 from tests.training.test_exact_resume import settings
 
 FILE = Path(own_callbacks.__file__)
+SB3 = FILE.with_name("sb3_callbacks.py")
 ADAPTIVE = {"callbacks": {f"{FILE}:Adaptive": None}}
 
 
@@ -68,7 +71,7 @@ def test_state_that_is_no_plain_data_is_reported(train, resume, run_of, capsys):
     with pytest.raises(TaskError):
         train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:Unsaved": None, f"{FILE}:Raises": None}})
     problem = "Unsaved: its window is a set, which a checkpoint does not store"
-    assert f"{problem}; a resume will not be bit-exact. Override state_dict" in capsys.readouterr().err
+    assert f"{problem}; a resume will not be bit-exact; see docs/callbacks.md" in capsys.readouterr().err
     with pytest.raises(TaskError):
         resume(run_of())
     assert re.search(f"resuming at step 0, not bit-exact: callback .*{problem}", capsys.readouterr().err)
@@ -107,8 +110,8 @@ def test_a_callback_that_never_returns_is_interrupted(train, run_of):
         ("missing.py:Adaptive", "no file .*missing.py"),
         (f"{FILE}:Adaptiv", "has no 'Adaptiv'.*Did you mean 'Adaptive'"),
         ("Adaptive", "give the class too: FILE.py:CLASS or MODULE:CLASS"),
-        (f"{FILE}:make_nothing", "not a rlctl.Callback"),
-        ("json:JSONDecoder", "not a rlctl.Callback"),
+        (f"{FILE}:make_nothing", "neither a rlctl.Callback nor a BaseCallback"),
+        ("json:JSONDecoder", "neither a rlctl.Callback nor a BaseCallback"),
     ],
 )
 def test_a_wrong_name_is_a_recipe_error(train, tmp_path, name, problem):
@@ -147,3 +150,46 @@ def test_a_callback_whose_file_has_changed_needs_force(train, resume, tmp_path, 
         resume(run, total_timesteps=320)
     resume(run, force=True, total_timesteps=320)
     assert "not bit-exact: " in capsys.readouterr().err
+
+
+def test_callbacks_of_stable_baselines3(train, tmp_path):
+    folder = {"folder": str(tmp_path)}
+    four = {"evaluation": folder, "several": folder, "Worst": None, "convert": None}
+    run = train("Line", {**SMALL_PPO, "callbacks": {f"{SB3}:{name}": given for name, given in four.items()}}).run
+    # It ends at the first boundary (64 steps each) after the step at which `convert` returns False.
+    assert run.status()["stop_reason"] == "ConvertCallback at step 92"
+    assert run.checkpoints()[-1].name.lstrip("0") == "128"
+    # Every 8, 24 and 100 steps of the four environments: a segment has 16 steps of each.
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [32, 64, 96, 128]
+    assert {file.name for file in tmp_path.glob("*.zip")} == {"rl_model_96_steps.zip", "every_100_steps.zip"}
+    written = EventAccumulator(str(run.tensorboard)).Reload().Scalars("own/worst")
+    assert [event.step for event in written] == [64, 128]
+
+
+@pytest.mark.parametrize("algo", ["ppo", "sac"])
+@pytest.mark.usefixtures("every_boundary")
+def test_resume_is_exact_with_a_callback_of_stable_baselines3(train, resume, kill_after, run_of, capsys, algo):
+    given = {**settings(algo), "callbacks": {f"{SB3}:Worst": None}}
+    whole = train("Line", given).run
+    ends = [line for line in capsys.readouterr().out.splitlines() if line.startswith("checked")]
+    undo = kill_after(20 if algo == "ppo" else 13)
+    with pytest.raises(Killed):
+        train("Line", given)
+    undo()
+    resume(run_of())
+    output = capsys.readouterr()
+    assert ", bit-exact" in output.err
+    assert [line for line in output.out.splitlines() if line.startswith("checked")] == ends
+    assert_same_run(whole, run_of())
+
+
+def test_a_schedule_that_sb3_callbacks_replace_is_reported(train, capsys):
+    train("Line", {**SMALL_PPO, "callbacks": {f"{SB3}:NewSchedule": None}})
+    assert "NewSchedule: its model.lr_schedule is a function, which a checkpoint does not" in capsys.readouterr().err
+
+
+def test_a_callback_cannot_reach_into_the_environments(train):
+    with pytest.raises(
+        TaskError, match=r"on_segment at step 64: AttributeError: worker environments hand out no metho"
+    ):
+        train("Line", {**SMALL_PPO, "callbacks": {f"{SB3}:ReachesIn": None}})
