@@ -37,6 +37,7 @@ class RecipeFlags:
         str | None, Option("Environment steps; 1e6 is fine.", ("--total-timesteps", "-n"), metavar="STEPS")
     ] = None
     n_envs: Annotated[int | None, Option("Environments stepped side by side.", min=1)] = None
+    track: Annotated[str | None, Option("Also send the run to wandb, mlflow or trackio.", metavar="TRACKER")] = None
 
     def merge(self) -> dict[str, Any]:
         """Return all keys and values, nested as in a recipe."""

@@ -127,6 +127,8 @@ class Recipe(Section):
     """Which checkpoints are kept."""
     callbacks: dict[str, dict[str, Any] | None] = {}
     """Callbacks: classes of yours by `FILE.py:CLASS` or `MODULE:CLASS`, and their arguments; see docs/callbacks.md."""
+    track: Literal["wandb", "mlflow", "trackio"] | None = None
+    """Experiment tracker that metrics, policy, report and film are also sent to; null: none."""
     stages: Annotated[list[Stage], pydantic.AfterValidator(check_promotions)] = []
     """Curriculum: what each stage changes, and when it ends."""
 
@@ -263,10 +265,10 @@ def _explain(problem: Any, path: Sequence[str | int], schema: validation.Schema,
 
 
 def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:
-    """Return the dotted keys that differ, each with its value in `recipe` and in `base`; the seed is not compared."""
-    ours, theirs = (dict(_flatten(one.model_dump(mode="json", by_alias=True))) for one in (recipe, base))
+    """Return the dotted keys that differ except `seed` and `track`, each with its value in `recipe` and in `base`."""
+    ours, theirs = (dict(flatten(one.model_dump(mode="json", by_alias=True))) for one in (recipe, base))
     keys = dict.fromkeys([*theirs, *ours])
-    pairs = {key: (ours.get(key, NOT_SET), theirs.get(key, NOT_SET)) for key in keys if key != "seed"}
+    pairs = {key: (ours.get(key, NOT_SET), theirs.get(key, NOT_SET)) for key in keys if key not in ("seed", "track")}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
@@ -275,9 +277,10 @@ def find_mixed(recipes: Sequence[Recipe]) -> list[str]:
     return sorted({key for recipe in recipes[1:] for key in find_difference(recipe, recipes[0])})
 
 
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted keys and their values: `algo_kwargs.gamma`."""
     for key, value in values.items():
         if isinstance(value, Mapping) and value:
-            yield from _flatten(value, f"{prefix}{key}.")
+            yield from flatten(value, f"{prefix}{key}.")
         elif value != {}:
             yield prefix + key, value

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rlctl.errors import ArtifactError, TaskError
 from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.processes.printed_lines import write_stderr
 from rlctl.recipe.recipe import Recipe
 from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
@@ -17,6 +18,7 @@ from rlctl.training.progress import Progress
 from rlctl.training.setup import set_up
 from rlctl.training.signals import StopSignals
 from rlctl.training.start import Start, find_start
+from rlctl.training.tracking import track
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +67,9 @@ def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> Tra
     best = _read_best(run)
     if run.status().get("status") != "finished":  # killed before the end was written
         status.write_end(run, start.step, progress, best)
+    if start.recipe.track is not None:
+        with track(run, start.recipe.track, write_stderr):
+            pass  # sends what the tracker has not received yet
     _raise_if_evaluations_failed(run, progress)
     note = "this run has finished: nothing to do; to train longer, give -n"
     if start.request.record:

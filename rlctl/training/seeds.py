@@ -20,6 +20,7 @@ from rlctl.run.group import Group, create_group, parse_seeds, read_group
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.start import check_arguments, preserve_process_state
+from rlctl.training.tracking import check_installed
 from rlctl.training.trainings import MakeTrainings, Trainings, make_local_trainings
 from rlctl.training.warm_start import find_source
 
@@ -104,6 +105,7 @@ def _begin(request: TrainRequest, seeds: str) -> Group:
     with preserve_process_state():
         registry.load(request.task)
     recipe = resolve(request.task, request.config, request.settings)
+    check_installed(recipe)
     if request.initial_policy is not None:
         find_source(request.initial_policy, recipe)
     return create_group(request, numbers)

@@ -25,6 +25,7 @@ from rlctl.run.directory import RunDirectory
 from rlctl.training import status
 from rlctl.training.display import Display
 from rlctl.training.start import Start
+from rlctl.training.tracking import track
 
 if TYPE_CHECKING:
     from rlctl.training.checkpoints import Checkpoints
@@ -75,6 +76,9 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
         if start.run is not None:
             evaluator.restore()
         display.run_folder(run)
+        if recipe.track is not None:
+            stack.enter_context(track(run, recipe.track, display.message))
+            stack.callback(display.phase, f"sending to {recipe.track}")
         try:
             yield TrainingLoop(learner, evaluator, checkpoints, display)
         except BaseException as error:

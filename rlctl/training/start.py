@@ -23,6 +23,7 @@ from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.callback import Callback
 from rlctl.training.callbacks import load_callbacks
+from rlctl.training.tracking import check_installed
 from rlctl.training.warm_start import find_source
 
 if TYPE_CHECKING:
@@ -107,6 +108,7 @@ def _find_new(request: TrainRequest) -> Start:
         recipe = resolve_with_stages(task, request.config, request.settings)
         recipe = own_modules.locate(recipe)
         callbacks = load_callbacks(recipe)
+    check_installed(recipe)
     note = describe_rounding(recipe)
     source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
     return Start(request, task, recipe, notes=(note,) if note else (), callbacks=callbacks, source=source)
@@ -124,6 +126,7 @@ def _find_checkpoint(request: TrainRequest) -> Start:
     lock = run.lock()  # before looking: a process that is training removes old checkpoints
     try:
         recipe = validate({**before.model_dump(by_alias=True), **request.settings}, "recipe")
+        check_installed(recipe)
         status = run.status()
         task = lookup.locate_task(status["task"], run)
         changes = describe_task_changes(status, task)

@@ -20,6 +20,7 @@ from rlctl.recipe.recipe import Recipe
 from rlctl.recipe.sources import find_config, resolve_with_stages
 from rlctl.run.directory import RunLock, create_group_folder
 from rlctl.training.start import preserve_process_state
+from rlctl.training.tracking import check_installed
 from rlctl.training.trainings import MakeTrainings, make_local_trainings
 from rlctl.tuning.space import Dimension, fill_parameters, list_usual_steps, list_values, nest, parse_search
 from rlctl.tuning.tune_request import TuneRequest
@@ -50,6 +51,7 @@ def tune(
 def _begin(request: TuneRequest, task: str) -> Tuning:
     with preserve_process_state():
         recipe = resolve_with_stages(task, request.config, request.settings)
+    check_installed(recipe)
     if request.storage is not None:
         _check_storage(request.storage)
     steps = [parse_search(request.search)] if request.search else list_usual_steps(recipe)
