@@ -53,5 +53,7 @@ def test_a_recipe_has_no_path_of_this_machine(tmp_path):
 
     run = RunDirectory(tmp_path)
     run.write_recipe(Recipe())
-    assert "$schema" not in run.recipe_file.read_text()
+    line, _, _ = run.recipe_file.read_text().partition("\n")
+    assert line == "# yaml-language-server: $schema=recipe.schema.json"
+    assert json.loads((tmp_path / "recipe.schema.json").read_text()) == VALIDATOR.schema
     assert run.recipe() == Recipe()
