@@ -1,7 +1,5 @@
 """`--on`: where the trainings of a group and the cells of a robustness map run."""
 
-from __future__ import annotations
-
 import functools
 import os
 from pathlib import Path
@@ -11,8 +9,7 @@ from rlctl.errors import UsageError
 from rlctl.evaluation.vary import PlayCells
 from rlctl.training.trainings import MakeTrainings, make_local_trainings
 
-VARIABLE = "RLCTL_ON"
-"""Environment variable that replaces the default, `local`."""
+VARIABLE = "RLCTL_ON"  # environment variable that replaces the default, `local`
 _NOT_ON_SLURM = {
     "tune": "each trial depends on the results of earlier ones",
     "eval": "a cell takes seconds, a job of SLURM waits longer",

@@ -3,8 +3,6 @@
 The exit code is 143 if SLURM shall requeue the job, otherwise that of the training.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import platform

@@ -36,19 +36,14 @@ _POLL_S = 5.0
 class CellWork:
     """What an actor needs to know to play cells."""
 
-    policy: bytes
-    """A policy file."""
-    suffix: str
-    """That of the policy file."""
-    spec: EnvSpec
-    """The nominal environment."""
+    policy: bytes  # a policy file
+    suffix: str  # that of the policy file
+    spec: EnvSpec  # the nominal environment
     request: EvalRequest
-    cwd: str | None
-    """The driver's current folder; None if nodes have a copy, in which they start."""
+    cwd: str | None  # the driver's current folder; None if nodes have a copy, in which they start
     cpus: int
     versions: dict[str, str]
-    source_sha256: str | None
-    """Hash of the task's file on the driver."""
+    source_sha256: str | None  # hash of the task's file on the driver
 
 
 class CellActor:

@@ -5,8 +5,6 @@ and signals: an attempt regularly sends it lines and receives a signal. An attem
 ends itself.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import platform
@@ -26,8 +24,7 @@ from rlctl.training.trainings import NextSignal, Trainings
 _BEAT_S = 0.5
 _POLL_S = 0.3
 _RETRY_S = 2.0
-_MOST_AT_ONCE = 256
-"""Trainings that the driver follows at the same time."""
+_MOST_AT_ONCE = 256  # trainings that the driver follows at the same time
 
 
 class Mailbox:

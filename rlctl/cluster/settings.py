@@ -1,7 +1,5 @@
 """`cluster.yaml`: the resources of a run on a cluster and the preparation of a node; every key is checked."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +9,18 @@ from pydantic import Field
 from rlctl.errors import RecipeError
 from rlctl.storage import validation, yaml_text
 
-FILE = Path("cluster.yaml")
-"""Read if it exists and no other file is given."""
+FILE = Path("cluster.yaml")  # read if it exists and no other file is given
 
 
 class ClusterSettings(pydantic.BaseModel, extra="forbid"):
     """The content of `cluster.yaml`."""
 
-    cpus: int = Field(2, ge=1)
-    """Cores of each run."""
-    retries: int = Field(3, ge=0, le=1000)
-    """How often a run is retried after its machine was lost or it was preempted."""
+    cpus: int = Field(2, ge=1)  # cores of each run
+    retries: int = Field(3, ge=0, le=1000)  # how often a run is retried after its machine was lost or it was preempted
     lease_s: float = Field(60.0, gt=0)
     """A run ends itself if the driver has not answered for this time [s]; not with `--detach`."""
-    sbatch: list[str] = []
-    """Options for `sbatch`, such as `--time=04:00:00`."""
-    setup: list[str] = []
-    """Shell commands that a SLURM node runs first, such as `source .venv/bin/activate`."""
+    sbatch: list[str] = []  # options for `sbatch`, such as `--time=04:00:00`
+    setup: list[str] = []  # shell commands that a SLURM node runs first, such as `source .venv/bin/activate`
 
 
 def read_settings(path: Path | None) -> ClusterSettings:

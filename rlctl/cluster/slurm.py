@@ -6,8 +6,6 @@ checkpoint and end after `lease_s`. With `--detach` there is no such file, and t
 follows an array again.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import shlex
@@ -30,16 +28,13 @@ from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.trainings import Detached, NextSignal, Trainings
 
-STOP_FILE = f"{JOBS}/stop"
-"""When this file exists, nodes save a checkpoint and stop their training."""
-BEAT_FILE = f"{JOBS}/beat"
-"""If it exists and does not change for `lease_s`, nodes do the same: the driver was killed."""
+STOP_FILE = f"{JOBS}/stop"  # when this file exists, nodes save a checkpoint and stop their training
+BEAT_FILE = f"{JOBS}/beat"  # if it exists and does not change for `lease_s`, nodes do the same: the driver was killed
 _POLL_S = 0.5
 _BEATS_PER_LEASE = 6
 _ASK_QUEUE_S = 15.0
 _ASK_AT_THE_END_S = 2.0
-_GONE_S = 120.0
-"""`squeue` may fail for this time, for example while the controller restarts."""
+_GONE_S = 120.0  # `squeue` may fail for this time, for example while the controller restarts
 _SCRIPT = """\
 #!/bin/bash
 #SBATCH --job-name={name} --array={array} --requeue --open-mode=append

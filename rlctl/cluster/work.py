@@ -3,8 +3,6 @@
 The node decides whether to begin or resume the run: a retry resumes it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import platform
@@ -38,23 +36,15 @@ class Work:
 
     seed: int
     task: str
-    request: dict[str, Any]
-    """A `TrainRequest` as JSON."""
-    root: str
-    """The folder of the group or tuning, absolute."""
-    cwd: str
-    """The driver's current folder; the paths of the task and the run are relative to it."""
-    command: list[str]
-    """The driver's command, for the run's record."""
-    token: str
-    """The content of the driver's file in the shared folder."""
+    request: dict[str, Any]  # a `TrainRequest` as JSON
+    root: str  # the folder of the group or tuning, absolute
+    cwd: str  # the driver's current folder; the paths of the task and the run are relative to it
+    command: list[str]  # the driver's command, for the run's record
+    token: str  # the content of the driver's file in the shared folder
     versions: dict[str, str]
-    source_sha256: str | None
-    """Hash of the task's file on the driver."""
-    settings: dict[str, Any]
-    """`ClusterSettings`."""
-    has_copy: bool = False
-    """Whether nodes start in a copy of the driver's current folder, and use it."""
+    source_sha256: str | None  # hash of the task's file on the driver
+    settings: dict[str, Any]  # `ClusterSettings`
+    has_copy: bool = False  # whether nodes start in a copy of the driver's current folder, and use it
 
     @property
     def folder(self) -> Path:

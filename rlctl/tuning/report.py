@@ -1,7 +1,5 @@
 """The results of a tuning, on the terminal and as JSON."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import shlex

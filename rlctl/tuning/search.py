@@ -1,7 +1,5 @@
 """A step of a tuning: Optuna proposes values, trainings try them; trainings below the median are stopped."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json
@@ -29,8 +27,7 @@ _EVALUATIONS_BEFORE_PRUNING = 2
 _TRIALS_BEFORE_PRUNING = 3
 _MOST_REPEATS = 50
 _KILLED = 128 + signal.SIGKILL
-_LABEL = "trial"
-"""User attribute of Optuna's trials: tuning and number of the trial."""
+_LABEL = "trial"  # user attribute of Optuna's trials: tuning and number of the trial
 _STATES = {"done": TrialState.COMPLETE, "pruned": TrialState.PRUNED, "failed": TrialState.FAIL}
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)

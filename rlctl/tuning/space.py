@@ -31,8 +31,7 @@ class Dimension:
     low: float = 0.0
     high: float = 0.0
     whole: bool = False
-    prefix: str = ""
-    """`lin_` before the number of a linear schedule."""
+    prefix: str = ""  # `lin_` before the number of a linear schedule
 
     @property
     def name(self) -> str:

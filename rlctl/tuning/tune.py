@@ -5,8 +5,6 @@ values so far. TPE (Bergstra et al. 2011, https://papers.nips.cc/paper/4443) pro
 it is below the median of the others at the same evaluation.
 """
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The arguments of `rlctl tune` as data. Imports nothing heavy."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path

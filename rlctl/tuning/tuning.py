@@ -1,7 +1,5 @@
 """The folder of a tuning: its search, trials and results; trials are ordinary runs in it."""
 
-from __future__ import annotations
-
 import dataclasses
 import glob
 from collections.abc import Mapping
@@ -29,17 +27,12 @@ _PART_JUDGED = 3  # the last third of the evaluations
 class Trial:
     """A training with some values of the hyperparameters."""
 
-    number: int
-    """From 0; trial 0 has the unchanged recipe."""
-    step: int
-    """Step of the search, from 1; 0 for the unchanged recipe."""
-    values: dict[str, Any]
-    """Values by dotted key, without those equal to the recipe's own."""
+    number: int  # from 0; trial 0 has the unchanged recipe
+    step: int  # step of the search, from 1; 0 for the unchanged recipe
+    values: dict[str, Any]  # values by dotted key, without those equal to the recipe's own
     state: Literal["begun", "done", "pruned", "failed"] = "begun"
-    score: float | None = None
-    """Mean of the metric over the last third of the evaluations."""
-    problem: str = ""
-    """Why it failed."""
+    score: float | None = None  # mean of the metric over the last third of the evaluations
+    problem: str = ""  # why it failed
 
 
 @dataclasses.dataclass
@@ -49,15 +42,12 @@ class Tuning:
     path: Path
     task: str
     config: Path | None
-    settings: dict[str, Any]
-    """Recipe keys from the command line, for every trial."""
+    settings: dict[str, Any]  # recipe keys from the command line, for every trial
     metric: Metric
     trials_per_step: int
-    seed: int
-    """Seed of the first trial and of Optuna; trial n has `seed` + n."""
+    seed: int  # seed of the first trial and of Optuna; trial n has `seed` + n
     steps: list[list[Dimension]]
-    storage: str | None = None
-    """URL of Optuna's storage, for its dashboard and for other tuners with an equal search."""
+    storage: str | None = None  # URL of Optuna's storage, for its dashboard and for other tuners with an equal search
     trials: list[Trial] = dataclasses.field(default_factory=list)
 
     def resolve_recipe(self) -> Recipe:
