@@ -44,7 +44,8 @@ def choose_cell_player(on: str | None, cluster: Path | None = None) -> PlayCells
         return None
     from rlctl.cluster.ray_cells import RayCells
 
-    return RayCells(address, read_settings(cluster))
+    settings = read_settings(cluster)
+    return lambda policy, request, specs: RayCells(address, settings, policy, request).play(specs)
 
 
 def _parse(on: str | None, verb: str) -> tuple[str, str]:

@@ -33,7 +33,7 @@ class _NodeTrainings(Trainings):
         beat = Standstill(lambda: _read(folder / BEAT_FILE))
 
         def must_stop() -> bool:
-            if (folder / BEAT_FILE).exists() and beat.seconds() > lease_s:
+            if beat.seconds() > lease_s and _read(folder / BEAT_FILE):
                 receive(f"error: the driver has not answered for {lease_s:g} s; --detach submits runs that need none")
                 return True
             return (folder / STOP_FILE).exists()

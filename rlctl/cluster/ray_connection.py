@@ -34,14 +34,8 @@ def connect(address: str, task: str, cpus: int) -> Any:
         atexit.register(shutil.rmtree, folder, ignore_errors=True)  # after Ray's own handler, which is registered later
         token = Path(folder) / "token"
         token.write_text(secrets.token_hex(32))  # its folder is this user's alone
-        os.environ.update(
-            {
-                "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
-                "RAY_TMPDIR": folder,
-                "RAY_AUTH_MODE": "token",
-                "RAY_AUTH_TOKEN_PATH": str(token),
-            }
-        )
+        os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_TMPDIR": folder}
+        os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token)}
     try:
         import ray
     except ModuleNotFoundError as error:
@@ -50,16 +44,15 @@ def connect(address: str, task: str, cpus: int) -> Any:
     if address:
         options["address"] = address
     else:
-        cores = max(cpus, available_cores())
-        options |= {"include_dashboard": False, "_node_ip_address": "127.0.0.1", "num_cpus": cores}
+        options |= {"include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+        options["num_cpus"] = max(cpus, available_cores())
     if is_copied(task):
         options["runtime_env"] = {"working_dir": os.getcwd(), "excludes": ["/runs"]}
     try:
         ray.init(**options)
     except Exception as error:  # ConnectionError, ValueError or RuntimeError
-        raise TaskError(
-            f"--on ray:{address or 'local'}: cannot be reached: {str(error).partition(chr(10))[0]}"
-        ) from None
+        reason = str(error).partition("\n")[0]
+        raise TaskError(f"--on ray:{address or 'local'}: cannot be reached: {reason}") from None
     return ray
 
 

@@ -68,8 +68,7 @@ def make_work(request: TrainRequest, token: str, settings: ClusterSettings) -> W
         cwd=os.getcwd(),
         command=sys.argv,
         token=token,
-        versions=collect_versions(),
-        source_sha256=identify_task(task)["source_sha256"],
+        **describe_driver(task),
         settings=settings.model_dump(),
     )
 
@@ -119,6 +118,11 @@ def _enter_folder(work: Work) -> None:
             f"{platform.node()}: {work.root}: this node has a different folder there, or none; "
             "share the runs folder and the current folder at the same paths"
         )
+
+
+def describe_driver(task: str) -> dict[str, Any]:
+    """Return what `compare_versions` on a node needs to know of this machine."""
+    return {"versions": collect_versions(), "source_sha256": identify_task(task)["source_sha256"]}
 
 
 def compare_versions(task: str, versions: Mapping[str, str], source_sha256: str | None) -> list[str]:
