@@ -11,6 +11,7 @@ import platform
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,14 @@ def train_on_node(mailbox: Any, content: dict[str, Any]) -> int:
     import ray
 
     work = Work(**content)
-    attempt = ray.get(mailbox.begin.remote(work.seed, platform.node()))
+    thread = ThreadPoolExecutor(1)
+
+    def ask(call: Any, timeout_s: float | None = None) -> int:
+        # If the main thread of a task waited in `ray.get`, Ray would give its cores to another task.
+        get: Callable[..., Any] = ray.get
+        return int(thread.submit(get, call, timeout=timeout_s).result())
+
+    attempt = ask(mailbox.begin.remote(work.seed, platform.node()))
     lines: list[str] = []
     heard_s = beat_s = time.monotonic()
     stopped = False
@@ -77,7 +85,7 @@ def train_on_node(mailbox: Any, content: dict[str, Any]) -> int:
         batch, lines[:] = lines[:], []
         lease_s = work.settings["lease_s"]
         try:
-            answer = int(ray.get(mailbox.beat.remote(work.seed, attempt, batch), timeout=lease_s))
+            answer = ask(mailbox.beat.remote(work.seed, attempt, batch), lease_s)
             heard_s = time.monotonic()
         except ray.exceptions.RayError:
             answer, lines[:0] = 0, batch
