@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,30 +26,27 @@ _NO_COLOR = [0.5, 0.5, 0.5, 1.0]  # of a geom that has a material, or none
 _XYZW = [1, 2, 3, 0]
 
 
-@dataclasses.dataclass(frozen=True)
-class _State:
-    """The part of the state that determines the poses of all bodies."""
-
-    qpos: Array
-    qvel: Array
-    mocap_pos: Array
-    mocap_quat: Array
-
-
 class MujocoReader:
-    """Reads the state after every step, without changing it."""
+    """Reads the poses of all bodies after every step, without changing the simulation."""
 
     def __init__(self, env: Env) -> None:
         self._env = env
-        self._states: list[_State] = []
-        self._markers: dict[str, list[Array]] = {}
 
     def read(self, step: int) -> None:
         """Read the world after a step; 0 is the reset."""
+        import mujoco
+
+        model, data = find_mujoco(self._env)  # type: ignore[misc]
         if step == 0:  # only now: a reset may load the model again
-            self._states, self._markers = [], {}
-        self._model, data = find_mujoco(self._env)  # type: ignore[misc]
-        self._states.append(_State(*(getattr(data, field.name).copy() for field in dataclasses.fields(_State))))
+            self._model, self._scratch = model, mujoco.MjData(model)
+            self._rows: list[list[Array]] = []
+            self._markers: dict[str, list[Array]] = {}
+        scratch = self._scratch
+        # After a step `xpos` is where bodies were before its last substep.
+        scratch.qpos[:], scratch.mocap_pos[:], scratch.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
+        mujoco.mj_kinematics(model, scratch)
+        parts = (scratch.xpos, scratch.xquat, scratch.geom_xpos, scratch.site_xpos, data.qpos, data.qvel)
+        self._rows.append([part.copy() for part in parts])
         inner = self._env.unwrapped
         if isinstance(inner, TaskEnv):
             markers = inner.task.markers()
@@ -62,104 +58,61 @@ class MujocoReader:
 
     def scene(self) -> Scene:
         """Return what was read since the last reset."""
-        grounds = _find_ground(self._model)
-        bodies = [_describe_ground(self._model, geom, len(self._states)) for geom in grounds]
-        robot, sites = _move_bodies(self._model, self._states, grounds)
-        complete = {name: np.stack(rows) for name, rows in self._markers.items() if len(rows) == len(self._states)}
-        return Scene([*bodies, robot], complete or sites)
+        model = self._model
+        positions, turns, centers, sites, qpos, qvel = (np.stack(part) for part in zip(*self._rows, strict=True))
+        grounds = _find_ground(model)
+        shown = [
+            geom for geom in range(model.ngeom) if model.geom_group[geom] < _VISIBLE_GROUPS and geom not in grounds
+        ]
+        links = [model.body(body).name or f"body {body}" for body in range(model.nbody)]
+        joints = [joint for joint in range(model.njnt) if model.jnt_type[joint] >= _enum("mjtJoint", "mjJNT_SLIDE")]
+        trunk = _find_trunk(model, positions)
+        robot = BodyMotion(
+            name="robot",
+            file=Path("MuJoCo model"),
+            joint_names=[joint_name(model, joint) for joint in joints],
+            joint_positions=qpos[:, model.jnt_qposadr[joints]],
+            joint_velocities=qvel[:, model.jnt_dofadr[joints]],
+            links=links,
+            positions=positions,
+            orientations=turns[:, :, _XYZW],
+            shapes=[shape for geom in shown if (shape := _describe_shape(model, geom, links)) is not None],
+            trunk=trunk,
+            box=_find_box(model, [geom for geom in shown if trunk is None or model.geom_bodyid[geom]], centers[0]),
+        )
+        names = {model.site(site).name: site for site in range(model.nsite)}
+        goals = {name: sites[:, site] for name, site in names.items() if "goal" in name or "target" in name}
+        complete = {name: np.stack(rows) for name, rows in self._markers.items() if len(rows) == len(positions)}
+        return Scene([*(_describe_ground(model, geom, centers[0]) for geom in grounds), robot], complete or goals)
+
+
+def _enum(kind: str, name: str) -> int:
+    import mujoco
+
+    return int(getattr(getattr(mujoco, kind), name))  # MuJoCo 4's enums compare with integers only after conversion
 
 
 def _find_ground(model: mujoco.MjModel) -> list[int]:
-    import mujoco
-
-    # MuJoCo 4's enums can be compared with integers only after conversion.
-    plane, box = (model.geom_type == int(kind) for kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX))
+    plane, box = (model.geom_type == _enum("mjtGeom", name) for name in ("mjGEOM_PLANE", "mjGEOM_BOX"))
     wide = box & (model.geom_size[:, :2].min(axis=1) > _GROUND_SIZE / 2)  # what PyBullet's plane.urdf is
     fixed = (model.body_weldid[model.geom_bodyid] == 0) & (model.geom_group < _VISIBLE_GROUPS)
     return [int(geom) for geom in np.flatnonzero((plane | wide) & fixed)]
 
 
-def _describe_ground(model: mujoco.MjModel, geom: int, rows: int) -> BodyMotion:
+def _describe_ground(model: mujoco.MjModel, geom: int, centers: Array) -> BodyMotion:
     name = model.geom(geom).name or f"plane {geom}"
-    return BodyMotion(
-        name=name,
-        file=Path(name),
-        ground_height=_find_height(model, geom),
-        terrain=None,
-        joint_names=[],
-        joint_positions=np.zeros((rows, 0)),
-        joint_velocities=np.zeros((rows, 0)),
-        links=[name],
-        positions=np.zeros((rows, 1, 3)),
-        orientations=np.tile([0.0, 0.0, 0.0, 1.0], (rows, 1, 1)),
-        shapes=[],
-        trunk=None,
-        box=(-np.ones(3), np.ones(3)),
-    )
+    thickness = model.geom_size[geom, 2] if model.geom_type[geom] == _enum("mjtGeom", "mjGEOM_BOX") else 0.0
+    return BodyMotion(name=name, file=Path(name), ground_height=float(centers[geom, 2] + thickness))
 
 
-def _find_height(model: mujoco.MjModel, geom: int) -> float:
-    import mujoco
-
-    scratch = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, scratch)
-    thickness = model.geom_size[geom][2] if model.geom_type[geom] == int(mujoco.mjtGeom.mjGEOM_BOX) else 0.0
-    return float(scratch.geom_xpos[geom][2] + thickness)
-
-
-def _move_bodies(
-    model: mujoco.MjModel, states: list[_State], grounds: list[int]
-) -> tuple[BodyMotion, dict[str, Array]]:
-    """Return the motion of all bodies, and of the sites named goal or target."""
-    import mujoco
-
-    scratch = mujoco.MjData(model)
-    shown = [geom for geom in range(model.ngeom) if model.geom_group[geom] < _VISIBLE_GROUPS and geom not in grounds]
-    names = {model.site(site).name: site for site in range(model.nsite)}
-    sites = {name: site for name, site in names.items() if "goal" in name or "target" in name}
-    site_positions: dict[str, list[Array]] = {name: [] for name in sites}
-    positions = np.empty((len(states), model.nbody, 3))
-    orientations = np.empty((len(states), model.nbody, 4))
-    centers = np.zeros((len(shown), 3))
-    for step, state in enumerate(states):
-        # After a step `xpos` is where bodies were before its last substep.
-        scratch.qpos[:], scratch.mocap_pos[:], scratch.mocap_quat[:] = state.qpos, state.mocap_pos, state.mocap_quat
-        mujoco.mj_kinematics(model, scratch)
-        positions[step], orientations[step] = scratch.xpos, scratch.xquat[:, _XYZW]
-        for name, site in sites.items():
-            site_positions[name].append(scratch.site_xpos[site].copy())
-        if step == 0:
-            centers = scratch.geom_xpos[shown].copy()
-    slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
-    joints = [joint for joint in range(model.njnt) if model.jnt_type[joint] >= slide]  # sliding ones and hinges
-    links = [model.body(body).name or f"body {body}" for body in range(model.nbody)]
-    trunk = _find_trunk(model, positions)
-    moving = [index for index, geom in enumerate(shown) if trunk is None or model.geom_bodyid[geom]] or [0]
-    radii = model.geom_rbound[shown][:, None] if shown else np.ones((1, 1))
-    centers = centers if shown else np.zeros((1, 3))
-    robot = BodyMotion(
-        name="robot",
-        file=Path("MuJoCo model"),
-        ground_height=None,
-        terrain=None,
-        joint_names=[joint_name(model, joint) for joint in joints],
-        joint_positions=np.stack([state.qpos[model.jnt_qposadr[joints]] for state in states]),
-        joint_velocities=np.stack([state.qvel[model.jnt_dofadr[joints]] for state in states]),
-        links=links,
-        positions=positions,
-        orientations=orientations,
-        shapes=[shape for geom in shown if (shape := _describe_shape(model, geom, links)) is not None],
-        trunk=trunk,
-        box=((centers - radii)[moving].min(axis=0), (centers + radii)[moving].max(axis=0)),
-    )
-    return robot, {name: np.stack(history) for name, history in site_positions.items()}
+def _find_box(model: mujoco.MjModel, geoms: list[int], centers: Array) -> tuple[Array, Array]:
+    radii, middle = model.geom_rbound[geoms, None], centers[geoms]
+    return ((middle - radii).min(axis=0), (middle + radii).max(axis=0)) if geoms else (-np.ones(3), np.ones(3))
 
 
 def _find_trunk(model: mujoco.MjModel, positions: Array) -> int | None:
     """Return the first body that travels on a free joint, or on a sliding joint without limits."""
-    import mujoco
-
-    free, slide = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+    free, slide = _enum("mjtJoint", "mjJNT_FREE"), _enum("mjtJoint", "mjJNT_SLIDE")
     for joint in range(model.njnt):
         kind, body = int(model.jnt_type[joint]), int(model.jnt_bodyid[joint])
         endless = kind == slide and not 0 < np.ptp(model.jnt_range[joint]) < _RAIL
@@ -170,24 +123,22 @@ def _find_trunk(model: mujoco.MjModel, positions: Array) -> int | None:
 
 def _describe_shape(model: mujoco.MjModel, geom: int, links: list[str]) -> Shape | None:
     """Describe a geom; None where it is transparent."""
-    import mujoco
-
     size, color, material = model.geom_size[geom].tolist(), model.geom_rgba[geom].tolist(), model.geom_matid[geom]
     if material >= 0 and color == _NO_COLOR:
         color = model.mat_rgba[material].tolist()
     if color[3] == 0:
         return None
-    kinds = mujoco.mjtGeom
-    known: dict[int, tuple[ShapeKind, tuple[float, ...]]] = {
-        int(kinds.mjGEOM_SPHERE): (ShapeKind.SPHERE, (size[0],)),
-        int(kinds.mjGEOM_ELLIPSOID): (ShapeKind.SPHERE, tuple(size)),
-        int(kinds.mjGEOM_BOX): (ShapeKind.BOX, tuple(2 * half for half in size)),
-        int(kinds.mjGEOM_CAPSULE): (ShapeKind.CAPSULE, (2 * size[1], size[0])),
-        int(kinds.mjGEOM_CYLINDER): (ShapeKind.CYLINDER, (2 * size[1], size[0])),
-        int(kinds.mjGEOM_PLANE): (ShapeKind.BOX, (2 * (size[0] or 2.0), 2 * (size[1] or 2.0), 0.002)),
-        int(kinds.mjGEOM_MESH): (ShapeKind.MESH, (1.0, 1.0, 1.0)),
+    known: dict[str, tuple[ShapeKind, tuple[float, ...]]] = {
+        "SPHERE": (ShapeKind.SPHERE, (size[0],)),
+        "ELLIPSOID": (ShapeKind.SPHERE, tuple(size)),
+        "BOX": (ShapeKind.BOX, tuple(2 * half for half in size)),
+        "CAPSULE": (ShapeKind.CAPSULE, (2 * size[1], size[0])),
+        "CYLINDER": (ShapeKind.CYLINDER, (2 * size[1], size[0])),
+        "PLANE": (ShapeKind.BOX, (2 * (size[0] or 2.0), 2 * (size[1] or 2.0), 0.002)),
+        "MESH": (ShapeKind.MESH, (1.0, 1.0, 1.0)),
     }
-    kind, extents = known.get(int(model.geom_type[geom]), (ShapeKind.OTHER, ()))
+    numbers = {_enum("mjtGeom", f"mjGEOM_{name}"): name for name in known}
+    kind, extents = known.get(numbers.get(int(model.geom_type[geom]), ""), (ShapeKind.OTHER, ()))
     mesh = _read_mesh(model, int(model.geom_dataid[geom])) if kind is ShapeKind.MESH else None
     position, orientation = model.geom_pos[geom].tolist(), model.geom_quat[geom][_XYZW].tolist()
     link = links[model.geom_bodyid[geom]]

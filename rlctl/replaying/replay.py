@@ -178,6 +178,8 @@ class _PolicySource:
         self._policy = load_policy(self._file)
         info = self._policy.info
         changes = parse_changes(request.settings) if request.settings else UNCHANGED
+        if request.sim is not None:  # as `rlctl eval --sim`: without the recipe's events, which may be PyBullet's only
+            changes = dataclasses.replace(changes, randomize=bool(changes.randomize))
         self.spec: EnvSpec = policy.locate(info.derive_spec(request.task, changes))
         if request.sim is not None:
             self.spec = dataclasses.replace(self.spec, sim=request.sim)

@@ -36,31 +36,35 @@ _LARGEST_PICTURE = 480  # [pixels]
 _JPEG_QUALITY = 80
 
 
-@dataclasses.dataclass(frozen=True)
+def _no_rows() -> Array:
+    return np.zeros((0, 0, 3))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class BodyMotion:
     """A body over T steps. Positions [m] and quaternions (x, y, z, w) are of link frames in the world frame."""
 
     name: str
     file: Path
-    ground_height: float | None
+    ground_height: float | None = None
     """Height of the upper face [m] if the body is the flat ground."""
-    terrain: Array | None
+    terrain: Array | None = None
     """Points of rough ground [m], world frame, shape (along x, along y, 3)."""
-    joint_names: list[str]
-    joint_positions: Array
+    joint_names: list[str] = dataclasses.field(default_factory=list)
+    joint_positions: Array = dataclasses.field(default_factory=_no_rows)
     """[rad or m], shape (T + 1, joints)."""
-    joint_velocities: Array
+    joint_velocities: Array = dataclasses.field(default_factory=_no_rows)
     """[rad/s or m/s], shape (T + 1, joints)."""
-    links: list[str]
+    links: list[str] = dataclasses.field(default_factory=list)
     """The base first."""
-    positions: Array
+    positions: Array = dataclasses.field(default_factory=_no_rows)
     """Shape (T + 1, links, 3)."""
-    orientations: Array
+    orientations: Array = dataclasses.field(default_factory=_no_rows)
     """Shape (T + 1, links, 4)."""
-    shapes: list[Shape]
-    trunk: int | None
+    shapes: list[Shape] = dataclasses.field(default_factory=list)
+    trunk: int | None = None
     """Index in `links` of the link that travels: a free base, or one on a sliding joint without limits; else None."""
-    box: tuple[Array, Array]
+    box: tuple[Array, Array] = (-np.ones(3), np.ones(3))
     """Lowest and highest corner [m] at the reset."""
 
 
