@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.bullet import pybullet
-from rlctl.task.motors import Motors
+from rlctl.task.properties import Properties
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -47,7 +47,7 @@ class Contacts(NamedTuple):
     """Distances [m], shape (points,), negative where the bodies overlap: `rewards.penetration` takes them."""
 
 
-class Body(Motors):
+class Body(Properties):
     """A body of the world. Joint arrays have one element per movable joint, in `joint_names` order."""
 
     def __init__(self, client: int, substeps: int, name: str, body_id: int, file: Path, fixed: bool) -> None:

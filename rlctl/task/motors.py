@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError
+from rlctl.errors import TaskError, check_name
 from rlctl.task.bullet import pybullet
 from rlctl.task.joints import Joints
-from rlctl.task.properties import Properties
 
 Array = NDArray[np.float64]
 _NUMBER = (int, float, np.number)
@@ -22,12 +22,11 @@ class _Plan(NamedTuple):
     # The part of a call of `drive_to` that stays the same in later calls.
     limits: tuple[object, ...]
     joints: list[int]
-    links: list[int]
     impulses: list[float]  # force of a substep [N m or N]
     gains: list[float]
 
 
-class Motors(Properties):
+class Motors:
     """The part of `Body` that drives its joints.
 
     `joints` are names, by default all in `joint_names` order. Arrays have one element per named joint; a limit may
@@ -35,6 +34,11 @@ class Motors(Properties):
     [m/s].
     """
 
+    client: int
+    id: int
+    file: Path
+    joint_names: list[str]
+    joint_indices: list[int]
     joint_low: Array
     joint_high: Array
     joint_max_force: Array
@@ -42,13 +46,27 @@ class Motors(Properties):
     _substeps: int
 
     def __init__(self) -> None:
-        super().__init__()
+        self.motor_strength: Array | None = None
+        """Fraction of the commanded force that the motors give, shape (joints,); None: all of it."""
+        self._built_strength: Array | None = None
         self._plans: dict[tuple[str, ...], _Plan] = {}
         self._commanded: list[float] | None = None  # by `set_torques`, of all joints; NaN: the motor's
 
+    def _save_nominal(self) -> None:
+        self._built_strength = self.motor_strength
+
     def _restore_nominal(self) -> None:
-        super()._restore_nominal()
+        self.motor_strength = self._built_strength
         self._commanded = None
+
+    def find_joints(self, joints: Collection[str] = ()) -> list[int]:
+        """Return the indices of joints, or of all, in joint arrays; raises `TaskError` for a name that is not there."""
+        for joint in joints:
+            if joint not in self.joint_names:  # checked first because tasks may name joints at every step
+                check_name(joint, self.joint_names, f"{self.file.name} has no joint", TaskError)
+        if not self.joint_names:
+            raise TaskError(f"{self.file.name} has no joints")
+        return [self.joint_names.index(joint) for joint in joints] or list(range(len(self.joint_names)))
 
     def drive_to(
         self,
@@ -73,14 +91,9 @@ class Motors(Properties):
             plan = self._plans[tuple(joints)] = self._plan_motors(joints, speeds, forces, gain)
         targets = self._read_values("positions", positions, len(plan.joints))
         self._forget_torques(plan.joints)
-        pybullet.setJointMotorControlArray(
-            self.id,
-            plan.links,
-            pybullet.POSITION_CONTROL,
-            targetPositions=targets,
-            forces=self._apply_strength(plan.impulses, plan.joints),
-            positionGains=plan.gains,
-            physicsClientId=self.client,
+        impulses = self._apply_strength(plan.impulses, plan.joints)
+        self._command(
+            plan.joints, "POSITION_CONTROL", targetPositions=targets, forces=impulses, positionGains=plan.gains
         )
 
     def _plan_motors(
@@ -91,16 +104,24 @@ class Motors(Properties):
         gain: float,
     ) -> _Plan:
         chosen = self.find_joints(joints)
-        links = [self.joint_indices[joint] for joint in chosen]
         given = self.joint_max_speed[chosen] if max_speed is None else max_speed
-        speeds = self._read_limits("max_speed", given, len(links))
+        self._limit_speeds(chosen, self._read_limits("max_speed", given, len(chosen)))
+        impulses = self._motor_impulses(chosen, max_force)
+        return _Plan((max_speed, max_force, gain), chosen, impulses, [gain] * len(chosen))
+
+    def _limit_speeds(self, joints: list[int], speeds: list[float]) -> None:
         # Only the call for one joint takes a speed; the motor keeps it when the call for all sets the targets.
-        for index, speed in zip(links, speeds, strict=True):
+        for joint, speed in zip(joints, speeds, strict=True):
+            index = self.joint_indices[joint]
             pybullet.setJointMotorControl2(
                 self.id, index, pybullet.POSITION_CONTROL, maxVelocity=speed, physicsClientId=self.client
             )
-        impulses = self._motor_impulses(chosen, max_force)
-        return _Plan((max_speed, max_force, gain), chosen, links, impulses, [gain] * len(links))
+
+    def _command(self, joints: list[int], mode: str, **values: Any) -> None:
+        links = [self.joint_indices[joint] for joint in joints]
+        pybullet.setJointMotorControlArray(
+            self.id, links, getattr(pybullet, mode), **values, physicsClientId=self.client
+        )
 
     def drive_at(
         self, velocities: Array, *, max_force: float | Sequence[float] | None = None, joints: Sequence[str] = ()
@@ -112,19 +133,17 @@ class Motors(Properties):
         chosen = self.find_joints(joints)
         targets = self._read_values("velocities", velocities, len(chosen))
         self._forget_torques(chosen)
-        pybullet.setJointMotorControlArray(
-            self.id,
-            [self.joint_indices[joint] for joint in chosen],
-            pybullet.VELOCITY_CONTROL,
-            targetVelocities=targets,
-            forces=self._apply_strength(self._motor_impulses(chosen, max_force), chosen),
-            physicsClientId=self.client,
-        )
+        forces = self._apply_strength(self._motor_impulses(chosen, max_force), chosen)
+        self._command(chosen, "VELOCITY_CONTROL", targetVelocities=targets, forces=forces)
 
     def _motor_impulses(self, joints: list[int], max_force: float | Sequence[float] | None) -> list[float]:
         # PyBullet computes a motor's impulse for the time of a whole step, and applies it in every substep.
         forces = self.joint_max_force[joints] if max_force is None else max_force
         return [force / self._substeps for force in self._read_limits("max_force", forces, len(joints))]
+
+    def _apply_strength(self, forces: list[float], joints: list[int]) -> list[float]:
+        # The forces that the motors give, one per index in `joints`.
+        return forces if self.motor_strength is None else (self.motor_strength[joints] * forces).tolist()
 
     def _read_limits(self, name: str, limits: float | Array | Sequence[float], count: int) -> list[float]:
         return self._read_values(name, [limits] * count if isinstance(limits, _NUMBER) else limits, count)
@@ -146,17 +165,9 @@ class Motors(Properties):
 
     def disable_motors(self, joints: Sequence[str] = ()) -> None:
         """Switch off the motors that PyBullet gives every joint, so that only `set_torques` moves the joints."""
-        links = [self.joint_indices[joint] for joint in self.find_joints(joints)]
-        count = len(links)
-        pybullet.setJointMotorControlArray(
-            self.id,
-            links,
-            pybullet.POSITION_CONTROL,
-            forces=[0.0] * count,
-            positionGains=[0.1] * count,
-            velocityGains=[0.1] * count,
-            physicsClientId=self.client,
-        )
+        chosen = self.find_joints(joints)
+        gains = [0.1] * len(chosen)
+        self._command(chosen, "POSITION_CONTROL", forces=[0.0] * len(chosen), positionGains=gains, velocityGains=gains)
 
     def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
         """Apply `torques` [N m or N] to the joints in all substeps of the next step.
@@ -166,15 +177,20 @@ class Motors(Properties):
         chosen = self.find_joints(joints)
         given = self._apply_strength(self._read_values("torques", torques, len(chosen)), chosen)
         if joints:
-            self._commanded = self._commanded or [math.nan] * len(self.joint_indices)
+            self._commanded = self._commanded or [math.nan] * len(self.joint_names)
             for joint, torque in zip(chosen, given, strict=True):
                 self._commanded[joint] = torque
         else:
             self._commanded = given
-        links = [self.joint_indices[joint] for joint in chosen] if joints else self.joint_indices
-        pybullet.setJointMotorControlArray(
-            self.id, links, pybullet.TORQUE_CONTROL, forces=given, physicsClientId=self.client
-        )
+        self._command(chosen, "TORQUE_CONTROL", forces=given)
+
+    def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
+        """Scale the force of the joints' motors by `factor`, until the next reset."""
+        built = np.ones(len(self.joint_names)) if self._built_strength is None else self._built_strength
+        strength = built.copy() if self.motor_strength is None else self.motor_strength.copy()
+        indices = self.find_joints(joints)
+        strength[indices] = factor * built[indices]
+        self.motor_strength = strength
 
     def cap_joint_speed(self, speed: float) -> None:
         """Limit the speed of all joints to `speed` [rad/s or m/s], whatever pushes them.

@@ -29,11 +29,13 @@ def refuse(name: str) -> NoReturn:
     raise UsageError(f"{name}: not in MuJoCo; this task runs in PyBullet only")
 
 
-class MujocoBody:
+class MujocoBody(Motors):
     """The methods of `Body`, for a body in MuJoCo; `child` is the `MjSpec` of its file."""
 
     def __init__(self, sim: MujocoSim, name: str, file: Path, fixed: bool, child: Any) -> None:
+        super().__init__()
         self._sim, self.name, self.file, self.fixed = sim, name, file, fixed
+        self._substeps = 1  # forces are not divided among substeps
         self.base_name: str = child.worldbody.first_body().name
         self.terrain = None
         self.geom_links: list[str] = [geom.parent.name for geom in child.geoms]
@@ -76,29 +78,22 @@ class MujocoBody:
         bodies = {body: model.body(body).name for body in range(model.nbody)}
         self.links = {name.removeprefix(prefix): body for body, name in bodies.items() if name.startswith(prefix)}
         self.link_names = {body: name for name, body in self.links.items()}
-        self.save()
+        self._plans.clear()
+        self._save_nominal()
         self.cap_joint_speed(self._speed_cap)
 
-    def save(self) -> None:
-        """Save the present friction as that of the built world, with full motor strength."""
+    def _save_nominal(self) -> None:
+        super()._save_nominal()
         self._built_friction = dict(self.friction)
-        self._strength = np.ones(len(self.joint_names))
 
-    def restore(self) -> None:
-        """Restore the built world's friction and motor strength."""
+    def _restore_nominal(self) -> None:
+        super()._restore_nominal()
         self.friction = dict(self._built_friction)
-        self._strength[:] = 1.0
 
     def find_link(self, link: str) -> int:
         """Return MuJoCo's index of a link; raises `TaskError` for an unknown name."""
         check_name(link, self.links, f"{self.file.name} has no link", TaskError)
         return self.links[link]
-
-    def find_joints(self, joints: Sequence[str] = ()) -> list[int]:
-        """As `Body.find_joints`."""
-        for joint in joints:
-            check_name(joint, self.joint_names, f"{self.file.name} has no joint", TaskError)
-        return [self.joint_names.index(joint) for joint in joints] or list(range(len(self.joint_names)))
 
     def find_trunk(self) -> str | None:
         """As `Body.find_trunk`, of free bodies."""
@@ -192,43 +187,16 @@ class MujocoBody:
         data.qpos[self._positions] = positions
         data.qvel[self._velocities] = 0.0 if velocities is None else velocities
 
-    def drive_to(
-        self,
-        positions: Array,
-        *,
-        max_speed: float | Sequence[float] | None = None,
-        max_force: float | Sequence[float] | None = None,
-        gain: float = 0.1,
-        joints: Sequence[str] = (),
-    ) -> None:
-        """As `Body.drive_to`."""
-        chosen, sim = self.find_joints(joints), self._sim
-        moved = self._velocities[chosen]
-        sim.target[moved], sim.speed[moved], sim.gain[moved] = positions, np.nan, gain
-        speeds = self.joint_max_speed[chosen] if max_speed is None else np.array(max_speed, float)
-        sim.top_speed[moved] = np.where(speeds > 0, speeds, np.inf)
-        self._set_force(chosen, max_force)
+    def _command(self, joints: list[int], mode: str, **values: Any) -> None:
+        sim, moved = self._sim, self._velocities[joints]
+        if mode == "TORQUE_CONTROL":
+            sim.torque[moved] = values["forces"]
+            return
+        sim.force[moved], sim.gain[moved] = values["forces"], values.get("positionGains", 0.0)
+        sim.target[moved], sim.speed[moved] = (values.get(f"target{of}", np.nan) for of in ("Positions", "Velocities"))
 
-    def drive_at(
-        self, velocities: Array, *, max_force: float | Sequence[float] | None = None, joints: Sequence[str] = ()
-    ) -> None:
-        """As `Body.drive_at`."""
-        chosen, sim = self.find_joints(joints), self._sim
-        moved = self._velocities[chosen]
-        sim.target[moved], sim.speed[moved], sim.top_speed[moved] = np.nan, velocities, np.inf
-        self._set_force(chosen, max_force)
-
-    def _set_force(self, joints: list[int], max_force: float | Sequence[float] | None) -> None:
-        forces = self.joint_max_force[joints] if max_force is None else np.array(max_force, float)
-        self._sim.force[self._velocities[joints]] = forces * self._strength[joints]
-
-    def disable_motors(self, joints: Sequence[str] = ()) -> None:
-        """As `Body.disable_motors`: MuJoCo gives joints no motors."""
-
-    def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
-        """As `Body.set_torques`."""
-        chosen = self.find_joints(joints)
-        self._sim.torque[self._velocities[chosen]] = np.array(torques) * self._strength[chosen]
+    def _limit_speeds(self, joints: list[int], speeds: list[float]) -> None:
+        self._sim.top_speed[self._velocities[joints]] = [speed or np.inf for speed in speeds]
 
     def cap_joint_speed(self, speed: float) -> None:
         """As `Body.cap_joint_speed`, but only for the joints."""
@@ -247,12 +215,6 @@ class MujocoBody:
         for number in {self.find_link(link) for link in links} or set(self.link_names):
             for name in ("body_mass", "body_inertia"):
                 getattr(model, name)[number] = factor * nominal[name][number]
-
-    def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
-        """As `Body.scale_motor_strength`."""
-        self._strength[self.find_joints(joints)] = factor
-
-    describe_joints: Any = Motors.describe_joints
 
 
 def _read(element: ElementTree.Element, path: str, name: str = "value", default: float = 0.0) -> float:

@@ -165,7 +165,7 @@ class MujocoSim:
         model.jnt_actfrclimited[:] = 0
         self._positions = np.zeros(model.nv, int)  # index in qpos, by degree of freedom
         self._positions[model.jnt_dofadr] = model.jnt_qposadr
-        self.velocity_cap = np.full(model.nv, np.inf)
+        self.velocity_cap, self.top_speed = np.full((2, model.nv), np.inf)  # of joints, of position motors
         self._forget_motors()
         self._dirty = True
         for body in self.bodies.values():
@@ -175,8 +175,7 @@ class MujocoSim:
     def _forget_motors(self) -> None:
         count = self.model.nv
         self.target, self.speed = np.full(count, np.nan), np.full(count, np.nan)  # of position, of velocity motors
-        self.gain, self.top_speed = np.zeros(count), np.full(count, np.inf)
-        self.force, self.torque, self.applied = np.zeros(count), np.zeros(count), np.zeros(count)
+        self.gain, self.force, self.torque, self.applied = np.zeros((4, count))
 
     def spread_friction(self) -> None:
         """Give contacts the product of the frictions of their links, as PyBullet computes it."""
@@ -213,8 +212,8 @@ class MujocoSim:
         friction_row = int(self.mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
         driven = ~np.isnan(self.target)
         for _ in range(self._substeps):
-            speeds = np.where(driven, self.gain * (self.target - data.qpos[self._positions]) / dt, self.speed)
-            speeds = np.clip(speeds, -self.top_speed, self.top_speed)
+            speeds = self.gain * (self.target - data.qpos[self._positions]) / dt
+            speeds = np.where(driven, np.clip(speeds, -self.top_speed, self.top_speed), self.speed)
             rows = np.flatnonzero(data.efc_type == friction_row)
             moved = data.efc_id[rows]
             # A friction row holds the velocity at 0; this reference makes it the motor's target, as in PyBullet.
@@ -231,7 +230,7 @@ class MujocoSim:
         self._gravity = self.model.opt.gravity.copy()
         self.nominal = {name: getattr(self.model, name).copy() for name in _CHANGEABLE}
         for body in self.bodies.values():
-            body.save()
+            body._save_nominal()
 
     def restore(self) -> None:
         """As `Sim.restore`; bit for bit."""
@@ -245,7 +244,7 @@ class MujocoSim:
         self._forget_motors()
         self._pushes.clear()
         for body in self.bodies.values():
-            body.restore()
+            body._restore_nominal()
         self.spread_friction()
 
     def shift_gravity(self, change: float) -> None:

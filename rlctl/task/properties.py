@@ -1,17 +1,14 @@
-"""Properties of a body that events change until the next reset: mass, friction, damping, colour, motor strength."""
+"""Properties of a body that events change until the next reset: mass, friction, damping, colour."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.bullet import pybullet
+from rlctl.task.motors import Motors
 
 _RAIL = 100.0  # [m]
 _RIGID = 1e12  # [N/m]
@@ -23,37 +20,30 @@ class _Dynamics(NamedTuple):
     inertia: tuple[float, float, float]  # [kg m^2]
 
 
-class Properties:
+class Properties(Motors):
     """The part of `Body` that events change: relative to the values of the built world, which a reset restores.
 
     `links` and `joints` are names, `base_name` included; by default all of them.
     """
 
-    client: int
-    id: int
-    file: Path
     base_name: str
     fixed: bool
-    joint_names: list[str]
-    joint_indices: list[int]
     _links: dict[str, int]
 
     def __init__(self) -> None:
+        super().__init__()
         self._dynamics_changed = self._damping_changed = self._colors_changed = self._contacts_changed = False
-        self.motor_strength: NDArray[np.float64] | None = None
-        """Fraction of the commanded force that the motors give, shape (joints,); None: all of it."""
-        self._built_strength: NDArray[np.float64] | None = None
 
     # PyBullet's saved states have positions and velocities, but none of these values.
 
     def _save_nominal(self) -> None:
+        super()._save_nominal()
         self._dynamics_changed = self._damping_changed = self._colors_changed = False
-        self._built_strength = self.motor_strength
         for values in ("_dynamics", "_damping", "_colors"):
             self.__dict__.pop(values, None)  # read again when needed: `build` may have set others
 
     def _restore_nominal(self) -> None:
-        self.motor_strength = self._built_strength
+        super()._restore_nominal()
         if self._dynamics_changed:
             self._dynamics_changed = False
             for link, (mass, friction, inertia) in self._dynamics.items():
@@ -92,10 +82,6 @@ class Properties:
             colors[shape[1], index] = shape[7]
         return colors
 
-    def _apply_strength(self, forces: list[float], joints: list[int]) -> list[float]:
-        # The forces that the motors give, one per index in `joints`.
-        return forces if self.motor_strength is None else (self.motor_strength[joints] * forces).tolist()
-
     def _change(self, link: int, **values: object) -> None:
         pybullet.changeDynamics(self.id, link, **values, physicsClientId=self.client)
 
@@ -107,15 +93,6 @@ class Properties:
             base = f"only its base, {self.base_name!r}"
             check_name(link, self._links, f"{self.file.name} has no link", TaskError, none=base)
         return self._links[link]
-
-    def find_joints(self, joints: Collection[str] = ()) -> list[int]:
-        """Return the indices of joints, or of all, in joint arrays; raises `TaskError` for a name that is not there."""
-        for joint in joints:
-            if joint not in self.joint_names:  # checked first because tasks may name joints at every step
-                check_name(joint, self.joint_names, f"{self.file.name} has no joint", TaskError)
-        if not self.joint_names:
-            raise TaskError(f"{self.file.name} has no joints")
-        return [self.joint_names.index(joint) for joint in joints] or list(range(len(self.joint_names)))
 
     def _part_index(self, part: str) -> int:
         # A link's index, or -1 for the base, by its name.
@@ -197,14 +174,6 @@ class Properties:
         for (link, shape), color in nominal.items():
             if link in chosen:
                 self._paint(link, shape, (*rgb, color[3]))
-
-    def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
-        """Scale the force of the joints' motors by `factor`, until the next reset."""
-        built = np.ones(len(self.joint_indices)) if self._built_strength is None else self._built_strength
-        strength = built.copy() if self.motor_strength is None else self.motor_strength.copy()
-        indices = self.find_joints(joints)
-        strength[indices] = factor * built[indices]
-        self.motor_strength = strength
 
     def _mass_centre(self, link: int) -> tuple[float, ...]:
         # [m], world frame; `link` is an index, -1 the base.
