@@ -31,7 +31,7 @@ class Motors:
 
     `joints` are names, by default all in `joint_names` order. Arrays have one element per named joint; a limit may
     also be one number for all. Forces are in [N m], of sliding joints in [N]; speeds in [rad/s], of sliding joints in
-    [m/s].
+    [m/s]. `_command` and `_limit_speeds` are PyBullet's; `MujocoBody` has its own.
     """
 
     client: int
