@@ -38,6 +38,7 @@ class Built:
     lines: Mapping[str, int] = dataclasses.field(default_factory=dict)  # method -> line in `file`
     accepts_seed: bool = True
     accepts_options: bool = True
+    model: str = ""  # Mass, joints and limits of a model in MuJoCo
     uses_pybullet: bool = False  # Whether a PyBullet client was connected once it was built
     waivers: Mapping[str, str] = dataclasses.field(default_factory=dict)  # rule -> reason
     file: str | None = None  # Where its class is written

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     import mujoco
 
 
+_SHOWN_JOINTS = 8
+
+
 def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
     """Return the MuJoCo `model` and `data` of an environment, or None."""
     library, inner = sys.modules.get("mujoco"), env.unwrapped
@@ -38,6 +41,20 @@ def describe_model(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     step = {"control_dt": float(dt)} if isinstance(dt, float | int) and dt > 0 else {}
     size = int(np.prod(env.action_space.shape or ()))
     return {**step, "joints": _describe_joints(simulation[0]) if size == simulation[0].nu else None}
+
+
+def describe_mujoco_model(env: gymnasium.Env[Any, Any]) -> str:
+    """Return the mass of a model in MuJoCo, and its joints with their limits; empty for any other environment."""
+    simulation = find_mujoco(env)
+    if simulation is None:
+        return ""
+    model, joints = simulation[0], []
+    for joint in np.flatnonzero(model.jnt_type >= int(sys.modules["mujoco"].mjtJoint.mjJNT_SLIDE)):
+        low, high = model.jnt_range[joint]
+        limits = f" {low:.3g} to {high:.3g}" if model.jnt_limited[joint] else ""
+        joints.append(f"{joint_name(model, joint)}{limits}")
+    more = f" and {len(joints) - _SHOWN_JOINTS} more" if len(joints) > _SHOWN_JOINTS else ""
+    return f"{total_mass(model):.4g} kg; joints: {', '.join(joints[:_SHOWN_JOINTS])}{more}"
 
 
 def _describe_joints(model: mujoco.MjModel) -> Joints | None:

@@ -5,6 +5,7 @@ from contextlib import closing
 import pytest
 
 from rlctl.environments.info import describe
+from rlctl.environments.mujoco_model import describe_mujoco_model
 from rlctl.environments.spec import EnvSpec
 
 pytest.importorskip("mujoco")
@@ -36,3 +37,15 @@ def test_limits_are_left_out_where_a_joint_has_none():
 def test_other_environments_have_no_model():
     info = about("Pendulum-v1")
     assert (info.control_dt, info.joints) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("task", "line"),
+    [
+        ("Reacher-v5", "0.07845 kg; joints: joint0, joint1 -3 to 3, target_x -0.27 to 0.27, target_y -0.27 to 0.27"),
+        ("Pendulum-v1", ""),
+    ],
+)
+def test_check_env_describes_a_model_in_one_line(task, line):
+    with closing(EnvSpec(task).make()) as env:
+        assert describe_mujoco_model(env) == line

@@ -20,6 +20,7 @@ from rlctl.checking.messages import Built, ChildMessage
 from rlctl.checking.records import RECORDING, Records, check, experiment
 from rlctl.environments import registry
 from rlctl.environments.dict_spaces import format_space
+from rlctl.environments.mujoco_model import describe_mujoco_model
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
 
 WAIVERS = "rlctl_ignore"  # The class attribute that waives rules: rule id -> reason
@@ -156,6 +157,7 @@ def describe_built(instance: Instance) -> Built:
         lines=_find_lines(author, file),
         accepts_seed=instance.accepts_seed,
         accepts_options=instance.accepts_options,
+        model=describe_mujoco_model(env),
         uses_pybullet=bool(find_clients()),
         waivers=_waivers(author),
         file=file,

@@ -118,6 +118,8 @@ def _facts(report: CheckReport) -> Iterator[str]:
         yield f"action {built.action_space}"
         if len(built.action_leaves) > 1:
             yield from _table(action_rows(report.records))
+        if built.model:
+            yield f"MuJoCo model {built.model}"
         yield f"speed {format_speed(report.records) or 'not measured'}"
         if built.events:
             from rlctl.environments.info import describe_randomization
