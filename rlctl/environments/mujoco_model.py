@@ -52,7 +52,7 @@ def describe_mujoco_model(env: gymnasium.Env[Any, Any]) -> str:
     for joint in np.flatnonzero(model.jnt_type >= int(sys.modules["mujoco"].mjtJoint.mjJNT_SLIDE)):
         low, high = model.jnt_range[joint]
         limits = f" {low:.3g} to {high:.3g}" if model.jnt_limited[joint] else ""
-        joints.append(f"{joint_name(model, joint)}{limits}")
+        joints.append(f"{joint_name(model, int(joint))}{limits}")
     more = f" and {len(joints) - _SHOWN_JOINTS} more" if len(joints) > _SHOWN_JOINTS else ""
     return f"{total_mass(model):.4g} kg; joints: {', '.join(joints[:_SHOWN_JOINTS])}{more}"
 
