@@ -60,11 +60,12 @@ def _list_warnings(status: Mapping[str, Any]) -> Iterator[str]:
 
 
 def describe_robustness(result: Robustness) -> Iterator[str]:
-    """Yield lines about the worst cell of all maps, the push test, and the command that measured them."""
+    """Yield lines about the worst cell of all maps and the nominal one, the push test, and the command."""
     if (worst := result.find_worst()) is not None:
-        where, cell = worst[0].name_cell(worst[1]), worst[1]
-        rate = "" if cell.success_rate is None else f"success {cell.success_rate:.1%}, "
-        yield f"worst cell, {result.episodes} episodes at {where}: {rate}return {cell.mean_return:.4g}"
+        where = f"worst cell, {result.episodes} episodes at {worst[0].name_cell(worst[1])}"
+        for name, outcome in ((where, worst[1]), ("with nothing varied", result.nominal)):
+            rate = "" if outcome.success_rate is None else f"success {outcome.success_rate:.1%}, "
+            yield f"{name}: {rate}return {outcome.mean_return:.4g}"
     if result.push is not None:
         yield result.push.verdict
     if result.command:

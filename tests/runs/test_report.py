@@ -145,6 +145,7 @@ def test_robustness_is_in_it_where_it_was_measured(group):
     robustness.write(group[0] / "robustness.json", result)
     page = write(group[0])
     assert "worst cell, 20 episodes at mass 0.6: success 30.0%, return 1" in page
+    assert "with nothing varied: success " in page
     (group[1] / "robustness.json").write_text("{")
     assert "robustness.json: damaged: " in write(group[1])
     assert 'aria-label="Success rate by mass"' in page
