@@ -52,9 +52,6 @@ class Biped(Legged):
     events = {  # with `randomize: true`, but for the push, which a recipe or a stage names
         "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
         "friction": Event("reset", events.set_friction, body="ground", friction=(0.3, 1.5)),
-        "contact_stiffness": Event(
-            "reset", events.set_contact_stiffness, body="ground", stiffness=(1.5e3, 1e5)
-        ),  # [N/m]
         "gravity": Event("reset", events.shift_gravity, change=(-0.5, 0.5)),  # [m/s^2]
         "joint_damping": Event("reset", events.scale_joint_damping, body="robot", joints=JOINTS, factor=(0.5, 1.5)),
         "motor_strength": Event("reset", events.scale_motor_strength, body="robot", joints=JOINTS, factor=(0.8, 1.0)),
