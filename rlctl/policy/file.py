@@ -131,6 +131,8 @@ def list_actor_tensors(algo: str, names: Iterable[str]) -> list[str]:
     """Return the names of the tensors that acting needs: those of the actor and of the normalisation."""
     names = list(names)
     prefixes = (GRAPH, "normalize/", *(f"policy/{prefix}" for prefix in _list_prefixes(algo)))
+    if GRAPH in names:  # a user's policy may have any names in it
+        prefixes += ("policy/mlp_extractor.",)
     return [name for name in names if name.startswith(prefixes)]
 
 

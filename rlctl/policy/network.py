@@ -46,12 +46,8 @@ class Network:
         }
         """Layers from each part of a raw observation to its features."""
         self.lstm = read.lstm("lstm_actor") if algo == "recurrent_ppo" else None
-        self.trunk, self.head = _read_actor(algo, read)
+        self.trunk, self.head = _read_actor(algo, read, graph_is_trunk=self.own is not None and self.lstm is None)
         """The head's output: the mean of the action, for TD3 and DDPG the action, logits, or DQN's values."""
-        if self.own is not None and self.lstm is None:
-            self.trunk = []
-            if algo in (*DETERMINISTIC, "dqn"):
-                self.head = []
         self.is_squashed = algo in ACTOR_CRITIC or bool(info.policy_kwargs.get("squash_output"))
         """Whether the network's actions are in [-1, 1] and are scaled to the bounds of the Box."""
         self.ends_with_tanh = self.is_squashed and algo not in DETERMINISTIC  # their head has the tanh
@@ -93,9 +89,12 @@ class Network:
         return self._std
 
 
-def _read_actor(algo: str, read: _Reader) -> tuple[list[Layer], list[Layer]]:
+def _read_actor(algo: str, read: _Reader, *, graph_is_trunk: bool) -> tuple[list[Layer], list[Layer]]:
+    """Return trunk and head; a user's graph contains the trunk, for deterministic actors and DQN the head too."""
+    if graph_is_trunk and algo in (*DETERMINISTIC, "dqn"):
+        return [], []
     if algo in SQUASHED_GAUSSIAN:
-        trunk = read.sequence("actor.latent_pi", end=read.activation)
+        trunk = [] if graph_is_trunk else read.sequence("actor.latent_pi", end=read.activation)
         if "actor.mu.weight" in read.tensors:
             return trunk, [read.linear("actor.mu")]
         limit = float(read.info.policy_kwargs.get("clip_mean", 2.0))
@@ -104,7 +103,8 @@ def _read_actor(algo: str, read: _Reader) -> tuple[list[Layer], list[Layer]]:
         return [], read.sequence("actor.mu", end=Activation("tanh"))
     if algo == "dqn":
         return [], read.sequence("q_net.q_net")
-    return read.sequence("mlp_extractor.policy_net", end=read.activation), [read.linear("action_net")]
+    trunk = [] if graph_is_trunk else read.sequence("mlp_extractor.policy_net", end=read.activation)
+    return trunk, [read.linear("action_net")]
 
 
 def read_normalization(policy: PolicyFile) -> dict[str, layers.Normalize]:

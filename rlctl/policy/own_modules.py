@@ -17,7 +17,7 @@ from rlctl.errors import ArtifactError, RecipeError, RlctlError
 from rlctl.recipe.recipe import Recipe
 from rlctl.storage import files
 
-KEYS = ("features_extractor_class", "activation_fn")  # the `policy_kwargs` that may name a class
+KEYS = ("policy_class", "features_extractor_class", "activation_fn")  # the `policy_kwargs` that may name a class
 VARIABLE = "RLCTL_NETWORKS"
 
 

@@ -85,16 +85,20 @@ def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
     return space
 
 
-def is_own_extractor(cls: type) -> bool:
-    """Return whether a features extractor is a user's own, not one of Stable-Baselines3."""
+def is_own(cls: type) -> bool:
+    """Return whether a policy or a features extractor is a user's own, not one of Stable-Baselines3."""
     return cls.__module__.partition(".")[0] not in ("stable_baselines3", "sb3_contrib")
 
 
 def describe_network(policy: BasePolicy) -> dict[str, Any]:
     """Return the constructor arguments of a network as plain data, for `build_network`."""
     described = {}
-    for name, value in {**policy._get_constructor_parameters(), **_list_missing_arguments(policy)}.items():
-        if name == "features_extractor_class" and is_own_extractor(value):
+    arguments = {**policy._get_constructor_parameters(), **_list_missing_arguments(policy)}
+    if is_own(type(policy)):  # its constructor may have others
+        own: Any = policy.own_arguments
+        arguments = {**own, "policy_class": type(policy)}
+    for name, value in arguments.items():
+        if name in ("policy_class", "features_extractor_class") and is_own(value):
             value = own_modules.describe_class(value)
         elif name in _LEFT_OUT or value is None:
             continue
@@ -135,6 +139,9 @@ def build_network(info: PolicyInfo) -> BasePolicy:
         kwargs["activation_fn"] = own_modules.find_class(name) if isinstance(name, dict) else ACTIVATIONS[name]
     if "features_extractor_class" in kwargs:
         kwargs["features_extractor_class"] = own_modules.find_class(kwargs["features_extractor_class"])
+    if "policy_class" in kwargs:
+        own: type[BasePolicy] = own_modules.find_class(kwargs.pop("policy_class"))
+        return own(network_space(observation_space), action_space, lr_schedule=lambda _: 0.0, **kwargs)
     return cls(
         network_space(observation_space),
         action_space,

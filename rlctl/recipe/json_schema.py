@@ -14,6 +14,7 @@ _GROUPED_DIGITS = {"type": "string", "pattern": r"^-?[0-9][0-9_]*(\.[0-9_]+)?$"}
 """`200_000`: rlctl reads a number, editors read text."""
 _BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
 _NUMBER = r"[0-9.]+(e[+-]?[0-9]+)?"
+_FOR_IMAGES = {"$ref": "#/$defs/_FeaturesExtractor"}
 _LINE = 120  # [characters]
 _KWARGS = ("algo_kwargs", "policy_kwargs")
 
@@ -66,6 +67,8 @@ def _convert(node: Any) -> Any:
         del known["title"]
     if isinstance(pattern := node.get("pattern"), str):  # written for people: lin_NUMBER
         known["pattern"] = f"^{pattern.replace('NUMBER', _NUMBER)}$"
+    if _FOR_IMAGES in node.get("anyOf", ()):  # the arguments of a user's class have any names
+        known["anyOf"] = [*node["anyOf"], {"type": "object"}]
     if node.get("type") in ("integer", "number"):
         about = {key: known.pop(key) for key in ("description", "default") if key in known}
         return {**about, "anyOf": [known, {"$ref": "#/$defs/GroupedDigits"}]}

@@ -55,15 +55,14 @@ def _to_plain(value: Any) -> Any:
 
 
 _OwnClass = Annotated[str, Field(pattern=r"^[^:]+:\w+$", json_schema_extra={"text": "FILE.py:CLASS or MODULE:CLASS"})]
-Activation = Annotated[
-    Literal["tanh", "relu", "elu", "silu"],
-    WrapValidator(lambda value, check: value if isinstance(value, str) and ":" in value else check(value)),
-]
+Activation = Literal["tanh", "relu", "elu", "silu"] | _OwnClass
 
 
 class _Network(Parameters):
     activation_fn: Activation = "relu"
-    """Activation function of the hidden layers, or a class of your own: `FILE.py:CLASS`, `MODULE:CLASS`."""
+    """Activation function of the hidden layers, or a class of torch or your own."""
+    policy_class: _OwnClass | None = None
+    """Your own policy: a subclass of SB3's policy of this algorithm, such as ActorCriticPolicy or SACPolicy."""
     features_extractor_class: _OwnClass | None = None
     """Your own features extractor before the layers of `net_arch`: a subclass of SB3's BaseFeaturesExtractor."""
     features_extractor_kwargs: Annotated[

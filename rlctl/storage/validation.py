@@ -102,7 +102,8 @@ def explain(
     if unit:
         expected = f"{expected.removesuffix(' or null')} [{unit}]"
     examples = f", such as {' or '.join(part['examples'])}" if "examples" in part else ""
-    close = did_you_mean(value, part.get("enum", ())) if isinstance(value, str) else ""
+    words = [word for option in (part, *part.get("anyOf", ())) for word in option.get("enum", ())]
+    close = did_you_mean(value, words) if isinstance(value, str) else ""
     got = repr(short_repr(value)) if isinstance(value, str) else short_repr(value)
     return f"{label}expected {expected}{examples}, got {got}{close and f'.{close}'}"
 

@@ -21,7 +21,8 @@ from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
 from rlctl.recipe.recipe import ON_POLICY, NormalizeSettings, Recipe
 from rlctl.storage import memory
 from rlctl.training.hindsight import replay_arguments
-from rlctl.training.own_networks import write_graph
+from rlctl.training.own_networks import check_policy_class, write_graph
+from rlctl.training.snapshot import pack
 from rlctl.training.vec_env import WorkerVecEnv
 
 # The system provides a replay buffer's memory only when it is written, so one that is too large fails hours later.
@@ -46,11 +47,16 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     check_spaces(recipe.algo, env.observation_space, env.action_space)
     _check_memory(recipe, env)
     keep_compiler_out()
+    policy_kwargs = _policy_kwargs(recipe)
+    own_policy = policy_kwargs.pop("policy_class", None)
+    base = next(iter(cls.policy_aliases.values()))
+    if own_policy is not None and not issubclass(own_policy, base):
+        raise RecipeError(f"policy_kwargs.policy_class: {own_policy.__name__} is not a subclass of {base.__name__}")
     try:
         model: BaseAlgorithm = cls(
-            name,
+            own_policy or name,
             wrap_normalize(env, recipe.normalize, kwargs.get("gamma", 0.99)),
-            policy_kwargs=_policy_kwargs(recipe),
+            policy_kwargs=policy_kwargs,
             seed=recipe.seed,
             device=device,
             **kwargs,
@@ -59,6 +65,13 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
             model.policy_delay = recipe.algo_kwargs.get("policy_delay", 1)  # type: ignore[attr-defined]
         _use_fused_adam(model)
         write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # reports faults of a user's network
+        if own_policy is not None:
+            own_arguments: Any = {
+                **model.policy_kwargs,
+                **({"use_sde": True} if getattr(model, "use_sde", False) else {}),
+            }
+            model.policy.own_arguments = own_arguments
+            check_policy_class(model, recipe.algo, pack(model, recipe.algo, env.workers.spec, env.workers.info))
         return model
     except (RlctlError, KeyboardInterrupt):
         raise

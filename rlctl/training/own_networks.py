@@ -15,18 +15,52 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from rlctl.environments.dict_spaces import SINGLE, join, split, split_space
 from rlctl.errors import RecipeError, describe_exception, short_repr
 from rlctl.exporting.layers import OPSET
-from rlctl.policy.file import ACTOR_CRITIC, GRAPH, Tensors
+from rlctl.policy.file import ACTOR_CRITIC, GRAPH, PolicyFile, Tensors
 from rlctl.policy.own_graph import OBSERVATION, OUTPUT
-from rlctl.policy.torch_policy import ACTIVATIONS, is_own_extractor
+from rlctl.policy.players.policy_player import PolicyPlayer
+from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy, is_own
 
+_COMPARED = 10
+"""Number of random observations."""
+_HEADS = {"dqn": "q_net", "td3": "actor.mu", "ddpg": "actor.mu"} | dict.fromkeys(
+    ("sac", "tqc", "crossq"), "actor.mu and actor.log_std"
+)
 _CACHE = "rlctl_own_graph"
 """Attribute of a policy: its graph does not change with its weights."""
 
 
 def has_own_parts(policy: Any) -> bool:
-    """Return whether a policy has a user's own features extractor or activation function."""
+    """Return whether a policy is a user's own, or has its own features extractor or activation function."""
     own_activation = getattr(policy, "activation_fn", None) not in (None, *ACTIVATIONS.values())
-    return own_activation or is_own_extractor(policy.features_extractor_class)
+    return own_activation or is_own(type(policy)) or is_own(policy.features_extractor_class)
+
+
+def check_policy_class(model: Any, algo: str, policy: PolicyFile) -> None:
+    """Raise `RecipeError` if a user's policy class acts otherwise than its exported graph and SB3's heads.
+
+    `policy` is the packed policy of `model`.
+    """
+    network, name = model.policy, type(model.policy).__name__
+    space = policy.info.env.spaces()[0]
+    space.seed(0)
+    try:
+        for method, owner in (
+            ("_get_action_dist_from_latent", network),
+            ("get_action_dist_params", getattr(network, "actor", None)),
+        ):
+            if (own := getattr(owner, method, None)) is not None and is_own(own):
+                raise ValueError(f"it overrides {method}")
+        reference, player = TorchPolicy(policy, network), PolicyPlayer(policy.actor_only())
+        for step in range(_COMPARED):
+            sample = space.sample()
+            expected, action = reference.predict(sample), player.act(sample, 0, step)[1]
+            if not np.allclose(action, expected, rtol=1e-4, atol=1e-5):
+                raise ValueError(f"it chooses the action {short_repr(expected)}, its graph {short_repr(action)}")
+    except Exception as error:  # any exception from the user's class
+        raise RecipeError(
+            f"policy_kwargs.policy_class: {name} cannot be exported as ONNX for acting: {short_repr(str(error), 200)}. "
+            f"Change only what is before Stable-Baselines3's {_HEADS.get(algo, 'action_net')}"
+        ) from error
 
 
 def write_graph(model: Any, algo: str, raw_space: spaces.Space[Any]) -> Tensors:

@@ -106,7 +106,11 @@ NETWORK = "expected [64, 64] or {pi: [64, 64], vf: [64, 64]}, got "
             "expected a list, each element a whole number in [1, 65536] or null, got {'pi': [64], 'qf':",
         ),
         ("ppo", "log_std_init=100", "expected a number in [-20, 10], got 100"),
-        ("ppo", "activation_fn=[tanh]", "expected tanh or relu or elu or silu, got ['tanh']"),
+        (
+            "ppo",
+            "activation_fn=[tanh]",
+            "expected tanh or relu or elu or silu or FILE.py:CLASS or MODULE:CLASS, got ['tanh']",
+        ),
         ("ppo", "features_extractor_kwargs={features_dim: 0}", "expected a whole number in [1, 65536], got 0"),
         (
             "ppo",
@@ -120,7 +124,7 @@ NETWORK = "expected [64, 64] or {pi: [64, 64], vf: [64, 64]}, got "
             "lstm_kwargs={device: meta}",
             "no key 'policy_kwargs.lstm_kwargs.device' for recurrent_ppo. Keys here: dropout, bias.",
         ),
-        ("ppo", "activation_fn=tahn", "elu or silu, got 'tahn'. Did you mean 'tanh'?"),
+        ("ppo", "activation_fn=tahn", "silu or FILE.py:CLASS or MODULE:CLASS, got 'tahn'. Did you mean 'tanh'?"),
         ("ppo", "gama=0.9", "no key 'algo_kwargs.gama' for ppo. Did you mean 'gamma'? Keys here: learning_rate, "),
         ("dqn", "use_sde=true", "no key 'algo_kwargs.use_sde' for dqn."),
         ("tqc", "n_quantiles=0", "expected a whole number in [1, 10000], got 0"),

@@ -7,6 +7,7 @@ import jsonschema
 import pytest
 
 from rlctl.recipe.json_schema import build_json_schema
+from rlctl.recipe.recipe import ALGORITHMS
 from rlctl.storage import yaml_text
 
 ROOT = Path(__file__).parents[2]
@@ -29,10 +30,20 @@ def test_recipes_are_valid(file):
         ({"algo": "pp"}, ["algo"]),
         ({"algo_kwargs": {"tau": 0.1}}, ["algo_kwargs"]),  # ppo has none
         ({"algo": "sac", "algo_kwargs": {"n_steps": "no"}}, ["algo_kwargs", "n_steps"]),
+        ({"policy_kwargs": {"activation_fn": "sine"}}, ["policy_kwargs", "activation_fn"]),
+        ({"callbacks": ["my.py:Patience"]}, ["callbacks"]),
     ],
 )
 def test_mistakes_are_found(recipe, place):
     assert place in [list(error.path) for error in VALIDATOR.iter_errors(recipe)]
+
+
+def test_classes_of_the_user_are_valid():
+    own = {"activation_fn": "torch.nn:Mish", "policy_class": "my_nets.py:Own", "net_arch": [8]}
+    extractor = {"features_extractor_class": "my_nets.py:Gated", "features_extractor_kwargs": {"heads": 3}}
+    recipe = {"policy_kwargs": {**own, **extractor}, "callbacks": {"my.py:Patience": {"factor": 0.5}, "mine:Log": None}}
+    for algo in ALGORITHMS:
+        assert [error.message for error in VALIDATOR.iter_errors({**recipe, "algo": algo})] == []
 
 
 def test_what_each_algorithm_has():

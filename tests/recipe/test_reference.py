@@ -40,6 +40,7 @@ def of_model(model):
     if "activation_fn" in found:
         found["activation_fn"] = ACTIVATIONS[found["activation_fn"]]
         assert found.pop("features_extractor_class") is None  # SB3's default, which follows from the observation
+        assert found.pop("policy_class") is None  # SB3's argument of the algorithm
     return found
 
 

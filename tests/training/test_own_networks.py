@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from rlctl.environments.info import describe
@@ -46,6 +47,7 @@ TINY = {
         ("ppo", "dict", "multidiscrete", {"features_extractor_class": Gated}),
         ("sac", "image", "box", {"features_extractor_class": Gated}),
         ("td3", "vector", "box", {"activation_fn": Wave}),
+        ("ppo", "vector", "box", {"activation_fn": torch.nn.PReLU}),
         ("dqn", "discrete", "discrete", {"features_extractor_class": Gated, "activation_fn": Wave}),
         ("recurrent_ppo", "vector", "box", {"features_extractor_class": Gated}),
     ],
@@ -72,7 +74,7 @@ def test_it_acts_and_exports_as_torch_does(algo, observation, action, own, tmp_p
         np.testing.assert_allclose(player.act(sample, 0, step)[1], expected, atol=2e-6)
         np.testing.assert_allclose(exported.predict(sample), expected, atol=2e-6)
     with pytest.raises(
-        UsageError, match=r"^export --c: the layer (Gated|Wave) of policy_kwargs\.\w+ cannot be written"
+        UsageError, match=r"^export --c: the layer (Gated|Wave|PReLU) of policy_kwargs\.\w+ cannot be written"
     ):
         write_c(policy, "policy")
 
@@ -171,6 +173,64 @@ def test_a_module_that_changed_is_not_resumed(train, resume, tmp_path):
 def test_what_is_wrong_with_a_class(train, name, problem):
     with pytest.raises(RecipeError, match=problem):
         train("Line", {**TINY, "policy_kwargs": {"features_extractor_class": name}})
+
+
+OWN_POLICIES = {
+    "ppo": ("Line", "OwnActorCritic", {"features_extractor_class": f"{NETS}:Gated"}),
+    "sac": ("Line", "OwnSac", {"net_arch": [8]}),
+    "td3": ("Line", "OwnTd3", {"net_arch": [8], "activation_fn": "torch.nn:PReLU"}),
+    "dqn": ("Discrete", "OwnDqn", {"net_arch": [8]}),
+    "recurrent_ppo": ("Line", "OwnRecurrent", {"lstm_hidden_size": 8}),
+}
+
+
+@pytest.mark.parametrize(
+    "algo", ["ppo", "sac", *(pytest.param(algo, marks=pytest.mark.slow) for algo in ("td3", "dqn", "recurrent_ppo"))]
+)
+def test_an_own_policy_class_trains_resumes_and_exports(train, resume, algo):
+    env, name, kwargs = OWN_POLICIES[algo]
+    networks = {**kwargs, "policy_class": f"{NETS}:{name}"}
+    given = {**TINY, "eval": {"episodes": 2, "every_steps": 64}, "algo": algo, "policy_kwargs": networks}
+    if "ppo" not in algo:
+        given["algo_kwargs"] = {"learning_starts": 16, "batch_size": 8, "buffer_size": 200}
+    first = train(env, {**given, "total_timesteps": 64})
+    described = PolicyFile.read_info(first.run.last_policy).policy_kwargs["policy_class"]
+    assert described["class"] == name
+    assert described["file"] == str(NETS)
+    resume(first, total_timesteps=128)
+    whole = train(env, given).run
+    ours, theirs = (PolicyFile.read(run.last_policy).tensors for run in (first.run, whole))
+    assert ours.keys() == theirs.keys()
+    (report,) = export_policy(ExportRequest(str(whole.path)))
+    assert report.agreement.agrees
+    assert report.closed_loop.agrees
+    assert all(np.array_equal(ours[key], theirs[key]) for key in ours)
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("OwnDistribution", "cannot be exported as ONNX for acting: it overrides _get_action_dist_from_latent. Change"),
+        ("OwnChoice", r"OwnChoice cannot be exported .* it chooses the action .*, its graph"),
+        (
+            "NoHead",
+            r"NoHead cannot be exported as ONNX for acting: .*Change only what is before Stable-Baseli.*action_net",
+        ),
+        ("PolicyRaises", r"ppo cannot be used here: 'bodies'"),
+        ("OwnSac", "OwnSac is not a subclass of ActorCriticPolicy"),
+        ("Gated", "Gated is not a subclass of ActorCriticPolicy"),
+    ],
+)
+def test_what_is_wrong_with_a_policy_class(train, tmp_path, name, problem):
+    with pytest.raises(RecipeError, match=problem):
+        train("Line", {**TINY, "policy_kwargs": {"policy_class": f"{NETS}:{name}"}})
+    assert not list((tmp_path / "runs").glob("*"))
+
+
+def test_an_own_activation_of_a_recurrent_policy_is_refused(train):
+    given = {**TINY, "algo": "recurrent_ppo", "policy_kwargs": {"activation_fn": "torch.nn:Mish"}}
+    with pytest.raises(UsageError, match="a network of a recurrent policy with activation 'Mish' is not supported"):
+        train("Line", given)
 
 
 def test_arguments_are_checked_without_an_own_class():
