@@ -24,10 +24,11 @@ class TrainFlags(RecipeFlags):
 
     def merge(self) -> dict[str, Any]:
         """Return all keys and values; the named callbacks come after those of `--set`."""
+        from rlctl.environments.spec import merge
+
         settings = super().merge()
-        if names := settings.pop("callback"):
-            settings["callbacks"] = {**settings.get("callbacks", {}), **dict.fromkeys(names)}
-        return settings
+        names = settings.pop("callback")
+        return merge(settings, {"callbacks": dict.fromkeys(names)}) if names else settings
 
 
 @command

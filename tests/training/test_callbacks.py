@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from rlctl.cli.train import TrainFlags
 from rlctl.errors import Interrupted, RecipeError, TaskError, UsageError
+from rlctl.policy import own_modules
+from rlctl.recipe.recipe import validate
 from rlctl.run.directory import RunDirectory
+from rlctl.run.train_request import TrainRequest
 from tests.training import own_callbacks
 from tests.training.comparing import Killed, assert_same_run
 from tests.training.conftest import SMALL_PPO
@@ -133,6 +137,15 @@ def test_the_example_of_the_page(train, tmp_path):
         best, failures = (value, 0) if value > best else (best, failures + 1)
     assert rates >= {3e-4}
     assert (failures == 3) == ("stop_reason" in run.status())
+
+
+def test_the_flag_is_a_key_of_the_recipe_and_part_of_the_request():
+    flags = TrainFlags(settings=["callbacks={a.py:A: {b: 1}}"], callback=["a.py:C", "d:E"])
+    request = TrainRequest("reach", settings=flags.merge())
+    names = {"a.py:A": {"b": 1}, "a.py:C": None, "d:E": None}
+    assert TrainRequest.from_json(request.to_json()).settings == {"callbacks": names}
+    recipe = own_modules.locate(validate(request.settings))
+    assert list(recipe.callbacks) == [f"{Path.cwd()}/a.py:A", f"{Path.cwd()}/a.py:C", "d:E"]
 
 
 def test_wrong_arguments_and_parameters_are_named(train):

@@ -144,13 +144,14 @@ def test_a_policy_is_replayed_without_its_module(train, tmp_path):
     run_replay(ReplayRequest(None, verify=episode.episode)).check()
 
 
-def test_a_module_that_changed_is_not_resumed(train, resume, tmp_path):
+@pytest.mark.parametrize(("key", "name"), [("features_extractor_class", "Gated"), ("policy_class", "OwnActorCritic")])
+def test_a_module_that_changed_is_not_resumed(train, resume, tmp_path, key, name):
     nets = tmp_path / "changing.py"
     shutil.copy(NETS, nets)
-    result = train("Line", {**TINY, "policy_kwargs": {"features_extractor_class": f"{nets}:Gated"}})
+    result = train("Line", {**TINY, "policy_kwargs": {key: f"{nets}:{name}"}})
     nets.write_text(nets.read_text() + "# changed\n")
     with pytest.raises(
-        ArtifactError, match=r"changing\.py, with Gated, is not the file that it was trained with; put it"
+        ArtifactError, match=rf"changing\.py, with {name}, is not the file that it was trained with; put it"
     ):
         resume(result, total_timesteps=256)
 
