@@ -70,7 +70,7 @@ class Callbacks:
         """Call `on_start`; a checkpoint of the step `resumed_at` is restored afterwards."""
         restored = copy.deepcopy(vars(self._progress))
         self._training.model.num_timesteps = resumed_at or 0
-        self._call("on_start")
+        self.call("on_start")
         if resumed_at is not None:
             vars(self._progress).update(restored)
 
@@ -78,23 +78,16 @@ class Callbacks:
         """Call `on_segment`; `row` is the row of metrics that is due."""
         if self._training.steps > self._progress.last_segment:
             self._training.metrics, self._training.episodes = row, episodes
-            self._call("on_segment")
+            self.call("on_segment")
             self._progress.last_segment = self._training.steps
 
     def finish_evaluation(self, row: Mapping[str, Any]) -> None:
         """Call `on_evaluation` with the row of `evals.csv`."""
         self._training.evaluation = row
-        self._call("on_evaluation")
+        self.call("on_evaluation")
 
-    def finish_checkpoint(self) -> None:
-        """Call `on_checkpoint`."""
-        self._call("on_checkpoint")
-
-    def end(self) -> None:
-        """Call `on_end`."""
-        self._call("on_end")
-
-    def _call(self, moment: str) -> None:
+    def call(self, moment: str) -> None:
+        """Call a method of all callbacks, such as `on_end`."""
         for name, callback in self._callbacks.items():
             self.running = f"callback {name}, {moment}"
             try:
@@ -117,30 +110,22 @@ class Callbacks:
                     tensors |= arrays
                 except TypeError:
                     unsaved.append(f"{key} is a {type(value).__name__}")
-            entries.append({"state": structure, "unsaved": unsaved})
-            self._report(_describe_unsaved(name, unsaved))
+            problem = f"callback {name}: its {', its '.join(unsaved)}, which a checkpoint does not store"
+            entries.append({"state": structure, "inexact": problem if unsaved else ""})
+            if unsaved and problem not in self._reported:
+                self._reported.add(problem)
+                self._warn(f"warning: {problem}; a resume will not be bit-exact; see docs/callbacks.md")
         return tensors, entries
-
-    def _report(self, problem: str) -> None:
-        if problem and problem not in self._reported:
-            self._reported.add(problem)
-            self._warn(f"warning: {problem}; a resume will not be bit-exact; see docs/callbacks.md")
 
     def restore(self, tensors: Tensors, entries: Sequence[Mapping[str, Any]]) -> list[str]:
         """Restore what `take` returned; return the reasons why the resume is not bit-exact."""
         from rlctl.training.snapshot import unflatten
 
-        problems = []
         for (name, callback), entry in zip(self._callbacks.items(), entries, strict=False):
             try:
                 state = {key: unflatten(structure, tensors) for key, structure in entry["state"].items()}
-                problems.append(_describe_unsaved(name, entry["unsaved"]))
             except (KeyError, ValueError, TypeError, AttributeError) as error:
                 raise ArtifactError(f"state of callback {name}: damaged: {error!r}") from None
             _call(name, lambda callback=callback, state=state: callback.load_state_dict(state), "load_state_dict: ")  # type: ignore[misc]
         self._training.apply_parameters()
-        return [problem for problem in problems if problem]
-
-
-def _describe_unsaved(name: str, unsaved: Sequence[str]) -> str:
-    return f"callback {name}: its {', its '.join(unsaved)}, which a checkpoint does not store" if unsaved else ""
+        return [entry["inexact"] for entry in entries if entry.get("inexact")]

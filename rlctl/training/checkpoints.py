@@ -108,7 +108,7 @@ class Checkpoints:
         if is_saved:
             self._report_saved_again()
             self.attempt("old checkpoints", self._folders.remove_old)
-            self.callbacks.finish_checkpoint()
+            self.callbacks.call("on_checkpoint")
         now = time.monotonic()
         self._next_s = now + (1 + self._uncounted_checkpoints) * (now - began) / CHECKPOINT_TIME_SHARE
         self._uncounted_checkpoints = 0

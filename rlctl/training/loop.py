@@ -149,5 +149,5 @@ class TrainingLoop:
             ):
                 break
         written = self.evaluator.episodes.record(recordings)
-        self.callbacks.end()
+        self.callbacks.call("on_end")
         return written
