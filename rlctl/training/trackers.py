@@ -64,8 +64,10 @@ class _Trackio(_Wandb):
     def __init__(self, run: TrackedRun) -> None:
         trackio = self._library = importlib.import_module("trackio")
         warnings.showwarning = lambda message, *_: run.warn(str(message))
-        self.id = run.name
-        self._run = trackio.init(**run.arguments, embed=False, auto_log_cpu=False, auto_log_gpu=False)
+        self.id = run.id or run.name
+        self._run = trackio.init(
+            **run.arguments | {"name": self.id}, embed=False, auto_log_cpu=False, auto_log_gpu=False
+        )
 
     def log(self, step: int, seconds: float, values: Mapping[str, float]) -> None:
         self._run.log(dict(values), step=step)

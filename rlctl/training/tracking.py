@@ -72,7 +72,7 @@ def main(connection: Connection, folder: str, tracker: str) -> None:
     """In the child: send what is new every few seconds, until the parent sends a message; print problems to stderr."""
     stderr = os.fdopen(os.dup(2), "w", buffering=1, errors="replace")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # the libraries print much
-    sender = _Sender(RunDirectory(Path(folder)), tracker, lambda text: print(_shorten(text), file=stderr))
+    sender = _Sender(RunDirectory(Path(folder).resolve()), tracker, lambda text: print(_shorten(text), file=stderr))
     while not connection.poll(_EVERY_S):
         sender.attempt(sender.send)
     sender.attempt(sender.finish)

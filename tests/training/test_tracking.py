@@ -15,6 +15,7 @@ import urllib.request
 import pytest
 
 from rlctl.errors import RecipeError, UsageError
+from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
 from rlctl.training import tracking
 from rlctl.training.seeds import train_seeds
@@ -87,7 +88,7 @@ def test_an_unknown_tracker_is_refused(train):
 def test_a_resumed_run_is_one_run_in_wandb(train, resume, tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     run = train("Line", {**SMALL, "track": "wandb"}).run
-    resume(run, total_timesteps=384)
+    resume(RunDirectory(tmp_path / "runs" / "latest"), total_timesteps=384)
     files = sorted(tmp_path.glob("wandb/offline-run-*/*.wandb"))
     begins, points, artifacts = [], [], []
     for file in files:
