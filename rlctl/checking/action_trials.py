@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_actions
-from rlctl.checking.finding import NotJudged
+from rlctl.checking.finding import NotJudged, OutOfTime
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import Leaf, flatten_action, flatten_numbers, name_element, pick
 from rlctl.checking.messages import FIRST_SEED
@@ -22,10 +22,6 @@ Frame = NDArray[np.float64]
 
 REPEATED_STEPS = 20
 REWARD = -3  # Where the reward is in a frame
-
-
-class OutOfTime(Exception):
-    """Raised where an experiment's time is over in the middle of a comparison."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,15 +68,12 @@ class Trials:
         """Raise `NotJudged` unless an episode is the same when it is played again."""
         if not self.instance.accepts_seed:
             raise NotJudged("reset takes no seed (RL202)")
-        try:
-            for _ in range(2):  # an instance's first episode may differ from all others
-                before = self.plain(FIRST_SEED, REPEATED_STEPS)
-                again = self.play(FIRST_SEED, self.actions(FIRST_SEED, REPEATED_STEPS))
-                if not find_differences(before, again):
-                    return
-                self._plain[FIRST_SEED, REPEATED_STEPS] = again
-        except OutOfTime:
-            raise NotJudged("playing one episode twice took all the time there is for it") from None
+        for _ in range(2):  # an instance's first episode may differ from all others
+            before = self.plain(FIRST_SEED, REPEATED_STEPS)
+            again = self.play(FIRST_SEED, self.actions(FIRST_SEED, REPEATED_STEPS))
+            if not find_differences(before, again):
+                return
+            self._plain[FIRST_SEED, REPEATED_STEPS] = again
         raise NotJudged("equal seeds and actions give unequal episodes (RL3)")
 
     def actions(self, seed: int, steps: int) -> list[Any]:
@@ -122,7 +115,7 @@ class Trials:
             if moment.step == 0:
                 after_reset()
         if episode.ended == "time":
-            raise OutOfTime
+            raise OutOfTime("time ran out before all comparisons were made")
         if episode.ended == "raised":
             raise NotJudged("step returns no observation, reward and flags (RL201)")
         return frames

@@ -25,7 +25,7 @@ WIDEST_RANGE = 1e3  # wider limits are none: some models write 1e16
 
 GRAVITY = -9.81  # [m/s^2]
 WEIGHT_STEPS = 20
-UNMOVED = 1e-3  # smaller differences are no effect of gravity [m, rad, m/s, rad/s]
+UNMOVED = 1e-6  # smaller differences are no effect of gravity [m, rad, m/s, rad/s]; stiff motors leave little
 LONGEST_S = 0.1  # simulated without the environment [s]: overlapping bodies are thrown out by then
 MOST_STEPS = 100
 

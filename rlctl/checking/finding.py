@@ -96,6 +96,10 @@ class NotJudged(Exception):
     """Raised by a check or an experiment that has too little to go by; the text says why."""
 
 
+class OutOfTime(NotJudged):
+    """Raised where an experiment's time is over in the middle of a comparison."""
+
+
 class NotApplicable(Exception):
     """Raised by a check or an experiment that has nothing to look at in this kind of environment; the text says why."""
 

@@ -88,7 +88,7 @@ class Records:
         """Return the episode of a comparison; raises `NotJudged` if there is none."""
         episodes = self.role(role)
         if not episodes:
-            raise NotJudged(self.skipped.get(role, f"the comparison {role!r} could not be made"))
+            raise NotJudged(f"the episode {role!r} could not be played")
         return episodes[0]
 
     def require_fact(self, experiment: str) -> Any:

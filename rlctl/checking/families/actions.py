@@ -12,7 +12,7 @@ import numpy as np
 from rlctl.checking import action_trials
 from rlctl.checking.action_trials import REWARD, ActionNumber, Trials
 from rlctl.checking.failures import EnvironmentRaised
-from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity, list_names
+from rlctl.checking.finding import NotApplicable, NotJudged, OutOfTime, RuleFinding, Severity, list_names
 from rlctl.checking.instance import Context
 from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage
 from rlctl.checking.records import experiment
@@ -46,10 +46,10 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
             if "lasting" not in effects.values():
                 costly = [dimension for dimension in every if effects.get(dimension.name) == "reward"]
                 effects |= {dimension.name: "cost" for dimension in costly if _only_costs(trials, dimension)}
-        except action_trials.OutOfTime:
+        except OutOfTime:
             why = "there was no time for more"
-        if not effects:
-            raise NotJudged("there was no time to compare a single action")
+            if not effects:
+                raise
     left_out = f" ({len(effects)} of {len(every)} dimensions: {why})" if why else ""
     yield from _without_effect(effects, len(every), left_out)
 
@@ -63,10 +63,7 @@ def give_nan(context: Context) -> Iterator[ChildMessage]:
         trials = Trials(context, instance)
         # A simulator may write a log about it to the working directory: MuJoCo does.
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.suppress(EnvironmentRaised):
-            try:
-                nan_in, lasts = _play_nan(trials)
-            except action_trials.OutOfTime:
-                raise NotJudged("time ran out before an action of NaN could be judged") from None
+            nan_in, lasts = _play_nan(trials)
             if nan_in:
                 evidence = {"seed": FIRST_SEED, "step": 1, "value": "NaN", "expected": "an exception"}
                 until = "also in later episodes" if lasts else "until the next reset"

@@ -8,18 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.action_trials import REWARD, Frame, OutOfTime, Trials, find_differences
-from rlctl.checking.attributes import (
-    Attribute,
-    find_assignment,
-    find_unequal,
-    read_attributes,
-)
+from rlctl.checking.action_trials import REWARD, Frame, Trials, find_differences
+from rlctl.checking.attributes import Attribute, find_assignment, find_unequal, read_attributes
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.failures import EnvironmentRaised
 from rlctl.checking.families.determinism import COMPARED_STEPS, LATE, find_difference, report
 from rlctl.checking.families.rewards import has_succeeded
-from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding
+from rlctl.checking.finding import NotApplicable, NotJudged, OutOfTime, RuleFinding
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import flatten_numbers
 from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage
@@ -46,14 +41,11 @@ def change_attributes(context: Context) -> Iterator[ChildMessage]:
         plain = trials.plain(FIRST_SEED, HIDDEN_STEPS)  # known by now
         if plain[0].size > MOST_OBSERVED:
             raise NotApplicable(f"the observation has more than {MOST_OBSERVED} numbers")
-        try:
-            for name, other in _find_drawn(instance, trials).items():
-                frames = _play_changed(instance, trials, name, other)
-                if frames is not None and _hides(plain, frames) and not _is_shown(instance, name):
-                    yield _hidden(instance, name, other, plain, frames)
-                    return
-        except OutOfTime:
-            raise NotJudged("time ran out before all attributes were changed") from None
+        for name, other in _find_drawn(instance, trials).items():
+            frames = _play_changed(instance, trials, name, other)
+            if frames is not None and _hides(plain, frames) and not _is_shown(instance, name):
+                yield _hidden(instance, name, other, plain, frames)
+                return
 
 
 def _find_drawn(instance: Instance, trials: Trials) -> dict[str, Attribute]:
@@ -74,6 +66,8 @@ def _play_changed(instance: Instance, trials: Trials, name: str, other: Attribut
 
     try:
         return trials.play(FIRST_SEED, trials.actions(FIRST_SEED, HIDDEN_STEPS), after_reset=change)
+    except OutOfTime:
+        raise
     except (EnvironmentRaised, AttributeError, TypeError, ValueError, KeyError, NotJudged):
         return None
 
