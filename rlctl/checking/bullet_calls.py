@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import inspect
+import itertools
 import linecache
 import math
 import re
@@ -60,6 +61,7 @@ class Target(NamedTuple):
     body: int
     joint: int
     value: float
+    force: float  # The most that its motor has [N m], [N]
     call: BulletCall
 
 
@@ -109,16 +111,18 @@ class BulletCalls:
             query = self.queries.setdefault(key, ContactQuery(call, client, bodies, (link, other)))  # type: ignore[arg-type]
             query.calls, query.contacts = query.calls + 1, query.contacts + len(result or ())
             return
-        for body, joint, value in _read_positions(name, arguments, keywords):
-            target = Target(client, body, joint, value, call)
+        for body, joint, value, force in _read_positions(name, arguments, keywords):
+            target = Target(client, body, joint, value, force, call)
             if name != "resetJointState":
                 self.targets[client, body, joint] = target
             if abs(value) > FULL_TURN and len(self.far_targets) < MOST_FAR:
                 self.far_targets.append(target)
 
 
-def _read_positions(name: str, arguments: Sequence[Any], keywords: dict[str, Any]) -> list[tuple[int, int, float]]:
-    """Return body, joint and position of each joint that a call moves by a position; empty for other modes."""
+def _read_positions(
+    name: str, arguments: Sequence[Any], keywords: dict[str, Any]
+) -> list[tuple[int, int, float, float]]:
+    """Return body, joint, position and force of each joint that a call moves by a position; empty for other modes."""
     many = name.endswith("Array")
     names = ["bodyUniqueId", "jointIndices" if many else "jointIndex"]
     names += ["targetValue"] if name == "resetJointState" else ["controlMode", "targetPosition" + "s" * many]
@@ -126,9 +130,12 @@ def _read_positions(name: str, arguments: Sequence[Any], keywords: dict[str, Any
     body, joints, values = given.get("bodyUniqueId", given.get("bodyIndex")), given.get(names[1]), given.get(names[-1])
     if body is None or joints is None or values is None or given.get("controlMode", POSITION) != POSITION:
         return []
-    pairs = zip(joints, values, strict=False) if many else [(joints, values)]
+    forces = given.get("force" + "s" * many)
+    if not many:
+        joints, values, forces = [joints], [values], None if forces is None else [forces]
     try:
-        return [(int(body), int(joint), float(value)) for joint, value in pairs]
+        triples = zip(joints, values, itertools.repeat(math.inf) if forces is None else forces, strict=False)
+        return [(int(body), int(joint), float(value), float(force)) for joint, value, force in triples]
     except (TypeError, ValueError):  # PyBullet itself has refused or converted it
         return []
 

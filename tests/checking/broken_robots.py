@@ -303,3 +303,10 @@ class ArmLongPhysicsSteps(Arm):
     def __init__(self):
         super().__init__()
         p.setTimeStep(1 / 30, physicsClientId=self.client)
+
+
+class ArmWeakMotors(Arm):
+    def drive(self, targets):
+        p.setJointMotorControlArray(
+            self.robot, range(3), p.POSITION_CONTROL, list(targets), forces=[0.5] * 3, physicsClientId=self.client
+        )

@@ -42,6 +42,7 @@ CASES = [
     broken("ArmTouchesNothing", "RL812", "warning", "ArmTouches"),
     broken("CrawlerOtherFloor", "RL812", "warning", "CrawlerFloor"),
     broken("ArmLongPhysicsSteps", "RL813", "warning", "Arm"),
+    broken("ArmWeakMotors", "RL814", "warning", "Arm"),
 ]
 
 

@@ -1,4 +1,4 @@
-"""RL116 and RL810 to RL812: how an environment drives and reads the robots of a PyBullet world."""
+"""RL116 and RL810 to RL814: how an environment drives and reads the robots of a PyBullet world."""
 
 from __future__ import annotations
 
@@ -65,6 +65,30 @@ def _find_wrong_order(world: LoggedWorld) -> Iterator[RuleFinding]:
                 )
                 evidence = {"element": joint.name, "value": target.value, "expected": float(positions[wrong[0]])}
                 yield RuleFinding("RL811", message, evidence, where=(target.call.file, target.call.line))
+                return
+
+
+def _find_weak_motors(world: LoggedWorld, calls: BulletCalls) -> Iterator[RuleFinding]:
+    p = ClientCalls(world.world.client)
+    for body, states in world.logs[0].bodies:
+        still = [0.0] * len(body.joints)
+        positions = states[0, JOINTS : JOINTS + len(body.joints)].tolist()
+        try:
+            if body.is_free or not still or p.getNumConstraints():  # a constraint may carry it
+                continue
+            torques = p.calculateInverseDynamics(body.id, positions, still, still)
+        except p.error:  # it has joints of several degrees of freedom
+            continue
+        for joint, torque in zip(body.joints, np.abs(torques).tolist(), strict=True):
+            target = calls.targets.get((world.world.client, body.id, joint.index))
+            if target is not None and 0 < target.force < torque:
+                unit = "N m" if joint.is_angle else "N"
+                message = (
+                    f"the motor of {joint.name} has at most {target.force:.4g} {unit}, "
+                    f"and to hold the weight at reset takes {torque:.4g} {unit}"
+                )
+                evidence = {"element": joint.name, "value": target.force, "expected": torque}
+                yield RuleFinding("RL814", message, evidence, where=(target.call.file, target.call.line))
                 return
 
 
@@ -178,5 +202,6 @@ def find_misuses(worlds: Sequence[LoggedWorld], calls: BulletCalls) -> Iterator[
     yield from _find_far_targets(calls)
     for world in worlds:
         yield from _find_wrong_order(world)
+        yield from _find_weak_motors(world, calls)
         yield from _find_empty_queries(world, calls)
         yield from _find_misread_quaternions(world)
