@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.checking import child
 from rlctl.checking.check import judge
-from rlctl.checking.progress import INTERVAL_S, read_clock, read_clock_of
+from rlctl.checking.progress import read_clock, read_clock_of
 from rlctl.checking.records import Records
 from rlctl.environments.spec import EnvSpec
 from tests.checking.judging import FOLDER, found
@@ -18,8 +18,8 @@ LINUX = pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="on
 def test_waiting_for_something_else_counts():
     before, begun = read_clock(), time.monotonic()
     time.sleep(0.3)
-    # The count of what does not count is read so often only.
-    assert 0.3 - INTERVAL_S <= read_clock() - before <= time.monotonic() - begun + INTERVAL_S
+    # The count of what does not count is not read at the same moment, and a busy machine may interrupt in between.
+    assert 0.15 <= read_clock() - before <= time.monotonic() - begun + 0.1
 
 
 @LINUX
