@@ -49,8 +49,8 @@ def evaluate(
     chosen = dataclasses.replace(options, checkpoint=choose_checkpoint(options.checkpoint, pretrained))
     request = EvalRequest(**vars(chosen), changes=parse_changes(settings))
     if vary or push or sim is not None:
-        if request.baseline is not None or request.limits is not None:
-            option = "--limits" if request.baseline is None else "--policy"
+        unsupported = {"--policy": request.baseline, "--limits": request.limits, "--record": request.record}
+        if option := next((name for name, value in unsupported.items() if value is not None), None):
             raise UsageError(f"{option} cannot be combined with --vary, --push or --sim")
         from rlctl.cluster.executors import choose_cell_player
         from rlctl.evaluation.vary import check_gates, measure_robustness

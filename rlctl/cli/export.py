@@ -7,7 +7,7 @@ from typing import Annotated
 
 from rlctl.cli.arguments import choose_checkpoint, command
 from rlctl.errors import UsageError
-from rlctl.exporting.request import ExportRequest, Format
+from rlctl.exporting.request import DatasetFormat, ExportRequest, Format
 from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName
 
 
@@ -20,11 +20,13 @@ def export(
         Path | None,
         Option("Write the actor with its measured score instead, as plugins ship it: .safetensors.", metavar="FILE"),
     ] = None,
+    dataset: Annotated[DatasetFormat | None, Option("Write episodes of the policy as a dataset instead.")] = None,
+    episodes: Annotated[int, Option("Episodes of the dataset.", min=1)] = 100,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,
     output: Annotated[
         Path | None,
-        Option("Default: exports/policy.onnx, or .c, of the run.", ("--output", "-o"), metavar="FILE"),
+        Option("Default: exports/policy.onnx, or .c, of the run.", ("--output", "-o"), metavar="PATH"),
     ] = None,
     json: Json = None,
 ) -> None:
@@ -33,7 +35,14 @@ def export(
     if policy is not None and (output is not None or onnx or c):
         raise UsageError("--policy FILE writes only that file: leave out --output, --onnx and --c")
     formats: tuple[Format, ...] = ("onnx", "c") if onnx and c else ("c",) if c else ("onnx",)
-    request = ExportRequest(run, formats, checkpoint, output, policy)
+    request = ExportRequest(run, formats, checkpoint, output, policy, episodes, dataset)
+    if dataset is not None:
+        if onnx or c or policy is not None:
+            raise UsageError("--dataset writes only a dataset: leave out --onnx, --c and --policy")
+        from rlctl.exporting import dataset as dataset_module
+
+        dataset_module.show(dataset_module.export_dataset(request), json)
+        return
     if policy is not None:
         from rlctl.exporting import policy_file
 

@@ -149,4 +149,4 @@ def _bind(work: Work) -> TrainRequest:
     run = find_run_of_seed(work.folder, work.seed) if request.resume is None else None
     if run is None:
         return request
-    return dataclasses.replace(request, task=None, config=None, initial_policy=None, resume=str(run.path), settings={})
+    return request.to_resume(run.path, {})

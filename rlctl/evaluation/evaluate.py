@@ -30,6 +30,7 @@ from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
+from rlctl.run.episode import save_episode
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,12 +151,17 @@ def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:
 
 
 def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
+    if request.record is not None:
+        _check_new(request.record)
     with start_workers(spec, request) as workers:
         limits = None if request.limits is None else _read_limits(request.limits, workers.info)
         actor.give_to(workers)
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
         episodes, info = _play(workers, request), workers.info
+        if request.record is not None:
+            for number, episode in enumerate(episodes):
+                save_episode(request.record / f"{number:06d}.npz", episode.describe(spec, info, actor.name))
         evaluation = _summarize(actor, spec, info, request, episodes)
         if limits is not None:
             workers.limit_actions(limits)
@@ -163,6 +169,11 @@ def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalReques
             evaluation = dataclasses.replace(limited, limited_by=request.limits, unlimited=evaluation)
     gates.check_possible(evaluation.success_rate is not None)
     return evaluation
+
+
+def _check_new(folder: Path) -> None:
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise UsageError(f"--record {folder}: exists already; give a new folder, or remove this one")
 
 
 def _read_limits(file: Path, info: EnvInfo) -> dict[str, Any]:
@@ -179,7 +190,9 @@ def _play(workers: Workers, request: EvalRequest) -> list[Episode]:
     seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
     exploration = Exploration(stochastic=not request.deterministic)
     with output.show_progress("evaluating", len(seeds)) as show:
-        return play_episodes(workers, seeds, exploration, record=request.measure_actions, watch=show)
+        return play_episodes(
+            workers, seeds, exploration, record=request.measure_actions or request.record is not None, watch=show
+        )
 
 
 def _summarize(

@@ -39,6 +39,9 @@ class EvalOptions:
         None
     )
     """Limits on the policy's actions; it is also evaluated without them."""
+    record: Annotated[
+        Path | None, Option("Write the episodes (.npz) into this new folder; --demos reads it.", metavar="FOLDER")
+    ] = None
     env_timeout_s: EnvTimeout = 60.0
 
 

@@ -7,6 +7,7 @@ from typing import Literal
 from rlctl.errors import UsageError
 
 Format = Literal["onnx", "c"]
+DatasetFormat = Literal["minari", "lerobot"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,11 +20,16 @@ class ExportRequest:
     output: Path | None = None
     """Default: in the run's folder, next to a policy file without a run, or in this folder for a shipped policy."""
     policy: Path | None = None  # write the actor with its measured score to this file instead, as plugins ship it
-    episodes: int = 100  # episodes of that measurement
+    episodes: int = 100  # episodes of that measurement, or of a dataset
+    dataset: DatasetFormat | None = None  # write a dataset of episodes instead; `output` is its folder
 
     def __post_init__(self) -> None:
         if self.policy is not None and self.policy.suffix != ".safetensors":
             raise UsageError(f"--policy {self.policy}: the name of a policy file ends in .safetensors")
-        if self.output is not None and self.output.suffix not in [f".{name}" for name in self.formats]:
+        if (
+            self.output is not None
+            and self.dataset is None
+            and self.output.suffix not in [f".{name}" for name in self.formats]
+        ):
             kind = "an ONNX file" if self.formats[0] == "onnx" else "a C file"
             raise UsageError(f"--output {self.output}: the name of {kind} ends in .{self.formats[0]}")

@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import join, split
+from rlctl.environments.info import EnvInfo
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import EpisodeFailed, TaskError
 from rlctl.policy.players.player import Exploration
 from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.workers import Workers
-from rlctl.run.episode import Trajectory
+from rlctl.run.episode import EpisodeInfo, RecordedEpisode, Trajectory
+from rlctl.version import collect_versions
 
 _CONTACTS_MEASURED = 10  # the first recorded episodes, in which contacts are measured; it takes about 3 % of a step
 MOST_STEPS = 100_000  # steps after which an episode without a time limit is an error: it may never end
@@ -25,6 +28,27 @@ class Episode:
 
     result: EpisodeResult
     trajectory: Trajectory | None = None
+    terminated: bool = False
+    """Whether its last step terminated it; else it was truncated."""
+
+    @property
+    def recorded(self) -> Trajectory:
+        """The trajectory of an episode that was recorded."""
+        assert self.trajectory is not None
+        return self.trajectory
+
+    def describe(self, spec: EnvSpec, env: EnvInfo, policy: str) -> RecordedEpisode:
+        """Return the episode, which must have been recorded, as a file holds it; `policy` is text for people."""
+        info = EpisodeInfo(
+            spec=spec,
+            seed=self.result.seed,
+            policy=policy,
+            success=self.result.success,
+            total_reward=self.result.total_reward,
+            term_names=list(env.reward_weights),
+            versions=collect_versions(),
+        )
+        return RecordedEpisode(**vars(self.recorded), info=info)
 
 
 def play_episodes(
@@ -84,7 +108,8 @@ def play_episodes(
                 play(env, -1)
                 continue
             del running[env]
-            episodes[recorder.index] = Episode(result, recorder.finish())
+            terminated = bool(workers.arrays.segment.terminated[env, result.row])
+            episodes[recorder.index] = Episode(result, recorder.finish(), terminated)
             begin(env)
     watch(len(episodes))
     return [episodes[index] for index in range(len(seeds))]

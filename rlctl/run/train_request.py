@@ -33,6 +33,10 @@ class TrainRequest:
             completes="run",
         ),
     ] = None
+    demos: Annotated[
+        str | None,
+        Option("Clone demonstrations first: episodes (.npz), or a Minari or LeRobot dataset.", metavar="PATH"),
+    ] = None
     config: Config = None
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Keys of the recipe and their values, nested as in a recipe; they go over `config`."""
@@ -44,6 +48,12 @@ class TrainRequest:
     env_timeout_s: EnvTimeout = 60.0
     """How long a step or reset may take [s]."""
     root: RunsFolder = Path("runs")
+
+    def to_resume(self, run: Path, settings: Mapping[str, Any]) -> TrainRequest:
+        """Return the request that resumes a run of this one."""
+        return dataclasses.replace(
+            self, task=None, config=None, initial_policy=None, demos=None, resume=str(run), settings=settings
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the request as JSON data."""

@@ -67,7 +67,8 @@ class EvaluationEpisodes:
 
     def keep(self, episodes: list[Episode], steps: int) -> None:
         """Save the first and the worst episode of an evaluation; remember all for `record`."""
-        self._latest = recorded = [self._recorded(episode, steps) for episode in episodes]
+        policy = f"{STEP_LABEL}{steps}"
+        self._latest = recorded = [episode.describe(self._spec, self._goal, policy) for episode in episodes]
         worst = min(
             range(len(episodes)), key=lambda i: (episodes[i].result.success is True, episodes[i].result.total_reward)
         )
@@ -115,17 +116,3 @@ class EvaluationEpisodes:
         path = run.episode_file(run.next_episode_number())
         save_episode(path, episode)
         return path
-
-    def _recorded(self, episode: Episode, steps: int) -> RecordedEpisode:
-        trajectory = episode.trajectory
-        assert trajectory is not None  # evaluations record
-        info = EpisodeInfo(
-            spec=self._spec,
-            seed=episode.result.seed,
-            policy=f"{STEP_LABEL}{steps}",
-            success=episode.result.success,
-            total_reward=episode.result.total_reward,
-            term_names=list(self._goal.reward_weights),
-            versions=collect_versions(),
-        )
-        return RecordedEpisode(**vars(trajectory), info=info)

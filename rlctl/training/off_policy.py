@@ -38,7 +38,7 @@ class OffPolicyRollouts(Rollouts):
 
     def _exploration(self) -> Exploration:
         model = self.model
-        plays = self.policy_plays_warmup or (model.use_sde and model.use_sde_at_warmup)
+        plays = self.is_trained or (model.use_sde and model.use_sde_at_warmup)
         return Exploration(
             stochastic=True,
             warmup=model.num_timesteps < model.learning_starts and not plays,
@@ -80,3 +80,4 @@ class OffPolicyRollouts(Rollouts):
             updates = model.gradient_steps if model.gradient_steps >= 0 else steps
             if updates > 0:
                 self._learner.train(batch_size=model.batch_size, gradient_steps=updates)
+                self.rehearse(updates)

@@ -33,8 +33,8 @@ class Rollouts(abc.ABC):
 
     overlap = False
     """Whether a segment is played while the model learns from earlier ones."""
-    policy_plays_warmup = False
-    """Whether the policy, already trained, plays the steps before the first update; else actions are random."""
+    is_trained = False
+    """Whether the policy begins trained; then it plays the steps before the first update, else actions are random."""
 
     def __init__(self, model: Any, env: WorkerVecEnv, recipe: Recipe, progress: Progress) -> None:
         self.model = model
@@ -43,6 +43,8 @@ class Rollouts(abc.ABC):
         self._progress = progress
         self._learner = choose_learner(model)
         self._policy_info: PolicyInfo | None = None
+        self.rehearse: Callable[[int], None] = lambda updates: None
+        """Called after so many off-policy updates; see `rlctl.training.cloning`."""
 
     def begin(self, total_timesteps: int) -> None:
         """Prepare the model to learn up to a step; start the first episodes of a new training."""
@@ -76,7 +78,9 @@ class Rollouts(abc.ABC):
         for key, rms in observation_statistics(self.model.get_vec_normalize_env()).items():
             mean, var = rms.mean.copy(), rms.var.copy()
             # A few resets vary too little: dividing by their deviation would give huge values.
-            statistics[key] = (mean, var) if self.model.num_timesteps else (np.zeros_like(mean), np.ones_like(var))
+            statistics[key] = (
+                (mean, var) if self.model.num_timesteps or self.is_trained else (np.zeros_like(mean), np.ones_like(var))
+            )
         return statistics
 
     def send_policy(self, statistics: Statistics) -> None:

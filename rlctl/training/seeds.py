@@ -130,9 +130,7 @@ def _make_request(group: Group, seed: int, resume: TrainRequest) -> TrainRequest
     if run is None:
         settings = {**group.request.settings, **resume.settings, "seed": seed}
         return dataclasses.replace(request, resume=None, settings=settings)
-    return dataclasses.replace(
-        request, task=None, config=None, initial_policy=None, resume=str(run.path), settings=resume.settings
-    )
+    return request.to_resume(run.path, resume.settings)
 
 
 def _is_waiting(group: Group, seed: int, resume: TrainRequest) -> bool:

@@ -120,17 +120,21 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
             goal = check_stages(specs, probe)
     # A plain Gymnasium environment shows only at the end of an episode whether it reports success.
     start.check_may_succeed(workers.info.has_success or not workers.info.reward_weights)
-    # The policy of --from is evaluated first: it may be better than all later ones.
-    progress = Progress(next_eval=0 if start.source else recipe.eval.every_steps or recipe.total_timesteps)
+    # A policy that begins trained is evaluated first: it may be better than all later ones.
+    progress = Progress(next_eval=0 if start.is_trained else recipe.eval.every_steps or recipe.total_timesteps)
     if start.checkpoint is not None:
         progress = start.checkpoint.progress
     env = WorkerVecEnv(workers, recipe.seed)
     model = build_model(recipe, env, start.request.device)
     rollouts = (OnPolicyRollouts if recipe.algo in ON_POLICY else OffPolicyRollouts)(model, env, recipe, progress)
-    if start.source is not None:
-        rollouts.policy_plays_warmup = True
-        if start.checkpoint is None:
-            display.message(load_source(start.source, model, goal))
+    rollouts.is_trained = start.is_trained
+    if start.source is not None and start.checkpoint is None:
+        display.message(load_source(start.source, model, goal))
+    if start.demos is not None:
+        from rlctl.training.cloning import clone
+
+        display.phase("cloning demonstrations")
+        clone(start, rollouts, goal, display.message)
     return Learner(recipe, rollouts, Curriculum(recipe.stages, specs, goal, progress), progress)
 
 

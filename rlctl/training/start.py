@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 import re
 import shlex
 import sys
 import time
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +25,7 @@ from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.callback import Callback
 from rlctl.training.callbacks import load_callbacks
+from rlctl.training.demonstrations import describe_source
 from rlctl.training.tracking import check_installed
 from rlctl.training.warm_start import find_source
 
@@ -48,6 +51,8 @@ class Start:
     callbacks: Mapping[str, Callback] = dataclasses.field(default_factory=dict)
     source: Mapping[str, Any] | None = None
     """The policy of `--from`; see `warm_start.find_source`."""
+    demos: Mapping[str, str] | None = None
+    """The demonstrations of `--demos`; see `demonstrations.describe_source`."""
     inexact: tuple[str, ...] = ()
     """Reasons, known before the start, why the resume cannot be bit-exact."""
     began: float = dataclasses.field(default_factory=time.monotonic)
@@ -63,6 +68,11 @@ class Start:
     def stage(self) -> int:
         """Stage of the curriculum, from 1."""
         return (self.checkpoint.progress.stage or 1) if self.checkpoint else 1
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether the policy begins trained, by `--from` or `--demos`."""
+        return self.source is not None or self.demos is not None
 
     @property
     def step(self) -> int:
@@ -96,6 +106,10 @@ def check_arguments(request: TrainRequest) -> None:
         both = request.task is not None
         problem = "TASK and --resume exclude each other" if both else "neither TASK nor --resume is given"
         raise UsageError(f"{problem}: give a task to train, or a run to resume")
+    if request.demos is not None and request.initial_policy is not None:
+        raise UsageError("--demos and --from exclude each other: cloning would replace the policy of --from")
+    if request.demos is not None and not os.path.exists(request.demos):
+        raise UsageError(f"--demos {request.demos}: no such file or folder")
     if not _DEVICE.fullmatch(request.device):  # checked before slow imports
         raise UsageError(f"--device {request.device!r}: no such device; give cpu, cuda, cuda:1, or auto")
     if request.resume is not None:
@@ -111,7 +125,13 @@ def _find_new(request: TrainRequest) -> Start:
     check_installed(recipe)
     note = describe_rounding(recipe)
     source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
-    return Start(request, task, recipe, notes=(note,) if note else (), callbacks=callbacks, source=source)
+    if request.demos is not None and recipe.algo in ("dqn", "recurrent_ppo"):
+        raise RecipeError(
+            f"--demos: {recipe.algo} cannot clone demonstrations; use ppo, a2c, sac, tqc, crossq, td3 or ddpg"
+        )
+    notes = (note,) if note else ()
+    demos = describe_source(Path(request.demos)) if request.demos is not None else None
+    return Start(request, task, recipe, notes=notes, callbacks=callbacks, source=source, demos=demos)
 
 
 def _find_checkpoint(request: TrainRequest) -> Start:
@@ -147,8 +167,8 @@ def _find_checkpoint(request: TrainRequest) -> Start:
         notes = ["no checkpoint yet: the training starts from step 0"]
         if newest is not None:
             notes = [f"warning: {problem}; resuming from step {newest.state.step:,}" for problem in damage]
-        callbacks, source = load_callbacks(recipe), status.get("from")
-        return Start(request, task, recipe, run, lock, newest, tuple(notes), callbacks, source, tuple(changes))
+        callbacks, source, demos = load_callbacks(recipe), status.get("from"), status.get("demos")
+        return Start(request, task, recipe, run, lock, newest, tuple(notes), callbacks, source, demos, tuple(changes))
     except BaseException:
         lock.release()
         raise
@@ -157,6 +177,8 @@ def _find_checkpoint(request: TrainRequest) -> Start:
 def _check_resume(request: TrainRequest) -> None:
     if request.config is not None:
         raise UsageError("--resume uses the run's own recipe: leave out --config")
+    if request.demos is not None:
+        raise UsageError("--demos and --resume exclude each other: the run has cloned its demonstrations")
     if request.initial_policy is not None:
         raise UsageError("--from and --resume exclude each other: --from starts a new run, --resume continues one")
     for key in request.settings:

@@ -54,6 +54,8 @@ def write_start(run: RunDirectory, start: Start) -> None:
         }
         if start.source is not None:
             changes["from"] = start.source
+        if start.demos is not None:
+            changes["demos"] = start.demos
     run.write_status(changes)
 
 
