@@ -86,6 +86,14 @@ def test_frictions_are_multiplied_and_restored():
         assert np.array_equal(env.sim.model.pair_friction, nominal)
 
 
+def test_feet_have_the_spinning_friction_of_their_file():
+    with closing(EnvSpec("biped-3d", sim="mujoco").make()) as env:
+        # 0.04 m of the two feet, times the ground's friction of 1; the other links have none.
+        spins = np.sort(env.unwrapped.sim.model.pair_friction[:, 2])
+    assert spins[-2:] == pytest.approx(0.04)
+    assert spins[:-2] == pytest.approx(0.0, abs=1e-4)
+
+
 @pytest.mark.parametrize("world", [Sim, MujocoSim])
 def test_a_force_sensor_measures_what_hangs_from_it(world):
     options = {"solref": 0.02} if world is MujocoSim else {}
