@@ -78,8 +78,7 @@ class EpisodeFailed(TaskError):
         self.what = what
         self.env = env
         self.seed = seed
-        self.step = step
-        """Number of the failed step, from 1; 0 for the reset."""
+        self.step = step  # number of the failed step, from 1; 0 for the reset
         self.actions: Any = None
         """The actions of the episode up to the failed step, shape (step, ...); None if they are unknown."""
 

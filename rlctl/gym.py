@@ -3,8 +3,6 @@
 `gymnasium.make("rlctl.gym:rlctl/reach-v0")`, or `--gym-packages rlctl.gym` in other tools.
 """
 
-from __future__ import annotations
-
 import gymnasium
 
 from rlctl.environments import installed

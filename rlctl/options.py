@@ -4,8 +4,6 @@ A request is a dataclass with the arguments of a command. The command line fills
 Python passes it, a group stores it and a child process receives it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
@@ -21,10 +19,8 @@ class Option:
     metavar: str | None = None
     min: float | None = None
     max: float | None = None
-    completes: Literal["task", "run", "algorithm"] | None = None
-    """What the shell offers after TAB."""
-    default_text: str | None = None
-    """The default in help, if it differs from the field's own."""
+    completes: Literal["task", "run", "algorithm"] | None = None  # what the shell offers after TAB
+    default_text: str | None = None  # the default in help, if it differs from the field's own
 
 
 @dataclasses.dataclass(frozen=True)

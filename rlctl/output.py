@@ -173,8 +173,7 @@ def _measure_columns(table: Sequence[Sequence[Text]]) -> list[int]:
     return [max(cell.cell_len for cell in column if cell is not None) for column in itertools.zip_longest(*table)]
 
 
-_FOLDED_TEXT = 24
-"""Width to which texts may be folded before columns are dropped."""
+_FOLDED_TEXT = 24  # width to which texts may be folded before columns are dropped
 
 
 def _measure_width(table: Sequence[Sequence[Text]], names: Sequence[str], left: Collection[str], gap: str) -> int:

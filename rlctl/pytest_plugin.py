@@ -8,8 +8,6 @@ def test_tasks(task, check_env):
     check_env(task)
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 Each command imports what it needs when it runs, so that help, lists and completion start fast.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterable
 from typing import Annotated

@@ -1,7 +1,5 @@
 """`rlctl check-env`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """Shell completion of tasks, algorithms and runs. Imports no plugin and no library."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 _RUNS = Path("runs")

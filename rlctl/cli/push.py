@@ -1,7 +1,5 @@
 """`rlctl push`."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from rlctl.cli.arguments import command

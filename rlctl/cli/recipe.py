@@ -1,7 +1,5 @@
 """`rlctl recipe`: the complete recipe of a task, and the JSON schema of recipes."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from rlctl.cli.arguments import command

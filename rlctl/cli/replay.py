@@ -1,7 +1,5 @@
 """`rlctl replay`."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import re

@@ -1,7 +1,5 @@
 """`rlctl runs` and its commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 

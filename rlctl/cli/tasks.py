@@ -1,7 +1,5 @@
 """`rlctl tasks`, `rlctl tasks show` and `rlctl tasks new`."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

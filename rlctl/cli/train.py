@@ -1,7 +1,5 @@
 """`rlctl train`."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """`rlctl tune`."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Annotated
 

@@ -4,8 +4,6 @@ Single runs are compared as policies: each plays the same episodes. Groups of ru
 are compared as recipes: each run's best policy is evaluated, and the score of a seed is its mean over the episodes.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,8 +23,7 @@ from rlctl.runs.listing import find_runs_of
 from rlctl.runs.significance import MeanDifference, Quantity, Verdict, compare_episodes, compare_seeds
 from rlctl.runs.summary import read_table, summarize
 
-THRESHOLD = 0.9
-"""The default threshold, a success rate."""
+THRESHOLD = 0.9  # the default threshold, a success rate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,8 +49,7 @@ class Side:
 
     name: str
     runs: list[EvaluatedRun]
-    mixed: list[str]
-    """Recipe keys in which its own runs differ; there should be none."""
+    mixed: list[str]  # recipe keys in which its own runs differ; there should be none
 
     @property
     def has_success(self) -> bool:
@@ -70,10 +66,8 @@ class Candidate:
     """A side that is compared with the baseline, and the differences in scores and recipe."""
 
     side: Side
-    differences: Mapping[Quantity, MeanDifference]
-    """`success`, where the task reports it, then `return`."""
-    recipe_changes: dict[str, tuple[Any, Any]]
-    """Per dotted key, the value here and the baseline's."""
+    differences: Mapping[Quantity, MeanDifference]  # `success`, where the task reports it, then `return`
+    recipe_changes: dict[str, tuple[Any, Any]]  # per dotted key, the value here and the baseline's
 
     @property
     def verdict(self) -> Verdict:
@@ -86,8 +80,7 @@ class Candidate:
 class RunComparison:
     """The baseline and the candidates that were compared with it."""
 
-    of_recipes: bool
-    """Whether recipes are compared, seed by seed; else two policies, episode by episode."""
+    of_recipes: bool  # whether recipes are compared, seed by seed; else two policies, episode by episode
     task: str
     baseline: Side
     candidates: list[Candidate]

@@ -1,7 +1,5 @@
 """Prints a comparison."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`rlctl runs`: every run below ./runs, newest first."""
 
-from __future__ import annotations
-
 import dataclasses
 import glob
 from collections.abc import Iterable

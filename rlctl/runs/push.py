@@ -1,7 +1,5 @@
 """`rlctl push`: uploads a run's best policy, recipe, scores and recording, with a model card of measured numbers."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path
@@ -14,8 +12,7 @@ from rlctl.run.directory import RunDirectory, refuse_links_out
 from rlctl.run.lookup import find_run
 
 _CARD = "README.md"
-_PRIVATE = ("folder", "command", "host", "pid")
-"""Keys of run.json about the machine that trained it; not uploaded."""
+_PRIVATE = ("folder", "command", "host", "pid")  # keys of run.json about the machine that trained it; not uploaded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,8 +21,7 @@ class PushResult:
 
     address: str
     files: tuple[str, ...]
-    size: int
-    """[bytes]"""
+    size: int  # [bytes]
 
 
 def push_run(run: str | None, address: str) -> PushResult:

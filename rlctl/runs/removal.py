@@ -1,7 +1,5 @@
 """`rlctl runs rm` and `prune`: remove runs, or the checkpoints of finished runs."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """`rlctl runs show`: one run: what it was trained with, its curve, its evaluations, its files."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -23,8 +21,7 @@ from rlctl.runs.summary import Rows, list_points, summarize
 
 _EVALUATIONS_SHOWN = 12
 _ALWAYS_SHOWN = ("steps", "success", "return")
-_PLOT_SIZE = (90, 13)
-"""Columns and lines of a curve."""
+_PLOT_SIZE = (90, 13)  # columns and lines of a curve
 
 
 class RunDescription(History):
@@ -38,8 +35,7 @@ class RunDescription(History):
             self.warnings.append(f"{change}: it was trained on another version of the task")
         self.summary = summarize(run.path)
         self.findings = diagnose(self)
-        self.robustness: Robustness | None = None
-        """What `rlctl eval --vary` or `--push` measured."""
+        self.robustness: Robustness | None = None  # what `rlctl eval --vary` or `--push` measured
         if run.robustness_file.is_file():
             try:
                 self.robustness = robustness.read(run.robustness_file)

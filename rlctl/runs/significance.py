@@ -7,8 +7,6 @@ Success and return are tested together, and each candidate against the baseline.
 if all are equal, at most `ALPHA` of the comparisons report a difference.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import itertools
@@ -23,8 +21,7 @@ from numpy.typing import NDArray
 Quantity = Literal["success", "return"]
 Array = NDArray[np.float64]
 
-ALPHA = 0.05
-"""A difference is significant below this p-value; intervals have the level 1 - ALPHA."""
+ALPHA = 0.05  # a difference is significant below this p-value; intervals have the level 1 - ALPHA
 POWER = 0.8
 _RESAMPLES = 9999
 _LEAST_PAIRS, _LEAST_SEEDS = 6, 4
@@ -44,11 +41,9 @@ class MeanDifference:
     """A candidate's mean minus the baseline's."""
 
     mean: float
-    low: float
-    """Lower end of the 95 % interval; equal to `mean` where there is nothing to resample."""
+    low: float  # lower end of the 95 % interval; equal to `mean` where there is nothing to resample
     high: float
-    p: float
-    """Two-sided p-value, adjusted for all tests; 1 if all pairs are equal."""
+    p: float  # two-sided p-value, adjusted for all tests; 1 if all pairs are equal
     needed: int | None
     """About how many episodes, or seeds per recipe, would decide if this is the true difference; None if it is 0."""
 
@@ -66,8 +61,7 @@ class SeedDifference(MeanDifference):
 
     probability_of_improvement: float
     """How often a training of the candidate beats one of the baseline; ties count half (Agarwal et al., 2021)."""
-    smallest_p: float
-    """The smallest p-value that this number of seeds can reach."""
+    smallest_p: float  # the smallest p-value that this number of seeds can reach
 
 
 _Kind = TypeVar("_Kind", bound=MeanDifference)

@@ -1,7 +1,5 @@
 """The summary of a run, read from the small files of its folder; a damaged folder has a summary too."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import dataclasses
@@ -17,14 +15,11 @@ from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
 from rlctl.run.group import find_run_of_seed
 from rlctl.run.job import list_jobs, read_job
 
-Rows = list[dict[str, float | None]]
-"""Of a table, oldest first; an empty field is None."""
-_LARGEST = 1e100
-"""Larger numbers are ignored: plots and sums would overflow."""
+Rows = list[dict[str, float | None]]  # of a table, oldest first; an empty field is None
+_LARGEST = 1e100  # larger numbers are ignored: plots and sums would overflow
 _STANDARD_ERRORS = 1.645
 """A success rate is lower beyond this many standard errors: 5 % of equal policies count as lower (one-sided)."""
-_TAIL_BYTES = 4096
-"""The last row of a table is read from this many bytes; a row has a few hundred."""
+_TAIL_BYTES = 4096  # the last row of a table is read from this many bytes; a row has a few hundred
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,25 +30,19 @@ class RunSummary:
     task: str = ""
     algo: str = ""
     seed: int | None = None
-    state: str = ""
-    """`done`, `queued`, `running`, `stopped`, `failed` or `damaged`."""
-    reason: str = ""
-    """Why it failed or is damaged; where a cluster executes it."""
-    started: str = ""
-    """ISO 8601, UTC."""
+    state: str = ""  # `done`, `queued`, `running`, `stopped`, `failed` or `damaged`
+    reason: str = ""  # why it failed or is damaged; where a cluster executes it
+    started: str = ""  # ISO 8601, UTC
     steps: int | None = None
-    seconds: float | None = None
-    """Spent training [s]."""
+    seconds: float | None = None  # spent training [s]
     best_step: int | None = None
     best_success: float | None = None
     best_return: float | None = None
     changes: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Recipe keys, dotted, that differ from the task's own recipe, and their values."""
     versions: dict[str, str] = dataclasses.field(default_factory=dict)
-    folder: str = ""
-    """The working folder of the training; a relative path of a task starts there."""
-    source_sha256: str = ""
-    """Of the task's file when the training began."""
+    folder: str = ""  # the working folder of the training; a relative path of a task starts there
+    source_sha256: str = ""  # of the task's file when the training began
 
     @property
     def name(self) -> str:

@@ -33,11 +33,9 @@ if TYPE_CHECKING:
 class Description:
     """Everything known about a task."""
 
-    content: dict[str, Any]
-    """The JSON output, as plain data."""
+    content: dict[str, Any]  # the JSON output, as plain data
     recipe: recipes.Recipe
-    policy: PolicyInfo | None
-    """Metadata of the policy that ships with the task."""
+    policy: PolicyInfo | None  # metadata of the policy that ships with the task
 
 
 def describe(task: str) -> Description:

@@ -1,7 +1,5 @@
 """`rlctl tasks`: the installed tasks, with summary, score of the shipped policy, and problems."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import functools
@@ -23,13 +21,10 @@ class ListedTask:
     target: str
     distribution: str
     version: str
-    summary: str
-    """First line of the task's docstring."""
+    summary: str  # first line of the task's docstring
     algo: str | None
-    success: float | None
-    """Success rate of the shipped policy, measured at its export."""
-    mean_return: float | None
-    """Mean return of the shipped policy in the same episodes."""
+    success: float | None  # success rate of the shipped policy, measured at its export
+    mean_return: float | None  # mean return of the shipped policy in the same episodes
     problem: str | None
 
 

@@ -1,7 +1,5 @@
 """`rlctl tasks new`: writes a starter plugin that passes every check and trains in seconds."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 import keyword
@@ -34,8 +32,7 @@ class NewPlugin:
     folder: Path
     package: str
     cls: str
-    files: list[Path]
-    """Relative to `folder`."""
+    files: list[Path]  # relative to `folder`
 
     @property
     def target(self) -> str:

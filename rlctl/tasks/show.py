@@ -1,7 +1,5 @@
 """Prints `rlctl tasks show`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Signs in the recorded episodes of the last evaluations, which are played without exploration."""
 
-from __future__ import annotations
-
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -13,11 +11,9 @@ from rlctl.runs.diagnosis.history import History
 Array = NDArray[np.float64]
 
 _LEAST_STEPS = 20
-_MOST_SPEED = {"m/s": 50.0, "rad/s": 300.0}
-"""No joint or body of a robot is faster: 300 rad/s are 2,900 turns a minute."""
+_MOST_SPEED = {"m/s": 50.0, "rad/s": 300.0}  # no joint or body of a robot is faster: 300 rad/s are 2,900 turns a minute
 _MOST_POSITION_SPEED = 50.0  # [m/s]
-_MOST_OVERLAP = 0.05
-"""[m]; feet that hit the ground reach 0.02, a fall 0.03."""
+_MOST_OVERLAP = 0.05  # [m]; feet that hit the ground reach 0.02, a fall 0.03
 
 
 def _actions(run: History) -> list[Array]:

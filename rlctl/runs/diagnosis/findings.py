@@ -1,7 +1,5 @@
 """Findings of a training; `findings.yaml` has the combinations of signs that make a finding, and its texts."""
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import functools
@@ -24,10 +22,8 @@ _NOT = "not "
 class Grade(enum.StrEnum):
     """How bad a finding is."""
 
-    WARNING = "warning"
-    """The training is very likely wrong."""
-    INFO = "info"
-    """Worth knowing."""
+    WARNING = "warning"  # the training is very likely wrong
+    INFO = "info"  # worth knowing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,22 +31,18 @@ class Setting:
     """A hyperparameter that may need another value."""
 
     name: str
-    value: Any
-    """The value in the recipe, or SB3's default."""
-    advice: str
-    """Its usual range and value, and what raising and lowering it does."""
+    value: Any  # the value in the recipe, or SB3's default
+    advice: str  # its usual range and value, and what raising and lowering it does
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
     """A problem that the records of a training show."""
 
-    id: str
-    """Q1 to Q13."""
+    id: str  # Q1 to Q13
     name: str
     grade: Grade
-    evidence: list[str]
-    """The numbers that show it."""
+    evidence: list[str]  # the numbers that show it
     meaning: str
     advice: list[str]
     settings: list[Setting]

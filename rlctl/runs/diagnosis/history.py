@@ -1,7 +1,5 @@
 """The records of a training, read from its run folder, as curves."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -22,12 +20,9 @@ from rlctl.runs.summary import Rows, list_points, read_table
 
 Array = NDArray[np.float64]
 
-LEAST_ROWS = 10
-"""Rows of `metrics.csv`; with fewer rows most signs are not checked."""
-_GOOD = 0.8
-"""A training with this success rate has succeeded, whatever its other records are."""
-EPISODES = 4
-"""Recorded episodes that are checked: the first and the worst of the last two evaluations."""
+LEAST_ROWS = 10  # rows of `metrics.csv`; with fewer rows most signs are not checked
+_GOOD = 0.8  # a training with this success rate has succeeded, whatever its other records are
+EPISODES = 4  # recorded episodes that are checked: the first and the worst of the last two evaluations
 
 
 @dataclasses.dataclass(frozen=True)

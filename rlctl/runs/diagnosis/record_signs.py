@@ -1,7 +1,5 @@
 """Signs in the use of time and in the end of a run. Functions as in `signs`."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

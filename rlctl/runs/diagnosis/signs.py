@@ -1,7 +1,5 @@
 """Signs in returns, lengths and successes. Each function returns the evidence of a sign, or None without it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,15 +1,12 @@
 """Signs in the values that are logged and measured after updates. Functions as in `signs`."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 
 from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
 
-_MOST_NORMALIZED_REWARD = 10.0
-"""Where SB3's `VecNormalize` clips."""
+_MOST_NORMALIZED_REWARD = 10.0  # where SB3's `VecNormalize` clips
 
 
 def critic_explains_nothing(run: History) -> str | None:

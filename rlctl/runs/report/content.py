@@ -1,7 +1,5 @@
 """The content of a report, before it is formatted."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shlex
@@ -32,8 +30,7 @@ _GOOD_SUCCESS = 0.5
 class RecipeRuns:
     """The runs of one recipe."""
 
-    name: str
-    """What distinguishes this recipe from the others; empty for a single one."""
+    name: str  # what distinguishes this recipe from the others; empty for a single one
     runs: list[RunDescription]
 
 
@@ -42,8 +39,7 @@ class RunReport:
     """One run, or several of one task."""
 
     recipes: list[RecipeRuns]
-    notes: list[str]
-    """Warnings about the runs."""
+    notes: list[str]  # warnings about the runs
 
     @property
     def runs(self) -> list[RunDescription]:

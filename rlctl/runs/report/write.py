@@ -1,7 +1,5 @@
 """Writes a report as one HTML file that needs nothing else, or as Markdown for pull requests."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -18,8 +16,7 @@ from rlctl.storage import files
 
 DEFAULT_FILE = Path("report.html")
 
-_PICTURES = 6
-"""Of an episode."""
+_PICTURES = 6  # of an episode
 
 
 def write_report(
