@@ -192,7 +192,11 @@ def test_a_plain_environment(rlctl, write_module):
     ],
 )
 def test_what_cannot_be_shown(rlctl, write_module, task, code, message):
-    write_module("broken.py", "class Broken:\n    def __init__(self):\n\n        raise RuntimeError('no motors')")
+    write_module(
+        "broken.py",
+        "class Broken:\n    def reset(self): ...\n    def step(self, action): ...\n"
+        "    def __init__(self): raise RuntimeError('no motors')",
+    )
     write_module("halves.py", "class Half:\n    action_space = 1\n    def reset(self): ...\n    def step(self, a): ...")
     result = rlctl("tasks", "show", task, "--json", "-")
     assert (result.returncode, result.stdout) == (code, "")
