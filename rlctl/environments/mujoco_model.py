@@ -22,7 +22,7 @@ _SHOWN_JOINTS = 8
 
 def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
     """Return the MuJoCo `model` and `data` of an environment, or None."""
-    library, inner = sys.modules.get("mujoco"), env.unwrapped
+    library, inner = sys.modules.get("mujoco"), getattr(env, "unwrapped", env)
     if library is None:
         return None
     world = getattr(inner, "sim", None) if type(getattr(inner, "sim", None)).__name__ == "MujocoSim" else inner

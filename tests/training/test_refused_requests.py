@@ -14,7 +14,10 @@ from rlctl.training.request import run_training
         ({"algo_kwargs": {"n_step": 16}}, "no key 'algo_kwargs.n_step' for ppo. Did you mean 'n_steps'?"),
         ({"algo": "sac", "algo_kwargs": {"n_epochs": 3}}, "no key 'algo_kwargs.n_epochs' for sac."),
         ({"policy_kwargs": {"net_arc": [8]}}, "no key 'policy_kwargs.net_arc' for ppo. Did you mean 'net_arch'?"),
-        ({"policy_kwargs": {"activation_fn": "rellu"}}, "or silu, got 'rellu'. Did you mean 'relu'?"),
+        (
+            {"policy_kwargs": {"activation_fn": "rellu"}},
+            "or FILE.py:CLASS or MODULE:CLASS, got 'rellu'. Did you mean 'relu'?",
+        ),
         ({"algo_kwargs": {"learning_rate": "lin_fast"}}, "a number in (0, 1] or lin_NUMBER, got 'lin_fast'"),
         ({"algo": "dqn"}, "dqn cannot be used here: "),
         ({"task": {"colour": 1}}, "task.colour: "),

@@ -40,6 +40,7 @@ def test_signals(served):
     content = file.read_bytes()
     file.write_bytes(content[:-1])
     process.send_signal(signal.SIGHUP)
+    assert "no --limits FILE" in process.stderr.readline()
     assert "the policy was not changed" in process.stderr.readline()
     file.write_bytes(content)
     process.send_signal(signal.SIGHUP)
