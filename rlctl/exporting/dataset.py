@@ -1,7 +1,5 @@
 """`rlctl export RUN --dataset minari|lerobot`: episodes of a policy as a dataset for other libraries."""
 
-from __future__ import annotations
-
 import importlib
 import json
 from pathlib import Path

@@ -3,8 +3,6 @@
 Names and defaults are compared with SB3's signatures by a test; `docs/recipe.md` is generated from these models.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """The JSON schema of recipes for editors: `rlctl recipe --schema`, and `recipe.schema.json` next to this module."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The parameters of the networks of every algorithm, `policy_kwargs`: SB3's names, with the type and range of each."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, PlainSerializer, ValidationInfo, WrapValidator

@@ -1,7 +1,5 @@
 """Strict types of a recipe's values: text and bools are not numbers, and numbers are not switches."""
 
-from __future__ import annotations
-
 import dataclasses
 import numbers
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Merges the sources of a recipe: a task's packaged YAML, then `--config`, then `--set` and the other flags."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -28,8 +28,7 @@ class Episode:
 
     result: EpisodeResult
     trajectory: Trajectory | None = None
-    terminated: bool = False
-    """Whether its last step terminated it; else it was truncated."""
+    terminated: bool = False  # whether its last step terminated it; else it was truncated
 
     @property
     def recorded(self) -> Trajectory:

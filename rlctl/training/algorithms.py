@@ -1,7 +1,5 @@
 """From a recipe to an SB3 model."""
 
-from __future__ import annotations
-
 import inspect
 import math
 from typing import Any
@@ -28,8 +26,7 @@ from rlctl.training.vec_env import WorkerVecEnv
 # The system provides a replay buffer's memory only when it is written, so one that is too large fails hours later.
 _FLOAT32 = 4  # [bytes]
 _USABLE_SHARE = 0.9  # of the free memory; the environments need memory too
-_DELAYED_BY_US = frozenset({"sac", "tqc"})
-"""Algorithms whose `policy_delay` Stable-Baselines3 does not have."""
+_DELAYED_BY_US = frozenset({"sac", "tqc"})  # algorithms whose `policy_delay` Stable-Baselines3 does not have
 _CONTINUOUS = frozenset({"sac", "td3", "ddpg", "tqc", "crossq"})
 
 

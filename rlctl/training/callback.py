@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from rlctl.rollout.shared_arrays import SegmentArrays
     from rlctl.training.learner import Learner
 
-_SCHEDULES = {"learning_rate": "lr_schedule", "clip_range": "clip_range"}
-"""Attribute of SB3's model by parameter."""
+_SCHEDULES = {"learning_rate": "lr_schedule", "clip_range": "clip_range"}  # attribute of SB3's model by parameter
 _NUMBERS = ("ent_coef", "vf_coef")
 """Parameters that PPO and A2C read at each update; SAC reads its `ent_coef` only at the start."""
 
@@ -22,15 +21,12 @@ class Training:
     """What a callback reads and changes. Steps are environment steps, all environments together."""
 
     def __init__(self, learner: Learner, folder: Path) -> None:
-        self.folder = folder
-        """The run's folder."""
+        self.folder = folder  # the run's folder
         self.recipe = learner.recipe
-        self.model = learner.model
-        """The Stable-Baselines3 model."""
+        self.model = learner.model  # the Stable-Baselines3 model
         self.metrics: Mapping[str, Any] = {}
         """In `on_segment`: the row of `metrics.csv` that is written next; empty if none is due."""
-        self.evaluation: Mapping[str, Any] = {}
-        """In `on_evaluation`: the row of `evals.csv`."""
+        self.evaluation: Mapping[str, Any] = {}  # in `on_evaluation`: the row of `evals.csv`
         self.episodes: Sequence[EpisodeResult] = ()
         """In `on_segment`: the training episodes that ended since the last call."""
         self._learner = learner

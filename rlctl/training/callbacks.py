@@ -58,8 +58,7 @@ class Callbacks:
     def __init__(
         self, callbacks: Mapping[str, Callback], learner: Learner, folder: Path, warn: Callable[[str], None]
     ) -> None:
-        self.running = ""
-        """Name and moment of the callback that is running."""
+        self.running = ""  # name and moment of the callback that is running
         self._callbacks = callbacks
         self._training = Training(learner, folder)
         self._progress = learner.progress

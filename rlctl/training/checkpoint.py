@@ -5,8 +5,6 @@ statistics, the actions of running episodes) and `state.json` (plain data, and e
 The replay buffer of an off-policy algorithm is in segments next to the folders.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json
@@ -45,18 +43,13 @@ class State(pydantic.BaseModel):
     """The content of `state.json`."""
 
     format: int = FORMAT
-    run: str = ""
-    """The `id` of its run."""
+    run: str = ""  # the `id` of its run
     step: int
-    model: dict[str, Any]
-    """Plain data of `snapshot.take`."""
+    model: dict[str, Any]  # plain data of `snapshot.take`
     progress: Progress
-    callbacks: list[dict[str, Any]] = []
-    """Plain data of `Callbacks.take`."""
-    segments: list[Segment] = []
-    """The segments of the replay buffer."""
-    computed_with: dict[str, str]
-    """What bit-exact results depend on: versions, processor, threads."""
+    callbacks: list[dict[str, Any]] = []  # plain data of `Callbacks.take`
+    segments: list[Segment] = []  # the segments of the replay buffer
+    computed_with: dict[str, str]  # what bit-exact results depend on: versions, processor, threads
     sha256: dict[str, str]
 
 

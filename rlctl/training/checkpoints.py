@@ -1,7 +1,5 @@
 """What a training writes into its run folder, and what a resume restores; a failing disk stops no training."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,10 +17,8 @@ from rlctl.training.checkpoint import Checkpoint, CheckpointFolders, find_differ
 from rlctl.training.learner import Learner
 from rlctl.training.snapshot import check_finite
 
-STEP_LABEL = "training step "
-"""Start of the `policy` text of a saved episode; the step's number follows."""
-CHECKPOINT_TIME_SHARE = 0.02
-"""Share of the training time that checkpoints may take."""
+STEP_LABEL = "training step "  # start of the `policy` text of a saved episode; the step's number follows
+CHECKPOINT_TIME_SHARE = 0.02  # share of the training time that checkpoints may take
 
 
 class Checkpoints:
@@ -34,20 +30,15 @@ class Checkpoints:
         self.callbacks = callbacks
         self.metrics = Table(run.metrics_file)
         self.evals = Table(run.evals_file)
-        self.saved_step: int | None = None
-        """Step of the last complete checkpoint."""
-        self.problem = ""
-        """The last write that failed, and why."""
+        self.saved_step: int | None = None  # step of the last complete checkpoint
+        self.problem = ""  # the last write that failed, and why
         self._learner = learner
         self._folders = CheckpointFolders(run, learner.model, learner.env, callbacks, learner.recipe.checkpoint.keep)
         self._warn = warn
         self._next_s = time.monotonic()
-        self._uncounted_checkpoints = 1
-        """Checkpoints that are written even if not due: the last one."""
-        self._reported: set[str] = set()
-        """Problems reported since the last successful checkpoint."""
-        self._unsaved_best: PolicyFile | None = None
-        """The best policy, if it could not be written yet."""
+        self._uncounted_checkpoints = 1  # checkpoints that are written even if not due: the last one
+        self._reported: set[str] = set()  # problems reported since the last successful checkpoint
+        self._unsaved_best: PolicyFile | None = None  # the best policy, if it could not be written yet
 
     def attempt(self, what: str, write: Callable[[], object]) -> bool:
         """Call `write`; on an `OSError` show a warning about `what` and return False.

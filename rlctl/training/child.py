@@ -1,7 +1,5 @@
 """Child process of a training: receives a request as JSON, exits with the exit code of `rlctl train`."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from multiprocessing.connection import Connection

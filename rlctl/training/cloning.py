@@ -3,8 +3,6 @@
 The library `imitation` is not used: its newest release, 1.0.1, needs gymnasium 0.29 and Stable-Baselines3 2.2.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -28,10 +26,8 @@ from rlctl.training.start import Start
 REHEARSAL_SHARE = 0.25
 """Share of an off-policy training in which the actor goes on learning from the demonstrations, less and less."""
 _UPDATES, _BATCH, _RATE = 3000, 256, 1e-3
-_STD = 0.1
-"""Exploration after cloning; the entropy of such noise is about SAC's target."""
-_CONSTANT = 1e-8
-"""Variance below which an observation counts as constant."""
+_STD = 0.1  # exploration after cloning; the entropy of such noise is about SAC's target
+_CONSTANT = 1e-8  # variance below which an observation counts as constant
 
 
 def clone(start: Start, rollouts: Rollouts, env: EnvInfo, show: Callable[[str], None]) -> None:

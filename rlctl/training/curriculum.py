@@ -1,7 +1,5 @@
 """The curriculum: its current stage, and when the next one begins."""
 
-from __future__ import annotations
-
 import statistics
 import warnings
 from collections.abc import Sequence
@@ -32,10 +30,8 @@ class Curriculum:
 
     def __init__(self, stages: Sequence[Stage], specs: Sequence[EnvSpec], goal: EnvInfo, progress: Progress) -> None:
         self.stages = stages
-        self.goal_spec = specs[-1]
-        """The last stage, in which evaluations are played and which policies store."""
-        self.goal = goal
-        """Description of the environments of `goal_spec`."""
+        self.goal_spec = specs[-1]  # the last stage, in which evaluations are played and which policies store
+        self.goal = goal  # description of the environments of `goal_spec`
         self._specs = specs
         self._progress = progress
         if stages and not progress.stage:

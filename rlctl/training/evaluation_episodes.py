@@ -1,7 +1,5 @@
 """Evaluation episodes of a training: the same each time; the first and the worst are saved."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Callable
 from pathlib import Path

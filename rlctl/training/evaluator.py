@@ -1,7 +1,5 @@
 """Evaluations while training, and the best policy: when to evaluate, what is written, and which policy is kept."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -17,8 +15,7 @@ from rlctl.training.display import Display, format_score
 from rlctl.training.evaluation_episodes import EvaluationEpisodes
 from rlctl.training.learner import Learner
 
-_FINAL_EPISODES = 30
-"""Minimum number of new episodes that compare the best policy with the last."""
+_FINAL_EPISODES = 30  # minimum number of new episodes that compare the best policy with the last
 
 
 class Evaluator:
@@ -31,14 +28,12 @@ class Evaluator:
         self, learner: Learner, episodes: EvaluationEpisodes, checkpoints: Checkpoints, display: Display
     ) -> None:
         self.episodes = episodes
-        self.best: PolicyInfo | None = None
-        """The best policy so far, with its score, as stored in its file."""
+        self.best: PolicyInfo | None = None  # the best policy so far, with its score, as stored in its file
         self._learner = learner
         self._recipe = learner.recipe
         self._checkpoints = checkpoints
         self._display = display
-        self._highest_success = 0.0
-        """Of all evaluations so far."""
+        self._highest_success = 0.0  # of all evaluations so far
         self._reported_findings: set[str] = set()
 
     def restore(self) -> None:

@@ -4,8 +4,6 @@ M. Andrychowicz et al., Hindsight Experience Replay, 2017, https://arxiv.org/abs
 In a curriculum the current stage computes the rewards of exchanged goals, also for episodes of earlier stages.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from gymnasium import spaces

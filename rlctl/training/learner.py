@@ -1,7 +1,5 @@
 """The learner: model, environments, curriculum and progress of a training."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

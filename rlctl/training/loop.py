@@ -4,8 +4,6 @@ Checkpoints are written between segments only. Steps decide what is done at a bo
 run equals one that was never stopped. Only the time of checkpoints depends on the clock, and they change no result.
 """
 
-from __future__ import annotations
-
 import shlex
 import time
 from pathlib import Path
@@ -27,8 +25,7 @@ class TrainingLoop:
         self.learner = learner
         self.evaluator = evaluator
         self.checkpoints = checkpoints
-        self.stop_signal: int | None = None
-        """Number of the signal after which to stop at the next boundary."""
+        self.stop_signal: int | None = None  # number of the signal after which to stop at the next boundary
         self.callbacks = checkpoints.callbacks
         self._metrics = Metrics(learner, checkpoints, display)
         self._display = display

@@ -4,8 +4,6 @@ Actions, exploration, values and gradients are read from SB3's buffers and optim
 steps only, so a resumed run measures the same. A value that does not exist, e.g. limits of discrete actions, is None.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,15 +23,11 @@ from rlctl.evaluation.episode_statistics import mean_metrics, mean_return, mean_
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.training.vec_env import WorkerVecEnv
 
-HISTOGRAMS = 20
-"""Number of times per training that histograms are written; they take more time than numbers."""
+HISTOGRAMS = 20  # number of times per training that histograms are written; they take more time than numbers
 
-_ROWS = 500
-"""Maximum number of last steps per environment that are measured."""
-_SAMPLES = 2000
-"""Values in a histogram."""
-_AT_LIMIT = 0.99
-"""An action counts as saturated from this fraction of half its range."""
+_ROWS = 500  # maximum number of last steps per environment that are measured
+_SAMPLES = 2000  # values in a histogram
+_AT_LIMIT = 0.99  # an action counts as saturated from this fraction of half its range
 
 
 _LOSSES = (
@@ -47,13 +41,11 @@ _LOSSES = (
 class LastSteps:
     """The last steps of all environments; arrays of shape (n_envs, steps, ...) except `values`."""
 
-    observation: Mapping[str, NDArray[Any]]
-    """Not normalised."""
+    observation: Mapping[str, NDArray[Any]]  # not normalised
     action: NDArray[Any]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
-    values: NDArray[Any] | None
-    """The critic's values of the steps, in any order; None if they were not computed."""
+    values: NDArray[Any] | None  # the critic's values of the steps, in any order; None if they were not computed
 
 
 def measure(model: BaseAlgorithm, env: WorkerVecEnv, last_row: int, total_timesteps: int) -> dict[str, float | None]:

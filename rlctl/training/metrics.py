@@ -1,7 +1,5 @@
 """The rows of `metrics.csv`, and the same numbers for TensorBoard and the display."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -1,7 +1,5 @@
 """SAC, TQC, CrossQ, TD3, DDPG and DQN on chunks of steps; with overlap workers play while the model learns."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

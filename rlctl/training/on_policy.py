@@ -1,7 +1,5 @@
 """PPO, A2C and recurrent PPO on segments played by workers: values and log-probabilities in batched passes."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from typing import Any
@@ -19,23 +17,18 @@ from rlctl.training.rollouts import Check, Rollouts, Statistics, to_network_layo
 
 Arrays = dict[str, NDArray[Any]]
 
-_ROWS = 4096
-"""Observations in one forward pass."""
+_ROWS = 4096  # observations in one forward pass
 
 
 @dataclasses.dataclass(frozen=True)
 class _SegmentValues:
     """What the networks compute for a segment."""
 
-    values: NDArray[np.float32]
-    """Shape (environments, steps)."""
+    values: NDArray[np.float32]  # shape (environments, steps)
     log_probs: NDArray[np.float32]
-    last_values: NDArray[np.float32]
-    """Values of the observations after the last step, shape (environments,)."""
-    final_values: NDArray[np.float32]
-    """Values of the final observations of truncated episodes."""
-    states: Arrays = dataclasses.field(default_factory=dict)
-    """LSTM states before each step, for the recurrent buffer."""
+    last_values: NDArray[np.float32]  # values of the observations after the last step, shape (environments,)
+    final_values: NDArray[np.float32]  # values of the final observations of truncated episodes
+    states: Arrays = dataclasses.field(default_factory=dict)  # LSTM states before each step, for the recurrent buffer
 
 
 class OnPolicyRollouts(Rollouts):

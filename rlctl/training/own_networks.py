@@ -1,7 +1,5 @@
 """A user's own networks: their part is exported as an ONNX graph, which workers run to act."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from typing import Any
@@ -20,13 +18,11 @@ from rlctl.policy.own_graph import OBSERVATION, OUTPUT
 from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy, is_own
 
-_COMPARED = 10
-"""Number of random observations."""
+_COMPARED = 10  # number of random observations
 _HEADS = {"dqn": "q_net", "td3": "actor.mu", "ddpg": "actor.mu"} | dict.fromkeys(
     ("sac", "tqc", "crossq"), "actor.mu and actor.log_std"
 )
-_CACHE = "rlctl_own_graph"
-"""Attribute of a policy: its graph does not change with its weights."""
+_CACHE = "rlctl_own_graph"  # attribute of a policy: its graph does not change with its weights
 
 
 def has_own_parts(policy: Any) -> bool:

@@ -5,8 +5,6 @@ all environments is one transition. A segment holds a range of them, and a check
 oldest first. Where two overlap the later one is valid. Segments that no checkpoint lists are removed.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -25,8 +23,7 @@ from rlctl.errors import ArtifactError
 from rlctl.storage import files
 from rlctl.training.snapshot import Tensors
 
-SEGMENT_BYTES = 8 * 2**20
-"""Size of a segment [bytes]; the last one is written again until it has this size."""
+SEGMENT_BYTES = 8 * 2**20  # size of a segment [bytes]; the last one is written again until it has this size
 _FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _NAME = re.compile(r"^\d{12}-\d{12}\.safetensors$")
 

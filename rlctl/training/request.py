@@ -1,7 +1,5 @@
 """`rlctl train`: from a request to a finished run."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from pathlib import Path

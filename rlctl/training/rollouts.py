@@ -3,8 +3,6 @@
 The normalisation statistics are constant while a segment is played, and are updated after it.
 """
 
-from __future__ import annotations
-
 import abc
 from collections.abc import Callable
 from typing import Any
@@ -22,8 +20,7 @@ from rlctl.training.snapshot import observation_statistics, pack
 from rlctl.training.updates import choose_learner
 from rlctl.training.vec_env import WorkerVecEnv
 
-Check = Callable[[], None]
-"""Called several times a second while workers play; may raise to stop."""
+Check = Callable[[], None]  # called several times a second while workers play; may raise to stop
 Statistics = dict[str, tuple[NDArray[Any], NDArray[Any]]]
 """Mean and variance per normalised observation, "" for one that is not a dict."""
 
@@ -31,8 +28,7 @@ Statistics = dict[str, tuple[NDArray[Any], NDArray[Any]]]
 class Rollouts(abc.ABC):
     """Replaces the loop in SB3's `learn`, which would query the policy at every step."""
 
-    overlap = False
-    """Whether a segment is played while the model learns from earlier ones."""
+    overlap = False  # whether a segment is played while the model learns from earlier ones
     is_trained = False
     """Whether the policy begins trained; then it plays the steps before the first update, else actions are random."""
 

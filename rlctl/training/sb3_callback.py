@@ -1,7 +1,5 @@
 """Callbacks written for Stable-Baselines3: `on_step` is called for every step of a segment that was played."""
 
-from __future__ import annotations
-
 import collections
 import inspect
 from collections.abc import Iterator
@@ -13,8 +11,7 @@ from rlctl.environments.dict_spaces import join
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.training.callback import Callback, Training
 
-_REFERENCES = ("model", "locals", "globals", "parent", "pbar")
-"""Attributes that are no state."""
+_REFERENCES = ("model", "locals", "globals", "parent", "pbar")  # attributes that are no state
 _WATCHED = ("learning_rate", "lr_schedule", "clip_range", "ent_coef", "vf_coef", "target_kl", "gamma", "tau")
 """Attributes of the model that a callback may replace; checkpoints store only those that are plain data."""
 

@@ -1,7 +1,5 @@
 """`rlctl train TASK --seeds 0-4`: a group with an ordinary run for every seed, each in its own process."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import shlex
@@ -38,8 +36,7 @@ class SeedsResult:
     """How the trainings of a group ended."""
 
     score: GroupScore
-    failed: Mapping[int, int]
-    """Exit code per seed that failed."""
+    failed: Mapping[int, int]  # exit code per seed that failed
 
     def check(self) -> None:
         """Raise `SeedsFailed` if a seed failed."""

@@ -33,12 +33,10 @@ if TYPE_CHECKING:
     from rlctl.training.loop import TrainingLoop
 
 
-_CHECK_BUDGET_S = 2.0
-"""Time for playing episodes [s], without importing and building the environment."""
+_CHECK_BUDGET_S = 2.0  # time for playing episodes [s], without importing and building the environment
 _FAILURES = ("RL104", "RL207", "RL208", "RL209", "RL601")
 """Rules of an environment that raises, crashes, hangs or returns NaN, which ends a training with the same exit code."""
-_EXPERIMENTS = ("build", "comparisons", "episodes")
-"""What one child process can do in that time."""
+_EXPERIMENTS = ("build", "comparisons", "episodes")  # what one child process can do in that time
 
 
 @contextlib.contextmanager

@@ -3,8 +3,6 @@
 `checkpoint.py` does this for the environments, `replay_segments.py` for the replay buffer.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

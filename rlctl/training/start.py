@@ -42,19 +42,14 @@ class Start:
     request: TrainRequest
     task: str
     recipe: Recipe
-    run: RunDirectory | None = None
-    """The resumed run; None for a new one."""
+    run: RunDirectory | None = None  # the resumed run; None for a new one
     lock: RunLock | None = None
     checkpoint: Checkpoint | None = None
-    notes: tuple[str, ...] = ()
-    """Messages for the user, before the first step."""
+    notes: tuple[str, ...] = ()  # messages for the user, before the first step
     callbacks: Mapping[str, Callback] = dataclasses.field(default_factory=dict)
-    source: Mapping[str, Any] | None = None
-    """The policy of `--from`; see `warm_start.find_source`."""
-    demos: Mapping[str, str] | None = None
-    """The demonstrations of `--demos`; see `demonstrations.describe_source`."""
-    inexact: tuple[str, ...] = ()
-    """Reasons, known before the start, why the resume cannot be bit-exact."""
+    source: Mapping[str, Any] | None = None  # the policy of `--from`; see `warm_start.find_source`
+    demos: Mapping[str, str] | None = None  # the demonstrations of `--demos`; see `demonstrations.describe_source`
+    inexact: tuple[str, ...] = ()  # reasons, known before the start, why the resume cannot be bit-exact
     began: float = dataclasses.field(default_factory=time.monotonic)
 
     def __enter__(self) -> Start:

@@ -1,7 +1,5 @@
 """What a training prints at its end."""
 
-from __future__ import annotations
-
 import shlex
 from typing import Any
 

@@ -1,7 +1,5 @@
 """SB3's logger, which writes TensorBoard's event files; if it cannot write, the training continues."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import platform

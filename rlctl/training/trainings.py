@@ -3,8 +3,6 @@
 `rlctl.cluster` has subclasses of `Trainings` that train on other machines.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os
@@ -25,8 +23,7 @@ from rlctl.rollout.workers import available_cores
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.signals import HandledSignals
 
-CORES_PER_TRAINING = 2
-"""One for the workers, one for the updates."""
+CORES_PER_TRAINING = 2  # one for the workers, one for the updates
 _WATCH_S = 0.25
 _ASK_S = 0.5
 Result = TypeVar("Result")
@@ -48,15 +45,13 @@ NextSignal = Callable[[], int]
 class Trainings:
     """Runs calls of `train`, several at a time, on this machine; a signal stops all."""
 
-    resume_options = ""
-    """Options that the resume command needs: ` --on slurm`."""
+    resume_options = ""  # options that the resume command needs: ` --on slurm`
 
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
         self._thread_numbers = itertools.count()
         self._signals: list[int] = []
-        self.stopped_by: int | None = None
-        """The signal that stopped all; later trainings do not start."""
+        self.stopped_by: int | None = None  # the signal that stopped all; later trainings do not start
 
     def describe(self) -> str:
         """Return as text where trainings run, and how many at a time."""

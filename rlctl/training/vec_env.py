@@ -1,7 +1,5 @@
 """The worker environments as a VecEnv of Stable-Baselines3."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -63,18 +61,14 @@ class WorkerVecEnv(VecEnv):
     def __init__(self, workers: Workers, run_seed: int) -> None:
         self.workers = workers
         self.run_seed = run_seed
-        self.episodes_started = [0] * workers.n_envs
-        """Per environment the number of episodes that have begun."""
-        self.history = ActionHistory(workers.arrays.segment.action[:, :0])
-        """The actions of the running episodes."""
+        self.episodes_started = [0] * workers.n_envs  # per environment the number of episodes that have begun
+        self.history = ActionHistory(workers.arrays.segment.action[:, :0])  # the actions of the running episodes
         self.outside, self.outside_message = 0, ""
         """Number of observations outside their space since it was set to 0, and a message about one."""
-        self.ended: list[EpisodeResult] = []
-        """Episodes that ended since the list was emptied."""
+        self.ended: list[EpisodeResult] = []  # episodes that ended since the list was emptied
         self.last_segment: SegmentArrays | None = None
         """The last result of `finish`; the next segment overwrites its arrays."""
-        self.waited_s = 0.0
-        """Time spent waiting for the environments to play [s], since it was set to 0."""
+        self.waited_s = 0.0  # time spent waiting for the environments to play [s], since it was set to 0
         self._steps = 0
         super().__init__(workers.n_envs, *workers.info.spaces())
 

@@ -1,7 +1,5 @@
 """`rlctl train TASK --from POLICY`: starts with the weights and the normalisation of a policy."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Updates with gradients computed in NumPy, without autograd; SB3 updates all other algorithms and networks."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from sb3_contrib import TQC

@@ -1,7 +1,5 @@
 """Minibatches of a replay buffer as NumPy arrays, for several updates at once."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -22,8 +20,7 @@ class Batch:
     next_features: Floats
     actions: NDArray[Any]
     rewards: Floats
-    discounts: Floats
-    """Factor of the next observation's value: 0 where the episode ended."""
+    discounts: Floats  # factor of the next observation's value: 0 where the episode ended
 
 
 def sample_batches(model: Any, network: Any, count: int, size: int) -> list[Batch]:

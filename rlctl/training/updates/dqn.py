@@ -3,8 +3,6 @@
 V. Mnih et al., Human-level control through deep reinforcement learning, Nature, 2015.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

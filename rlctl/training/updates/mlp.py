@@ -5,8 +5,6 @@ computes unneeded gradients, e.g. of the critic's weights in the actor's update.
 as fast as torch's on AMD processors, and a NumPy call takes a third of the time.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 
@@ -17,8 +15,7 @@ from torch import Tensor, nn
 
 Floats = NDArray[np.float32]
 
-LOG_SQRT_TAU = 0.5 * math.log(2 * math.pi)
-"""Minus the logarithm of the standard normal density at 0."""
+LOG_SQRT_TAU = 0.5 * math.log(2 * math.pi)  # minus the logarithm of the standard normal density at 0
 _ACTIVATIONS = (nn.Tanh, nn.ReLU)
 
 

@@ -4,8 +4,6 @@ J. Schulman et al., Proximal Policy Optimization Algorithms, 2017, https://arxiv
 gradient is its variable: `to_mean` is the gradient of the loss with respect to the mean.
 """
 
-from __future__ import annotations
-
 import collections
 import functools
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 T. Haarnoja et al., Soft Actor-Critic Algorithms and Applications, 2018, https://arxiv.org/abs/1812.05905.
 """
 
-from __future__ import annotations
-
 import collections
 import functools
 from typing import Any, ClassVar
@@ -18,8 +16,7 @@ from rlctl.training.updates.mlp import Floats, is_mlp
 from rlctl.training.updates.side_by_side import SideBySide
 from rlctl.training.updates.squashed_actor import Sample, SquashedGaussianActor
 
-_LOSS_EVERY = 8
-"""Every so many updates the losses are computed, for the log only."""
+_LOSS_EVERY = 8  # every so many updates the losses are computed, for the log only
 
 
 class SacUpdate:

@@ -1,7 +1,5 @@
 """Updates independent networks in parallel, on two cores."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -14,8 +12,7 @@ from rlctl.training.updates.mlp import MlpStack, count_weights
 
 Result = TypeVar("Result")
 
-_WORTHWHILE = 8_000_000
-"""Multiplications per forward pass from which a second thread saves time."""
+_WORTHWHILE = 8_000_000  # multiplications per forward pass from which a second thread saves time
 
 
 class SideBySide:

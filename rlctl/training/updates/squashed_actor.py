@@ -3,8 +3,6 @@
 The name of a gradient is its variable: `to_action` is the gradient of the loss with respect to the action.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -29,14 +27,11 @@ _LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0  # SB3's limits, without gSDE
 class Sample:
     """Sampled actions of a batch, and the values for their gradients; shape (batch, actions) each."""
 
-    values: list[Floats]
-    """The outputs of the actor's layers."""
-    noise: Floats
-    """Added to the mean before tanh."""
+    values: list[Floats]  # the outputs of the actor's layers
+    noise: Floats  # added to the mean before tanh
     std: Floats
     action: Floats
-    log_prob: Floats
-    """Shape (batch, 1)."""
+    log_prob: Floats  # shape (batch, 1)
 
 
 class SquashedGaussianActor:

@@ -4,8 +4,6 @@ S. Fujimoto et al., Addressing Function Approximation Error in Actor-Critic Meth
 https://arxiv.org/abs/1802.09477.
 """
 
-from __future__ import annotations
-
 import collections
 import functools
 from typing import Any

@@ -4,8 +4,6 @@ A. Kuznetsov et al., Controlling Overestimation Bias with Truncated Mixture of C
 Critics, 2020, https://arxiv.org/abs/2005.04269.
 """
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 import numpy as np
