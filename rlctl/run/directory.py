@@ -58,8 +58,7 @@ class RunDirectory:
     claim_file = _RunPath(".claim")  # the token of the process that may write the run
     episodes = _RunPath("episodes")  # the folder of recorded episodes and recordings
     tensorboard = _RunPath("tensorboard")  # the folder of TensorBoard files
-    tracking_file = _RunPath("tracking.json")
-    """The id in the experiment tracker, and what was sent to it."""
+    tracking_file = _RunPath("tracking.json")  # the id in the experiment tracker, and what was sent to it
     onnx_file = _RunPath("exports/policy.onnx")  # the default file of an export
     replay_segments = _RunPath("checkpoints/replay")  # the folder of the replay buffer that checkpoints share
 
