@@ -36,7 +36,7 @@ class RecipeFlags:
     total_timesteps: Annotated[
         str | None, Option("Environment steps; 1e6 is fine.", ("--total-timesteps", "-n"), metavar="STEPS")
     ] = None
-    n_envs: Annotated[int | None, Option("Environments stepped side by side.", min=1)] = None
+    n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1)] = None
     track: Annotated[str | None, Option("Also send the run to wandb, mlflow or trackio.", metavar="TRACKER")] = None
 
     def merge(self) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     def run(**values: Any) -> None:
         output.results()  # reserves stdout for the result: plugins print to stderr from now on
         for name, (request, fields) in requests.items():
-            # A flag that turns a field off is True where the field is to be False.
+            # A flag that turns a field off is True if the field must become False.
             arguments = {field: values.pop(field) != turns_off for field, turns_off in fields.items() if turns_off}
             values[name] = request(**arguments, **{field: values.pop(field) for field in fields if field in values})
         return function(**values)

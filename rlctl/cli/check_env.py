@@ -14,25 +14,27 @@ from rlctl.options import EnvTimeout, Json, Option, OptionalTask, Settings
 def check_env(
     task: OptionalTask = None,
     settings: Settings = [],
-    select: Annotated[list[str], Option("Judge only these: RL3,RL501.", metavar="RULES")] = [],
-    ignore: Annotated[list[str], Option("Leave these out: RL106.", metavar="RULES")] = [],
+    select: Annotated[list[str], Option("Check only these rules: RL3,RL501.", metavar="RULES")] = [],
+    ignore: Annotated[list[str], Option("Skip these rules: RL106.", metavar="RULES")] = [],
     strict: Annotated[bool, Option("Exit 1 for warnings too.", ("--strict",))] = False,
     form: Annotated[
         Literal["text", "json", "sarif", "github"] | None,
-        Option("Form of the report.", ("--format",), default_text="text"),
+        Option("Format of the report.", ("--format",), default_text="text"),
     ] = None,
     output: Annotated[
-        str | None, Option("Where the report goes.", ("--output", "-o"), metavar="FILE", default_text="stdout")
+        str | None, Option("File of the report.", ("--output", "-o"), metavar="FILE", default_text="stdout")
     ] = None,
     json: Json = None,
     baseline: Annotated[
-        str | None, Option("A report of --json: what it has is known and fails nothing.", metavar="FILE")
+        str | None, Option("An earlier report of --json; its findings are not reported again.", metavar="FILE")
     ] = None,
     env_timeout: EnvTimeout = 10.0,
-    list_rules: Annotated[bool, Option("List all rules, and do nothing else.", ("--list",))] = False,
-    explain: Annotated[str | None, Option("Say what a rule, or a finding as Q10, means.", metavar="RULE")] = None,
+    list_rules: Annotated[bool, Option("List all rules and exit.", ("--list",))] = False,
+    explain: Annotated[
+        str | None, Option("Explain a rule, or a finding of a training, such as Q10.", metavar="RULE")
+    ] = None,
 ) -> None:
-    """Find what is wrong with an environment before hours of training do."""
+    """Find mistakes in an environment before hours of training are lost."""
     from rlctl.checking import formats
     from rlctl.checking.check import check
     from rlctl.checking.finding import choose_rules
@@ -51,7 +53,7 @@ def check_env(
     if task is None:
         raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")
     if json is not None and (form or output):
-        raise UsageError("--json FILE excludes --format and -o")
+        raise UsageError("--json and --format or -o exclude each other")
     known = set() if baseline is None else structured.read_baseline(Path(baseline))
     spec = parse_changes(settings).apply(EnvSpec(task))
     report = check(spec, rules=choose_rules(select, ignore), strict=strict, env_timeout_s=env_timeout)

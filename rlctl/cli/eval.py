@@ -27,7 +27,7 @@ def evaluate(
             metavar="NAME=LOW:HIGH:COUNT|all",
         ),
     ] = [],
-    push: Annotated[bool, Option("Find the smallest push at which it fails.", ("--push",))] = False,
+    push: Annotated[bool, Option("Find the smallest push at which the policy fails.", ("--push",))] = False,
     sim: Annotated[
         str | None,
         Option("Play in MuJoCo too, with soft, medium and stiff contacts.", metavar="mujoco[:SOLREF]"),

@@ -16,15 +16,17 @@ def export(
     c: Annotated[bool, Option("Write a C99 header and source file without dependencies.", ("--c",))] = False,
     policy: Annotated[
         Path | None,
-        Option("Write the actor with its measured score instead, as plugins ship it: .safetensors.", metavar="FILE"),
+        Option("Instead, write the policy with its measured score, as plugins ship it (.safetensors).", metavar="FILE"),
     ] = None,
-    dataset: Annotated[DatasetFormat | None, Option("Write episodes of the policy as a dataset instead.")] = None,
+    dataset: Annotated[DatasetFormat | None, Option("Instead, write episodes of the policy as a dataset.")] = None,
     episodes: Annotated[int, Option("Episodes of the dataset.", min=1)] = 100,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,
     output: Annotated[
         Path | None,
-        Option("Default: exports/policy.onnx, or .c, of the run.", ("--output", "-o"), metavar="PATH"),
+        Option(
+            "Default: exports/policy.onnx or exports/policy.c in the run's folder.", ("--output", "-o"), metavar="PATH"
+        ),
     ] = None,
     json: Json = None,
 ) -> None:

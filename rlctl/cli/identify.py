@@ -12,7 +12,10 @@ def identify(
     task: TaskName,
     log: Annotated[
         Path | None,
-        Option("CSV of the robot: time, action_..., position_JOINT, velocity_JOINT; a row per action.", metavar="FILE"),
+        Option(
+            "Recording of the robot (CSV): time, action_..., position_JOINT, velocity_JOINT; a row per action.",
+            metavar="FILE",
+        ),
     ] = None,
     excite: Annotated[Path | None, Option("Instead, write a safe trajectory to play and log.", metavar="FILE")] = None,
     events: Annotated[

@@ -16,7 +16,7 @@ _BY_OUTCOME = ("--worst", "--best", "--failures")
 
 
 class ReplayCommand(TyperCommand):
-    """Reads `--best RUN` as `--best 1 RUN`, and so for the other options that choose episodes by outcome."""
+    """Reads `--best RUN` as `--best 1 RUN`; the same for `--worst` and `--failures`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Insert the missing counts, then parse as Typer does."""

@@ -84,7 +84,7 @@ def compare_runs(
     task: Annotated[str | None, Option("Evaluate all on this task.")] = None,
     settings: Settings = [],
     threshold: Annotated[
-        float | None, Option("Report the steps to this success rate (or return); 0.9 if success is known.")
+        float | None, Option("Report the steps until this success rate (or return); default for success: 0.9.")
     ] = None,
     force: Annotated[bool, Option("Compare even if the task has changed.", ("--force",))] = False,
     gate: Annotated[Literal["not-worse"] | None, Option("Exit 1 if one is worse than the first.")] = None,

@@ -17,7 +17,7 @@ class TrainFlags(RecipeFlags):
         float | None, Option("Stop after two evaluations in a row at this success rate.", metavar="RATE")
     ] = None
     callback: Annotated[
-        list[str], Option("Call a class of yours during the training.", ("--callback",), metavar="FILE.py:CLASS")
+        list[str], Option("Call your own class during the training.", ("--callback",), metavar="FILE.py:CLASS")
     ] = dataclasses.field(default_factory=list)
 
     def merge(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from rlctl.training.trainings import MakeTrainings, make_local_trainings
 VARIABLE = "RLCTL_ON"  # environment variable that replaces the default, `local`
 _NOT_ON_SLURM = {
     "tune": "each trial depends on the results of earlier ones",
-    "eval": "a cell takes seconds, a job of SLURM waits longer",
+    "eval": "a cell takes seconds, less than a job waits in SLURM's queue",
 }
 
 

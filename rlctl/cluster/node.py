@@ -1,6 +1,6 @@
 """SLURM starts `python -m rlctl.cluster.node WORKS INDEX` on a node: it executes one training of an array.
 
-The exit code is 143 if SLURM shall requeue the job, otherwise that of the training.
+The exit code is 143 if SLURM must requeue the job, otherwise that of the training.
 """
 
 import dataclasses

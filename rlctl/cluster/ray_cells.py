@@ -1,4 +1,4 @@
-"""Cells of a robustness map on Ray: actors that stay play one cell after another.
+"""Plays the cells of a robustness map on Ray: each actor plays one cell after another.
 
 An actor receives the policy's bytes and needs no shared folder. A lost actor is replaced, and its cell is played again.
 """
@@ -37,7 +37,7 @@ class CellActor:
                 os.chdir(driver["cwd"])
         warnings = compare_versions(spec.task, driver["versions"], driver["source_sha256"])
         os.environ["RLCTL_CORES"] = str(driver["cpus"])
-        self._folder = tempfile.TemporaryDirectory(prefix="rlctl-")  # it ends with the actor
+        self._folder = tempfile.TemporaryDirectory(prefix="rlctl-")  # removed when the actor ends
         file = Path(self._folder.name) / name
         file.write_bytes(policy)
         player = load_player(file, request.deterministic)

@@ -33,7 +33,7 @@ def connect(address: str, task: str, cpus: int) -> Any:
         folder = tempfile.mkdtemp(prefix="rlctl-ray-")
         atexit.register(shutil.rmtree, folder, ignore_errors=True)  # after Ray's own handler, which is registered later
         token = Path(folder) / "token"
-        token.write_text(secrets.token_hex(32))  # its folder is this user's alone
+        token.write_text(secrets.token_hex(32))  # only this user can read its folder
         os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_TMPDIR": folder}
         os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token)}
     try:
@@ -57,7 +57,7 @@ def connect(address: str, task: str, cpus: int) -> Any:
 
 
 class Pulse:
-    """Raises an error if the cluster is gone: Ray itself would end this process after 60 s without a line of rlctl."""
+    """Raises an error if the cluster is lost; Ray itself would end this process after 60 s, without rlctl's message."""
 
     def __init__(self, ray: Any, hint: str = "") -> None:
         host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
@@ -65,7 +65,7 @@ class Pulse:
         self._asked_s = self._answered_s = time.monotonic()
 
     def check(self) -> None:
-        """Ask every few seconds whether the cluster is there; raise `TaskError` after `_GONE_S` without an answer."""
+        """Connect to the cluster every few seconds; raise `TaskError` after `_GONE_S` without an answer."""
         if time.monotonic() - self._asked_s < _ASK_S:
             return
         self._asked_s = time.monotonic()
@@ -85,9 +85,9 @@ def is_copied(task: str) -> bool:
 
 
 def describe_slots(ray: Any, cpus: int, most: int) -> tuple[str, int]:
-    """Return as text how many of `most` run at a time with `cpus` cores each, and their number."""
+    """Return how many of `most` run at a time with `cpus` cores each: as text, and as a number."""
     cores = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
     slots = min(most, sum(int(count // cpus) for count in cores))
     if not slots:
-        return f"on Ray: waiting for a machine with {cpus} cores (cpus in cluster.yaml); it has none", 0
+        return f"on Ray: waiting, because no machine has {cpus} cores (cpus in cluster.yaml)", 0
     return f"on Ray, {slots} at a time: {cpus} of its {sum(cores):g} cores each", slots

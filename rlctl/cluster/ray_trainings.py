@@ -1,8 +1,8 @@
 """Trainings as tasks of Ray: `ray` starts Ray on this machine, `ray:auto` and `ray:HOST:PORT` use a running cluster.
 
-Ray retries a task whose machine is lost; the new attempt resumes the run. An actor on the driver's node passes on lines
-and signals: an attempt regularly sends it lines and receives a signal. An attempt that gets no answer for `lease_s`
-ends itself.
+Ray retries a task whose machine is lost; the new attempt resumes the run. Each attempt
+regularly calls an actor on the driver's node: it sends lines, and the answer is a signal. An attempt that gets no
+answer for `lease_s` ends itself.
 """
 
 import contextlib

@@ -3,7 +3,7 @@
 A node starts or resumes a run (`rlctl.cluster.node`). A run that is preempted, out of time or warned saves a checkpoint
 and ends with 143; the script then requeues the job. The driver regularly writes a file; without it, runs save a
 checkpoint and end after `lease_s`. With `--detach` there is no such file, and the array needs no driver. A new driver
-follows an array again.
+can follow the array.
 """
 
 import dataclasses
@@ -68,7 +68,7 @@ class SlurmTrainings(Trainings):
         *,
         detach: bool = False,
     ) -> None:
-        """`waiting` runs in the folder of a group; `jobs` has no meaning here, as SLURM decides how many run."""
+        """`waiting` runs in the folder of a group; `jobs` is ignored: SLURM decides how many run."""
         super().__init__(max(waiting, 1))
         self._folder, self._settings, self._detach = folder, settings, detach
         self._token = mark_shared_folder(folder)

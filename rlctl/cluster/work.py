@@ -44,7 +44,7 @@ class Work:
     versions: dict[str, str]
     source_sha256: str | None  # hash of the task's file on the driver
     settings: dict[str, Any]  # `ClusterSettings`
-    has_copy: bool = False  # whether nodes start in a copy of the driver's current folder, and use it
+    has_copy: bool = False  # whether nodes work in a copy of the driver's current folder
 
     @property
     def folder(self) -> Path:
@@ -133,7 +133,7 @@ def compare_versions(task: str, versions: Mapping[str, str], source_sha256: str 
     here, node = collect_versions(), platform.node()
     if here["rlctl"] != versions["rlctl"]:
         both = here["rlctl"], versions["rlctl"]
-        raise ArtifactError("{}: rlctl {}, and {} on the driver: install the same version".format(node, *both))
+        raise ArtifactError("{}: rlctl {}, but {} on the driver: install the same version".format(node, *both))
     if identify_task(task)["source_sha256"] != source_sha256:
         raise ArtifactError(f"{node}: the file of task {task!r} differs from the driver's: install the same version")
     return [

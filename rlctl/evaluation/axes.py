@@ -143,7 +143,7 @@ def _vary_parameter(name: str, task: Any, span: tuple[float, float, int], spec: 
 
 
 def _is_whole(declared: inspect.Parameter, values: Sequence[float]) -> bool:
-    """Say whether a parameter takes only whole numbers: by its type, else by its default and `values`."""
+    """Return whether a parameter takes only whole numbers: by its type, else by its default and `values`."""
     if declared.annotation is not declared.empty:
         return declared.annotation in (int, "int")
     return type(declared.default) is int and all(value.is_integer() for value in values)

@@ -128,15 +128,15 @@ def order_cells(specs: Sequence[EnvSpec]) -> list[int]:
 def _play_maps(
     maps: Sequence[list[Axis]], spec: EnvSpec, play: Callable[[Sequence[EnvSpec]], Iterator[tuple[int, Outcome]]]
 ) -> list[RobustnessMap]:
-    places = [(axes, values) for axes in maps for values in itertools.product(*(axis.values for axis in axes))]
+    points = [(axes, values) for axes in maps for values in itertools.product(*(axis.values for axis in axes))]
     cells: dict[int, Cell] = {}
-    with output.show_progress("varying", len(places)) as show:
-        for index, outcome in play([_apply(axes, values, spec) for axes, values in places]):
-            axes, values = places[index]
+    with output.show_progress("varying", len(points)) as show:
+        for index, outcome in play([_apply(axes, values, spec) for axes, values in points]):
+            axes, values = points[index]
             cells[index] = Cell(**outcome.model_dump(), values=list(values), nominal=_is_nominal(axes, values))
             show(len(cells))
     return [
-        RobustnessMap(axes=axes, cells=[cells[index] for index in range(len(places)) if places[index][0] is axes])
+        RobustnessMap(axes=axes, cells=[cells[index] for index in range(len(points)) if points[index][0] is axes])
         for axes in maps
     ]
 

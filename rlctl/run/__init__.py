@@ -1,1 +1,1 @@
-"""Files on disk: names, formats, atomic writes."""
+"""The run folder: the names of its files, finding runs and policies, episodes, groups."""

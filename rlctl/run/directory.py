@@ -176,9 +176,9 @@ class RunDirectory:
 def refuse_links_out(folder: Path, kind: str = "run") -> None:
     """Raise `ArtifactError` for a folder with a link out of it: what is written or uploaded must be in the folder."""
     own = folder.resolve()
-    for place in folder.rglob("*"):
-        if place.is_symlink() and not place.resolve().is_relative_to(own):
-            raise ArtifactError(f"{place}: a symbolic link out of the {kind}'s folder; remove it")
+    for path in folder.rglob("*"):
+        if path.is_symlink() and not path.resolve().is_relative_to(own):
+            raise ArtifactError(f"{path}: a symbolic link out of the {kind}'s folder; remove it")
 
 
 class RunLock:

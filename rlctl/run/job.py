@@ -1,4 +1,4 @@
-"""What is known of a training that a cluster executes: a small file for each in the folder of its group."""
+"""The state of a training that a cluster executes: a small file per seed in the folder of the group."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ class Job:
     seed: int
     task: str
     state: str  # `queued`, `running` or `ended`
-    place: str = ""  # what the cluster calls it, such as `slurm 123_4`
+    place: str = ""  # its name in the cluster, such as `slurm 123_4`
     host: str = ""  # the machine of the last attempt
     attempts: int = 0
     code: int | None = None  # the exit code, once it has ended
@@ -35,12 +35,12 @@ def job_file(folder: Path, seed: int, kind: str = "json") -> Path:
 
 
 def write_job(folder: Path, job: Job) -> None:
-    """Write what is known of a job, atomically."""
+    """Write a job's state, atomically."""
     files.write_json(job_file(folder, job.seed), dataclasses.asdict(job))
 
 
 def read_job(folder: Path, seed: int) -> Job | None:
-    """Return what is known of the job of a seed; None if there is none, or its file cannot be read."""
+    """Read the job of a seed; None if there is none, or its file cannot be read."""
     try:
         content: Any = files.read_json(job_file(folder, seed))
         return Job(**content)

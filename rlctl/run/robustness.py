@@ -19,7 +19,7 @@ class Outcome(_Content):
     """The scores of the episodes in one setting."""
 
     success_rate: float | None  # in [0, 1]; None where the task reports no success
-    success_interval: Interval | None  # 95 % interval of the success rate; see `success_interval`
+    success_interval: Interval | None  # 95 % interval of the success rate (Clopper-Pearson)
     mean_return: float
     return_interval: Interval
     """95 % interval of the mean, by Student's t; for a single episode both ends are its return."""

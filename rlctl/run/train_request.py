@@ -39,7 +39,7 @@ class TrainRequest:
     ] = None
     config: Config = None
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Keys of the recipe and their values, nested as in a recipe; they go over `config`."""
+    """Keys of the recipe and their values, nested as in a recipe; they override `config`."""
     device: Annotated[str, Option("cpu, cuda, or auto.")] = "cpu"
     record: Annotated[int, Option("Write the last N evaluation episodes as .rrd.", metavar="N", min=0)] = 0
     check: Annotated[bool, Option("Train without checking the environment first.", ("/--no-check",))] = True

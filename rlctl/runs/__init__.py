@@ -1,1 +1,1 @@
-"""`rlctl runs`: what can be asked of trained runs: list, show, compare, remove."""
+"""`rlctl runs` and `rlctl push`: list, show, diagnose, compare, report, remove and upload runs."""

@@ -31,7 +31,7 @@ def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Pat
     that is not a run.
     """
     if bool(runs) == (keep_best is not None) or "" in runs:  # an unset variable of the shell
-        raise UsageError("say what to remove: RUN..., or --keep-best N for all but the N best of each task")
+        raise UsageError("give RUN..., or --keep-best N to remove all but the N best of each task")
     if keep_best is not None:
         return _measure([run.path for run in _all_but_best(list_runs(root=root), keep_best)])
     paths = [_resolve_run_folder(Path(text), root) for text in runs]
@@ -42,7 +42,7 @@ def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Pat
 
 
 def _resolve_run_folder(path: Path, root: Path) -> Path:
-    """Return the folder of a run: one with a run.json of rlctl, or a damaged one at the place of a run."""
+    """Return the folder of a run: one with a run.json of rlctl, or a damaged one two levels below `root`."""
     below = root / path
     folder = path if path.is_dir() else below
     is_run = (folder / "run.json").is_file()

@@ -158,7 +158,7 @@ def _state(run: RunDirectory, status: dict[str, Any]) -> tuple[str, str]:
 
 
 def _remote_state(run: RunDirectory, status: dict[str, Any]) -> tuple[str, str] | None:
-    """Return the state of a run that a cluster executes, or will go on with; None for others."""
+    """Return the state of a run that a cluster executes or will resume; None for others."""
     seed = _whole(_first_number(status.get("seed")))
     job = None if seed is None else read_job(run.path.parent, seed)
     return None if job is None or job.state == "ended" else (job.state, job.describe())
@@ -234,7 +234,7 @@ def is_better(new: Score, best: Score | None, highest: float, episodes: float) -
 
 
 def find_best_row(rows: Rows) -> dict[str, float | None] | None:
-    """Return the evaluation whose policy the training has kept as the best; None where no row has a return."""
+    """Return the evaluation that selected the training's best policy; None if no row has a return."""
     best_row, best_score, highest = None, None, 0.0
     for row in rows:
         if (mean_return := row.get("return")) is None:

@@ -33,25 +33,25 @@ def name_in_errors(path: Path) -> Iterator[None]:
 
 def write_with(path: Path, write: Callable[[Path], None]) -> None:
     """Let `write` create a temporary file next to `path`, sync it to disk, and rename it to `path`."""
-    if not path.name:  # `/`, which has no name to put a file beside
+    if not path.name:  # `/`, which has no folder for a temporary file
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     os.makedirs(path.parent, exist_ok=True)
-    beside = path.with_name(f".{os.getpid()}.part.{path.name}")  # the suffix stays: some writers depend on it
+    temporary = path.with_name(f".{os.getpid()}.part.{path.name}")  # the suffix stays: some writers depend on it
     try:
         with name_in_errors(path):
-            write(beside)
-            sync(beside)
-            os.replace(beside, path)
+            write(temporary)
+            sync(temporary)
+            os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(OSError):  # the first error is the one to report
-            os.unlink(beside)
+            os.unlink(temporary)
         raise
     _sync_folder(path.parent)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file, atomically."""
-    write_with(path, lambda beside: append(beside, content, 0))
+    write_with(path, lambda temporary: append(temporary, content, 0))
 
 
 def write_new(path: Path, content: bytes) -> None:
@@ -103,16 +103,16 @@ _OLD = ".old.part"
 @contextlib.contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary folder to fill with `write_new`; at the end it is renamed to `path`, or removed on errors."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    remove_tree(beside)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    remove_tree(temporary)
     try:
         with name_in_errors(path):
-            os.makedirs(beside)
-            yield beside
-            sync(beside)
-            _take_place(beside, path)
+            os.makedirs(temporary)
+            yield temporary
+            sync(temporary)
+            _take_place(temporary, path)
     except BaseException:
-        remove_tree(beside)
+        remove_tree(temporary)
         raise
     _sync_folder(path.parent)
 

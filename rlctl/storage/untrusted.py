@@ -63,8 +63,8 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
 def _check_size(path: Path, size: int, what: str = "") -> None:
     """Raise `ArtifactError` if `size` bytes are more than half of the available memory."""
     # Measuring memory costs as much as reading a small file, and `rlctl runs` reads thousands of them.
-    if size > _ALWAYS_READ and (there := memory.available()) is not None and size > there // 2:
-        needs = f"{what}it needs {format_bytes(size)} of memory, and {format_bytes(there)} are free"
+    if size > _ALWAYS_READ and (free := memory.available()) is not None and size > free // 2:
+        needs = f"{what}it needs {format_bytes(size)} of memory, and {format_bytes(free)} are free"
         raise ArtifactError(f"{path}: too large: {needs}")
 
 

@@ -121,13 +121,13 @@ def _make_class_name(name: str, used: str) -> str:
 
 def write_files(folder: Path, content: dict[Path, str]) -> None:
     """Write files into a new folder atomically; raises `OSError` if the folder exists or a write fails."""
-    beside = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     try:
         with storage_files.name_in_errors(folder):
             for path, text in content.items():
-                file = beside / path
+                file = temporary / path
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_text(text, encoding="utf-8")
-            beside.rename(folder)  # fails if the folder now exists and has files
+            temporary.rename(folder)  # fails if the folder now exists and has files
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)

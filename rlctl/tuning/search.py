@@ -88,7 +88,7 @@ class StepSearch:
         sizes = [len(dimension.choices) or math.inf for dimension in self._dimensions]
         # The unchanged recipe, already trained, is the first trial of the first step.
         trials = self._tuning.trials_per_step - (self._number == 1)
-        most = min(trials, math.prod(sizes) - 1)  # the best trial has one of them
+        most = min(trials, math.prod(sizes) - 1)  # the best trial already has one combination
         finished = [trial for trial in self._tuning.trials if trial.step == self._number and trial.state != "begun"]
         return max(0, int(most) - len(finished))
 
@@ -195,8 +195,8 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
     def receive(line: str) -> None:
         lines.append(line)
         if line.startswith("error: interrupted"):
-            behind = "stopped: below the median of the other trials" if pruning else f"stopped: no {tuning.metric}"
-            line = behind if trainings.stopped_by is None else "interrupted"
+            reason = "stopped: below the median of the other trials" if pruning else f"stopped: no {tuning.metric}"
+            line = reason if trainings.stopped_by is None else "interrupted"
         print(f"trial {trial.number}: {line}", file=sys.stderr, flush=True)
 
     changes = [f"{key.rpartition('.')[2]}={value}" for key, value in trial.values.items()]

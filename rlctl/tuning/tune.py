@@ -26,13 +26,13 @@ from rlctl.tuning.tuning import Trial, Tuning, find, load
 
 _FEWEST_EVALUATIONS = 6
 _EVALUATIONS = 10
-_OF_THE_RETURN = ("task", "reward_weights", "events", "randomize")
+_CHANGE_THE_RETURN = ("task", "reward_weights", "events", "randomize")
 
 
 def tune(
     request: TuneRequest, *, jobs: int | None = None, make_trainings: MakeTrainings = make_local_trainings
 ) -> Tuning:
-    """Search hyperparameters, or resume a tuning, whose interrupted trials are resumed; return every trial.
+    """Search hyperparameters, or resume a tuning and its interrupted trials; return the tuning.
 
     Raises `UsageError` without optuna or for an invalid search, `RecipeError` for values that a recipe cannot have,
     `TaskError` if the unchanged recipe cannot be trained, `Interrupted` after a signal.
@@ -92,7 +92,7 @@ def _check(dimension: Dimension, task: str, request: TuneRequest) -> None:
     first = dimension.key.partition(".")[0]
     if dimension.key in ("seed", "total_timesteps", "stop_success") or first in ("eval", "checkpoint"):
         raise UsageError(f"--search {dimension.key}: not a hyperparameter: it changes the measurement, not the policy")
-    if first in _OF_THE_RETURN and request.metric == "return":
+    if first in _CHANGE_THE_RETURN and request.metric == "return":
         raise UsageError(
             f"--search {dimension.key}: it changes the reward, so returns are not comparable; use --metric success"
         )

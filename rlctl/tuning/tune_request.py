@@ -38,5 +38,5 @@ class TuneRequest:
     ] = None
     config: Config = None
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Keys of the recipe and their values, for every trial; they go over `config`."""
+    """Keys of the recipe and their values, for every trial; they override `config`."""
     root: RunsFolder = Path("runs")

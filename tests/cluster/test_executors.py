@@ -27,7 +27,8 @@ def test_the_variable_replaces_the_default(monkeypatch):
     assert choose_executor(None).func.__name__ == "SlurmTrainings"
     assert choose_executor("local") is make_local_trainings
     with pytest.raises(
-        UsageError, match="eval --on slurm: a cell takes seconds, a job of SLURM waits longer; give ray or local"
+        UsageError,
+        match="eval --on slurm: a cell takes seconds, less than a job waits in SLURM's queue; give ray or local",
     ):
         choose_cell_player(None)
 

@@ -208,7 +208,7 @@ def test_no_machine_has_enough_cores(cluster, node, tmp_path):
     wait_for(lambda: list(tmp_path.glob("runs/*/*_seeds/.jobs/3.json")))
     code, printed = driver.end(signal.SIGINT)
     assert code == 130
-    assert "1 seed, on Ray: waiting for a machine with 64 cores (cpus in cluster.yaml); it has none" in printed
+    assert "1 seed, on Ray: waiting, because no machine has 64 cores (cpus in cluster.yaml)" in printed
 
 
 @slow

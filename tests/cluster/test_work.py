@@ -40,7 +40,7 @@ def test_another_version_of_a_library_is_a_warning(work):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"versions": {"rlctl": "0.0.1"}}, "and 0.0.1 on the driver: install the same version"),
+        ({"versions": {"rlctl": "0.0.1"}}, "but 0.0.1 on the driver: install the same version"),
         ({"source_sha256": "0" * 64}, "the file of task 'toy.py:Toy' differs from the driver's"),
         ({"token": "another"}, "this node has a different folder there, or none; share the runs folder"),
         ({"root": "/nowhere/runs"}, "/nowhere/runs: this node has a different folder there, or none"),

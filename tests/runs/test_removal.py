@@ -77,7 +77,7 @@ def test_refuses_what_is_not_a_run(write_run, tmp_path):
         with pytest.raises(ArtifactError, match="not the folder of a run"):
             plan_removal([path])
     for nothing in ([], [""]):
-        with pytest.raises(UsageError, match="say what to remove"):
+        with pytest.raises(UsageError, match="give RUN"):
             plan_removal(nothing)
 
 

@@ -163,7 +163,7 @@ class Command:
         sent = sent if self._is_action else bounds.offset + sent * bounds.factor
         if not bounds.keeps_limits(sent, before, reference):
             raise UnsafeCommand("no command within the limits was found", "limits", str(sent.tolist()))
-        self._before, self._sent = x, action.copy()  # the caller may write into its own
+        self._before, self._sent = x, action.copy()  # the caller may write into the returned array
         if bounds.is_value and reference is not None:
             self._reference = command
         return action

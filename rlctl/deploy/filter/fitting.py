@@ -24,7 +24,7 @@ _CAN_BE_LIMITED = {
     "torque": ("torque", "rate", "action"),
     "action": ("rate", "action"),
 }
-_SMALLEST = 1e-100  # step [unit of the command]; squares of smaller ones vanish
+_SMALLEST = 1e-100  # step [unit of the command]; squares of smaller ones become 0
 _NO_CONTROL_DT = "limits: this policy has no control_dt; write control_dt: SECONDS"
 
 

@@ -70,7 +70,7 @@ class ObservationLayout:
     def flatten(self, observation: Any) -> NDArray[np.float64]:
         """Return the numbers of an observation without its images, shape (size,).
 
-        Raises `ObservationError` for what is not numbers, or not as many.
+        Raises `ObservationError` for values that are not numbers, or too few or many.
         """
         parts = split(observation)
         keys = [SINGLE] if SINGLE in parts else [*self.slices]
@@ -87,15 +87,15 @@ def read_numbers(values: Any) -> NDArray[np.float64]:
     """Return a flat float64 copy of real numbers; raises `ObservationError` for everything else."""
     try:
         if np.ma.is_masked(values):
-            raise ObservationError("masked values, which are none")
+            raise ObservationError("masked values, which are not numbers")
         array = np.asarray(values)
     except ObservationError:
         raise
-    except Exception as error:  # conversion calls what the object brings, which may raise anything
-        raise ObservationError(f"a value that is no array of numbers ({type(error).__name__})") from None
+    except Exception as error:  # conversion calls methods of the object, which may raise anything
+        raise ObservationError(f"a value that is not an array of numbers ({type(error).__name__})") from None
     if array.dtype.kind not in "biuf":
         raise ObservationError(f"values of type {array.dtype}, not real numbers")
-    with np.errstate(over="ignore"):  # what float64 cannot hold is not finite then
+    with np.errstate(over="ignore"):  # numbers too large for float64 become infinite
         return array.astype(np.float64).ravel()
 
 
@@ -171,7 +171,7 @@ class SensorChecks:
         elif self._has_range and (outside := self._find_outside(values)) is not None:
             low, high = float(self._low[outside]), float(self._high[outside])
             fault = ("range", self._name(outside), float(values[outside]), low if values[outside] < low else high)
-        elif not abs(age_s) <= self._oldest:  # from the future: the clocks differ, so nobody knows how old it is
+        elif not abs(age_s) <= self._oldest:  # from the future: the clocks differ, so its age is unknown
             fault = ("stale", "age", age_s, self._oldest)
         if self._frozen:
             fault = self._check_frozen(values) or fault

@@ -27,11 +27,11 @@ class SafetyEvent:
 
     @property
     def names(self) -> Sequence[str]:
-        """As those of an `Intervention`."""
+        """The event's name alone; an `Intervention` has several."""
         return (self.name,)
 
     def list_events(self) -> list[SafetyEvent]:
-        """As those of an `Intervention`."""
+        """Return the event alone; an `Intervention` makes several."""
         return [self]
 
 
@@ -57,7 +57,7 @@ class Intervention:
 
     def list_events(self) -> list[SafetyEvent]:
         """Return an event per joint, with values in the units of the limit."""
-        with np.errstate(over="ignore"):  # a policy may want anything
+        with np.errstate(over="ignore"):  # a policy's action may be any number
             values, limits = self._convert()
         acted = self.acted
         return [

@@ -82,7 +82,7 @@ class SafetyFilter:
         self._enter("stopped", reason)
 
     def hold(self, reason: str = "hold ordered") -> None:
-        """Keep the robot where it is until `resume`; a stop stays."""
+        """Keep the robot where it is until `resume`; a stop stays in effect."""
         if self.state != "stopped":
             self._ordered, self._goes_home = True, False
             self._enter("holding", reason)
@@ -164,7 +164,7 @@ class SafetyFilter:
     def observe(self, observation: Any, age_s: float = 0.0) -> bool:
         """Check an observation in the policy's form; None: it is missing. Return whether it may be used.
 
-        `age_s` is its age [s]; what is further in the future than it may be old is a fault too.
+        `age_s` is its age [s]. A negative age, of an observation from the future, has the same limit.
         """
         if observation is None:
             return self.fail("missing")
@@ -188,7 +188,7 @@ class SafetyFilter:
         self._fault = what
         return False
 
-    @np.errstate(all="ignore")  # a policy may want anything; what is computed is checked at the end
+    @np.errstate(all="ignore")  # a policy's action may be any number; the last check is of the result
     def limit(self, action: Any | None) -> Array:
         """Return the robot's action for the policy's action; None: the policy could not act."""
         self.steps += 1

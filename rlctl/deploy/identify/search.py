@@ -90,7 +90,7 @@ class SearchWorkers:
         try:
             answers = self._pool.ask_each(questions, "following the log")
         except WorkerFault as fault:
-            raise TaskError(f"task {self._task!r}: {fault}; see what it printed") from None
+            raise TaskError(f"task {self._task!r}: {fault}; its output is above") from None
         if isinstance(answers[-1], WorkerException):
             raise make_error(answers[-1], self._task)
         return answers
@@ -127,7 +127,9 @@ def search(
     report(f"least squares from {len(starts)} starts")
     fit_all([FindFit(start, weights, _EVALUATIONS) for start in starts])
     best = _best(fits)
-    while neighbours := [d for d in (best.delay - 1, best.delay + 1) if 0 <= d <= _MAX_DELAY and d not in fits]:
+    while neighbours := [
+        delay for delay in (best.delay - 1, best.delay + 1) if 0 <= delay <= _MAX_DELAY and delay not in fits
+    ]:
         fit_all([FindFit(SearchPoint(best.at.tolist(), delay), weights, _EVALUATIONS) for delay in neighbours])
         if _best(fits).delay == best.delay:
             break
@@ -135,7 +137,7 @@ def search(
     best = _best(fits)
     report("intervals")
     weights = 1.0 / np.maximum(best.errors, 1e-4 / weights)
-    near = [d for d in (best.delay - 1, best.delay, best.delay + 1) if d in fits]
+    near = [delay for delay in (best.delay - 1, best.delay, best.delay + 1) if delay in fits]
     fits = {}
     evaluations = {delay: _LAST_EVALUATIONS if delay == best.delay else _EVALUATIONS for delay in near}
     fit_all([FindFit(SearchPoint(best.at.tolist(), delay), weights, evaluations[delay]) for delay in near])

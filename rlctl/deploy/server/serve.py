@@ -116,7 +116,7 @@ async def serve_until(
 
 
 def _is_worth_a_traceback(record: logging.LogRecord) -> bool:
-    """Say whether an error is one of the server; what is no HTTP is answered with 400, and not logged."""
+    """Return whether to log an error; invalid HTTP requests are answered with 400 and not logged."""
     from aiohttp.http_exceptions import HttpProcessingError
 
     return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))
