@@ -48,7 +48,8 @@ def resolve(
     if stages and "stages" not in merged:
         merged["stages"] = validate({"stages": list(stages)}, f"class of {task}").model_dump(by_alias=True)["stages"]
     recipe = fill_defaults(validate(merged, *sources))
-    if "total_timesteps" in overrides and "every_steps" not in (overrides.get("eval") or {}):
+    is_other_length = "total_timesteps" in overrides and recipe.total_timesteps != packaged.get("total_timesteps")
+    if is_other_length and "every_steps" not in (overrides.get("eval") or {}):
         # The packaged interval is for the packaged length.
         every = min(recipe.eval.every_steps or 1, max(1, recipe.total_timesteps // _FEWEST_EVALUATIONS))
         recipe = recipe.model_copy(update={"eval": recipe.eval.model_copy(update={"every_steps": every})})

@@ -51,6 +51,7 @@ class Motors:
         self._built_strength: Array | None = None
         self._plans: dict[tuple[str, ...], _Plan] = {}
         self._commanded: list[float] | None = None  # by `set_torques`, of all joints; NaN: the motor's
+        self._chosen: set[int] = set()  # joints whose motors the task has set or disabled
 
     def _save_nominal(self) -> None:
         self._built_strength = self.motor_strength
@@ -159,6 +160,7 @@ class Motors:
         return numbers
 
     def _forget_torques(self, joints: list[int]) -> None:
+        self._chosen.update(joints)
         if self._commanded is not None:
             for joint in joints:
                 self._commanded[joint] = math.nan
@@ -166,16 +168,23 @@ class Motors:
     def disable_motors(self, joints: Sequence[str] = ()) -> None:
         """Switch off the motors that PyBullet gives every joint, so that only `set_torques` moves the joints."""
         chosen = self.find_joints(joints)
+        self._chosen.update(chosen)
         gains = [0.1] * len(chosen)
         self._command(chosen, "POSITION_CONTROL", forces=[0.0] * len(chosen), positionGains=gains, velocityGains=gains)
 
     def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
         """Apply `torques` [N m or N] to the joints in all substeps of the next step.
 
-        For joints whose motors are disabled: see `disable_motors`.
+        For joints whose motors are disabled: see `disable_motors`. Raises `TaskError` for a joint that its default
+        motor holds in place.
         """
         chosen = self.find_joints(joints)
         given = self._apply_strength(self._read_values("torques", torques, len(chosen)), chosen)
+        if not self._chosen.issuperset(chosen):
+            held = next(self.joint_names[joint] for joint in chosen if joint not in self._chosen)
+            raise TaskError(
+                f"set_torques: the motor of {held!r} holds it in place; call disable_motors() in build first"
+            )
         if joints:
             self._commanded = self._commanded or [math.nan] * len(self.joint_names)
             for joint, torque in zip(chosen, given, strict=True):

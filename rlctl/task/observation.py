@@ -33,6 +33,8 @@ class ObservationFormat:
         }
         self.sizes = {name: int(np.size(value)) for name, value in first.items()}
         """Elements per name, in the order of the flat observation."""
+        if empty := [name for name, size in self.sizes.items() if size == 0]:
+            raise TaskError(f"{self._name}: observation {empty[0]!r} is empty: check the slice in observe")
         self.space = self._make_space()
         self._zeros = np.zeros(self.space.shape or (), np.float32)
 

@@ -55,12 +55,12 @@ def test_spaces_of_the_old_gym_and_of_an_older_numpy(space):
 
 class Greeting:
     def __reduce__(self):
-        return print, ("hello",)
+        return len, ("hello",)
 
 
 def test_objects_are_data():
     read = pickle_data.read(pickle.dumps({"call": Greeting(), "list": [1, (2.5, "x")], "none": None}))
-    assert str(read["call"].function) == "builtins.print"
+    assert str(read["call"].function) == "builtins.len"
     assert read["call"].arguments == ("hello",)
     assert read["list"] == [1, (2.5, "x")]
 

@@ -279,6 +279,7 @@ def test_units_of_the_number_of_steps():
 
 def test_a_shorter_training_is_evaluated_as_often():
     assert resolve("reach", None, {}).eval.every_steps == 40_000
+    assert resolve("reach", None, {"total_timesteps": 120_000}).eval.every_steps == 40_000
     assert resolve("reach", None, {"total_timesteps": 20_000}).eval.every_steps == 4_000
     chosen = {"total_timesteps": 20_000, "eval": {"every_steps": 10_000}}
     assert resolve("reach", None, chosen).eval.every_steps == 10_000

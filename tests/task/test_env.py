@@ -281,16 +281,25 @@ def test_observation_bounds(make):
 def test_the_observation_farthest_outside_its_bounds_is_named(make, layout):
     class Several(Slider):
         observation_layout = layout
-        observation_bounds = {"none": (0.0, 1.0), "rounded": (0.0, 1.0), "place": (-1.0, 1.5)}
+        observation_bounds = {"rounded": (0.0, 1.0), "place": (-1.0, 1.5)}
 
         def observe(self):
-            return {**super().observe(), "none": np.zeros(0), "rounded": np.array([1.0 + 1e-6])}
+            return {**super().observe(), "rounded": np.array([1.0 + 1e-6])}
 
     env = make(Several())
     env.reset(seed=0)
     env.step(np.array([0.5, 0.0]))
     with pytest.raises(TaskError, match=r"^Several: observation 'place' is 1\.75"):
         env.step(np.array([0.25, 0.0]))
+
+
+def test_an_empty_observation_is_named(make):
+    class Sliced(Slider):
+        def observe(self):
+            return {**super().observe(), "swing": np.zeros(2)[2:]}
+
+    with pytest.raises(TaskError, match=r"^Sliced: observation 'swing' is empty: check the slice in observe$"):
+        make(Sliced())
 
 
 def test_bounds_of_what_is_not_observed():

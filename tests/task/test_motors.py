@@ -109,6 +109,15 @@ def test_no_damping_to_scale(sim, tmp_path):
         wheels.scale_joint_damping(1.2)
 
 
+def test_torques_of_a_joint_that_its_motor_holds(sim, tmp_path):
+    wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
+    left, right = wheels.joint_names
+    wheels.disable_motors([right])
+    wheels.set_torques(np.ones(1), [right])
+    with pytest.raises(TaskError, match=rf"^set_torques: the motor of '{left}' holds it in place; call disable_motors"):
+        wheels.set_torques(np.ones(2))
+
+
 def test_a_value_too_few_or_too_many(sim, tmp_path):
     wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
     message = r"^model.urdf: {} of shape \({},\) for {} joints; joint_names of the body has all$"
