@@ -22,6 +22,7 @@ from rlctl.storage import files, untrusted
 
 MANIFEST = "rlctl.json"
 _ADDRESS = re.compile(r"^(?!wss?:)[a-z][a-z0-9+.-]+://.")
+_DIGEST = re.compile("[0-9a-f]{64}")
 _SUFFIXES = (".safetensors", ".onnx", ".json", ".yaml", ".csv", ".md", ".rrd")
 _BUCKETS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "hf"}
 _MAX_FILES = 1000
@@ -59,7 +60,9 @@ def fetch(address: str) -> Path:
     A file, or the manifest of a run, is checked against `#sha256=HEX` after the address. Raises `ArtifactError` if it
     is missing, incomplete or differs from its checksum, `UsageError` if the package for its scheme is not installed.
     """
-    base, _, expected = address.partition("#sha256=")
+    base, mark, expected = address.partition("#sha256=")
+    if mark and not _DIGEST.fullmatch(expected := expected.lower()):  # it names a folder of the cache
+        raise UsageError(f"{short_repr(address, 200)}: #sha256= takes 64 hexadecimal digits")
     with _open_store(base) as (store, path):
         if PurePosixPath(path).suffix in _SUFFIXES:
             return _fetch_file(store, path, base, expected)

@@ -96,6 +96,13 @@ def test_one_file_and_its_checksum(run, pushed):
         store.fetch(f"{ADDRESS}#sha256={'0' * 64}")
 
 
+def test_a_checksum_is_no_path(tmp_path, run):
+    (tmp_path / "best.safetensors").write_bytes((run / "policies/best.safetensors").read_bytes())
+    for checksum in ("", "0" * 63, str(tmp_path), f"../../{tmp_path}"):  # of a path, the file there would be used
+        with pytest.raises(UsageError, match="#sha256= takes 64 hexadecimal digits"):
+            store.fetch(f"{ADDRESS}/best.safetensors#sha256={checksum}")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
