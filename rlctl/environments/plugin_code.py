@@ -4,14 +4,11 @@ import contextlib
 import importlib
 import importlib.util
 import os
-import signal
 import sys
-import threading
 import traceback
 from collections.abc import Callable, Iterator
 from importlib.machinery import PathFinder
 from pathlib import Path
-from types import FrameType
 from typing import Any, NoReturn
 
 from rlctl import errors
@@ -63,7 +60,7 @@ def import_module(task: str, name: str) -> Any:
     is_installed = name in sys.modules or find_module_file(name) is not None
     if not is_installed and find_module_file(name, in_current_folder=True) is None:
         raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
-    with _survive_import(task):
+    with _refuse_exit():
         return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
 
 
@@ -87,7 +84,7 @@ def import_file(task: str, file: Path) -> Any:
     sys.modules[name] = module
     loader = spec.loader
     try:
-        with _survive_import(task):
+        with _refuse_exit():
             call_plugin(task, lambda: loader.exec_module(module), doing="import failed: ")
     except BaseException:
         sys.modules.pop(name, None)
@@ -102,11 +99,8 @@ def append_to_path(folder: str) -> None:
 
 
 @contextlib.contextmanager
-def _survive_import(task: str) -> Iterator[None]:
-    """Turn `os._exit` into an exception during an import, and cancel an alarm that the module has set.
-
-    Both would end the process without a message.
-    """
+def _refuse_exit() -> Iterator[None]:
+    """Turn `os._exit` into an exception during an import: it would end the process without a message."""
     leave, process = os._exit, os.getpid()
 
     def refuse(status: int) -> NoReturn:
@@ -115,23 +109,10 @@ def _survive_import(task: str) -> Iterator[None]:
         raise SystemExit(f"os._exit({status})")
 
     os._exit = refuse
-    unhandled = signal.getsignal(signal.SIGALRM) == signal.SIG_DFL
-    if in_main := unhandled and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGALRM, _raise_alarm)
     try:
         yield
     finally:
         os._exit = leave
-        if in_main and signal.getsignal(signal.SIGALRM) == _raise_alarm:
-            if signal.setitimer(signal.ITIMER_REAL, 0.0)[0]:
-                print(
-                    f"warning: task {task!r}: importing it set an alarm (SIGALRM); rlctl cancelled it", file=sys.stderr
-                )
-            signal.signal(signal.SIGALRM, signal.SIG_DFL)
-
-
-def _raise_alarm(number: int, frame: FrameType | None) -> NoReturn:
-    raise TimeoutError("the module set an alarm (SIGALRM), which fired during the import")
 
 
 def _find_loaded(file: Path) -> Path:

@@ -179,17 +179,13 @@ def make(
     """
     env = EnvSpec(task, parameters, randomize=randomize, events=events or {}).make(render_mode)
     if is_task(load(task)):
-        env.unwrapped.spec = _make_gymnasium_spec(task, render_mode, randomize, events, parameters)
+        from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
+
+        kwargs = {"task": task, "render_mode": render_mode, "randomize": randomize, "events": events, **parameters}
+        env.unwrapped.spec = GymnasiumSpec(
+            f"rlctl/{make_slug(task)}-v0", "rlctl.environments.spec:make", kwargs=kwargs, disable_env_checker=True
+        )
     return env
-
-
-def _make_gymnasium_spec(task: str, render_mode: str | None, randomize: bool, events: Any, parameters: Any) -> Any:
-    from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
-
-    kwargs = {"task": task, "render_mode": render_mode, "randomize": randomize, "events": events, **parameters}
-    return GymnasiumSpec(
-        f"rlctl/{make_slug(task)}-v0", "rlctl.environments.spec:make", kwargs=kwargs, disable_env_checker=True
-    )
 
 
 def make_several(spec: EnvSpec, count: int) -> list[gymnasium.Env[Any, Any]]:

@@ -27,7 +27,6 @@ from rlctl.policy.file import PolicyInfo
 from rlctl.policy.players.player import Exploration
 from rlctl.policy.shipped import MeasuredScore
 from rlctl.rollout.collect import Episode, play_episodes
-from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run.episode import save_episode
@@ -64,24 +63,23 @@ class Evaluation:
 
     def rows(self) -> list[dict[str, Any]]:
         """Return a row per episode, as the JSON of `rlctl eval` has it; terms and metrics are dicts."""
-        return [_make_row(index, episode.result) for index, episode in enumerate(self.played)]
+        return [
+            {
+                "index": index,
+                "seed": result.seed,
+                "success": result.success,
+                "return": result.total_reward,
+                "length": result.length,
+                "final_distance": result.final_distance,
+                "terms": result.terms,
+                "metrics": result.metrics,
+            }
+            for index, result in enumerate(episode.result for episode in self.played)
+        ]
 
     def __repr__(self) -> str:
         rate = "" if self.success_rate is None else f"success {self.success_rate:.1%}, "
         return f"Evaluation({self.spec.task}, {len(self.played)} episodes: {rate}return {self.returns.mean:.4g})"
-
-
-def _make_row(index: int, result: EpisodeResult) -> dict[str, Any]:
-    return {
-        "index": index,
-        "seed": result.seed,
-        "success": result.success,
-        "return": result.total_reward,
-        "length": result.length,
-        "final_distance": result.final_distance,
-        "terms": result.terms,
-        "metrics": result.metrics,
-    }
 
 
 def _flatten(row: dict[str, Any]) -> dict[str, Any]:

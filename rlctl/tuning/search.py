@@ -102,16 +102,11 @@ class StepSearch:
             trial, asked = proposal
             train(self._tuning, trial, self._trainings, _Pruning(self._tuning, trial, asked))
             with self._lock:
-                if trial.state != "begun":
-                    self._tell(trial, asked)
+                if trial.state != "begun" and asked is None:
+                    self._add(trial)
+                elif trial.state != "begun" and asked is not None:
+                    self._study.tell(asked, trial.score if trial.state == "done" else None, _STATES[trial.state])
                 self._tuning.save()
-
-    def _tell(self, trial: Trial, asked: optuna.Trial | None) -> None:
-        """Report the end of a trial to Optuna."""
-        if asked is None:
-            self._add(trial)
-        else:
-            self._study.tell(asked, trial.score if trial.state == "done" else None, _STATES[trial.state])
 
     def _propose(self) -> tuple[Trial, optuna.Trial | None] | None:
         """Return a trial and Optuna's (None for a resumed trial); None if all proposals were tried before."""
@@ -137,16 +132,12 @@ class StepSearch:
     def _label(self, trial: Trial) -> str:
         return f"{self._tuning.path.name}/{trial.number}"
 
-    def _list_drawn(self, trial: Trial) -> dict[str, Any]:
-        """Return Optuna's parameters of a trial; None for a value outside its distribution."""
-        content = merge(self._recipe, nest(trial.values))
-        return {
-            dimension.key: dimension.from_value(get_value(content, dimension.key)) for dimension in self._dimensions
-        }
-
     def _add(self, trial: Trial) -> None:
         """Add a finished trial to Optuna's study if its values are within the distributions."""
-        drawn, label, state = self._list_drawn(trial), self._label(trial), _STATES[trial.state]
+        content, label, state = merge(self._recipe, nest(trial.values)), self._label(trial), _STATES[trial.state]
+        drawn = {
+            dimension.key: dimension.from_value(get_value(content, dimension.key)) for dimension in self._dimensions
+        }
         known = (asked.user_attrs.get(_LABEL) for asked in self._study.get_trials(deepcopy=False, states=(state,)))
         if None in drawn.values() or label in known:
             return

@@ -39,7 +39,10 @@ def tune(
     """
     if (request.task is None) == (request.resume is None):
         raise UsageError("TASK and --resume exclude each other: give a task to tune, or --resume FOLDER")
-    _require_optuna()
+    try:
+        import optuna  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise UsageError(explain_missing_package("rlctl tune", error.name, "tune")) from None
     # Read twice: first to refuse a folder that is no tuning before locking it, then again under the lock.
     tuning = _begin(request, request.task or "") if request.resume is None else find(request.resume, request.root)
     with RunLock(tuning.path, "tuning"):
@@ -68,13 +71,6 @@ def _begin(request: TuneRequest, task: str) -> Tuning:
     )
     tuning.save()
     return tuning
-
-
-def _require_optuna() -> None:
-    try:
-        import optuna  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise UsageError(explain_missing_package("rlctl tune", error.name, "tune")) from None
 
 
 def _check_storage(url: str) -> None:

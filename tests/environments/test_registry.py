@@ -263,18 +263,6 @@ def test_a_plugin_that_raises(write_module, source, message):
         assert caught.value.exit_code == 3
 
 
-def test_an_alarm_in_a_module(rlctl, write_module):  # a process of its own: here, an alarm ends tests that hang
-    write_module("early.py", "import signal, time; signal.setitimer(signal.ITIMER_REAL, 0.01); time.sleep(60)")
-    done = rlctl("tasks", "show", "early.py:E")
-    assert done.returncode == 3
-    assert "TimeoutError: the module set an alarm (SIGALRM), which fired during the import" in done.stderr
-    write_module("late.py", "import signal; signal.alarm(60)\nclass E: pass")
-    done = rlctl("tasks", "show", "late.py:E")
-    assert done.stderr.startswith(
-        "warning: task 'late.py:E': importing it set an alarm (SIGALRM); rlctl cancelled it\n"
-    )
-
-
 def test_hints_that_cannot_be_read(write_module):
     write_module(
         "late.py",

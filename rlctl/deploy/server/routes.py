@@ -24,17 +24,15 @@ _FILE_NAME = re.compile(r"[A-Za-z0-9_. +-]{1,100}")
 _ORDERS = ("stop", "home", "hold", "resume")
 
 
-def make_app(server: PolicyServer, connections: Connections) -> web.Application:
-    """Return the web application of a server."""
-    return _Routes(server, connections).make_app()
+class Routes:
+    """The HTTP routes of a policy server."""
 
-
-class _Routes:
     def __init__(self, server: PolicyServer, connections: Connections) -> None:
         self.server, self.connections = server, connections
         self.page = (Path(__file__).parent / "page.html").read_text("utf-8")
 
     def make_app(self) -> web.Application:
+        """Return the web application."""
         middlewares = [self.connections.follow, self._check_access]
         app = web.Application(middlewares=middlewares, client_max_size=_MAX_POLICY_SIZE)
         app.add_routes(

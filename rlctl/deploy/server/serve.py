@@ -79,12 +79,12 @@ async def serve_until(
     from aiohttp import web
 
     from rlctl.deploy.server.connections import BACKLOG, Connections, count_allowed_connections
-    from rlctl.deploy.server.routes import make_app
+    from rlctl.deploy.server.routes import Routes
 
     request = server.request
     logging.getLogger("aiohttp.server").addFilter(_is_worth_a_traceback)
     connections = Connections(count_allowed_connections(request.max_clients))
-    runner = web.AppRunner(make_app(server, connections), access_log=None, shutdown_timeout=1.0)
+    runner = web.AppRunner(Routes(server, connections).make_app(), access_log=None, shutdown_timeout=1.0)
     await runner.setup()
     web_server = runner.server
     assert web_server is not None

@@ -85,9 +85,9 @@ def test_starts_without_what_takes_long_to_import(tmp_path):
         "import pathlib, sys\n"
         "from rlctl.deploy.server.request import ServeRequest\n"
         "from rlctl.deploy.server.serve import make_server\n"
-        "from rlctl.deploy.server.routes import make_app\n"
+        "from rlctl.deploy.server.routes import Routes\n"
         "from rlctl.deploy.server.connections import Connections\n"
-        f"make_app(make_server(pathlib.Path({str(file)!r}), ServeRequest()), Connections(100))\n"
+        f"Routes(make_server(pathlib.Path({str(file)!r}), ServeRequest()), Connections(100)).make_app()\n"
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
