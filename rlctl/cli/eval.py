@@ -46,6 +46,8 @@ def evaluate(
     gates = Gates(min_success, min_success_lower, min_return)
     chosen = dataclasses.replace(options, checkpoint=choose_checkpoint(options.checkpoint, pretrained))
     request = EvalRequest(**vars(chosen), changes=parse_changes(settings))
+    if on is not None and not vary and sim is None:
+        raise UsageError("--on plays the cells of a map: give --vary or --sim too")
     if vary or push or sim is not None:
         unsupported = {"--policy": request.baseline, "--limits": request.limits, "--record": request.record}
         if option := next((name for name, value in unsupported.items() if value is not None), None):
@@ -57,8 +59,6 @@ def evaluate(
         robustness = measure_robustness(request, vary, push=push, sim=sim, yes=yes, gates=gates, play_cells=play)
         show_robustness(robustness, json)
         return check_gates(robustness, gates)
-    if on is not None:
-        raise UsageError("--on plays the cells of a map: give --vary or --sim too")
     if request.run is not None and request.baseline is None and is_group(folder := Path(request.run)):
         from rlctl.evaluation.group import evaluate_group
 
