@@ -46,6 +46,6 @@ def identify(
         log,
         events=events,
         seed=seed,
-        report=lambda line: output.err().print(f"identify: {line}", highlight=False),
+        report=lambda line: output.err().print(f"identify: {line}"),
     )
     report.show(result, json)

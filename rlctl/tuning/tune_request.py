@@ -33,7 +33,8 @@ class TuneRequest:
     storage: Annotated[
         str | None,
         Option(
-            "Optuna's storage, e.g. sqlite:///tune.db; equal searches with the same storage share it.", metavar="URL"
+            "Optuna's storage, e.g. sqlite:///tune.db; equal searches with this storage share their trials.",
+            metavar="URL",
         ),
     ] = None
     config: Config = None

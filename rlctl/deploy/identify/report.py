@@ -18,13 +18,13 @@ def show(result: Identification, json: str | None) -> None:
     if output.present({**dataclasses.asdict(result), "events": result.events()}, json):
         return
     out = output.out()
-    out.print(f"{result.task}: {result.log}, {result.rows:,} rows, {result.seconds:.1f} s", highlight=False)
+    out.print(f"{result.task}: {result.log}, {result.rows:,} rows, {result.seconds:.1f} s")
     for line in _list_lines(result):
-        out.print(line, highlight=False)
+        out.print(line)
     if sys.stdout.isatty():
-        out.print(draw_curves(result), highlight=False)
-    out.print("\nto train with these values, add to a recipe:", highlight=False)
-    out.print(write_fragment(result), end="", highlight=False)
+        out.print(draw_curves(result))
+    out.print("\nto train with these values, add to a recipe:")
+    out.print(write_fragment(result), end="")
 
 
 def write_fragment(result: Identification) -> str:
@@ -65,11 +65,9 @@ def show_excitation(result: Excitation, json: str | None) -> None:
     """Print the trajectory's file and how much of the ranges it uses."""
     if output.present(result, json):
         return
-    lines = [
-        f"{result.path}: {result.seconds:g} s for {result.task}, {result.amplitude:.0%} of the action range",
+    output.out().print(
+        f"{result.path}: {result.seconds:g} s for {result.task}, {result.amplitude:.0%} of the action range\n"
         f"in simulation the joints use {result.largest_share:.0%} of their range (without margins), touch nothing "
-        "and stay below their top speeds; the robot's cables and surroundings are not simulated",
-        f"play its actions on the robot, log the same columns, then: rlctl identify {result.task} --log FILE",
-    ]
-    for line in lines:
-        output.out().print(line, highlight=False)
+        "and stay below their top speeds; the robot's cables and surroundings are not simulated\n"
+        f"play its actions on the robot, log the same columns, then: rlctl identify {result.task} --log FILE"
+    )
