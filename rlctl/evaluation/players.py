@@ -26,7 +26,7 @@ class LoadedPolicy:
 
     @property
     def name(self) -> str:
-        """The file, as it is shown."""
+        """The path of the file, as text."""
         return str(self.path)
 
     def give_to(self, workers: Workers) -> None:

@@ -171,7 +171,8 @@ def read_space(value: Any) -> spaces.Space[Any]:
         return spaces.MultiBinary(read_array(state["n"]).tolist())
     if kind == "Dict":
         parts = state["spaces"].items
-        return spaces.Dict([(str(k), read_space(v)) for k, v in (parts() if callable(parts) else parts.items())])
+        pairs = parts() if callable(parts) else parts.items()
+        return spaces.Dict([(str(key), read_space(space)) for key, space in pairs])
     raise NotPlainData(f"a {kind} space")
 
 

@@ -228,7 +228,7 @@ class RunLock:
 
 
 def is_being_written(folder: Path) -> bool:
-    """Say whether a process trains in a run folder now; False where the file system has no locks."""
+    """Return whether a process trains in a run folder now; False where the file system has no locks."""
     try:
         descriptor = os.open(folder / ".lock", os.O_RDONLY | os.O_NONBLOCK)
     except OSError:
@@ -279,7 +279,7 @@ def _make_new_folder(parent: Path, kind: str) -> Path:
 
 
 def is_group(path: Path) -> bool:
-    """Say whether a folder holds runs that belong together: of several seeds, or of a tuning."""
+    """Return whether a folder holds runs that belong together: of several seeds, or of a tuning."""
     return (path / GROUP_FILE).is_file() or (path / TUNE_FILE).is_file()
 
 

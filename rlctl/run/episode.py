@@ -93,7 +93,8 @@ def _find_mismatch(episode: RecordedEpisode) -> str | None:
     parts = split(observations)
     # A failed episode has only its actions, of any number.
     acted, observed = (None, 0) if episode.info.failure and not steps else (steps, steps + 1)
-    for name, values, count in (("actions", episode.actions, acted), *((k, v, observed) for k, v in parts.items())):
+    observations_and_counts = ((name, values, observed) for name, values in parts.items())
+    for name, values, count in (("actions", episode.actions, acted), *observations_and_counts):
         label = name if name == "actions" else f"observations {name}".strip()
         if values.ndim == 0 or (count is not None and len(values) != count):
             return f"{label} are {_describe_array(values)}, not {count} of them"

@@ -52,7 +52,7 @@ class RobustnessMap(_Content):
     """One or two axes varied together; everything else is nominal."""
 
     axes: list[Axis]
-    cells: list[Cell]  # for every combination of the axes' values, that of the last axis changing fastest
+    cells: list[Cell]  # for every combination of the axes' values; the value of the last axis changes fastest
 
     def name_cell(self, cell: Cell) -> str:
         """Return where a cell is: `mass 0.6, friction 0.2`."""

@@ -210,14 +210,14 @@ def list_points(rows: Rows, column: str) -> list[tuple[float, float]]:
 
 
 def is_lower(success: float, highest: float, episodes: float) -> bool:
-    """Say whether a success rate is lower than the highest by more than chance, both of so many episodes."""
+    """Return whether a success rate is lower than the highest by more than chance, over `episodes` episodes each."""
     pooled = (success + highest) / 2
     standard_error = math.sqrt(max(2 * pooled * (1 - pooled), 0.0) / max(episodes, 1))
     return highest - success > _STANDARD_ERRORS * standard_error
 
 
 def is_better(new: Score, best: Score | None, highest: float, episodes: float) -> bool:
-    """Say whether a policy is better than the best so far: by success, and by return where success cannot tell.
+    """Return whether a policy is better than the best so far: by success, and by return where success cannot tell.
 
     `highest` is the highest success rate so far, in [0, 1]. Success cannot tell where neither rate is lower than it by
     more than chance; comparing with the highest keeps many small losses from adding up.
