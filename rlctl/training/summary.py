@@ -25,12 +25,13 @@ def show(result: TrainResult, json: str | None) -> None:
 
 
 def list_next_commands(result: TrainResult) -> list[str]:
-    """Return the next commands; without export if the policy never succeeded."""
+    """Return the next commands: export, or for a policy that never succeeded the diagnosis of its run."""
     run = shlex.quote(str(result.run.path))
     score = result.best.evaluation if result.best else None
-    export = [] if score is not None and score.success == 0 else [f"rlctl export {run} --onnx"]
+    fails = score is not None and score.success == 0
     tensorboard = f"tensorboard --logdir {shlex.quote(str(result.run.tensorboard))}"
-    return [f"rlctl eval {run}", *export, f"rlctl replay {run}", tensorboard]
+    second = f"rlctl runs show {run}" if fails else f"rlctl export {run} --onnx"
+    return [f"rlctl eval {run}", second, f"rlctl replay {run}", tensorboard]
 
 
 def _to_json(result: TrainResult, findings: list[Finding]) -> dict[str, Any]:
