@@ -1,7 +1,5 @@
 """Plays one episode again with some of its actions changed, and compares what comes back bit for bit."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools

@@ -1,7 +1,5 @@
 """Reads an environment's own attributes: what reset draws, what it keeps, and which random generators there are."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import dataclasses

@@ -1,7 +1,5 @@
 """Records how an environment calls PyBullet: which calls leave physicsClientId out."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import inspect

@@ -3,8 +3,6 @@
 `getCollisionShapeData` is left alone: it crashes on some models.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

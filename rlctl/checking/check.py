@@ -1,7 +1,5 @@
 """`check`: from a description of an environment to a report. The environment runs in child processes only."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import time

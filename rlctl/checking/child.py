@@ -1,7 +1,5 @@
 """What runs in a child process of check-env: its experiments, sent to the parent message by message."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 import traceback

@@ -1,7 +1,5 @@
 """What a call into an environment raised, as plain data: when, where, and which file it could not find."""
 
-from __future__ import annotations
-
 import inspect
 import linecache
 import re

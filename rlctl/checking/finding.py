@@ -1,7 +1,5 @@
 """Rules and what they find. The texts of the rules are data, in `rules.yaml` next to this module."""
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import re

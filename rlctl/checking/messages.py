@@ -1,7 +1,5 @@
 """What the experiments of a child process send: recorded episodes, failures, findings, and what could not be judged."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Times calls on a busy machine, and says which functions their time goes to."""
 
-from __future__ import annotations
-
 import cProfile
 import dataclasses
 import functools

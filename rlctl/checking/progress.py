@@ -4,8 +4,6 @@ Time limits run on this clock, so a busy machine judges what an idle one does, a
 while a process waits for a processor. Linux counts that in `schedstat`; elsewhere it is the ordinary time.
 """
 
-from __future__ import annotations
-
 import ctypes
 import dataclasses
 import mmap

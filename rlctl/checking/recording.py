@@ -1,7 +1,5 @@
 """Writes an episode down: everything that an environment that is not trusted returns."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

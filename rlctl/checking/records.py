@@ -1,7 +1,5 @@
 """What the child processes have sent about one environment; and what judges rules: experiments and checks of this."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any

@@ -3,8 +3,6 @@
 What a process had left to do when it died or hung is done in another one, so that most rules are judged even then.
 """
 
-from __future__ import annotations
-
 import functools
 import os
 from collections import deque

@@ -1,7 +1,5 @@
 """The worlds of an instance, logged through a few short episodes."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import sys

@@ -28,8 +28,6 @@ It names the experiments that it needs (by default `RECORDING`, which record the
 from the rule's. All checks of a module in `MODULES` count; `PROCESSES` orders the experiments.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Collection, Iterable
 

@@ -1,7 +1,5 @@
 """RL7: the actions do something."""
 
-from __future__ import annotations
-
 import contextlib
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """RL5: how episodes end."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """RL110, RL117 and RL118: numbers in an observation that say nothing, jump, or are large."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """RL604, RL606 and RL609 to RL611: what the reward pays for, and success, as `info["is_success"]` reports it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

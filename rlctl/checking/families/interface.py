@@ -1,7 +1,5 @@
 """RL2, the interface: what reset, step and render take and return, that they come back, and unasked windows."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Iterator

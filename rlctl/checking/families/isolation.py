@@ -1,7 +1,5 @@
 """RL4: instances do not influence each other, and release what they acquire."""
 
-from __future__ import annotations
-
 import ctypes
 import dataclasses
 import gc

@@ -1,7 +1,5 @@
 """RL0: from the name on the command line to an environment."""
 
-from __future__ import annotations
-
 import ast
 import difflib
 import inspect

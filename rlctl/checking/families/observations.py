@@ -1,7 +1,5 @@
 """RL101 to RL109: spaces that learners can use, and observations inside their space."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

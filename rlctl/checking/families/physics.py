@@ -1,7 +1,5 @@
 """RL8: the physics, as PyBullet has it while the environment runs."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import math

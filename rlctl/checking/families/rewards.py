@@ -1,7 +1,5 @@
 """RL6: the reward as a number, its terms in `info["reward_terms"]`, and for other goals (RL601-603, 612, 614)."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 

@@ -1,7 +1,5 @@
 """RL116 and RL810 to RL814: how an environment drives and reads the robots of a PyBullet world."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 

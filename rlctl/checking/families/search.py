@@ -5,8 +5,6 @@ a few held actions, drawn around the best sequences of the generation before. Th
 another action from some step on; at last a finished one stops shortly before its end, next to the goal.
 """
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """RL3, seeds: they change something, later episodes follow from them, and no generator of the process is moved."""
 
-from __future__ import annotations
-
 import random
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """RL9: speed. Training takes millions of steps; the time of each decides what can be trained."""
 
-from __future__ import annotations
-
 import cProfile
 import dataclasses
 import statistics

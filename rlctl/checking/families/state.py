@@ -1,7 +1,5 @@
 """RL114, RL310 and RL311: what reset draws and hides, what an ended episode leaves, and generators without a seed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The forms a report comes in; each turns a report into text."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

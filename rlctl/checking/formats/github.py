@@ -1,7 +1,5 @@
 """A report as GitHub Actions annotations: workflow commands that put findings beside the class's line."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Format: OASIS, "Static Analysis Results Interchange Format (SARIF) Version 2.1.0".
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

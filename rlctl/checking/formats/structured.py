@@ -1,7 +1,5 @@
 """A report as JSON (its schema is report.schema.json), and what of observations and actions was declared and seen."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
