@@ -211,7 +211,7 @@ class NoneInfo(Clean):
 
 class SuccessIsADistance(Clean):
     def info(self):
-        return {"is_success": float(np.linalg.norm(self.position))}
+        return {"is_success": max(0.0, 0.1 - float(np.linalg.norm(self.position)))}
 
 
 class Raises(Clean):

@@ -146,8 +146,8 @@ class StartsInTheFloor(Cart):
 
 class LongPhysicsSteps(Cart):
     def vary(self):
-        p.setTimeStep(0.25, physicsClientId=self.client)
-        p.setPhysicsEngineParameter(numSubSteps=0, physicsClientId=self.client)
+        p.setTimeStep(1 / 48, physicsClientId=self.client)
+        p.setPhysicsEngineParameter(numSubSteps=1, physicsClientId=self.client)
 
 
 class ForgetsClient(Cart):

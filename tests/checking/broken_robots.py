@@ -87,7 +87,7 @@ class BoatStaysAtBuoy(Boat):
 
     def is_success(self):
         self.arrived = self.arrived or self.distance() < 0.2
-        return self.arrived
+        return self.distance() < (0.24 if self.arrived else 0.2)
 
 
 class BoatArrives(BoatStaysAtBuoy):
@@ -187,7 +187,7 @@ class CrawlerTerms(Crawler):
 
 class BoatMovingBuoy(Boat):
     def observe(self):
-        return np.array([*self.place, 0.0, 1.0, *self.speed], np.float32)
+        return np.array([*self.place, np.sin(self.heading), np.cos(self.heading), *self.speed], np.float32)
 
     def start(self):
         super().start()
@@ -204,23 +204,23 @@ class BoatFixedBuoy(BoatMovingBuoy):
         return np.array([0.5, 0.5])
 
 
-class TankOtherWish(Tank):
+class TankOneWish(Tank):
     def start(self):
-        super().start()
-        self.temperature, self.wanted = 0.0, 0.5
+        self.temperature, self.rate, self.wanted = 0.0, 0.0, 0.5
+        self.power = self.np_random.uniform(0.5, 1.0)
 
     def observe(self):
-        return np.array([self.temperature, self.rate, 0.1 * self.rate], np.float32)
+        return np.array([self.temperature, self.rate, self.power], np.float32)
 
+    def move(self, action):
+        super().move(self.power * action)
+
+
+class TankOtherWish(TankOneWish):
     def move(self, action):
         super().move(action)
         if self.steps == 30:
             self.wanted = 0.2
-
-
-class TankOneWish(TankOtherWish):
-    def move(self, action):
-        Tank.move(self, action)
 
 
 class BoatLateReward(Boat):
@@ -252,17 +252,20 @@ class TankNan(Tank):
 
 
 class ArmDegrees(Arm):
-    def target(self, action):
-        return np.rad2deg(self.home + 0.4 * action)
+    def start(self):
+        super().start()
+        self.drive(np.rad2deg(self.home))
 
 
 class CrawlerStartsInDegrees(Crawler):
     def start(self):
-        super().start()
         p.resetJointState(self.robot, 0, np.rad2deg(0.3), physicsClientId=self.client)
+        super().start()
 
 
 class ArmOrder(Arm):
+    home = np.array([0.9, -0.5, 0.3])
+
     def target(self, action):
         return super().target(action)[[1, 2, 0]]
 
@@ -274,7 +277,8 @@ class CrawlerOrder(Crawler):
 
 
 class ArmTouchesNothing(Arm):
-    home = np.array([1.6, 0.6, 0.0])
+    home = np.array([1.0, 1.1, 0.0])
+    height = 0.2
 
     def reward(self):
         return super().reward() - 1.0 * self.touches(3)
@@ -308,5 +312,5 @@ class ArmLongPhysicsSteps(Arm):
 class ArmWeakMotors(Arm):
     def drive(self, targets):
         p.setJointMotorControlArray(
-            self.robot, range(3), p.POSITION_CONTROL, list(targets), forces=[0.5] * 3, physicsClientId=self.client
+            self.robot, range(3), p.POSITION_CONTROL, list(targets), forces=[0.9] * 3, physicsClientId=self.client
         )

@@ -15,10 +15,12 @@ CASES = [
     broken("TankHiddenWish", "RL114", "warning", "Tank"),
     broken("BoatOldObservation", "RL115", "error", "Boat"),
     broken("ArmOldObservation", "RL115", "error", "Arm"),
-    broken("CrawlerQuaternion", "RL116", "error", "Crawler"),
     broken("ArmQuaternion", "RL116", "error", "ArmRightQuaternion"),
     broken("BoatWraps", "RL117", "info", "Boat"),
     broken("CrawlerWraps", "RL117", "info", "Crawler"),
+    case(
+        "broken_robots.py:CrawlerQuaternion", ("RL116", "error"), ("RL117", "info"), twin="robots.py:Crawler"
+    ),  # at pi
     broken("BoatMillimetres", "RL118", "info", "Boat"),
     broken("CrawlerDegrees", "RL118", "info", "Crawler"),
     broken("BoatStaysAtBuoy", "RL310", "error", "BoatArrives"),

@@ -120,26 +120,26 @@ def play_after_ends(context: Context, success: Sequence[Any] | None) -> Iterator
     `success` are the actions that succeeded in the search, with the first seed.
     """
     ended: set[str] = set()
-    with context.fresh() as instance:
+    instance = context.build()  # not closed: that may break the kept instance (RL402), which is used again
 
-        def record(role: str, seed: int, most: int, given: Sequence[Any] | None = None) -> Recording:
-            recording = Recording(role, EpisodePlayer(instance, seed, max_steps=most, given=given), context.budget)
-            recording.run()
-            return recording
+    def record(role: str, seed: int, most: int, given: Sequence[Any] | None = None) -> Recording:
+        recording = Recording(role, EpisodePlayer(instance, seed, max_steps=most, given=given), context.budget)
+        recording.run()
+        return recording
 
-        def repeat(role: str) -> Iterator[ChildMessage]:
-            yield from record(role, FIRST_SEED, COMPARED_STEPS).messages()
+    def repeat(role: str) -> Iterator[ChildMessage]:
+        yield from record(role, FIRST_SEED, COMPARED_STEPS).messages()
 
-        yield from repeat("before ends")
-        yield from repeat("before ends again")
-        if success is not None and has_succeeded(record("", FIRST_SEED, len(success), success).trajectory):
-            yield from repeat("after success")
-        for seed in (SECOND_SEED, SECOND_SEED + 1):
-            how = record("", seed, MOST_SECOND_STEPS).trajectory.ended
-            role = {"terminated": "after termination", "truncated": "after truncation"}.get(how)
-            if role and role not in ended and not context.budget.why_spent():
-                ended.add(role)
-                yield from repeat(role)
+    yield from repeat("before ends")
+    yield from repeat("before ends again")
+    if success is not None and has_succeeded(record("", FIRST_SEED, len(success), success).trajectory):
+        yield from repeat("after success")
+    for seed in (SECOND_SEED, SECOND_SEED + 1):
+        how = record("", seed, MOST_SECOND_STEPS).trajectory.ended
+        role = {"terminated": "after termination", "truncated": "after truncation"}.get(how)
+        if role and role not in ended and not context.budget.why_spent():
+            ended.add(role)
+            yield from repeat(role)
 
 
 @check("RL310", "search")
