@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.bullet_calls import LIBRARIES
+from rlctl.checking.bullet_calls import LIBRARIES, is_library
 from rlctl.checking.leaves import NUMBERS
 
 MOST_NUMBERS = 64  # larger arrays are buffers, images or tables, no single quantity
@@ -142,7 +142,7 @@ class GeneratorWatch:
 
         def default_rng(seed: Any = None) -> np.random.Generator:
             frame = sys._getframe(1)
-            if seed is None and str(frame.f_globals.get("__name__", "")).partition(".")[0] not in LIBRARIES:
+            if seed is None and not is_library(frame):
                 self.calls.add((frame.f_code.co_filename, frame.f_lineno))
             return original(seed)
 

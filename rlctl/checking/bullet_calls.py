@@ -44,6 +44,11 @@ class BulletCall:
         return f"{Path(self.file).name}:{self.line}"
 
 
+def is_library(frame: FrameType) -> bool:
+    """Say whether a frame runs code of a package that is not part of an environment."""
+    return str(frame.f_globals.get("__name__", "")).partition(".")[0] in LIBRARIES
+
+
 MOTORS = ("setJointMotorControl2", "setJointMotorControlArray", "resetJointState")
 """Functions that set a joint's position, or the target of its motor."""
 RECORDED = (*MOTORS, "getContactPoints")
@@ -83,6 +88,7 @@ class BulletCalls:
         self.targets: dict[tuple[int, int, int], Target] = {}  # last motor target by client, body and joint
         self.far_targets: list[Target] = []  # Positions of more than a full turn
         self.queries: dict[tuple[Any, ...], ContactQuery] = {}
+        self.late_links: dict[BulletCall, float] = {}  # how far getLinkState was from the present position [m]
         self._known: set[tuple[CodeType, int]] = set()
 
     def note_call(self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
@@ -90,9 +96,8 @@ class BulletCalls:
         where = frame.f_code, frame.f_lasti
         if "physicsClientId" not in keywords and where not in self._known:
             self._known.add(where)
-            is_library = str(frame.f_globals.get("__name__", "")).partition(".")[0] in LIBRARIES
             has_client = bool(arguments) if name in FIRST_IS_CLIENT else CLIENT_WORDS.search(_read_arguments(frame))
-            if not is_library and not has_client:
+            if not is_library(frame) and not has_client:
                 self.without_client.add(BulletCall(frame.f_code.co_filename, frame.f_lineno, name))
 
     def note_result(
@@ -115,6 +120,13 @@ class BulletCalls:
                 self.targets[client, body, joint] = target
             if abs(value) > FULL_TURN and len(self.far_targets) < MOST_FAR:
                 self.far_targets.append(target)
+
+    def note_link(self, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any], position: Any) -> None:
+        """Note how far a position that getLinkState returned is from the present one."""
+        if len(arguments) <= 3 and not keywords.get("computeForwardKinematics") and not is_library(frame):
+            call = BulletCall(frame.f_code.co_filename, frame.f_lineno, "getLinkState")
+            present = sys.modules["pybullet"].getLinkState(*arguments, **{**keywords, "computeForwardKinematics": 1})
+            self.late_links[call] = max(self.late_links.get(call, 0.0), math.dist(position, present[4]))
 
 
 def _read_positions(
@@ -169,6 +181,8 @@ class _RecordedFunction(_Replacement):
         result = self._function(*arguments, **keywords)
         if self._name in RECORDED:
             self._calls.note_result(self._name, frame, arguments, keywords, result)
+        elif self._name == "getLinkState":
+            self._calls.note_link(frame, arguments, keywords, result[4])
         return result
 
 

@@ -163,11 +163,7 @@ def read_orientations(world: World) -> dict[Link, list[float]]:
         if body.is_free:
             orientations[body.id, -1] = list(p.getBasePositionAndOrientation(body.id)[1])
         links = range(min(MOST_LINKS, len(body.links) - 1)) if body.joints else ()
-        for link, state in zip(
-            links,
-            p.getLinkStates(body.id, links, computeForwardKinematics=1) or (),
-            strict=False,
-        ):
+        for link, state in zip(links, p.getLinkStates(body.id, links, computeForwardKinematics=1) or (), strict=False):
             orientations[body.id, link] = list(state[5])
     return orientations
 

@@ -314,3 +314,29 @@ class ArmWeakMotors(Arm):
         p.setJointMotorControlArray(
             self.robot, range(3), p.POSITION_CONTROL, list(targets), forces=[0.9] * 3, physicsClientId=self.client
         )
+
+
+class ArmOldHand(Arm):
+    def hand(self):
+        return p.getLinkState(self.robot, 3, physicsClientId=self.client)
+
+
+class CrawlerOldFoot(Crawler):
+    def reward(self):
+        return super().reward() - p.getLinkState(self.robot, 0, physicsClientId=self.client)[4][2]
+
+
+class CrawlerFoot(Crawler):
+    def reward(self):
+        foot = p.getLinkState(self.robot, 0, computeForwardKinematics=True, physicsClientId=self.client)
+        return super().reward() - foot[4][2]
+
+
+class ArmPullsOnly(Arm):
+    def target(self, action):
+        return super().target(np.array([max(0.0, action[0]), *action[1:]]))
+
+
+class BoatForwardOnly(Boat):
+    def move(self, action):
+        super().move(np.maximum(action, 0.0))

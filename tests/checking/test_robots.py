@@ -45,6 +45,8 @@ CASES = [
     broken("CrawlerOtherFloor", "RL812", "warning", "CrawlerFloor"),
     broken("ArmLongPhysicsSteps", "RL813", "warning", "Arm"),
     broken("ArmWeakMotors", "RL814", "warning", "Arm"),
+    broken("ArmOldHand", "RL815", "info", "Arm"),
+    broken("CrawlerOldFoot", "RL815", "info", "CrawlerFoot"),
 ]
 
 

@@ -36,11 +36,13 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
         trials = Trials(context, instance)
         trials.require_repeatable()
         effects: dict[str, Effect] = {}
+        halves: list[str] = []
         why = f"only {MOST_DIMENSIONS} are compared" if len(every) > MOST_DIMENSIONS else ""
         try:
             yield from _late_effects(trials, every)
             for dimension in every[:MOST_DIMENSIONS]:
                 effects[dimension.name] = _find_effect(trials, dimension)
+                halves += _find_dead_half(trials, dimension) if effects[dimension.name] == "lasting" else []
             if "lasting" not in effects.values():
                 costly = [dimension for dimension in every if effects.get(dimension.name) == "reward"]
                 effects |= {dimension.name: "cost" for dimension in costly if _only_costs(trials, dimension)}
@@ -50,6 +52,9 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
                 raise
     left_out = f" ({len(effects)} of {len(every)} dimensions: {why})" if why else ""
     yield from _without_effect(effects, len(every), left_out)
+    if halves:
+        message = f"every value in one half of the range has the same effect: {list_names(halves, MOST_NAMES)}"
+        yield _finding(halves, message, Severity.INFO)
 
 
 @experiment("nan action", "RL704", share=0.2)
@@ -119,6 +124,21 @@ def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:
             elif effect == "none" and action_trials.observations_differ(plain, played):
                 effect = "copy"
     return "lasting" if effect == "reward" and _lasts(trials, dimension) else effect
+
+
+def _find_dead_half(trials: Trials, dimension: ActionNumber) -> list[str]:
+    low, high = dimension.ends
+    copies = trials.copies(dimension, FIRST_SEED, action_trials.REPEATED_STEPS, LONGEST_DELAY)
+
+    def is_same(one: float, two: float) -> bool:
+        played = ([trials.with_values(*stage, {dimension: value}) for value in (one, two)] for stage in STAGES)
+        return not any(action_trials.observations_differ(a, b, copies) for a, b in played)
+
+    middle = (low + high) / 2
+    for end, other in ((low, high), (high, low)) if "float" in dimension.leaf.dtype else ():
+        if is_same(end, middle) and is_same(end, (end + middle) / 2) and not is_same(other, (other + middle) / 2):
+            return [f"{dimension.name} from {min(end, middle):g} to {max(end, middle):g}"]
+    return []
 
 
 def _lasts(trials: Trials, dimension: ActionNumber) -> bool:

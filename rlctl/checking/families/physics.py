@@ -36,7 +36,7 @@ MOST_NAMES = 3
 MOST_CALLS = 20  # Calls that a finding's evidence has
 
 
-@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 14)), share=4.0)
+@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15)), share=4.0)
 def watch_worlds(context: Context) -> Iterator[ChildMessage]:
     """Log the worlds of an instance through a few episodes, then let them fall alone, which changes them."""
     if "pybullet" not in sys.modules:

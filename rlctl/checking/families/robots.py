@@ -1,4 +1,4 @@
-"""RL116 and RL810 to RL814: how an environment drives and reads the robots of a PyBullet world."""
+"""RL116 and RL810 to RL815: how an environment drives and reads the robots of a PyBullet world."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -13,6 +13,7 @@ from rlctl.checking.world_logs import LoggedWorld, WorldLog
 
 FAR_RANGES = 3.0  # a target farther outside the limits is not just out of reach
 FEWEST_JOINTS = 3
+LATE_LINK = 0.001  # [m]
 NEAR = 0.05  # of sorted targets and positions that are equal [rad], [m]
 APART = 0.2  # of a target and its own joint's position [rad], [m]
 FEWEST_QUERIES = 50
@@ -88,6 +89,13 @@ def _find_weak_motors(world: LoggedWorld, calls: BulletCalls) -> Iterator[RuleFi
                 evidence = {"element": joint.name, "value": target.force, "expected": torque}
                 yield RuleFinding("RL814", message, evidence, where=(target.call.file, target.call.line))
                 return
+
+
+def _find_late_links(calls: BulletCalls) -> Iterator[RuleFinding]:
+    call = max(calls.late_links, key=lambda call: calls.late_links[call], default=None)
+    if call is not None and (distance := calls.late_links[call]) > LATE_LINK:
+        message = f"getLinkState returns the position before the last physics step: up to {1e3 * distance:.3g} mm away"
+        yield RuleFinding("RL815", message, {"value": distance, "expected": 0.0}, where=(call.file, call.line))
 
 
 def _find_empty_queries(world: LoggedWorld, calls: BulletCalls) -> Iterator[RuleFinding]:
@@ -198,6 +206,7 @@ def find_angles(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
 def find_misuses(worlds: Sequence[LoggedWorld], calls: BulletCalls) -> Iterator[RuleFinding]:
     """Yield what is wrong with how the robots of some worlds are driven and read; the worlds have to be there still."""
     yield from _find_far_targets(calls)
+    yield from _find_late_links(calls)
     for world in worlds:
         yield from _find_wrong_order(world)
         yield from _find_weak_motors(world, calls)
