@@ -1,7 +1,5 @@
 """Draws a world in a recording: the shapes of bodies, markers, paths."""
 
-from __future__ import annotations
-
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray

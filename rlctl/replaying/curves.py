@@ -1,7 +1,5 @@
 """Sends the numbers of an episode to a recording, as curves with names and colours."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
@@ -58,8 +56,7 @@ class Plot:
 
     title: str
     entity: str
-    kind: str
-    """reward, action, joints, observation or image."""
+    kind: str  # reward, action, joints, observation or image
     values: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
     """Values of the curves, shape (rows, curves)."""
 

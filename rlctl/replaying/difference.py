@@ -1,7 +1,5 @@
 """Compares a recorded episode with a rollout of its actions, bit for bit."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -17,17 +15,13 @@ from rlctl.run.episode import RecordedEpisode
 class Difference:
     """Where a rollout begins to differ from the recorded episode."""
 
-    step: int
-    """The first step that differs; 0 is the reset."""
+    step: int  # the first step that differs; 0 is the reset
     what: str
     recorded: str
     now: str
-    size: float | None
-    """Absolute difference there; None if it is not a finite number."""
-    steps: int
-    """How many steps differ; 0 if only the end differs."""
-    length: int
-    """Steps of the recorded episode."""
+    size: float | None  # absolute difference there; None if it is not a finite number
+    steps: int  # how many steps differ; 0 if only the end differs
+    length: int  # steps of the recorded episode
 
     def __str__(self) -> str:
         by = "" if self.size is None else f" (off by {self.size:.3g})"

@@ -1,7 +1,5 @@
 """Writes films of episodes, `.mp4` or `.gif`, without a display: with PyBullet's software renderer, or `render()`."""
 
-from __future__ import annotations
-
 import fractions
 import time
 from collections.abc import Callable, Sequence

@@ -5,8 +5,6 @@ getCollisionShapeData crashes on some robots. Recordings show what was simulated
 PyBullet 3.2 does: `axisangle` is always in radians; `euler`, `zaxis` and `xyaxes` are ignored.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 from collections.abc import Iterator, Mapping
@@ -33,10 +31,8 @@ class ShapeKind(enum.Enum):
 class Mesh:
     """A mesh in memory."""
 
-    vertices: np.ndarray
-    """[m], shape (vertices, 3)."""
-    triangles: np.ndarray
-    """Indices of vertices, shape (triangles, 3)."""
+    vertices: np.ndarray  # [m], shape (vertices, 3)
+    triangles: np.ndarray  # indices of vertices, shape (triangles, 3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,8 +46,7 @@ class Shape:
     mesh: Path | Mesh | None
     position: tuple[float, ...]
     orientation: tuple[float, ...]
-    color: tuple[float, ...]
-    """RGBA in [0, 1]."""
+    color: tuple[float, ...]  # RGBA in [0, 1]
 
 
 _KINDS = {kind.value: kind for kind in ShapeKind if kind not in (ShapeKind.MESH, ShapeKind.OTHER)}

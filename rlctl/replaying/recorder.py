@@ -1,7 +1,5 @@
 """Plays an episode in this process and records its numbers, a log, and the scene to draw."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import math
@@ -26,8 +24,7 @@ from rlctl.version import collect_versions
 
 Choose = Callable[[Any, int], Any]
 """Returns the action for an observation and the number of steps so far; None ends the episode."""
-Watch = Callable[[int], None]
-"""Called with the number of a step after it; 0 is the reset."""
+Watch = Callable[[int], None]  # called with the number of a step after it; 0 is the reset
 
 ONLY_OF_POLICIES = ("torch", "stable-baselines3", "sb3-contrib")
 """Packages that policies need, but recorded episodes, which contain the actions, do not."""
@@ -48,17 +45,13 @@ class Rollout:
 
     env: EnvInfo
     episode: RecordedEpisode
-    weighted_terms: NDArray[np.float64]
-    """Shape (T, terms); they add up to the reward."""
+    weighted_terms: NDArray[np.float64]  # shape (T, terms); they add up to the reward
     successes: NDArray[np.bool_] | None
     """Whether the goal held after each step, shape (T,); None if the environment does not report it."""
-    ended: bool
-    """Whether the environment ended the episode, rather than the list of actions."""
+    ended: bool  # whether the environment ended the episode, rather than the list of actions
     log: list[LogEntry]
-    dt: float | None
-    """Time between two steps [s]; None if unknown."""
-    scene: Scene
-    """Empty if the episode was played without `draw`."""
+    dt: float | None  # time between two steps [s]; None if unknown
+    scene: Scene  # empty if the episode was played without `draw`
 
     @property
     def length(self) -> int:
@@ -91,8 +84,7 @@ class _Step(NamedTuple):
     action: Any
     observation: Any
     reward: float
-    raw: list[float]
-    """Reward terms, by the names of the weights."""
+    raw: list[float]  # reward terms, by the names of the weights
     weighted: list[float]
     success: bool | None
     events: dict[str, dict[str, float]]

@@ -1,7 +1,5 @@
 """`rlctl replay`: rollouts of a policy, or a recorded episode, as recordings, films, or in a window."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Sequence
@@ -185,8 +183,7 @@ class _PolicySource:
             self.spec = dataclasses.replace(self.spec, sim=request.sim)
         self.name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
         self._described = f"{self._file} ({info.algo}, step {info.training_steps:,})"
-        self._chosen: dict[int, float] = {}
-        """Returns of the chosen episodes, by seed."""
+        self._chosen: dict[int, float] = {}  # returns of the chosen episodes, by seed
         self._choice = ""
         if request.choice is None:
             self.seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes or 1)

@@ -1,7 +1,5 @@
 """The result of a replay, as text and JSON."""
 
-from __future__ import annotations
-
 import dataclasses
 import shlex
 from collections.abc import Mapping
@@ -23,12 +21,9 @@ class ReplayedEpisode:
     length: int
     total_reward: float
     success: bool | None
-    events: Mapping[str, bool]
-    """The events that the task offers, and whether each acted."""
-    recording: Path | None = None
-    """The `.rrd` file."""
-    episode: Path | None = None
-    """The `.npz` file."""
+    events: Mapping[str, bool]  # the events that the task offers, and whether each acted
+    recording: Path | None = None  # the `.rrd` file
+    episode: Path | None = None  # the `.npz` file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,8 +32,7 @@ class Verification:
 
     episode: Path
     difference: Difference | None
-    other_versions: dict[str, tuple[str, str | None]]
-    """Recorded and current version, by name, of those that differ."""
+    other_versions: dict[str, tuple[str, str | None]]  # recorded and current version, by name, of those that differ
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,10 +43,8 @@ class FilmReport:
     pictures: int
     width: int
     height: int
-    rate: float
-    """Pictures per second, as it plays."""
-    drawn_per_s: float
-    """Pictures per second, as they were drawn."""
+    rate: float  # pictures per second, as it plays
+    drawn_per_s: float  # pictures per second, as they were drawn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,10 +55,8 @@ class ReplayResult:
     policy: str
     episodes: list[ReplayedEpisode]
     verification: Verification | None = None
-    policy_file: str = ""
-    """Path and description of the policy; empty for a recorded episode."""
-    choice: str = ""
-    """How the episodes were chosen by outcome; empty if they were not."""
+    policy_file: str = ""  # path and description of the policy; empty for a recorded episode
+    choice: str = ""  # how the episodes were chosen by outcome; empty if they were not
     film: FilmReport | None = None
 
     def check(self) -> None:

@@ -1,7 +1,5 @@
 """Reproduces recorded episodes: compares them with the recorded values, or writes them as `.rrd`."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a replay is asked for: the arguments of `rlctl replay` as data. Imports nothing heavy."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """Writes a rollout as a Rerun recording (`.rrd`), with the layout for the viewer."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Sequence
@@ -22,8 +20,7 @@ from rlctl.replaying.scene import BodyMotion, Scene, Warn
 from rlctl.run.episode import RecordedEpisode
 from rlctl.storage import files
 
-Followed = tuple[str, BodyMotion] | None
-"""What the camera follows: an entity, and its body."""
+Followed = tuple[str, BodyMotion] | None  # what the camera follows: an entity, and its body
 
 _LEVEL_COLORS = {"INFO": 0x3D7DD8FF, "WARN": 0xC06A00FF, "DEBUG": 0x787878FF}  # readable on white and on black
 _EYE_DIRECTION = np.array([1.0, 0.75, 0.5])  # from the front left, looking down

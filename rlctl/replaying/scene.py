@@ -3,8 +3,6 @@
 It is read after every step and drawn when the episode has ended.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import itertools
@@ -25,8 +23,7 @@ from rlctl.task.env import TaskEnv
 
 Env = gymnasium.Env[Any, Any]
 Array = NDArray[np.float64]
-Warn = Callable[[str], None]
-"""Receives a message for the user, about something that cannot be drawn correctly."""
+Warn = Callable[[str], None]  # receives a message for the user, about something that cannot be drawn correctly
 
 _GROUND_SIZE = 8.0  # [m]; a body without joints that is wider both ways is the ground
 _INERTIAL_POSE = slice(3, 5)  # of getDynamicsInfo: the centre of mass in the link frame
@@ -46,26 +43,18 @@ class BodyMotion:
 
     name: str
     file: Path
-    ground_height: float | None = None
-    """Height of the upper face [m] if the body is the flat ground."""
-    terrain: Array | None = None
-    """Points of rough ground [m], world frame, shape (along x, along y, 3)."""
+    ground_height: float | None = None  # height of the upper face [m] if the body is the flat ground
+    terrain: Array | None = None  # points of rough ground [m], world frame, shape (along x, along y, 3)
     joint_names: list[str] = dataclasses.field(default_factory=list)
-    joint_positions: Array = dataclasses.field(default_factory=_no_rows)
-    """[rad or m], shape (T + 1, joints)."""
-    joint_velocities: Array = dataclasses.field(default_factory=_no_rows)
-    """[rad/s or m/s], shape (T + 1, joints)."""
-    links: list[str] = dataclasses.field(default_factory=list)
-    """The base first."""
-    positions: Array = dataclasses.field(default_factory=_no_rows)
-    """Shape (T + 1, links, 3)."""
-    orientations: Array = dataclasses.field(default_factory=_no_rows)
-    """Shape (T + 1, links, 4)."""
+    joint_positions: Array = dataclasses.field(default_factory=_no_rows)  # [rad or m], shape (T + 1, joints)
+    joint_velocities: Array = dataclasses.field(default_factory=_no_rows)  # [rad/s or m/s], shape (T + 1, joints)
+    links: list[str] = dataclasses.field(default_factory=list)  # the base first
+    positions: Array = dataclasses.field(default_factory=_no_rows)  # shape (T + 1, links, 3)
+    orientations: Array = dataclasses.field(default_factory=_no_rows)  # shape (T + 1, links, 4)
     shapes: list[Shape] = dataclasses.field(default_factory=list)
     trunk: int | None = None
     """Index in `links` of the link that travels: a free base, or one on a sliding joint without limits; else None."""
-    box: tuple[Array, Array] = (-np.ones(3), np.ones(3))
-    """Lowest and highest corner [m] at the reset."""
+    box: tuple[Array, Array] = (-np.ones(3), np.ones(3))  # lowest and highest corner [m] at the reset
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,10 +62,8 @@ class Scene:
     """What can be drawn of an episode of T steps."""
 
     bodies: list[BodyMotion] = dataclasses.field(default_factory=list)
-    markers: dict[str, Array] = dataclasses.field(default_factory=dict)
-    """World positions [m], shape (T + 1, 3)."""
-    pictures: list[tuple[int, bytes]] = dataclasses.field(default_factory=list)
-    """Step and JPEG file."""
+    markers: dict[str, Array] = dataclasses.field(default_factory=dict)  # world positions [m], shape (T + 1, 3)
+    pictures: list[tuple[int, bytes]] = dataclasses.field(default_factory=list)  # step and JPEG file
 
     def robots(self) -> list[BodyMotion]:
         """Return the bodies with joints."""

@@ -93,10 +93,8 @@ class _World:
 class PictureStrip:
     """An episode in pictures."""
 
-    pictures: list[tuple[int, bytes]]
-    """Step and JPEG file."""
-    deepest_contact: float
-    """How far bodies overlapped at most [m]; 0 without overlap, or without a task's world."""
+    pictures: list[tuple[int, bytes]]  # step and JPEG file
+    deepest_contact: float  # how far bodies overlapped at most [m]; 0 without overlap, or without a task's world
 
 
 def take_pictures(episode: RecordedEpisode, count: int) -> PictureStrip:

@@ -1,7 +1,5 @@
 """PyBullet's window, or that of a Gymnasium environment: `--gui`."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

@@ -1,7 +1,5 @@
 """Imports PyBullet on first use, and reads the errors that it prints."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import importlib

@@ -1,7 +1,5 @@
 """Constraints between links: gears, points held together, links held at a pose."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """`TaskEnv`: the Gymnasium environment around a task."""
 
-from __future__ import annotations
-
 import copy
 import math
 import numbers

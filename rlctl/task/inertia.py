@@ -1,7 +1,5 @@
 """Finds masses and inertias in a URDF that are physically impossible."""
 
-from __future__ import annotations
-
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator

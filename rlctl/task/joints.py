@@ -1,7 +1,5 @@
 """The joints that a policy's action moves, as plain data: in policies and exports, for whoever drives the robot."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

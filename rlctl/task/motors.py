@@ -1,7 +1,5 @@
 """Motors of a body's joints: position, velocity and torque control, limits, and applied torques."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Sequence
 from pathlib import Path

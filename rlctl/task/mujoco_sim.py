@@ -5,8 +5,6 @@ Contacts differ: they are soft, with the time constant `solref` [s] of at least 
 equivalent in MuJoCo are not defined here or in `MujocoBody`; using one raises `UsageError`.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Checks what a task observes at every step, and assembles the environment's observation: a flat Box, or a Dict."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

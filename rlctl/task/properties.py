@@ -1,7 +1,5 @@
 """Properties of a body that events change until the next reset: mass, friction, damping, colour."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple

@@ -13,8 +13,6 @@ Terms are unsigned: a weight gives the sign.
 | states a robot should not be in   | `near_limits`, `excess_force`, `penetration`                |
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Literal, overload

@@ -3,8 +3,6 @@
 Quaternions are (x, y, z, w), as in PyBullet. The state of a body is read at most once per control step.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

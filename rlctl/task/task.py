@@ -1,7 +1,5 @@
 """`Task`: what a plugin author writes."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

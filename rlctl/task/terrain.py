@@ -1,7 +1,5 @@
 """Rough ground from a seed: heights for `Sim.add_height_field`."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The events that act in one environment: called at their moments, in the order the task declares them."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import Any

@@ -3,8 +3,6 @@
 Each draws from the ranges it is given, changes a body from its nominal values, and returns what it drew.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Ranges from which events draw values: how they are written, the limits of their values, and how they widen."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Noise and delay between the world, the policy and the motors."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np
