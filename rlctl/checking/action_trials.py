@@ -106,7 +106,7 @@ class Trials:
 
     def play(self, seed: int, chosen: Sequence[Any], after_reset: Callable[[], None] = lambda: None) -> list[Frame]:
         """Play an episode with given actions, to its end at most; the first frame is that of reset."""
-        episode = EpisodePlayer(self.instance, seed, given=chosen, max_steps=len(chosen))
+        episode = EpisodePlayer(self.instance, seed, sequence=chosen, max_steps=len(chosen))
         frames = []
         for moment in episode:
             frames.append(_to_frame(moment))
@@ -121,8 +121,8 @@ class Trials:
     def copies(self, dimension: ActionNumber, seed: int, steps: int, longest_delay: int) -> list[int]:
         """Return the columns of a frame that only repeat this number of an earlier action."""
         rows = [frame[:REWARD] for frame in self.plain(seed, steps)[1:]]
-        given = [flatten_action(self.instance.action_leaves, action) for action in self.actions(seed, len(rows))]
-        values = np.array([action[dimension.column] for action in given])
+        chosen = [flatten_action(self.instance.action_leaves, action) for action in self.actions(seed, len(rows))]
+        values = np.array([action[dimension.column] for action in chosen])
         if not rows or len({row.shape for row in rows}) > 1:
             return []
         returned = np.stack(rows)

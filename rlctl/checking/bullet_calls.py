@@ -136,11 +136,11 @@ def _read_positions(
     many = name.endswith("Array")
     names = ["bodyUniqueId", "jointIndices" if many else "jointIndex"]
     names += ["targetValue"] if name == "resetJointState" else ["controlMode", "targetPosition" + "s" * many]
-    given = {**dict(zip(names, arguments, strict=False)), **keywords}
-    body, joints, values = given.get("bodyUniqueId", given.get("bodyIndex")), given.get(names[1]), given.get(names[-1])
-    if body is None or joints is None or values is None or given.get("controlMode", POSITION) != POSITION:
+    named = {**dict(zip(names, arguments, strict=False)), **keywords}
+    body, joints, values = named.get("bodyUniqueId", named.get("bodyIndex")), named.get(names[1]), named.get(names[-1])
+    if body is None or joints is None or values is None or named.get("controlMode", POSITION) != POSITION:
         return []
-    forces = given.get("force" + "s" * many)
+    forces = named.get("force" + "s" * many)
     if not many:
         joints, values, forces = [joints], [values], None if forces is None else [forces]
     try:

@@ -40,7 +40,7 @@ class CheckVerdict:
 
 @dataclasses.dataclass(frozen=True)
 class CheckReport:
-    """What was found, and what it was found by."""
+    """The verdict on one environment, and the records that it follows from."""
 
     task: str
     verdict: CheckVerdict
@@ -91,20 +91,18 @@ def check(
     budget_s: float = families.PROCESS_S,
     show_progress: bool = True,
 ) -> CheckReport:
-    """Check an environment with some rules, given by id, or with what these can say from some experiments `only`.
+    """Check an environment with some rules, by id; with `only`, from some of their experiments.
 
     Raises `UsageError` for a task or a parameter that does not exist. Whatever the environment itself does, a crash
     or a hang of more than `env_timeout_s` seconds in a call included, is in the report.
     """
     started = time.monotonic()
     records = Records(spec.task, normalizes=lambda what: _normalizes(spec.task, what))
-    mistakes: list[UsageError] = []
 
     def receive(message: ChildMessage) -> None:
         if isinstance(message, Mistake):
-            mistakes.append(UsageError(message.message))
-        else:
-            records.add(message)
+            raise UsageError(message.message)
+        records.add(message)
 
     needed = {"build"} | {name for name in families.find_needs(rules) if only is None or name in only}
     experiments = {
@@ -117,8 +115,6 @@ def check(
             supervisor.run({name: names for name, names in experiments.items() if names}, say)
     finally:
         supervisor.close()
-    if mistakes:
-        raise mistakes[0]
     records.printed_lines, records.printed_first = supervisor.children[0].printed, supervisor.children[0].first_line
     return CheckReport(spec.task, judge(records, rules), records, time.monotonic() - started, budget_s, strict)
 
@@ -174,7 +170,7 @@ def _apply(rule: str, records: Records, verdict: CheckVerdict) -> None:
         verdict.not_applicable[rule] = str(reason)
     except UsageError:  # the recipe that comes with the task
         raise
-    except Exception:  # a rule's bug must not hide what the other rules findings, and must not look like a pass
+    except Exception:  # a bug in a rule must not hide other findings, and must not look like a pass
         verdict.crashed[rule] = traceback.format_exc()
     else:
         verdict.judged.append(rule)

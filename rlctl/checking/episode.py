@@ -61,10 +61,10 @@ class EpisodePlayer:
         action_seed: int | None = None,
         max_steps: int = 10_000,
         longest_s: float = float("inf"),
-        given: Iterable[Any] | None = None,
+        sequence: Iterable[Any] | None = None,
     ) -> None:
-        """`actions` is a kind (see `draw_actions`), drawn with `action_seed`, else with `seed`; or the name of
-        those that are `given`. It ends after `longest_s`, or when the experiment's time is over."""
+        """`actions` is a kind (see `draw_actions`), drawn with `action_seed` (default `seed`), or the name of a
+        `sequence` of actions. The episode ends after `longest_s`, or when the experiment's time is over."""
         self.instance = instance
         self.seed = seed
         self.number = number
@@ -74,7 +74,7 @@ class EpisodePlayer:
         self.ended = ""
         """`terminated`, `truncated`, `both`, `raised`, or what cut it: `steps`, `time`; empty while it goes on."""
         self.actions = actions
-        self._given = given
+        self._sequence = sequence
         self._action_seed = seed if action_seed is None else action_seed
         self._next = iter(self._choose_actions())
 
@@ -97,8 +97,8 @@ class EpisodePlayer:
         return Moment(0, None, returned, form=_form(returned))
 
     def _choose_actions(self) -> Iterator[Any]:
-        if self._given is not None:
-            return iter(self._given)
+        if self._sequence is not None:
+            return iter(self._sequence)
         return draw_actions(self.instance.env.action_space, self.actions, self._action_seed)
 
     def step(self) -> Moment:

@@ -29,7 +29,7 @@ _LIBRARY = re.compile(
     rf"^<|^{re.escape(sysconfig.get_path('stdlib'))}/(?!site-packages|dist-packages)|"
     rf"(site|dist)-packages/({'|'.join(LIBRARIES)})(/|\\.)"
 )
-"""Files of Python itself and of libraries: what raises there was called wrongly by the environment."""
+"""Files of Python itself and of libraries: an exception there comes from a wrong call in the environment."""
 _MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
 
 

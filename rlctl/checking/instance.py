@@ -29,7 +29,7 @@ class Budget:
     deadline: float  # On `read_clock`'s clock [s]
     bytes_left: int = 48 * 2**20
     failures: int = 0
-    was_cut: bool = False  # The clock ended something before it had its number of steps or resets
+    was_cut: bool = False  # whether the clock stopped something before its number of steps or resets
 
     @property
     def seconds_left(self) -> float:
@@ -37,13 +37,13 @@ class Budget:
         return max(0.0, self.deadline - read_clock())
 
     def is_over(self) -> bool:
-        """Say whether there is no more time; what asks ends then, so the experiment was cut."""
+        """Say whether time is up, and note that this cut the experiment: the caller stops then."""
         is_over = read_clock() > self.deadline
         self.was_cut |= is_over
         return is_over
 
     def why_spent(self) -> str:
-        """Return what there is no more of; empty while there is some of everything."""
+        """Return which resource is used up; empty if none is."""
         if self.failures >= MOST_FAILURES:
             return f"{self.failures} of them raised"
         return "memory was over" if self.bytes_left <= 0 else "time was over" if self.is_over() else ""

@@ -167,7 +167,7 @@ class Skipped:
 
 @dataclasses.dataclass(frozen=True)
 class Finished:
-    """An experiment has come to its end: by itself, by what the environment raised, or by a bug."""
+    """An experiment has ended: complete, by an exception of the environment, or by a bug."""
 
     experiment: str
     seconds: float
@@ -185,7 +185,7 @@ class Mistake:
 
 @dataclasses.dataclass(frozen=True)
 class End:
-    """The process has done all it was asked for."""
+    """The process has finished."""
 
 
 ChildMessage = Built | CheckedEpisode | CallFailure | RuleFinding | Fact | Skipped | Finished | Mistake | End

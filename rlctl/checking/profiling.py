@@ -1,4 +1,4 @@
-"""Times calls on a busy machine, and says which functions their time goes to."""
+"""Times calls on a busy machine, and finds the functions that take the time."""
 
 import cProfile
 import dataclasses
@@ -36,7 +36,7 @@ KINDS = {
 
 
 class Stopwatch:
-    """Calls functions, and keeps how long each took without the time in which it waited for a processor [s]."""
+    """Calls functions and records their times, without the time of waiting for a processor [s]."""
 
     def __init__(self) -> None:
         self.seconds: list[float] = []

@@ -1,4 +1,4 @@
-"""Where a child process is, in memory that its parent reads too, so that a hang or crash can be placed; and its clock.
+"""The position of a child process, in memory shared with its parent to locate hangs and crashes; and its clock.
 
 Time limits run on this clock, so a busy machine judges what an idle one does, and only takes longer: it stands still
 while a process waits for a processor. Linux counts that in `schedstat`; elsewhere it is the ordinary time.

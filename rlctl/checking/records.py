@@ -1,4 +1,4 @@
-"""What the child processes have sent about one environment; and what judges rules: experiments and checks of this."""
+"""What the child processes have sent about one environment, and the two kinds of code that judge rules by it."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
@@ -132,7 +132,7 @@ class Check:
     rule: str
     run: Callable[[Records], Iterable[RuleFinding]]
     needs: tuple[str, ...]  # The experiments that record what it reads
-    of_absence: bool = False  # it judges what never happened, so it needs them to the end
+    of_absence: bool = False  # it judges what never happened, so its experiments must be complete
 
 
 def experiment(

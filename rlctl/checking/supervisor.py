@@ -1,6 +1,6 @@
 """Starts the child processes, two at a time, and passes on what they send; deaths and hangs become failures.
 
-What a process had left to do when it died or hung is done in another one, so that most rules are judged even then.
+The experiments that a dead or hung process had left run in another one, so that most rules are judged even then.
 """
 
 import functools
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 
 from rlctl.checking import families
-from rlctl.checking.messages import Built, CallFailure, ChildMessage, End, Finished, Mistake
+from rlctl.checking.messages import Built, CallFailure, ChildMessage, End, Finished
 from rlctl.checking.progress import CallProgress, Position, read_clock_of
 from rlctl.environments.spec import EnvSpec
 from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill, anonymous_file
@@ -156,8 +156,6 @@ class Supervisor:
                 return
             case Built():
                 self._has_built = True
-            case Mistake():
-                self._waiting.clear()
             case Finished():
                 child.experiments.remove(message.experiment)
                 child.has_finished_one = True

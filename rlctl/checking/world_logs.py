@@ -40,7 +40,7 @@ class WorldLog:
     """Motor targets that the first step sets, with the zero action only."""
 
     def look(self, place: Place, observation: Any) -> bool:
-        """Add what is there now; False where the world has gone, or has other bodies."""
+        """Add the present state; return False if the world is gone or has other bodies."""
         client = self.world.client
         try:
             states, contacts = bullet_worlds.read_states(self.world), bullet_worlds.read_contacts(client)

@@ -17,7 +17,7 @@ EPISODES = (
 )
 """How the actions of each episode are chosen: every kind first, in case `MOST_STEPS` are over."""
 MOST_STEPS = 5_000  # in all; more episodes with other seeds show little more
-ENDLESS_STEPS = 3_000  # After so many steps an episode without an end is left
+ENDLESS_STEPS = 3_000  # an episode without an end is stopped after so many steps
 LATER_ENDLESS_STEPS = 500  # The same, once one had no end
 FEWEST_EPISODES = 5
 SHORTEST_LIMIT = 5  # shorter games with one length have no time limit [steps]

@@ -16,7 +16,7 @@ from rlctl.errors import RecipeError
 
 NUMBERS = ("float", "int", "numpy.float64")  # Reward types that both libraries accept
 MANY_LINES = 0.5  # lines per step; a few per reset are not slow
-FEWEST_STEPS = 20  # With fewer, what is printed belongs to the start
+FEWEST_STEPS = 20  # with fewer steps most lines come from the start
 MOST_FAILURES = 3
 RENDERING = "rendering"  # The experiment that renders
 OF_OTHER_RULES = ("interleaved", "after close", RENDERING)  # failures there are RL401's, RL402's and RL215's

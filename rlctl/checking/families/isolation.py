@@ -189,7 +189,7 @@ class Counts:
         if not _PROCESS.exists():
             return
         gc.collect()
-        # What was freed before would otherwise be used again, and hide what is kept.
+        # Python would otherwise reuse freed memory, and a leak would not show.
         if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
             trim(0)
         pages = int((_PROCESS / "statm").read_text().split()[1])

@@ -22,13 +22,13 @@ from rlctl.checking.records import experiment
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
 
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))  # actions and logged steps
-LASTING_STEPS = 3  # What lasts for fewer steps is a blow that the solver has not answered yet
+LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved yet
 PART_OF_RANGE, LEAST_ANGLE, LEAST_LENGTH = 0.1, 0.05, 0.01
 """How far outside its limits a joint may be: part of the range, and at least so much [rad], [m]."""
 FASTEST_BASE = 50.0  # [m/s]; PyBullet stops at 100 per axis, and no robot is faster than a car
 FASTEST_JOINT = 90.0  # [rad/s]; PyBullet stops at 100; arms and legs stay below 30
 FASTEST_SLIDE = 50.0  # [m/s]
-FASTEST_MEANT = 100.5  # somebody raised the limit of 100, as for wheels: only NONSENSE counts
+FASTEST_MEANT = 100.5  # the author raised the limit of 100, for example for wheels: only NONSENSE counts
 NONSENSE = 5_000.0
 FASTEST_JUMP = 1.0  # above falling, 0.1 s after a reset: ten times gravity [m/s]
 LONGEST_TIME_STEP = 0.02  # PyBullet's own is 1/240 [s]

@@ -247,7 +247,7 @@ def recompute_rewards(context: Context) -> Iterator[ChildMessage]:
         raise NotJudged("no step could be taken")
     try:
         goals = [np.stack([np.asarray(moment.observation[name]) for moment in taken]) for name in GOALS]
-        given = np.array([float(moment.reward) for moment in taken])
+        rewards = np.array([float(moment.reward) for moment in taken])
         infos = np.array([moment.info for moment in taken])
     except (LookupError, TypeError, ValueError):
         raise NotJudged("goals are missing or change their shape (RL101), or types are wrong (RL204)") from None
@@ -257,15 +257,15 @@ def recompute_rewards(context: Context) -> Iterator[ChildMessage]:
         raised = describe(error.__cause__ or error)
         yield RuleFinding("RL614", f"compute_reward, of many goals at once, raises {raised}", {"steps": len(taken)})
         return
-    if computed.shape != given.shape:
-        shapes = f"of {len(taken)} goals at once it returns shape {computed.shape}, not {given.shape}"
+    if computed.shape != rewards.shape:
+        shapes = f"of {len(taken)} goals at once it returns shape {computed.shape}, not {rewards.shape}"
         yield RuleFinding("RL614", f"compute_reward: {shapes}", {"steps": len(taken)})
         return
-    off = np.abs(computed - given)
+    off = np.abs(computed - rewards)
     # Written so that NaN is another reward; where the environment itself gives one, RL601 says so.
-    is_other = np.isfinite(given) & ~(off <= TOLERANCE * np.maximum(1.0, np.abs(given)))
+    is_other = np.isfinite(rewards) & ~(off <= TOLERANCE * np.maximum(1.0, np.abs(rewards)))
     if is_other.any():
         step = int(np.where(is_other, off, 0.0).argmax())
-        message = f"the reward of step {step + 1} is {given[step]:.6g}, and compute_reward says {computed[step]:.6g}"
-        evidence = {"step": step + 1, "value": float(computed[step]), "expected": float(given[step])}
+        message = f"the reward of step {step + 1} is {rewards[step]:.6g}, and compute_reward says {computed[step]:.6g}"
+        evidence = {"step": step + 1, "value": float(computed[step]), "expected": float(rewards[step])}
         yield RuleFinding("RL614", message, evidence)

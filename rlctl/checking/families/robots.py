@@ -52,10 +52,10 @@ def _find_wrong_order(world: LoggedWorld) -> Iterator[RuleFinding]:
             if len(driven) < FEWEST_JOINTS:
                 continue
             positions = states[0, [JOINTS + j for j in driven]]
-            given = np.array([target.value for target in driven.values()])
-            order = np.argsort(given, kind="stable")
-            is_sorted_same = np.abs(given[order] - np.sort(positions)).max() <= NEAR
-            wrong = np.flatnonzero(np.abs(given - positions) > APART)
+            values = np.array([target.value for target in driven.values()])
+            order = np.argsort(values, kind="stable")
+            is_sorted_same = np.abs(values[order] - np.sort(positions)).max() <= NEAR
+            wrong = np.flatnonzero(np.abs(values - positions) > APART)
             if is_sorted_same and wrong.size >= 2:
                 joint, target = body.joints[list(driven)[wrong[0]]], list(driven.values())[wrong[0]]
                 message = (

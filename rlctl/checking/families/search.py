@@ -24,7 +24,7 @@ from rlctl.checking.records import experiment
 
 MOST_STEPS = 4_500  # in all: they find the goal of the bundled `reach` from most seeds
 MOST_EPISODES = 60
-LONGEST = 150  # An episode is left after so many steps: most of a goal's pull shows before
+LONGEST = 150  # episodes are stopped after so many steps; a reward that leads to a goal shows before
 SEGMENTS = 3  # Of a sequence, each one action that is held: few numbers to search among
 GENERATION = 10
 ELITE = 3
@@ -36,7 +36,7 @@ CONTINUED = 12  # Episodes that follow the best and then go on otherwise
 STOPS = (1, 2, 4, 8)  # steps before the end of a finished episode, to stop there
 FAR_ABOVE = 5.0  # times the spread of early rewards; a robot that falls at speed ends with a good reward
 CLEARLY = 0.1  # How much more stopping has to earn than finishing
-LATE = 10  # The mean of so many rewards is what each later step is taken to earn [steps]
+LATE = 10  # steps after the recorded ones are assumed to earn the mean of the last so many rewards
 
 
 @dataclasses.dataclass
@@ -142,9 +142,9 @@ class _Search:
 
     def play(self, sequence: list[Any], kind: str = "searched") -> Iterator[ChildMessage]:
         """Play one sequence of actions."""
-        given = (copy.deepcopy(action) for action in sequence)
+        copies = (copy.deepcopy(action) for action in sequence)
         number, steps = len(self.attempts), len(sequence)
-        episode = EpisodePlayer(self.instance, FIRST_SEED, kind, number=number, max_steps=steps, given=given)
+        episode = EpisodePlayer(self.instance, FIRST_SEED, kind, number=number, max_steps=steps, sequence=copies)
         recording = Recording("search", episode, self.budget)
         yield from recording.run()
         played = recording.trajectory

@@ -120,10 +120,10 @@ def play_after_ends(context: Context, success: Sequence[Any] | None) -> Iterator
     `success` are the actions that succeeded in the search, with the first seed.
     """
     ended: set[str] = set()
-    instance = context.build()  # not closed: that may break the kept instance (RL402), which is used again
+    instance = context.build()  # not closed: closing may break the kept instance (RL402), which later experiments use
 
-    def record(role: str, seed: int, most: int, given: Sequence[Any] | None = None) -> Recording:
-        recording = Recording(role, EpisodePlayer(instance, seed, max_steps=most, given=given), context.budget)
+    def record(role: str, seed: int, most: int, sequence: Sequence[Any] | None = None) -> Recording:
+        recording = Recording(role, EpisodePlayer(instance, seed, max_steps=most, sequence=sequence), context.budget)
         recording.run()
         return recording
 

@@ -1,4 +1,4 @@
-"""A report as JSON (its schema is report.schema.json), and what of observations and actions was declared and seen."""
+"""A report as JSON (its schema is report.schema.json), and the ranges of observations and actions."""
 
 import dataclasses
 import json
