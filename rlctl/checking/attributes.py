@@ -1,5 +1,6 @@
 """Reads an environment's own attributes: what reset draws, what it keeps, and which random generators there are."""
 
+import collections
 import contextlib
 import copy
 import dataclasses
@@ -84,9 +85,10 @@ def _is_quantity(value: Any) -> bool:
         return True
     if isinstance(value, np.ndarray):
         return value.dtype.kind in "biuf" and 0 < value.size <= MOST_NUMBERS
-    if not isinstance(value, list | tuple):
+    if not isinstance(value, list | tuple | collections.deque) or not 0 < len(value) <= MOST_NUMBERS:
         return False
-    return 0 < len(value) <= MOST_NUMBERS and all(isinstance(number, NUMBERS) for number in value)
+    sizes = [np.size(item) for item in value if isinstance(item, (*NUMBERS, np.ndarray))]
+    return len(sizes) == len(value) and len(set(sizes)) == 1 and sum(sizes) <= MOST_NUMBERS
 
 
 def _is_own(value: Any) -> bool:

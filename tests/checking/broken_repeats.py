@@ -1,5 +1,6 @@
 """Environments that do not repeat, and instances that disturb each other."""
 
+import collections
 import random
 import time
 
@@ -32,6 +33,23 @@ class LeakyReset(Clean):
         self.wind = (self.wind + 0.01 * action).astype(np.float32)
         super().move(self.wind)
         self.unfinished = self.steps < LIMIT
+
+
+class OldActions(Clean):
+    """Keeps the last actions over a reset, and knows when the reset was."""
+
+    def __init__(self):
+        super().__init__()
+        self.actions = collections.deque([np.zeros(2, np.float32)] * 5, maxlen=5)
+
+    def start(self):
+        super().start()
+        self.a_time = time.time()
+        self.position += 0.1 * self.actions[0]
+
+    def move(self, action):
+        self.actions.append(action)
+        super().move(action)
 
 
 class ClassCounter(Clean):

@@ -162,6 +162,11 @@ def test_difference_is_named():
     assert finding.evidence["relative_difference"] > 1e-3
 
 
+def test_state_that_reset_keeps_is_named():
+    (finding,) = findings("broken_repeats.py:OldActions", "RL301")
+    assert finding.message.endswith("; a new process repeats it, so reset keeps state (self.actions, self.position)")
+
+
 def test_what_a_nearer_rule_explains_is_not_judged():
     verdict = verdict_of("broken_repeats.py:NoisyStep", "RL303", "RL304", "RL305", "RL401", "RL402")
     assert {"RL303", "RL304", "RL305", "RL401", "RL402"} <= verdict.not_judged.keys()
