@@ -125,10 +125,10 @@ def name_type(value: Any) -> str:
 
 
 def read_flag(flag: Any) -> bool:
-    """Return what a flag means, whatever its type; False for what has no truth."""
+    """Return what a flag means, whatever its type; False for what has no truth, and any of a flag per agent."""
     if isinstance(flag, bool):  # nearly always; asking numpy takes a tenth of a robot's step
         return flag
     try:
-        return bool(np.any(flag))
+        return bool(np.any(list(flag.values()) if isinstance(flag, dict) else flag))
     except Exception:  # its type is noted, and is a finding
         return False

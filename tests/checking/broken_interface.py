@@ -18,6 +18,14 @@ class NewSpaces(Clean):
         return spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 
+class FlagsPerAgent(Clean):
+    """Returns the flags as dictionaries, as environments of many agents do."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, {"left": terminated}, {"left": truncated}, info
+
+
 class Renders(Clean):
     """Draws the point: nothing is wrong with it."""
 

@@ -52,6 +52,20 @@ class OldActions(Clean):
         super().move(action)
 
 
+class KeptChance(Clean):
+    """Starts where chance in the steps of the episode before left it."""
+
+    offset = 0.0
+
+    def start(self):
+        super().start()
+        self.position += np.float32(self.offset)
+
+    def move(self, action):
+        self.offset = random.random()
+        super().move(action)
+
+
 class ClassCounter(Clean):
     count = 0
 

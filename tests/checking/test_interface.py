@@ -91,3 +91,8 @@ def test_what_ends_the_process_while_rendering_is_an_error():
     (finding,) = check(EnvSpec(task), env_timeout_s=10, rules=["RL208", "RL215"]).verdict.findings
     assert (finding.rule, finding.severity) == ("RL215", "error")
     assert finding.message == "rendering without a window: the process ended with exit code 9 in render"
+
+
+def test_flags_per_agent_are_of_a_wrong_type_and_end_nothing():
+    verdict = verdict_of(f"{FILE}:FlagsPerAgent", "RL204", "RL502", "RL504")
+    assert [finding.rule for finding in verdict.findings] == ["RL204", "RL204"]

@@ -167,6 +167,11 @@ def test_state_that_reset_keeps_is_named():
     assert finding.message.endswith("; a new process repeats it, so reset keeps state (self.actions, self.position)")
 
 
+def test_chance_that_reset_keeps_is_no_missing_seed():
+    verdict = verdict_of("broken_repeats.py:KeptChance", "RL308")
+    assert verdict.not_judged["RL308"] == "an episode depends already on the one before it (RL301 to RL303)"
+
+
 def test_what_a_nearer_rule_explains_is_not_judged():
     verdict = verdict_of("broken_repeats.py:NoisyStep", "RL303", "RL304", "RL305", "RL401", "RL402")
     assert {"RL303", "RL304", "RL305", "RL401", "RL402"} <= verdict.not_judged.keys()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.attributes import read_generators
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.families.determinism import compare
 from rlctl.checking.finding import NotJudged, RuleFinding
@@ -52,6 +53,9 @@ def compare_unseeded(context: Context) -> Iterator[ChildMessage]:
         if _differing(*(_play(instance, seed=FIRST_SEED) for instance in (first, second))):
             raise NotJudged("equal seeds and actions give unequal episodes (RL3)")
         values = _differing(*(_play(instance) for instance in (first, second)))
+        agree = read_generators(first.env) == read_generators(second.env)
+        if values and agree and _differing(*(_play(instance, seed=FIRST_SEED) for instance in (first, second))):
+            raise NotJudged("an episode depends already on the one before it (RL301 to RL303)")
     if values:
         message = f"reset with one seed, and then without: {values[0]:.6g} in an observation, in another instance "
         evidence = {"seed": FIRST_SEED, "value": values[1], "expected": values[0]}
