@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pybullet
 from broken_envs import LIMIT, Clean
+from gymnasium.envs.registration import EnvSpec
 
 
 class GlobalRandom(Clean):
@@ -50,6 +51,12 @@ class OldActions(Clean):
     def move(self, action):
         self.actions.append(action)
         super().move(action)
+
+
+class OldActionsAsRegistered(OldActions):
+    """Its registration calls chance what reset keeps."""
+
+    spec = EnvSpec("OldActions-v0", nondeterministic=True)
 
 
 class KeptChance(Clean):

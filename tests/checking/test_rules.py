@@ -51,6 +51,7 @@ CASES = [
     case("broken_repeats.py:ClassCounter", ("RL304", "error")),
     case("broken_repeats.py:FixedStart", ("RL306", "info")),
     case("broken_repeats.py:UnseededLater", ("RL308", "warning")),
+    case("broken_repeats.py:OldActionsAsRegistered", ("RL301", "error")),
     case("broken_repeats.py:Residue", ("RL301", "warning")),
     case("broken_repeats.py:SharedWorld", ("RL401", "error"), ("RL402", "error"), ("RL808", "error")),
     case("broken_repeats.py:CloseBreaks", ("RL402", "error")),
@@ -170,6 +171,10 @@ def test_state_that_reset_keeps_is_named():
 def test_chance_that_reset_keeps_is_no_missing_seed():
     verdict = verdict_of("broken_repeats.py:KeptChance", "RL308")
     assert verdict.not_judged["RL308"] == "an episode depends already on the one before it (RL301 to RL303)"
+
+
+def test_episodes_that_are_completed_early_are_no_failures():
+    assert findings("broken_envs.py:CompletesEarly", "RL507") == []
 
 
 def test_what_a_nearer_rule_explains_is_not_judged():

@@ -105,9 +105,9 @@ def report(
     *,
     is_mild: bool = False,
 ) -> RuleFinding:
-    """Return the finding that two recordings differ; an info where the environment's registration says they may."""
+    """Return the finding that two recordings differ; an info if they are registered to, and no cause is known."""
     severity = Severity.WARNING if difference.is_small or is_mild else None
-    if records.require_built().nondeterministic or difference.largest < LAST_BITS:
+    if (records.require_built().nondeterministic and not cause) or difference.largest < LAST_BITS:
         severity = Severity.INFO
     return RuleFinding(rule, f"{what}: {difference.text()}{cause}", difference.evidence(trajectory), severity, fix)
 

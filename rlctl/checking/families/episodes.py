@@ -139,9 +139,11 @@ def _find_failure_as_truncated(records: Records) -> Iterator[RuleFinding]:
     lengths = [episode.steps for episode in episodes if episode.ended == "truncated"]
     limit = records.require_built().max_steps or max(lengths, default=0)
     early = [steps for steps in lengths if steps < limit]
-    if any(episode.terminated.any() for episode in episodes) or len(set(early)) < FEWEST_LENGTHS:
-        return
     steps = sorted(set(early))
+    if any(episode.terminated.any() for episode in episodes) or len(steps) < FEWEST_LENGTHS:
+        return
+    if 2 * len(early) <= len(episodes):  # a task that some actions complete early
+        return
     message = f"{len(early)} of {len(episodes)} episodes are truncated before step {limit}, at {len(steps)} different "
     yield RuleFinding("RL507", f"{message}steps, and none is terminated", {"value": steps, "expected": limit})
 
