@@ -109,11 +109,12 @@ def make_slug(task: str) -> str:
 def _load_target(task: str, target: str) -> Callable[..., Any]:
     place, _, attribute = target.rpartition(":")
     module = import_file(task, Path(place)) if place.endswith(".py") else import_module(task, place)
+    registered = attribute in getattr(sys.modules.get("gymnasium"), "registry", ())
+    if registered and not callable(getattr(module, attribute, None)):
+        return _load_gymnasium(attribute)  # an id without a version; a submodule may have its name
     constructor = module
     for part in attribute.split("."):
         if not hasattr(constructor, part):
-            if attribute in getattr(sys.modules.get("gymnasium"), "registry", ()):
-                return _load_gymnasium(attribute)  # the module has registered an id without a version
             classes = [name for name, value in vars(module).items() if inspect.isclass(value)]
             own = [name for name in classes if getattr(module, name).__module__ == module.__name__]
             raise NoSuchClassError(

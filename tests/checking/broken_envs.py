@@ -287,14 +287,3 @@ class NanReward(Clean):
 
 
 NUMBER = 3
-
-
-class CompletesEarly(Clean):
-    """Truncates a third of its episodes earlier, when all is done: no failure."""
-
-    def start(self):
-        super().start()
-        self.limit = LIMIT - self.np_random.choice([0, 0, 0, 0, 10, 20])
-
-    def is_truncated(self):
-        return self.steps >= self.limit

@@ -142,8 +142,6 @@ def _find_failure_as_truncated(records: Records) -> Iterator[RuleFinding]:
     steps = sorted(set(early))
     if any(episode.terminated.any() for episode in episodes) or len(steps) < FEWEST_LENGTHS:
         return
-    if 2 * len(early) <= len(episodes):  # a task that some actions complete early
-        return
     message = f"{len(early)} of {len(episodes)} episodes are truncated before step {limit}, at {len(steps)} different "
     yield RuleFinding("RL507", f"{message}steps, and none is terminated", {"value": steps, "expected": limit})
 
