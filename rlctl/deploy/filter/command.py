@@ -63,6 +63,11 @@ class Command:
         self._blend_left = self._blend_steps
         self._blend_from = None
 
+    def begin_from_measured(self) -> None:
+        """Let the next command begin at the measured positions: a stopped robot may have been moved."""
+        if self.position is not None:
+            self._reference, self._before, self._sent, self._smooth = None, self._zeros, None, None
+
     def measure(self, position: Array) -> None:
         """Store the measured positions of the joints."""
         self._expected = self._reference if self._bounds.is_value else None
@@ -159,20 +164,34 @@ class Command:
             x = bounds.bound(target - reference, before, reference, self._note)
             command = np.minimum(np.maximum(reference + x, bounds.low), bounds.high)
         action = self._as_action(command)
-        sent = action.ravel().astype(np.float64)
-        sent = sent if self._is_action else bounds.offset + sent * bounds.factor
-        if not bounds.keeps_limits(sent, before, reference):
-            raise UnsafeCommand("no command within the limits was found", "limits", str(sent.tolist()))
+        if not self._keeps_limits(action) and self._space.dtype.kind != "f":
+            # The nearest whole action may be beyond a limit; the next one towards the present command is not.
+            present = self._zeros if not bounds.is_value else self._safe if reference is None else reference
+            action = self._as_action(command, np.where(command > present, -1, 1))
+        if not self._keeps_limits(action):
+            raise UnsafeCommand("no command within the limits was found", "limits", str(action.tolist()))
         self._before, self._sent = x, action.copy()  # the caller may write into the returned array
         if bounds.is_value and reference is not None:
-            self._reference = command
+            self._reference = command if self._space.dtype.kind == "f" else self._read_command(action)
         return action
 
-    def _as_action(self, command: Array) -> NDArray[Any]:
-        """Return the action of a command, of the space's shape and type."""
+    def _keeps_limits(self, action: NDArray[Any]) -> bool:
+        return self._bounds.keeps_limits(self._read_command(action), self._before, self._reference)
+
+    def _read_command(self, action: NDArray[Any]) -> Array:
+        sent = action.ravel().astype(np.float64)
+        return sent if self._is_action else self._bounds.offset + sent * self._bounds.factor
+
+    def _as_action(self, command: Array, direction: NDArray[np.int64] | None = None) -> NDArray[Any]:
+        """Return the action of a command, of the space's shape and type.
+
+        Whole numbers are rounded to the nearest one, or per joint in a `direction`: -1 down, 1 up.
+        """
         action = command if self._is_action else (command - self._bounds.offset) / self._bounds.factor
         if self._space.dtype.kind != "f":
-            action = np.rint(action)
+            action = (
+                np.rint(action) if direction is None else np.where(direction < 0, np.floor(action), np.ceil(action))
+            )
         action = action.astype(self._space.dtype).reshape(self._space.shape)
         if self._is_action:
             return action

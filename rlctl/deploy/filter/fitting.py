@@ -97,14 +97,16 @@ def _make_bounds(
     largest, digits = _describe_numbers(space.dtype)
     low = np.maximum(np.maximum(space.low.ravel(), -largest), _gather(joints, "action", -np.inf, 0))
     high = np.minimum(np.minimum(space.high.ravel(), largest), _gather(joints, "action", np.inf, 1))
-    if space.dtype.kind != "f":
-        low, high = np.ceil(low), np.floor(high)
     low, high = offset + factor * low, offset + factor * high
     position = np.array([_gather(joints, "position", -np.inf, 0), _gather(joints, "position", np.inf, 1)])
     if is_value:
         torque = np.array([joint.torque or np.inf for joint in joints])
         low = np.maximum(np.maximum(low, position[0]), -torque)
         high = np.minimum(np.minimum(high, position[1]), torque)
+    if space.dtype.kind != "f":  # the outermost whole actions within the limits
+        low = offset + factor * np.ceil((low - offset) / factor * (1 - digits))
+        high = offset + factor * np.floor((high - offset) / factor * (1 + digits))
+    if is_value:
         position = np.array([low, high])
     elif ((low > 0) | (high < 0)).any():
         raise UsageError("limits: the action bounds of this policy exclude zero, so the robot could not stand still")
@@ -113,6 +115,9 @@ def _make_bounds(
         raise RecipeError(f"limits: {name}: no action keeps these limits and the policy's own action bounds")
     speed = np.array([joint.speed or joint.rate or np.inf for joint in joints]) * dt
     change = np.array([joint.acceleration or np.inf for joint in joints]) * dt**2
+    if space.dtype.kind != "f" and (slow := np.minimum(speed, change) < factor).any():
+        name = names[int(np.argmax(slow))]
+        raise RecipeError(f"limits: {name}: the smallest whole action is faster than the limits allow")
     if not (np.isfinite([low, high]).all() and min(factor.min(), speed.min(), change.min()) > _SMALLEST):
         raise RecipeError("limits: scale, offset, a limit or control_dt is too large or too small to calculate with")
     return Bounds(
@@ -127,7 +132,7 @@ def _make_bounds(
         _drop_infinite(speed),
         _drop_infinite(change),
         precision=8.0 * digits,
-        resolution=factor * (digits if space.dtype.kind == "f" else 1.0),
+        resolution=factor * digits,
         position_name=limits.command if limits.command in ("torque", "action") else "position",
         speed_name="rate" if limits.command in ("torque", "action") else "speed",
     )

@@ -99,6 +99,8 @@ class SafetyFilter:
         """Let the policy act again from the robot's present position; a fault that persists holds it again at once."""
         self._ordered = False
         self._fault = ""
+        if self._command is not None and self.state == "stopped":
+            self._command.begin_from_measured()
         self.begin_blend()
         self._enter("idle", "")
 

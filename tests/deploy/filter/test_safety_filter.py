@@ -11,7 +11,7 @@ from hypothesis import given, settings
 
 from rlctl.deploy import Limits, SafetyFilter
 from rlctl.environments.info import EnvInfo, space_to_json
-from rlctl.errors import UsageError
+from rlctl.errors import RecipeError, UsageError
 from tests.deploy.conftest import REPEATABLE, make_arm, make_filter, observe_at, run_filter
 
 REST = observe_at(0.0, 0.0)
@@ -245,9 +245,9 @@ def test_positions_keep_every_limit(steps, on_fault, lowpass):
     )  # fmt: skip
     commands: list[np.ndarray] = []
     for action, positions, order in steps:
+        if order == "reset" or (order == "resume" and safety.state == "stopped"):
+            commands.clear()  # the next command begins at the measured positions
         give_order(safety, order)
-        if order == "reset":
-            commands.clear()
         out = run_filter(safety, observe_at(*positions), action)
         assert out.dtype == np.float32
         assert out.shape == (2,)
@@ -295,6 +295,41 @@ def test_values_keep_every_limit(steps, command):
         assert (out <= (1.8 if command == "torque" else 2.0) + 1e-6).all()
         assert (np.abs(out - before) <= 0.5 + 1e-6).all()  # 5 per second over 0.1 s
         before = out
+
+
+def test_a_robot_that_was_moved_while_stopped_resumes_from_there():
+    safety = make_filter(make_arm(), command="position", limits={"all": {"speed": 1.0}}, blend_in_s=0)
+    run_filter(safety, observe_at(0.0, 0.0), [0.0, 0.0])
+    safety.stop()
+    run_filter(safety, observe_at(0.5, -0.5), [0.0, 0.0])
+    safety.resume()
+    # 1 rad/s over 0.1 s from the measured 0.5 and -0.5, not from the last command at 0
+    assert run_filter(safety, observe_at(0.5, -0.5), [0.8, -0.8]).tolist() == pytest.approx([0.6, -0.6], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "measured", "expected"),
+    [
+        ({"command": "torque", "scale": 10.0, "limits": {"all": {"torque": 15.0}}}, REST, [1, -1]),  # 20 N m of 15
+        ({"command": "torque", "scale": 10.0, "limits": {"all": {"torque": 6.0}}}, REST, [0, 0]),
+        # 0.5 rad/s over 0.1 s: 0.05 rad, 2.5 actions of 0.02 rad
+        ({"command": "step", "scale": 0.02, "limits": {"all": {"speed": 0.5}}}, REST, [2, -2]),
+    ],
+)
+def test_whole_numbers_never_exceed_a_limit(arm, settings, measured, expected):
+    space = space_to_json(spaces.Box(-100, 100, (2,), np.int64))
+    safety = make_filter(arm.model_copy(update={"action_space": space}), blend_in_s=0, **settings)
+    assert run_filter(safety, measured, [100.0, -100.0]).tolist() == expected
+
+
+def test_limits_without_a_whole_action(arm):
+    info = arm.model_copy(update={"action_space": space_to_json(spaces.Box(-9, 9, (2,), np.int64))})
+    with pytest.raises(RecipeError, match="no action keeps these limits"):
+        make_filter(info, command="position", scale=93.0, limits={"all": {"position": [0.5, 2.9]}})
+    with pytest.raises(RecipeError, match="smallest whole action is faster than the limits allow"):
+        make_filter(info, command="action", limits={"all": {"rate": 6.0}})  # 0.6 in a step of 0.1 s
+    safety = make_filter(info, command="action", limits={"all": {"rate": 16.0}}, blend_in_s=0)
+    assert [int(run_filter(safety, REST, [9.0, 9.0])[0]) for _ in range(4)] == [1, 2, 3, 4]  # 1.6 in a step
 
 
 def test_whole_numbers_are_rounded_and_stay_within_their_limits(arm):
