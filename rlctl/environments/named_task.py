@@ -73,6 +73,11 @@ def _is_of_python(file: Path) -> bool:
     return file.is_relative_to(library) and not _is_installed(file)
 
 
+def is_own_file(file: Path) -> bool:
+    """Return whether a file is the user's: not of rlctl, Python or an installed package."""
+    return not _is_of_python(file) and not _is_installed(file)
+
+
 def _is_installed(file: Path) -> bool:
     return bool({"site-packages", "dist-packages"} & set(file.resolve().parts))
 
@@ -112,5 +117,5 @@ def _may_be_called(task: str, constructor: Any) -> bool:
     except (TypeError, OSError):
         return False
     source = registry.find_source_file(task)
-    own = source is not None and source.expanduser().resolve() == file.resolve() and not _is_installed(file)
-    return own and not _is_of_python(file) and bool(re.search("gymnasium|rlctl", _read_source(file)))
+    own = source is not None and source.expanduser().resolve() == file.resolve() and is_own_file(file)
+    return own and bool(re.search("gymnasium|rlctl", _read_source(file)))

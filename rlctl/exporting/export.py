@@ -11,6 +11,7 @@ from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.exporting.report import ExportReport, format_agreement, format_closed_loop
 from rlctl.exporting.request import ExportRequest
 from rlctl.exporting.verify import MIN_OBSERVATIONS, measure_latency, verify
+from rlctl.hub import store
 from rlctl.output import print_notes
 from rlctl.policy import onnx_file
 from rlctl.policy.file import PolicyFile, PolicyInfo
@@ -54,8 +55,11 @@ def export_policy(request: ExportRequest) -> list[ExportReport]:
 
 def _export(source: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
     policy = check_playable(PolicyFile.read(source.file))
-    if source.run is not None and any(isinstance(policy.info.policy_kwargs.get(key), dict) for key in KEYS):
-        import_named(source.run.recipe().policy_kwargs)  # the user's own networks, named by the user's run
+    has_own = any(isinstance(policy.info.policy_kwargs.get(key), dict) for key in KEYS)
+    if source.run is not None and has_own and not store.is_cached(source.run.path):
+        import_named(
+            source.run.recipe().policy_kwargs
+        )  # named by the user's run; others write runs that are downloaded
     info = policy.info
     # The environments are built while torch is imported.
     with Workers(source.locate(info.spec), available_cores()) as workers:

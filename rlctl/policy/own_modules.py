@@ -30,6 +30,12 @@ def import_named(policy_kwargs: Mapping[str, Any]) -> dict[str, type]:
     return {key: _import(key, name) for key, name in names.items() if isinstance(name, str) and ":" in name}
 
 
+def list_names(recipe: Recipe) -> list[str]:
+    """Return the names of a user's classes in a recipe, callbacks included."""
+    networks = [recipe.policy_kwargs.get(key) for key in KEYS]
+    return [*recipe.callbacks, *(name for name in networks if isinstance(name, str) and ":" in name)]
+
+
 def locate(recipe: Recipe) -> Recipe:
     """Return a recipe with absolute paths of a user's files, so that a run can be resumed from any folder."""
     networks = {key: _locate(value) if key in KEYS else value for key, value in recipe.policy_kwargs.items()}

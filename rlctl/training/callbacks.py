@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import copy
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlctl.environments import registry
+from rlctl.environments import named_task, registry
 from rlctl.environments.plugin_code import call_plugin
 from rlctl.errors import ArtifactError, RecipeError, RlctlError, TaskError
 from rlctl.recipe.recipe import Recipe
@@ -17,6 +18,10 @@ from rlctl.training.callback import Callback, Training
 if TYPE_CHECKING:
     from rlctl.training.learner import Learner
     from rlctl.training.snapshot import Tensors
+
+
+_OF_SB3 = "stable_baselines3.common.callbacks"
+_NO_CALLBACK = "neither a rlctl.Callback nor a BaseCallback of Stable-Baselines3"
 
 
 def load_callbacks(recipe: Recipe) -> dict[str, Callback]:
@@ -35,14 +40,23 @@ def _load(name: str, arguments: Mapping[str, Any]) -> Callback:
     except RlctlError as error:
         problem = str(error).removeprefix(f"task {name!r}: ")
         raise RecipeError(f"callbacks: {name}: {problem}", details=error.details) from None
+    if not _may_be_called(constructor):
+        raise RecipeError(f"callbacks: {name}: {_NO_CALLBACK}, or a function of your own file that returns one")
     callback: Any = _call(name, lambda: constructor(**arguments))
-    if "stable_baselines3.common.callbacks" in (base.__module__ for base in type(callback).__mro__):
+    if _OF_SB3 in (base.__module__ for base in type(callback).__mro__):
         from rlctl.training.sb3_callback import Sb3Callback
 
         return Sb3Callback(callback)
     if isinstance(callback, Callback):
         return callback
-    raise RecipeError(f"callbacks: {name}: neither a rlctl.Callback nor a BaseCallback of Stable-Baselines3")
+    raise RecipeError(f"callbacks: {name}: {_NO_CALLBACK}")
+
+
+def _may_be_called(constructor: Any) -> bool:
+    # A recipe may come from somebody else: it must not call `os:system`.
+    if inspect.isclass(constructor):
+        return any(base is Callback or base.__module__ == _OF_SB3 for base in constructor.__mro__)
+    return inspect.isfunction(constructor) and named_task.is_own_file(Path(inspect.getfile(constructor)))
 
 
 def _call(name: str, call: Callable[[], Any], doing: str = "") -> Any:

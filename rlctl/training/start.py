@@ -17,6 +17,7 @@ import numpy as np
 
 from rlctl.environments.task_version import describe_task_changes
 from rlctl.errors import ArtifactError, RecipeError, UsageError
+from rlctl.hub import store
 from rlctl.policy import own_modules
 from rlctl.recipe.recipe import Recipe, validate
 from rlctl.recipe.sources import describe_rounding, resolve_with_stages
@@ -162,6 +163,11 @@ def _find_checkpoint(request: TrainRequest) -> Start:
         notes = ["no checkpoint yet: the training starts from step 0"]
         if newest is not None:
             notes = [f"warning: {problem}; resuming from step {newest.state.step:,}" for problem in damage]
+        if store.is_cached(run.path) and (names := own_modules.list_names(recipe)):
+            raise UsageError(
+                f"{run.path}: its recipe names {names[0]}, and a run that was downloaded imports nothing; "
+                f"to train further with it: rlctl train {task} --config {run.recipe_file} --from {run.path}"
+            )
         callbacks, source, demos = load_callbacks(recipe), status.get("from"), status.get("demos")
         return Start(request, task, recipe, run, lock, newest, tuple(notes), callbacks, source, demos, tuple(changes))
     except BaseException:

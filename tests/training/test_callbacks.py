@@ -54,6 +54,22 @@ def test_a_callback_logs_changes_the_rate_and_stops(train):
     assert run.status()["stop_reason"] == "enough"
 
 
+@pytest.mark.parametrize("name", ["os:system", "subprocess:run", "shutil:rmtree", "pathlib:Path"])
+def test_what_is_no_callback_is_not_called(train, tmp_path, name):
+    """A recipe may come from somebody else."""
+    arguments = {"command": f"touch {tmp_path / 'called'}"}
+    with pytest.raises(RecipeError, match=f"callbacks: {name}: neither a rlctl.Callback nor a BaseCallback"):
+        train("Line", {**SMALL_PPO, "callbacks": {name: arguments}})
+    assert not (tmp_path / "called").exists()
+
+
+def test_a_downloaded_run_imports_no_callback(train, resume, monkeypatch):
+    run = train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:Adaptive": {}}}).run
+    monkeypatch.setattr("rlctl.hub.store._cache", lambda: run.path.parent)
+    with pytest.raises(UsageError, match="a run that was downloaded imports nothing"):
+        resume(run)
+
+
 @pytest.mark.parametrize("algo", ["ppo", "sac"])
 @pytest.mark.usefixtures("every_boundary")
 def test_resume_is_exact_with_a_schedule_that_a_callback_changes(train, resume, kill_after, run_of, capsys, algo):
