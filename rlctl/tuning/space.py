@@ -33,6 +33,10 @@ class Dimension:
     whole: bool = False
     prefix: str = ""  # `lin_` before the number of a linear schedule
 
+    def __post_init__(self) -> None:
+        if not self.low <= self.high:
+            raise ValueError(f"{self.key}: {self.low} is not below {self.high}")
+
     @property
     def name(self) -> str:
         """Return the last part of the key."""

@@ -2,11 +2,13 @@
 
 import dataclasses
 import glob
+import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
+from annotated_types import Ge, Le
 
 from rlctl.environments import registry
 from rlctl.environments.spec import merge
@@ -44,7 +46,7 @@ class Tuning:
     config: Path | None
     settings: dict[str, Any]  # recipe keys from the command line, for every trial
     metric: Metric
-    trials_per_step: int
+    trials_per_step: Annotated[int, Ge(1), Le(100_000)]
     seed: int  # seed of the first trial and of Optuna; trial n has `seed` + n
     steps: list[list[Dimension]]
     storage: str | None = None  # URL of Optuna's storage, for its dashboard and for other tuners with an equal search
@@ -119,6 +121,7 @@ def load(folder: Path) -> Tuning:
         raise ArtifactError(f"{folder}: not the folder of a tuning: it has no {TUNE_FILE}")
     content = files.read_json(file)
     try:
+        json.dumps(content, allow_nan=False)  # raises for NaN, also within the values of trials
         return pydantic.TypeAdapter(Tuning).validate_python({**content, "path": folder})
-    except (pydantic.ValidationError, TypeError):
+    except (ValueError, TypeError):  # pydantic's is a ValueError
         raise ArtifactError(f"{file}: damaged: it does not describe a tuning") from None

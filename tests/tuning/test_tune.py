@@ -305,6 +305,24 @@ def test_a_damaged_tuning(tmp_path):
         resume(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"trials_per_step": 10**30},
+        {"trials": [{"number": 0, "step": 0, "values": {}, "state": "done", "score": float("nan")}]},
+        {"trials": [{"number": 0, "step": 0, "values": {"algo_kwargs.gamma": float("nan")}}]},
+        {"steps": [[{"key": "algo_kwargs.gamma", "low": 5.0, "high": -1.0}]]},
+    ],
+)
+def test_a_tuning_with_impossible_numbers_is_damaged(tmp_path, change):
+    sound = {"task": LINE, "config": None, "settings": {}, "metric": "return", "trials_per_step": 2, "seed": 0}
+    (tmp_path / "tune.json").write_text(json.dumps({**sound, "steps": []}))
+    assert load(tmp_path).trials_per_step == 2
+    (tmp_path / "tune.json").write_text(json.dumps({**sound, "steps": [], **change}))
+    with pytest.raises(ArtifactError, match="damaged"):
+        load(tmp_path)
+
+
 def test_without_optuna(monkeypatch, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "optuna", None)
     with pytest.raises(UsageError, match="rlctl tune needs optuna: pip install 'optuna"):
