@@ -110,7 +110,7 @@ def _time_filter(actions: list[np.ndarray], repeat: int) -> float:
         }
     )
     limits = {"all": {"position": [-2, 2], "speed": 1.5, "acceleration": 10}}
-    settings = {"command": "position", "measured": {"position": "positions"}, "limits": limits}
+    settings = {"command": "position", "scale": 1.0, "measured": {"position": "positions"}, "limits": limits}
     safety = SafetyFilter(info, Limits.model_validate(settings))
     observation, times = np.zeros(_SIZE, np.float32), []
     for _ in range(5 * repeat):
