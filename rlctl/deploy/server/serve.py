@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.deploy.server.request import KEY_VARIABLE, LOOPBACK, ServeRequest
-from rlctl.deploy.server.served_policy import load_served_policy
+from rlctl.deploy.server.session import load_served_policy
 from rlctl.errors import ArtifactError, RlctlError, UsageError, explain_missing_package
 from rlctl.storage import untrusted
 
@@ -78,8 +78,7 @@ async def serve_until(
     """Serve until `end` is set."""
     from aiohttp import web
 
-    from rlctl.deploy.server.connections import BACKLOG, Connections, count_allowed_connections
-    from rlctl.deploy.server.routes import Routes
+    from rlctl.deploy.server.routes import BACKLOG, Connections, Routes, count_allowed_connections
 
     request = server.request
     logging.getLogger("aiohttp.server").addFilter(_is_worth_a_traceback)

@@ -17,11 +17,9 @@ from rlctl.deploy.filter.limits import Limits
 from rlctl.deploy.filter.observation import ObservationLayout
 from rlctl.deploy.filter.safety_events import SafetyEvent
 from rlctl.deploy.server import messages
-from rlctl.deploy.server.logs import EventLog, RerunLog
-from rlctl.deploy.server.measurements import Measurements
+from rlctl.deploy.server.records import EventLog, Measurements, RerunLog
 from rlctl.deploy.server.request import ServeRequest
-from rlctl.deploy.server.served_policy import ServedPolicy, load_served_policy
-from rlctl.deploy.server.session import Session
+from rlctl.deploy.server.session import ServedPolicy, Session, load_served_policy
 from rlctl.errors import RlctlError, short_repr
 from rlctl.version import __version__
 

@@ -13,9 +13,9 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given, settings
 
-from rlctl.deploy.server import connections, messages
+from rlctl.deploy.server import messages, routes
 from rlctl.deploy.server.client import PolicyClient
-from rlctl.deploy.server.measurements import read_memory
+from rlctl.deploy.server.records import read_memory
 from tests.deploy.conftest import REPEATABLE
 from tests.deploy.server.serving import OBSERVATION, RunningServer, write_policy
 
@@ -115,7 +115,7 @@ def test_two_hundred_connections(server):
 
 
 def test_request_heads_that_never_end_are_timed_out(server, monkeypatch):
-    monkeypatch.setattr(connections, "_FIRST_REQUEST_S", 0.1)
+    monkeypatch.setattr(routes, "_FIRST_REQUEST_S", 0.1)
     with server.client() as client:
         slow = socket.create_connection(("127.0.0.1", server.port), timeout=30)
         slow.sendall(b"GET /metadata HTTP/1.1\r\nHost: localhost\r\nX-Slow: ")

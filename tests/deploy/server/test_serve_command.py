@@ -86,7 +86,7 @@ def test_starts_without_what_takes_long_to_import(tmp_path):
         "from rlctl.deploy.server.request import ServeRequest\n"
         "from rlctl.deploy.server.serve import make_server\n"
         "from rlctl.deploy.server.routes import Routes\n"
-        "from rlctl.deploy.server.connections import Connections\n"
+        "from rlctl.deploy.server.routes import Connections\n"
         f"Routes(make_server(pathlib.Path({str(file)!r}), ServeRequest()), Connections(100)).make_app()\n"
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))\n"
     )

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from rlctl.deploy.filter.safety_events import SafetyEvent
-from rlctl.deploy.server.logs import EventLog
+from rlctl.deploy.server.records import EventLog
 from rlctl.errors import ArtifactError
 from tests.deploy.server.serving import OBSERVATION, RunningServer, write_policy
 from tests.replaying.reading import column
