@@ -29,15 +29,14 @@ def identify(
 ) -> None:
     """Estimate the physical values with which the simulation follows a log of the robot."""
     from rlctl import output
-    from rlctl.deploy.identify import report
-    from rlctl.deploy.identify.excite import write_excitation
-    from rlctl.deploy.identify.identify import identify
+    from rlctl.deploy.identify.excite import show_excitation, write_excitation
+    from rlctl.deploy.identify.identify import identify, show
     from rlctl.environments.spec import EnvSpec
     from rlctl.errors import UsageError
 
     spec = parse_changes(settings).apply(EnvSpec(task))
     if excite is not None and log is None:
-        report.show_excitation(write_excitation(spec, excite, seconds=seconds, seed=seed), json)
+        show_excitation(write_excitation(spec, excite, seconds=seconds, seed=seed), json)
         return
     if log is None or excite is not None:
         raise UsageError("give either --excite FILE or --log FILE")
@@ -48,4 +47,4 @@ def identify(
         seed=seed,
         report=lambda line: output.err().print(f"identify: {line}"),
     )
-    report.show(result, json)
+    show(result, json)

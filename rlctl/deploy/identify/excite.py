@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from rlctl import output
 from rlctl.deploy.identify.follow import describe_expected, find_joints, open_world
 from rlctl.deploy.identify.log import MIN_ROWS, Array, Log, write_log
 from rlctl.environments.spec import EnvSpec
@@ -59,6 +60,18 @@ def write_excitation(spec: EnvSpec, path: Path, *, seconds: float, seed: int) ->
         )
     finally:
         env.close()
+
+
+def show_excitation(result: Excitation, json: str | None) -> None:
+    """Print the trajectory's file and how much of the ranges it uses."""
+    if output.present(result, json):
+        return
+    output.out().print(
+        f"{result.path}: {result.seconds:g} s for {result.task}, {result.amplitude:.0%} of the action range\n"
+        f"in simulation the joints use {result.largest_share:.0%} of their range (without margins), touch nothing "
+        "and stay below their top speeds; the robot's cables and surroundings are not simulated\n"
+        f"play its actions on the robot, log the same columns, then: rlctl identify {result.task} --log FILE"
+    )
 
 
 def _draw_sines(env: TaskEnv, steps: int, seed: int) -> Array:

@@ -1,12 +1,15 @@
 """Estimates the physical values of a task's events from a log, each with a confidence interval."""
 
 import dataclasses
+import sys
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
+from rlctl import output
 from rlctl.deploy.identify.follow import Follower, describe_expected, open_world
 from rlctl.deploy.identify.log import Array, Log, check_actions, read_log
 from rlctl.deploy.identify.parameters import Unknowns, find_unknowns
@@ -21,6 +24,8 @@ _MIN_COMPONENT = 0.3  # smallest component of a value in a direction, for its na
 _MIN_WIDTH = 0.02
 """Smallest half width of a training interval, relative to the value: intervals leave out the model's errors."""
 _MIN_MOTION = 1e-3  # [rad or m]
+_PLOT_SIZE = (100, 18)
+_PLOT_POINTS = 400
 _MIN_COST_RATIO = 1.05  # smallest ratio of two delays' costs that tells them apart
 
 
@@ -203,3 +208,51 @@ def _explain_unknown(unknowns: Unknowns, index: int, information: Array) -> str:
     own, large = unknowns.parameters[index], np.flatnonzero(np.abs(direction) >= _MIN_COMPONENT)
     others = [unknowns.parameters[other].name for other in large if other != index] or ["the others"]
     return f"this log cannot tell {own.name} from {' and '.join(others)}"
+
+
+def show(result: Identification, json: str | None) -> None:
+    """Print the values with their intervals, or write them as JSON to a file or, for `-`, to stdout."""
+    if output.present({**dataclasses.asdict(result), "events": result.events()}, json):
+        return
+    out = output.out()
+    out.print(f"{result.task}: {result.log}, {result.rows:,} rows, {result.seconds:.1f} s")
+    for line in _list_lines(result):
+        out.print(line)
+    if sys.stdout.isatty():
+        out.print(draw_curves(result))
+    out.print("\nto train with these values, add to a recipe:")
+    out.print(write_fragment(result), end="")
+
+
+def write_fragment(result: Identification) -> str:
+    """Return the part of a recipe with the estimated values as intervals."""
+    return yaml.safe_dump({"events": result.events()}, sort_keys=False, default_flow_style=None)
+
+
+def _list_lines(result: Identification) -> list[str]:
+    width = max([len(value.name) for value in result.values] + [len(result.delay_event) + 6, len("position error")])
+    lines = [f"{value.name:<{width}}  {_format_value(value)}" for value in result.values]
+    if result.delay_event:
+        note = "" if result.delay_known else "; one step more or less fits this log as well"
+        lines.append(f"{result.delay_event + '.steps':<{width}}  {result.delay}{note}")
+    for name, (before, after) in (("position error", result.position_error), ("velocity error", result.velocity_error)):
+        lines.append(f"{name:<{width}}  {before:.3g} -> {after:.3g}, root mean square over windows of 1 s")
+    return lines
+
+
+def _format_value(value: IdentifiedValue) -> str:
+    if value.known:
+        return f"{value.value:.4g}, 95 % in [{value.low:.4g}, {value.high:.4g}]"
+    return f"not known: {value.note}"
+
+
+def draw_curves(result: Identification) -> str:
+    """Return a plot in characters of the joint with the largest error, measured and simulated."""
+    import plotext
+
+    plotext.clear_figure()
+    plotext.plotsize(*_PLOT_SIZE)
+    plotext.title(f"{result.curves['joint']}: position over rows")
+    for label in ("measured", "before", "after"):
+        plotext.plot(result.curves[label][:_PLOT_POINTS], label=label)
+    return str(plotext.uncolorize(plotext.build()))
