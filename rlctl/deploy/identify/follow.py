@@ -43,13 +43,10 @@ def describe_expected(env: TaskEnv, task: str) -> Expected:
     joints = find_joints(env)
     described = env.task.describe_joints()
     driven = tuple(described.names) if described else ()
-    free = [body.name for body, _ in joints.values() if not body.fixed and body.joint_names]
-    if not joints or (free and not any(body.fixed for body, _ in joints.values())):
-        if not free:
-            raise UsageError(f"{task}: it has no joints; identify compares simulated joint states with a log")
+    if not any(body.fixed for body, _ in joints.values()):
         raise UsageError(
-            f"{task}: the base of {free[0]!r} is free, and a log of joints does not say where it is; log the robot "
-            "hanging in a frame, and identify a task that loads it with fixed=True"
+            f"{task}: no body with a fixed base has joints, and a log of joints does not say where a free base is; log "
+            "the robot hanging in a frame, and identify a task that loads it with fixed=True"
         )
     limits = {name: (float(body.joint_low[i]), float(body.joint_high[i])) for name, (body, i) in joints.items()}
     return Expected(limits, driven, int(np.prod(env.action_space.shape or ())), env.task.control_dt)

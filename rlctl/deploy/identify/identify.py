@@ -13,7 +13,7 @@ from rlctl import output
 from rlctl.deploy.identify.follow import Follower, describe_expected, open_world
 from rlctl.deploy.identify.log import Array, Log, check_actions, read_log
 from rlctl.deploy.identify.parameters import Unknowns, find_unknowns
-from rlctl.deploy.identify.search import Fit, SearchWorkers, search
+from rlctl.deploy.identify.search import Fit, search, start_search_workers
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo
 from rlctl.rollout.workers import available_cores
@@ -107,8 +107,8 @@ def identify(
             )
         follower = Follower(env, log, unknowns)
         weights = 1.0 / follower.spread
-        with SearchWorkers(spec, log, unknowns, n_workers or available_cores()) as workers:
-            fits = search(workers, unknowns, weights, seed, report)
+        with start_search_workers(spec, log, unknowns, n_workers or available_cores()) as ask:
+            fits = search(ask, unknowns, weights, seed, report)
         best = min(fits.values(), key=lambda fit: fit.cost)
         values = _estimate_values(unknowns, best)
         delay_known = all(fit.cost > _MIN_COST_RATIO * best.cost for fit in fits.values() if fit is not best)
@@ -216,8 +216,13 @@ def show(result: Identification, json: str | None) -> None:
         return
     out = output.out()
     out.print(f"{result.task}: {result.log}, {result.rows:,} rows, {result.seconds:.1f} s")
-    for line in _list_lines(result):
-        out.print(line)
+    rows = [(value.name, _format_value(value)) for value in result.values]
+    if result.delay_event:
+        note = "" if result.delay_known else "; one step more or less fits this log as well"
+        rows.append((f"{result.delay_event}.steps", f"{result.delay}{note}"))
+    for name, (before, after) in (("position error", result.position_error), ("velocity error", result.velocity_error)):
+        rows.append((name, f"{before:.3g} -> {after:.3g}, root mean square over windows of 1 s"))
+    output.print_table(("", ""), rows, left=("",))
     if sys.stdout.isatty():
         out.print(draw_curves(result))
     out.print("\nto train with these values, add to a recipe:")
@@ -227,17 +232,6 @@ def show(result: Identification, json: str | None) -> None:
 def write_fragment(result: Identification) -> str:
     """Return the part of a recipe with the estimated values as intervals."""
     return yaml.safe_dump({"events": result.events()}, sort_keys=False, default_flow_style=None)
-
-
-def _list_lines(result: Identification) -> list[str]:
-    width = max([len(value.name) for value in result.values] + [len(result.delay_event) + 6, len("position error")])
-    lines = [f"{value.name:<{width}}  {_format_value(value)}" for value in result.values]
-    if result.delay_event:
-        note = "" if result.delay_known else "; one step more or less fits this log as well"
-        lines.append(f"{result.delay_event + '.steps':<{width}}  {result.delay}{note}")
-    for name, (before, after) in (("position error", result.position_error), ("velocity error", result.velocity_error)):
-        lines.append(f"{name:<{width}}  {before:.3g} -> {after:.3g}, root mean square over windows of 1 s")
-    return lines
 
 
 def _format_value(value: IdentifiedValue) -> str:

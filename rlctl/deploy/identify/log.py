@@ -93,13 +93,7 @@ def _read_columns(path: Path) -> tuple[dict[str, Array], list[int]]:
         rows = list(csv.reader(io.StringIO(untrusted.read_bytes(path, _MAX_SIZE).decode("utf-8-sig"))))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ArtifactError(f"{path}: not a CSV file: {error}") from None
-    if not rows or TIME not in [name.strip() for name in rows[0]]:
-        raise ArtifactError(
-            f"{path}: its first line must name the columns, with commas: {TIME}, action_..., position_JOINT"
-        )
-    names = [name.strip() for name in rows[0]]
-    if repeated := [name for name in names if names.count(name) > 1]:
-        raise ArtifactError(f"{path}: two columns are named {repeated[0]!r}")
+    names = [name.strip() for name in rows[0]] if rows else []
     numbered = [(line, row) for line, row in enumerate(rows[1:], start=2) if row]
     if len(numbered) < MIN_ROWS:
         raise ArtifactError(f"{path}: {len(numbered)} rows; a log needs at least {MIN_ROWS}; record a few seconds")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -56,55 +57,40 @@ class SearchPoint:
 
 
 @dataclasses.dataclass(frozen=True)
-class ComputeCosts:
-    """Asks a worker for the cost of each trial."""
-
-    trials: list[SearchPoint]
-    weights: Array
-
-
-@dataclasses.dataclass(frozen=True)
 class FindFit:
-    """Asks a worker for the best fit near a trial."""
+    """Asks a worker for the best fit near a point, or without `evaluations` for the cost of the point."""
 
     start: SearchPoint
     weights: Array
-    evaluations: int
+    evaluations: int = 0
 
 
-class SearchWorkers:
-    """Worker processes that simulate a log; `ask` raises the task's errors."""
+Ask = Callable[[Sequence[Follow | FindFit]], list[Any]]
+"""Sends each question to the next free worker; returns the answers in the order of the questions."""
 
-    def __init__(self, spec: EnvSpec, log: Log, unknowns: Unknowns, count: int) -> None:
-        self.count = count
-        self._task = spec.task
-        self._pool = ProcessPool("rlctl.deploy.identify.search:main", [{}] * count, write_stderr)
+
+@contextlib.contextmanager
+def start_search_workers(spec: EnvSpec, log: Log, unknowns: Unknowns, count: int) -> Iterator[Ask]:
+    """Start processes that simulate a log; yield a function that asks them, and raises the task's errors."""
+    pool = ProcessPool("rlctl.deploy.identify.search:main", [{}] * count, write_stderr)
+
+    def ask(questions: Sequence[Follow | FindFit]) -> list[Any]:
         try:
-            self.ask([Follow(spec, log, unknowns)] * count)
-        except BaseException:
-            self._pool.close(grace_s=0.0)
-            raise
-
-    def ask(self, questions: Sequence[Follow | ComputeCosts | FindFit]) -> list[Any]:
-        """Return the answers in the order of the questions; each goes to the next free worker."""
-        try:
-            answers = self._pool.ask_each(questions, "following the log")
+            answers = pool.ask_each(questions, "following the log")
         except WorkerFault as fault:
-            raise TaskError(f"task {self._task!r}: {fault}; its output is above") from None
+            raise TaskError(f"task {spec.task!r}: {fault}; its output is above") from None
         if isinstance(answers[-1], WorkerException):
-            raise make_error(answers[-1], self._task)
+            raise make_error(answers[-1], spec.task)
         return answers
 
-    def __enter__(self) -> SearchWorkers:
-        return self
+    try:
+        ask([Follow(spec, log, unknowns)] * count)
+        yield ask
+    finally:
+        pool.close(grace_s=0.0)
 
-    def __exit__(self, *_: object) -> None:
-        self._pool.close(grace_s=0.0)
 
-
-def search(
-    workers: SearchWorkers, unknowns: Unknowns, weights: Array, seed: int, report: Callable[[str], None]
-) -> dict[int, Fit]:
+def search(ask: Ask, unknowns: Unknowns, weights: Array, seed: int, report: Callable[[str], None]) -> dict[int, Fit]:
     """Return the best fit for the best delay and its neighbours; the lowest cost is the best.
 
     Trials all over the ranges choose the starts of least squares. Then delays next to the best one are tried, and the
@@ -113,16 +99,14 @@ def search(
     fits: dict[int, Fit] = {}
 
     def fit_all(questions: list[FindFit]) -> None:
-        for fit in workers.ask(questions):
+        for fit in ask(questions):
             if fit.delay not in fits or fit.cost < fits[fit.delay].cost:
                 fits[fit.delay] = fit
 
     trials = _make_trials(unknowns, seed)
     report(f"{len(trials)} trials")
-    parts = [trials[index :: workers.count * 4] for index in range(workers.count * 4)]
-    costs = workers.ask([ComputeCosts(part, weights) for part in parts if part])
-    by_cost = [pair for part, values in zip(parts, costs, strict=False) for pair in zip(values, part, strict=True)]
-    ranked = [trial for _, trial in sorted(by_cost, key=lambda pair: pair[0])]
+    costs = ask([FindFit(trial, weights) for trial in trials])
+    ranked = [trials[index] for index in np.argsort(costs, kind="stable")]
     starts = _choose_starts(trials[0], ranked)
     report(f"least squares from {len(starts)} starts")
     fit_all([FindFit(start, weights, _EVALUATIONS) for start in starts])
@@ -175,22 +159,19 @@ def main(connection: Connection) -> None:
     """Answer questions until the connection closes; the first one is `Follow`."""
     follower: Follower
 
-    def answer(question: Follow | ComputeCosts | FindFit) -> list[float] | Fit | None:
+    def answer(question: Follow | FindFit) -> float | Fit | None:
         nonlocal follower
-        match question:
-            case Follow():
-                follower = Follower(open_world(question.spec), question.log, question.unknowns)
-                return None
-            case ComputeCosts():
-                return [_compute_cost(follower, trial, question.weights) for trial in question.trials]
-            case FindFit():
-                return _find_fit(follower, question)
+        if isinstance(question, Follow):
+            follower = Follower(open_world(question.spec), question.log, question.unknowns)
+            return None
+        return _find_fit(follower, question) if question.evaluations else _compute_cost(follower, question)
 
     answer_messages(connection, answer, describe_failure)
 
 
-def _compute_cost(follower: Follower, trial: SearchPoint, weights: Array) -> float:
-    cost = float(np.square(follower.compare(np.array(trial.at), trial.delay) * weights).mean())
+def _compute_cost(follower: Follower, question: FindFit) -> float:
+    errors = follower.compare(np.array(question.start.at), question.start.delay)
+    cost = float(np.square(errors * question.weights).mean())
     return cost if np.isfinite(cost) else np.inf  # a simulation diverged
 
 
