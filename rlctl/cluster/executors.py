@@ -4,7 +4,7 @@ import functools
 import os
 from pathlib import Path
 
-from rlctl.cluster.settings import read_settings
+from rlctl.cluster.work import read_settings
 from rlctl.errors import UsageError
 from rlctl.evaluation.vary import PlayCells
 from rlctl.training.trainings import MakeTrainings, make_local_trainings

@@ -13,8 +13,7 @@ from typing import Any
 
 from rlctl import output
 from rlctl.cluster.ray_connection import Pulse, connect, describe_slots, is_copied
-from rlctl.cluster.settings import ClusterSettings
-from rlctl.cluster.work import compare_versions, describe_driver
+from rlctl.cluster.work import ClusterSettings, compare_versions, describe_driver
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.evaluation.episode_statistics import summarize

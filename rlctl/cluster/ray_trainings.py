@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.cluster.ray_connection import Pulse, connect, describe_slots, is_copied
-from rlctl.cluster.settings import ClusterSettings
-from rlctl.cluster.work import PREEMPTED, TAKEN, Work, execute, make_work, mark_shared_folder
+from rlctl.cluster.work import PREEMPTED, TAKEN, ClusterSettings, Work, execute, make_work, mark_shared_folder
 from rlctl.run.job import Job, read_job, write_job
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.trainings import NextSignal, Trainings

@@ -20,8 +20,7 @@ from types import FrameType
 from typing import TypeVar
 
 from rlctl import output
-from rlctl.cluster.settings import ClusterSettings
-from rlctl.cluster.work import TAKEN, Work, make_work, mark_shared_folder
+from rlctl.cluster.work import TAKEN, ClusterSettings, Work, make_work, mark_shared_folder
 from rlctl.errors import TaskError, UsageError
 from rlctl.run.job import JOBS, Job, job_file, list_jobs, read_job, write_job
 from rlctl.run.train_request import TrainRequest

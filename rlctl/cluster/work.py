@@ -1,4 +1,4 @@
-"""`Work`, the description of one training as JSON, and how a node executes it.
+"""`cluster.yaml`; `Work`, the description of one training as JSON; and how a node executes it.
 
 The node decides whether to begin or resume the run: a retry resumes it.
 """
@@ -12,7 +12,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rlctl.cluster.settings import ClusterSettings
+import pydantic
+from pydantic import Field
+
 from rlctl.environments.task_version import identify_task
 from rlctl.errors import ArtifactError, RlctlError
 from rlctl.run.directory import RunDirectory
@@ -20,14 +22,33 @@ from rlctl.run.group import find_run_of_seed
 from rlctl.run.job import JOBS, list_jobs
 from rlctl.run.lookup import locate_task
 from rlctl.run.train_request import TrainRequest
-from rlctl.storage import files
+from rlctl.storage import files, yaml_text
 from rlctl.training.trainings import NextSignal, train_in_child
 from rlctl.version import collect_versions
 
+FILE = Path("cluster.yaml")  # read if it exists and no other file is given
 PREEMPTED, TAKEN = 143, 75
 """Exit codes after which a training is retried: the cluster ended it; another process writes the run."""
 _TOKEN_FILE = f"{JOBS}/driver"
 """The driver writes a token into it; a node that reads a different token has a different folder mounted."""
+
+
+class ClusterSettings(pydantic.BaseModel, extra="forbid"):
+    """The content of `cluster.yaml`."""
+
+    cpus: int = Field(2, ge=1)  # cores of each run
+    retries: int = Field(3, ge=0, le=1000)  # how often a run is retried after its machine was lost or it was preempted
+    lease_s: float = Field(60.0, gt=0)
+    """A run ends itself if the driver has not answered for this time [s]; not with `--detach`."""
+    sbatch: list[str] = []  # options for `sbatch`, such as `--time=04:00:00`
+    setup: list[str] = []  # shell commands that a SLURM node runs first, such as `source .venv/bin/activate`
+
+
+def read_settings(path: Path | None) -> ClusterSettings:
+    """Read a file, by default `cluster.yaml` if it exists; raises `RecipeError` if it is invalid."""
+    if path is None and not FILE.is_file():
+        return ClusterSettings()
+    return yaml_text.read_model(path or FILE, ClusterSettings)
 
 
 @dataclasses.dataclass(frozen=True)

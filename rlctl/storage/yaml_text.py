@@ -3,12 +3,17 @@
 import re
 from collections.abc import Hashable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
 
 from rlctl.errors import RecipeError, short_repr
 from rlctl.storage import untrusted
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+Model = TypeVar("Model", bound="BaseModel")
 
 _PREFIX = "tag:yaml.org,2002:"
 _DEEPEST = 50
@@ -129,6 +134,31 @@ def find_line(text: str, path: Sequence[str | int]) -> int:
             line = node.start_mark.line + 1
     loader.dispose()
     return line
+
+
+def read_model(path: Path, model: type[Model]) -> Model:
+    """Read a YAML file as a pydantic model whose descriptions have units in brackets.
+
+    Raises `ArtifactError` if it cannot be read, `RecipeError` with the line of each wrong value.
+    """
+    from pydantic import ValidationError
+
+    from rlctl.storage import validation
+
+    text = read_text(path)
+    content = load(text, str(path))
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        schema = model.model_json_schema()
+
+        def explain(problem: Any, place: validation.Place) -> str:
+            unit = re.search(r"\[(.+?)\]", validation.find_schema(schema, place).get("description", ""))
+            key = ".".join(str(part) for part in place)
+            message = validation.explain(problem, place, schema, content, key=key, unit=unit[1] if unit else "")
+            return f"{path}:{find_line(text, place)}: {message}"
+
+        raise RecipeError(validation.explain_all(error, schema, explain)) from None
 
 
 def dump(value: Any) -> str:

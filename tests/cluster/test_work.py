@@ -4,8 +4,7 @@ import dataclasses
 
 import pytest
 
-from rlctl.cluster.settings import ClusterSettings
-from rlctl.cluster.work import execute, make_work, mark_shared_folder
+from rlctl.cluster.work import ClusterSettings, execute, make_work, mark_shared_folder
 
 
 @pytest.fixture

@@ -1,17 +1,14 @@
 """`limits.yaml`: limits on the commands of a robot, by the names of its joints. Typed, every key checked."""
 
-import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pydantic
 from pydantic import Field
 
-from rlctl.errors import RecipeError, short_repr
 from rlctl.recipe.quantities import Number, Section
-from rlctl.storage import validation, yaml_text
+from rlctl.storage import yaml_text
 
-_NUMBER_WITH_UNIT = re.compile(r"^\s*[-+]?\d[\d.eE+-]*\s*[^\d\s.]")
 Positive = Annotated[Number, Field(gt=0)]
 
 
@@ -95,25 +92,4 @@ class Limits(Section):
 
 def read_limits(path: Path) -> Limits:
     """Read a limits file; raises `ArtifactError` if it cannot be read, `RecipeError` if its content is invalid."""
-    text = yaml_text.read_text(path)
-    content = yaml_text.load(text, str(path))
-    if not isinstance(content, dict):
-        raise RecipeError(f"{path}: a limits file is a mapping of keys to values, such as `limits: {{all: ...}}`")
-    try:
-        return Limits.model_validate(content)
-    except pydantic.ValidationError as error:
-        schema = Limits.model_json_schema()
-
-        def explain(problem: Any, place: validation.Place) -> str:
-            return f"{path}:{yaml_text.find_line(text, place)}: {_explain(problem, place, schema, content)}"
-
-        raise RecipeError(validation.explain_all(error, schema, explain)) from None
-
-
-def _explain(problem: Any, place: validation.Place, schema: validation.Schema, content: Any) -> str:
-    key, given = ".".join(str(part) for part in place), problem["input"]
-    match = re.search(r"\[(.+?)\]", validation.find_schema(schema, place).get("description", ""))
-    unit = match[1] if match else ""
-    if isinstance(given, str) and unit and _NUMBER_WITH_UNIT.match(given):
-        return f"{key}: write the number alone, in {unit}, got {short_repr(given)!r}"
-    return validation.explain(problem, place, schema, content, key=key, unit=unit)
+    return yaml_text.read_model(path, Limits)

@@ -52,11 +52,11 @@ def test_a_whole_file(write, arm):
         ),
         (
             "limits:\n  elbow: {speed: 90 deg/s}",
-            "limits.yaml:2: limits.elbow.speed: write the number alone, in rad/s or m/s, got '90 deg/s'",
+            "limits.yaml:2: limits.elbow.speed: expected a number > 0 [rad/s or m/s], got '90 deg/s'",
         ),
         ("limits:\n  elbow: {speed: -1}", "limits.elbow.speed: expected a number > 0 [rad/s or m/s], got -1"),
         ("limits:\n  elbow: {sped: 1}", "no key 'limits.elbow.sped'. Did you mean 'speed'?"),
-        ("- 1", "a limits file is a mapping"),
+        ("- 1", "limits.yaml:1: expected a mapping of command, scale, "),
         ("blend_in_s: .nan", "blend_in_s: expected a number >= 0 [s], got nan"),
     ],
 )
