@@ -1,13 +1,14 @@
 """Trainings as an array of SLURM jobs: a script for `sbatch`, and a small file per seed that shows the job's state.
 
-A node starts or resumes a run (`rlctl.cluster.node`). A run that is preempted, out of time or warned saves a checkpoint
-and ends with 143; the script then requeues the job. The driver regularly writes a file; without it, runs save a
-checkpoint and end after `lease_s`. With `--detach` there is no such file, and the array needs no driver. A new driver
-can follow the array.
+On a node `python -m rlctl.cluster.slurm WORKS INDEX` executes one training. A run that is preempted, out of time or
+warned saves a checkpoint and ends with 143; the script then requeues the job. The driver regularly writes a file;
+without it, runs save a checkpoint and end after `lease_s`. With `--detach` there is no such file: the array needs no
+driver, and a new one can follow it.
 """
 
 import dataclasses
 import os
+import platform
 import shlex
 import subprocess
 import sys
@@ -20,11 +21,13 @@ from types import FrameType
 from typing import TypeVar
 
 from rlctl import output
-from rlctl.cluster.work import TAKEN, ClusterSettings, Work, make_work, mark_shared_folder
+from rlctl.cluster.work import PREEMPTED, TAKEN, ClusterSettings, Work, execute, make_work, mark_shared_folder
 from rlctl.errors import TaskError, UsageError
+from rlctl.processes.child_process import Standstill
 from rlctl.run.job import JOBS, Job, job_file, list_jobs, read_job, write_job
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
+from rlctl.training.signals import HandledSignals
 from rlctl.training.trainings import Detached, NextSignal, Trainings
 
 STOP_FILE = f"{JOBS}/stop"  # when this file exists, nodes save a checkpoint and stop their training
@@ -42,7 +45,7 @@ _SCRIPT = """\
 trap : TERM USR1 USR2  # the step gets them too, saves a checkpoint and ends with 143
 cd {cwd} || exit 5
 {setup}
-srun --ntasks=1 {python} -m rlctl.cluster.node {works} "$SLURM_ARRAY_TASK_ID"
+srun --ntasks=1 {python} -m rlctl.cluster.slurm {works} "$SLURM_ARRAY_TASK_ID"
 code=$?
 case $code in  # saved, or ended by a signal before it began
   138|140|143) scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_$SLURM_ARRAY_TASK_ID" && sleep 60 ;;
@@ -104,11 +107,11 @@ class SlurmTrainings(Trainings):
             return 0
         return self._follow(work.seed, log, receive, next_signal)
 
-    def run(self, calls: Sequence[Callable[[], Result]], to_go_on: str) -> list[Result]:
+    def run(self, calls: Sequence[Callable[[], Result]], resume_command: str) -> list[Result]:
         """Return the result of each call; with `detach`, raise `Detached` once all runs are submitted."""
-        results = super().run(calls, to_go_on)
+        results = super().run(calls, resume_command)
         if self._detach and calls:
-            raise Detached(f"submitted to SLURM; to follow the runs: {to_go_on}{self.resume_options}")
+            raise Detached(f"submitted to SLURM; to follow the runs: {resume_command}{self.resume_options}")
         return results
 
     def _pass_on(self, number: int, frame: FrameType | None) -> None:
@@ -226,3 +229,64 @@ def _call(command: list[str]) -> str:
             f"--on slurm: {command[0]} failed: {(done.stderr or done.stdout).strip().partition(chr(10))[0]}"
         )
     return done.stdout
+
+
+class _NodeTrainings(Trainings):
+    """The only training of this node; it receives SLURM's signals."""
+
+    def __init__(self, work: Work) -> None:
+        super().__init__(1)
+        self._work = work
+
+    def train_work(self, receive: Callable[[str], None]) -> int:
+        """Execute the work; return its exit code."""
+        folder, lease_s = self._work.folder, self._work.settings["lease_s"]
+        beat = Standstill(lambda: _read_beat(folder))
+
+        def must_stop() -> bool:
+            if beat.seconds() > lease_s and _read_beat(folder):
+                receive(f"error: the driver has not answered for {lease_s:g} s; --detach submits runs that need none")
+                return True
+            return (folder / STOP_FILE).exists()
+
+        with HandledSignals(self._pass_on):
+            code = self.train(TrainRequest.from_json(self._work.request), receive, must_stop)
+        return code if self.stopped_by is None or code else PREEMPTED  # a signal came before the training began
+
+    def _execute(self, request: TrainRequest, receive: Callable[[str], None], next_signal: NextSignal) -> int:
+        return execute(self._work, receive, next_signal)
+
+
+def _read_beat(folder: Path) -> str:
+    try:
+        return (folder / BEAT_FILE).read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
+def run_on_node(works: Path, index: int) -> int:
+    """Execute the work at an index and record its state in the job file.
+
+    Return 143 if SLURM must requeue the job, otherwise the exit code of the training.
+    """
+    work = Work(**files.read_json(works)[index])
+    folder = work.folder
+    before = read_job(folder, work.seed)
+    place = f"slurm {os.environ.get('SLURM_ARRAY_JOB_ID', '?')}_{index}"
+    attempts = before.attempts + 1 if before is not None and before.place == place else 1
+    job = Job(work.seed, work.task, "running", place, platform.node(), attempts)
+    write_job(folder, job)
+    with job_file(folder, work.seed, "log").open("a", buffering=1, encoding="utf-8") as log:
+        code = _NodeTrainings(work).train_work(lambda line: print(line, file=log))
+        is_retried = code in (PREEMPTED, TAKEN) and not (folder / STOP_FILE).exists()
+        if is_retried and attempts > work.settings["retries"]:
+            print(f"error: gave up after {attempts} attempts; raise retries in cluster.yaml for more", file=log)
+            is_retried = False
+    write_job(
+        folder, dataclasses.replace(job, state="queued" if is_retried else "ended", code=None if is_retried else code)
+    )
+    return PREEMPTED if is_retried else code
+
+
+if __name__ == "__main__":
+    sys.exit(run_on_node(Path(sys.argv[1]), int(sys.argv[2])))
