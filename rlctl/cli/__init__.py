@@ -1,4 +1,4 @@
-"""The command line. A module per command parses the arguments, calls one function and prints the result.
+"""The command line. A function per command parses the arguments, calls one function and prints the result.
 
 Each command imports what it needs when it runs, so that help, lists and completion start fast.
 """
@@ -9,8 +9,7 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli import check_env, eval, export, identify, push, recipe, replay, runs, serve, tasks, train, tune
-from rlctl.cli.arguments import suggest_setting
+from rlctl.cli import check_env, deploy, eval, export, replay, runs, tasks, train
 from rlctl.errors import UsageError
 from rlctl.processes import error_boundary
 from rlctl.version import __version__
@@ -33,15 +32,15 @@ def _root(
 COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "check-env": check_env.check_env,
     "train": train.train,
-    "tune": tune.tune,
+    "tune": train.tune,
     "eval": eval.evaluate,
     "export": export.export,
     "replay": replay.replay,
-    "push": push.push,
-    "serve": serve.serve,
-    "identify": identify.identify,
+    "push": export.push,
+    "serve": deploy.serve,
+    "identify": deploy.identify,
     "tasks": tasks.app,
-    "recipe": recipe.recipe,
+    "recipe": tasks.recipe,
     "runs": runs.app,
 }
 
@@ -93,7 +92,7 @@ def _call(arguments: list[str]) -> int:
         raise KeyboardInterrupt from None
     except Exception as error:
         option = getattr(error, "option_name", None)  # of Typer's error for an option that does not exist
-        if option is not None and arguments[0] in ("train", "tune") and (setting := suggest_setting(option)):
+        if option is not None and arguments[0] in ("train", "tune") and (setting := train.suggest_setting(option)):
             raise UsageError(f"no option {option}; set the recipe's key instead: {setting}VALUE") from None
         raise
     if code == error_boundary.INTERRUPTED:

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share."""
+"""From the fields of requests to options of Typer, what the shell completes, and options that commands share."""
 
 from __future__ import annotations
 
@@ -6,56 +6,55 @@ import dataclasses
 import inspect
 import typing
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from rlctl import output
-from rlctl.cli import completion
-from rlctl.options import Argument, Option, Settings
+from rlctl.options import Argument, Option
 
 if TYPE_CHECKING:
     from rlctl.environments.spec import EnvChanges
 
+_RUNS = Path("runs")
+_MOST = 50
+
+
+def complete_task(incomplete: str) -> list[str]:
+    """Return the installed tasks and the Python files here that begin with `incomplete`."""
+    from rlctl.environments import installed  # here, because the help of every command imports this module
+
+    names = [entry.name for entry in installed.list_installed() if entry.problem is None]
+    return [name for name in (*dict.fromkeys(names), *_list_paths(incomplete, "*.py")) if name.startswith(incomplete)]
+
+
+def complete_algorithm(incomplete: str) -> list[str]:
+    """Return the algorithms that begin with `incomplete`."""
+    known = ("ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo")
+    return [name for name in known if name.startswith(incomplete)]
+
+
+def complete_run(incomplete: str) -> list[str]:
+    """Return `latest`, tasks with runs, runs (newest first) and policy files here that begin with `incomplete`."""
+    runs = sorted((file.parent for file in _RUNS.glob("*/*/run.json")), key=lambda run: run.name, reverse=True)
+    tasks = dict.fromkeys(run.parent.name for run in runs)
+    latest = ["latest"] if runs else []
+    files = [*_list_paths(incomplete, "*.safetensors"), *_list_paths(incomplete, "*.onnx")]
+    candidates = [*latest, *tasks, *(str(run) for run in runs[:_MOST]), *files]
+    return [text for text in candidates if text.startswith(incomplete)]
+
+
+def _list_paths(incomplete: str, pattern: str) -> list[str]:
+    folder = Path(incomplete).parent if "/" in incomplete else Path()
+    return [str(path) for path in sorted(folder.glob(pattern))[:_MOST]]
+
+
 _COMPLETIONS = {
-    "task": completion.complete_task,
-    "run": completion.complete_run,
-    "algorithm": completion.complete_algorithm,
+    "task": complete_task,
+    "run": complete_run,
+    "algorithm": complete_algorithm,
 }
-
-
-@dataclasses.dataclass(frozen=True)
-class RecipeFlags:
-    """Recipe keys from the command line; a flag overrides `--set`."""
-
-    settings: Settings = dataclasses.field(default_factory=list)
-    algo: Annotated[
-        str | None, Option("ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.", completes="algorithm")
-    ] = None
-    seed: Annotated[int | None, Option("Seed of everything random.")] = None
-    total_timesteps: Annotated[
-        str | None, Option("Environment steps; 1e6 is fine.", ("--total-timesteps", "-n"), metavar="STEPS")
-    ] = None
-    n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1)] = None
-    track: Annotated[str | None, Option("Also send the run to wandb, mlflow or trackio.", metavar="TRACKER")] = None
-
-    def merge(self) -> dict[str, Any]:
-        """Return all keys and values, nested as in a recipe."""
-        from rlctl.recipe.sources import merge_flags
-
-        return merge_flags(**vars(self))
-
-
-def suggest_setting(option: str) -> str | None:
-    """Return `--set algo_kwargs.learning_rate=` for `--lr` or `--learning-rate`; None where no recipe has the key."""
-    from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
-    from rlctl.recipe.recipe import Recipe
-
-    name = option.lstrip("-").replace("-", "_")
-    name = {"lr": "learning_rate"}.get(name, name)
-    if any(name in parameters.model_fields for parameters in ALGORITHM_PARAMETERS.values()):
-        return f"--set algo_kwargs.{name}="
-    return f"--set {name}=" if name in Recipe.model_fields else None
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:

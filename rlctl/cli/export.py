@@ -1,4 +1,4 @@
-"""`rlctl export`."""
+"""`rlctl export` and `rlctl push`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,7 +6,7 @@ from typing import Annotated
 from rlctl.cli.arguments import choose_checkpoint, command
 from rlctl.errors import UsageError
 from rlctl.exporting.request import DatasetFormat, ExportRequest, Format
-from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName
+from rlctl.options import Argument, Checkpoint, Json, Option, Pretrained, RunName
 
 
 @command
@@ -52,3 +52,15 @@ def export(
     from rlctl.exporting.report import show
 
     show(export_policy(request), json)
+
+
+@command
+def push(
+    run: RunName,
+    address: Annotated[str, Argument("hf://ORG/NAME, s3://BUCKET/NAME or another scheme of fsspec.")],
+    json: Json = None,
+) -> None:
+    """Upload a run's best policy, recipe, scores, recording and a model card to an address."""
+    from rlctl.runs.push import push_run, show
+
+    return show(push_run(run, address), json)

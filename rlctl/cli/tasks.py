@@ -1,4 +1,4 @@
-"""`rlctl tasks`, `rlctl tasks show` and `rlctl tasks new`."""
+"""`rlctl tasks` and its commands, and `rlctl recipe`."""
 
 from typing import Annotated
 
@@ -6,7 +6,7 @@ import typer
 
 from rlctl.cli.arguments import command
 from rlctl.errors import UsageError
-from rlctl.options import Argument, Json, Option, TaskName
+from rlctl.options import Argument, Json, Option, OptionalTask, TaskName
 
 app = typer.Typer()
 
@@ -47,3 +47,25 @@ def new_task(
     from rlctl.tasks.new import create, show
 
     show(create(name), json)
+
+
+@command
+def recipe(
+    task: OptionalTask = None,
+    schema: Annotated[bool, Option("Print the JSON schema of recipes, for editors.", ("--schema",))] = False,
+) -> None:
+    """Print the complete recipe of a task, or the JSON schema of recipes."""
+    from rlctl import output
+
+    if schema:
+        from rlctl.recipe.json_schema import render_json_schema
+
+        output.results().write(render_json_schema())
+        return
+    if task is None:
+        raise UsageError("give a task, such as rlctl recipe reach, or --schema")
+    from rlctl.environments import registry
+    from rlctl.recipe.sources import resolve
+
+    registry.load(task)  # a name that is no task has no recipe
+    output.results().write(resolve(task, None, {}).to_yaml())

@@ -1,12 +1,47 @@
-"""`rlctl train`."""
+"""`rlctl train` and `rlctl tune`."""
 
 import dataclasses
 from typing import Annotated, Any
 
-from rlctl.cli.arguments import RecipeFlags, command
+from rlctl.cli.arguments import command
 from rlctl.errors import UsageError
-from rlctl.options import Cluster, Jobs, Json, On, Option
+from rlctl.options import Cluster, Jobs, Json, On, Option, Settings
 from rlctl.run.train_request import TrainRequest
+from rlctl.tuning.tune_request import TuneRequest
+
+
+@dataclasses.dataclass(frozen=True)
+class RecipeFlags:
+    """Recipe keys from the command line; a flag overrides `--set`."""
+
+    settings: Settings = dataclasses.field(default_factory=list)
+    algo: Annotated[
+        str | None, Option("ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.", completes="algorithm")
+    ] = None
+    seed: Annotated[int | None, Option("Seed of everything random.")] = None
+    total_timesteps: Annotated[
+        str | None, Option("Environment steps; 1e6 is fine.", ("--total-timesteps", "-n"), metavar="STEPS")
+    ] = None
+    n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1)] = None
+    track: Annotated[str | None, Option("Also send the run to wandb, mlflow or trackio.", metavar="TRACKER")] = None
+
+    def merge(self) -> dict[str, Any]:
+        """Return all keys and values, nested as in a recipe."""
+        from rlctl.recipe.sources import merge_flags
+
+        return merge_flags(**vars(self))
+
+
+def suggest_setting(option: str) -> str | None:
+    """Return `--set algo_kwargs.learning_rate=` for `--lr` or `--learning-rate`; None where no recipe has the key."""
+    from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
+    from rlctl.recipe.recipe import Recipe
+
+    name = option.lstrip("-").replace("-", "_")
+    name = {"lr": "learning_rate"}.get(name, name)
+    if any(name in parameters.model_fields for parameters in ALGORITHM_PARAMETERS.values()):
+        return f"--set algo_kwargs.{name}="
+    return f"--set {name}=" if name in Recipe.model_fields else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,3 +103,26 @@ def train(
     from rlctl.training.summary import show
 
     return show(run_training(request), json)
+
+
+@dataclasses.dataclass(frozen=True)
+class TuneFlags(RecipeFlags):
+    """The keys of a recipe that have a flag of `rlctl tune`."""
+
+    seed: Annotated[int | None, Option("Seed of the first trial; trial n has seed + n.")] = None
+    total_timesteps: Annotated[
+        str | None, Option("Environment steps of a trial.", ("--total-timesteps", "-n"), metavar="STEPS")
+    ] = None
+
+
+@command
+def tune(
+    flags: TuneFlags, request: TuneRequest, jobs: Jobs = None, on: On = None, cluster: Cluster = None, json: Json = None
+) -> None:
+    """Find hyperparameters: the learning rate, then rollout and minibatch, then the discount, with Optuna."""
+    from rlctl.cluster.executors import choose_executor
+    from rlctl.tuning import report
+    from rlctl.tuning.tune import tune as run_tuning
+
+    request = dataclasses.replace(request, settings=flags.merge())
+    return report.show(run_tuning(request, jobs=jobs, make_trainings=choose_executor(on, cluster, verb="tune")), json)

@@ -1,0 +1,90 @@
+"""`rlctl serve` and `rlctl identify`."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+from rlctl.cli.arguments import choose_checkpoint, command, parse_changes
+from rlctl.deploy.server.request import ServeRequest
+from rlctl.errors import UsageError
+from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName, Settings, TaskName
+
+
+@command
+def serve(
+    request: ServeRequest,
+    run: RunName = None,
+    checkpoint: Checkpoint = "best",
+    pretrained: Pretrained = False,
+    self_test: Annotated[
+        bool, Option("Play the task through the server in simulation, and print the scores.", ("--self-test",))
+    ] = False,
+    episodes: Annotated[int, Option("Episodes of the self-test.", min=1, max=1_000_000)] = 100,
+    json: Json = None,
+) -> None:
+    """Serve a policy to robots: WebSocket and HTTP, with limits, watchdog, log and a live page."""
+    from rlctl import output
+    from rlctl.deploy.server.serve import make_server, run_server
+    from rlctl.run.lookup import find_policy
+
+    policy = find_policy(run, choose_checkpoint(checkpoint, pretrained))
+    output.print_notes(policy.notes)
+    if request.limits is None:
+        output.print_notes(["warning: no --limits FILE: only the policy's own bounds of actions limit the robot"])
+    if self_test:
+        from rlctl.evaluation import self_test as test
+        from rlctl.evaluation.request import EvalRequest
+
+        server = make_server(policy.file, dataclasses.replace(request, port=0, watchdog=False))
+        result = test.run_self_test(server, EvalRequest(str(policy.file), episodes=episodes, limits=request.limits))
+        test.show(result, json)
+        return result.check()
+
+    def show(address: str) -> None:
+        out = output.out()
+        out.print(f"{policy.file}: serving at ws://{address}, live page at http://{address}/")
+        out.file.flush()
+
+    return run_server(make_server(policy.file, request), show)
+
+
+@command
+def identify(
+    task: TaskName,
+    log: Annotated[
+        Path | None,
+        Option(
+            "Recording of the robot (CSV): time, action_..., position_JOINT, velocity_JOINT; a row per action.",
+            metavar="FILE",
+        ),
+    ] = None,
+    excite: Annotated[Path | None, Option("Instead, write a safe trajectory to play and log.", metavar="FILE")] = None,
+    events: Annotated[
+        list[str],
+        Option("Estimate the values of this event only; repeatable.", ("--event",), metavar="NAME"),
+    ] = [],
+    seconds: Annotated[float, Option("Length of the trajectory of --excite [s].", min=1.0, max=3600.0)] = 10.0,
+    settings: Settings = [],
+    seed: Annotated[int, Option("Seed of the search, or of the trajectory.", min=0)] = 0,
+    json: Json = None,
+) -> None:
+    """Estimate the physical values with which the simulation follows a log of the robot."""
+    from rlctl import output
+    from rlctl.deploy.identify.excite import show_excitation, write_excitation
+    from rlctl.deploy.identify.identify import identify, show
+    from rlctl.environments.spec import EnvSpec
+
+    spec = parse_changes(settings).apply(EnvSpec(task))
+    if excite is not None and log is None:
+        show_excitation(write_excitation(spec, excite, seconds=seconds, seed=seed), json)
+        return
+    if log is None or excite is not None:
+        raise UsageError("give either --excite FILE or --log FILE")
+    result = identify(
+        spec,
+        log,
+        events=events,
+        seed=seed,
+        report=lambda line: output.err().print(f"identify: {line}"),
+    )
+    show(result, json)
