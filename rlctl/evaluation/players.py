@@ -10,8 +10,7 @@ from rlctl.errors import UsageError, explain_missing_package
 from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import check_playable, load_policy
-from rlctl.policy.players.baselines import BASELINES, load_function
-from rlctl.policy.players.named import SERVER
+from rlctl.policy.players.named import BASELINES, SERVER, load_function
 from rlctl.rollout.workers import Workers
 from rlctl.run import lookup
 

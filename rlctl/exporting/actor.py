@@ -9,12 +9,11 @@ from gymnasium import spaces
 
 from rlctl.environments.dict_spaces import SINGLE, split_space
 from rlctl.exporting.layers import BATCH, Graph, concatenate, emit, emit_lstm, unsupported
+from rlctl.policy import onnx_policy
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.layers import Lstm, Normalize, OneHot
 from rlctl.policy.network import Network
-from rlctl.policy.onnx_file import METADATA_KEY
-from rlctl.policy.onnx_policy import ACTION, SINGLE_INPUT, STATE_INPUTS, STATE_OUTPUTS
-from rlctl.policy.own_graph import OBSERVATION, OwnGraph
+from rlctl.policy.onnx_policy import OwnGraph
 from rlctl.task.joints import Joints
 
 _STATE_MEANING = "LSTM state; zeros when an episode begins, then the output of the step before"
@@ -35,7 +34,9 @@ def build(policy: PolicyFile) -> onnx.ModelProto:
         value = _emit_own(graph, inputs, network.own)
     state: tuple[str, ...] = ()
     if (lstm := network.lstm) is not None:
-        hidden, cell = (graph.input(name, np.float32, _find_state_shape(lstm), _STATE_MEANING) for name in STATE_INPUTS)
+        hidden, cell = (
+            graph.input(name, np.float32, _find_state_shape(lstm), _STATE_MEANING) for name in onnx_policy.STATE_INPUTS
+        )
         value, state = emit_lstm(graph, value, (hidden, cell), lstm)
     value = emit(graph, value, [*network.trunk, *network.head])
     if isinstance(action_space, spaces.Box):
@@ -45,8 +46,8 @@ def build(policy: PolicyFile) -> onnx.ModelProto:
     else:
         value, dtype = _emit_discrete(graph, value, action_space), np.dtype(np.int64)
     shape: tuple[int | str, ...] = (BATCH, *(action_space.shape or ()))
-    graph.output(value, ACTION, dtype, shape, info.env.action_meaning or "action of the environment")
-    for name, part in zip(STATE_OUTPUTS, state, strict=False):
+    graph.output(value, onnx_policy.ACTION, dtype, shape, info.env.action_meaning or "action of the environment")
+    for name, part in zip(onnx_policy.STATE_OUTPUTS, state, strict=False):
         assert lstm is not None  # only an LSTM has a state
         graph.output(part, name, np.float32, _find_state_shape(lstm), "LSTM state for the next step")
     description = (
@@ -62,7 +63,7 @@ def _find_state_shape(lstm: Lstm) -> tuple[int, str, int]:
 
 def _add_input(graph: Graph, info: PolicyInfo, key: str, space: spaces.Space[Any]) -> tuple[str, Any]:
     """Add the input of a part of the observation; return its name and dtype."""
-    name = SINGLE_INPUT if key == SINGLE else key
+    name = onnx_policy.SINGLE_INPUT if key == SINGLE else key
     if space.shape is None or space.dtype is None:
         raise unsupported(f"observation {name!r}, a {type(space).__name__} space,")
     meaning = _describe_input(info) if key == SINGLE else f"observation {key!r}"
@@ -87,9 +88,9 @@ def _emit_part(graph: Graph, source: tuple[str, Any], network: Network, key: str
 
 def _emit_own(graph: Graph, inputs: Mapping[str, tuple[str, Any]], own: OwnGraph) -> str:
     """Add a user's network, from all parts of the observation to its last hidden layer."""
-    values = {f"{OBSERVATION}{key}": value for key, (value, _) in inputs.items()}
+    values = {f"{onnx_policy.OWN_INPUT}{key}": value for key, (value, _) in inputs.items()}
     for key, layer in own.normalize.items():
-        values[f"{OBSERVATION}{key}"] = emit(graph, inputs[key][0], [layer])
+        values[f"{onnx_policy.OWN_INPUT}{key}"] = emit(graph, inputs[key][0], [layer])
     values |= {name: graph.constant(name, weight) for name, weight in own.weights.items()}
     return graph.inline(onnx.ModelProto.FromString(own.content).graph, values)
 
@@ -151,7 +152,10 @@ def make_metadata(info: PolicyInfo) -> dict[str, str]:
         "state": "state_h and state_c: zeros when an episode begins" if info.algo == "recurrent_ppo" else "",
         "versions": ", ".join(f"{name} {version}" for name, version in info.versions.items()),
     }
-    return {METADATA_KEY: info.model_dump_json(), **{key: value for key, value in plain.items() if value.strip(",")}}
+    return {
+        onnx_policy.METADATA_KEY: info.model_dump_json(),
+        **{key: value for key, value in plain.items() if value.strip(",")},
+    }
 
 
 def _format_joints(joints: Joints | None) -> dict[str, str]:

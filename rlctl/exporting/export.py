@@ -13,7 +13,6 @@ from rlctl.exporting.request import ExportRequest
 from rlctl.exporting.verify import MIN_OBSERVATIONS, measure_latency, verify
 from rlctl.hub import store
 from rlctl.output import print_notes
-from rlctl.policy import onnx_file
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import check_playable
 from rlctl.policy.own_modules import KEYS, import_named
@@ -92,12 +91,12 @@ def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) ->
 
 
 def _export_onnx(policy: TorchPolicy, workers: Workers, target: Path, model: onnx.ModelProto) -> ExportReport:
-    from rlctl.policy.onnx_policy import OnnxPolicy
+    from rlctl.policy.onnx_policy import OnnxPolicy, encode
 
     reports: list[ExportReport] = []
 
     def write(part: Path) -> None:
-        part.write_bytes(onnx_file.encode(model))
+        part.write_bytes(encode(model))
         exported = OnnxPolicy.load(part)
         ports = {"inputs": exported.session.get_inputs(), "outputs": exported.session.get_outputs()}
         opset, size = model.opset_import[0].version, part.stat().st_size

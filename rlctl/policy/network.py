@@ -18,7 +18,7 @@ from rlctl.policy.file import ACTOR_CRITIC, DETERMINISTIC, GRAPH, SQUASHED_GAUSS
 from rlctl.policy.layers import Activation, Array, Layer, Linear, apply
 
 if TYPE_CHECKING:
-    from rlctl.policy.own_graph import OwnGraph
+    from rlctl.policy.onnx_policy import OwnGraph
 
 _BATCH_RENORM_EPSILON = 1e-3
 _RELU_BY_DEFAULT = (*ACTOR_CRITIC, "dqn")
@@ -137,7 +137,7 @@ class _Reader:
     def own_graph(self) -> OwnGraph | None:
         if GRAPH not in self.tensors:
             return None
-        from rlctl.policy.own_graph import OwnGraph  # only here: it imports onnxruntime
+        from rlctl.policy.onnx_policy import OwnGraph  # only here: it imports onnxruntime
 
         return OwnGraph(self.policy.tensors, self.normalize)
 

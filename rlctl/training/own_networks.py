@@ -14,7 +14,7 @@ from rlctl.environments.dict_spaces import SINGLE, join, split, split_space
 from rlctl.errors import RecipeError, describe_exception, short_repr
 from rlctl.exporting.layers import OPSET
 from rlctl.policy.file import ACTOR_CRITIC, GRAPH, PolicyFile, Tensors
-from rlctl.policy.own_graph import OBSERVATION, OUTPUT
+from rlctl.policy.onnx_policy import OWN_INPUT, OWN_OUTPUT
 from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy, is_own
 
@@ -149,7 +149,7 @@ def _check_features(actor: _Actor, sample: tuple[torch.Tensor, ...]) -> None:
 def _export(actor: _Actor, sample: tuple[torch.Tensor, ...]) -> NDArray[np.uint8]:
     import onnx
 
-    names = [f"{OBSERVATION}{'' if key == SINGLE else key}" for key in actor.parts]
+    names = [f"{OWN_INPUT}{'' if key == SINGLE else key}" for key in actor.parts]
     file = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter is deprecated, but the new one needs onnxscript
@@ -160,8 +160,8 @@ def _export(actor: _Actor, sample: tuple[torch.Tensor, ...]) -> NDArray[np.uint8
             dynamo=False,
             opset_version=OPSET,
             input_names=names,
-            output_names=[OUTPUT],
-            dynamic_axes={name: {0: "batch"} for name in [*names, OUTPUT]},
+            output_names=[OWN_OUTPUT],
+            dynamic_axes={name: {0: "batch"} for name in [*names, OWN_OUTPUT]},
             keep_initializers_as_inputs=True,
             do_constant_folding=False,
         )

@@ -10,9 +10,8 @@ from gymnasium import spaces
 from rlctl.environments.info import describe
 from rlctl.errors import UsageError
 from rlctl.exporting.actor import build
-from rlctl.policy import onnx_file
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.onnx_policy import OnnxPolicy
+from rlctl.policy.onnx_policy import OnnxPolicy, encode
 from rlctl.policy.torch_policy import ACTIVATIONS
 
 ALGORITHMS = ["ppo", "a2c", "sac", "td3", "ddpg", "tqc", "crossq", "recurrent_ppo", "dqn"]
@@ -209,7 +208,7 @@ def test_file_says_what_it_is(train, tmp_path):
     assert metadata["training_steps"] == "0"
     assert "stable-baselines3 " in metadata["versions"]
     path = tmp_path / "policy.onnx"
-    path.write_bytes(onnx_file.encode(proto))
+    path.write_bytes(encode(proto))
     assert OnnxPolicy.load(path).info == info
 
 

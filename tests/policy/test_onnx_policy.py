@@ -15,8 +15,7 @@ from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.exporting.actor import build
-from rlctl.policy import onnx_file
-from rlctl.policy.onnx_policy import OnnxPolicy
+from rlctl.policy.onnx_policy import OnnxPolicy, encode
 from rlctl.policy.torch_policy import ALGORITHMS, policy_name
 from rlctl.training.snapshot import pack
 
@@ -29,7 +28,7 @@ def exported(path, algo="ppo", **kwargs):
     model = ALGORITHMS[algo](policy_name(algo, env.observation_space), env, device="cpu", seed=0, **kwargs)
     model.policy.action_net.weight.data.mul_(100.0)  # SB3 begins with actions near zero
     policy = pack(model, algo, PENDULUM, describe(PENDULUM.make()))
-    path.write_bytes(onnx_file.encode(build(policy)))
+    path.write_bytes(encode(build(policy)))
     return path
 
 
@@ -119,7 +118,7 @@ def with_description(path, target, change):
     description = json.loads(entry.value)
     change(description)
     entry.value = json.dumps(description)
-    target.write_bytes(onnx_file.encode(model))
+    target.write_bytes(encode(model))
     return target
 
 

@@ -16,10 +16,10 @@ from rlctl.exporting.actor import build
 from rlctl.exporting.c_source import write_c
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.request import ExportRequest
-from rlctl.policy import onnx_file, own_modules
+from rlctl.policy import own_modules
 from rlctl.policy.file import GRAPH, PolicyFile
 from rlctl.policy.numpy_policy import load_policy
-from rlctl.policy.onnx_policy import OnnxPolicy
+from rlctl.policy.onnx_policy import OnnxPolicy, encode
 from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.policy.torch_policy import ALGORITHMS, TorchPolicy, policy_name
 from rlctl.recipe.recipe import NormalizeSettings, validate
@@ -64,7 +64,7 @@ def test_it_acts_and_exports_as_torch_does(algo, observation, action, own, tmp_p
     policy.write(tmp_path / "policy.safetensors")
     torch_policy = TorchPolicy.load(tmp_path / "policy.safetensors")
     player = PolicyPlayer(policy.actor_only())
-    (tmp_path / "policy.onnx").write_bytes(onnx_file.encode(build(policy)))
+    (tmp_path / "policy.onnx").write_bytes(encode(build(policy)))
     exported = OnnxPolicy.load(tmp_path / "policy.onnx")
     space = torch_policy.observation_space
     space.seed(0)

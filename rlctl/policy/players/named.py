@@ -1,15 +1,29 @@
-"""Players by name: zero and random actions, exported files, functions that a user writes."""
+"""Players by name: zero and random actions, a function that a user writes, an exported file."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from gymnasium import spaces
 
+from rlctl.environments import registry
+from rlctl.environments.dict_spaces import map_parts
+from rlctl.errors import (
+    NoSuchClassError,
+    PolicyError,
+    RlctlError,
+    UsageError,
+    describe_exception,
+    did_you_mean,
+    format_plugin_traceback,
+    short_repr,
+)
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, CPolicy
 from rlctl.policy.numpy_policy import load_policy
-from rlctl.policy.players.baselines import FunctionPlayer, RandomPlayer, ZeroPlayer
-from rlctl.policy.players.player import Player
+from rlctl.policy.players.player import Player, make_generator
 
+BASELINES = ("zero", "random")
 SERVER = ("ws://", "wss://")
 """Prefixes of the address of a policy server; its player is `rlctl.deploy.server.client.RemotePlayer`."""
 
@@ -21,6 +35,85 @@ def make_player(name: str, space: spaces.Space[Any]) -> Player:
     if name == "random":
         return RandomPlayer(space)
     return FunctionPlayer(name, space) if ":" in Path(name).name else ExportedPlayer(name)
+
+
+def load_function(text: str) -> Callable[..., Any]:
+    """Import `module:function` or `path/to/file.py:function`, a function from an observation to an action.
+
+    Raises `UsageError` for text without a function, `TaskError` for a file whose import fails.
+    """
+    if ":" not in text:
+        close = did_you_mean(text, BASELINES)
+        raise UsageError(f"--policy {text}: give zero, random, MODULE:FUNCTION or PATH.py:FUNCTION.{close}")
+    try:
+        return registry.load(text)
+    except NoSuchClassError:
+        place, _, name = text.rpartition(":")
+        raise UsageError(f"--policy {text}: {place} has no function {name!r}") from None
+    except RlctlError as error:
+        raise type(error)(
+            f"--policy {text}: {str(error).removeprefix(f'task {text!r}: ')}", details=error.details
+        ) from None
+
+
+class ZeroPlayer(Player):
+    """Plays the action 0, clipped to the action space; for discrete actions the first."""
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        if isinstance(space, spaces.Box):
+            self._action: Any = np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
+        else:
+            self._action = np.full(space.shape or (), getattr(space, "start", 0), np.int64)
+
+    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        """Return the same action at every step."""
+        return self._action, self._action
+
+
+class RandomPlayer(Player):
+    """Plays uniformly random actions."""
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        self._space = space
+
+    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        """Return an action that depends only on seed and step."""
+        self._space.seed(int(make_generator(seed, 0, step).integers(2**31)))
+        action = self._space.sample()
+        return action, action
+
+
+class FunctionPlayer(Player):
+    """Plays the actions that a user's function returns; actions of a Box are clipped to its bounds."""
+
+    def __init__(self, name: str, space: spaces.Space[Any]) -> None:
+        self._function = load_function(name)
+        place, _, function = name.rpartition(":")
+        self._name = f"{Path(place).name}:{function}"
+        self._space = space
+
+    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        """Call the function; raises `PolicyError` if it raises, or if it returns no action of the space."""
+        try:
+            result = self._function(map_parts(np.copy, observation))
+        except Exception as error:
+            details = format_plugin_traceback(error) or None
+            raise PolicyError(f"policy {self._name}: {describe_exception(error)}", details=details) from error
+        action = self._check(result)
+        return action, action
+
+    def _check(self, result: Any) -> Any:
+        space = self._space
+        try:
+            action = np.asarray(result, space.dtype)
+        except (ValueError, TypeError):
+            action = np.zeros(0)
+        if action.shape == (space.shape or ()) and result is not None:
+            if isinstance(space, spaces.Box) and np.isfinite(action).all():
+                return np.clip(action, space.low, space.high)
+            if space.contains(action if space.shape else action[()]):
+                return action
+        raise PolicyError(f"policy {self._name}: it returned {short_repr(result)}, the action space is {space}")
 
 
 class ExportedPlayer(Player):

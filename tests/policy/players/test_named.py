@@ -8,8 +8,7 @@ from rlctl.errors import PolicyError, UsageError
 from rlctl.evaluation.evaluate import Gates, run_evaluation
 from rlctl.evaluation.report import as_json
 from rlctl.evaluation.request import EvalRequest
-from rlctl.policy.players.baselines import load_function
-from rlctl.policy.players.named import make_player
+from rlctl.policy.players.named import load_function, make_player
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 FUNCTIONS = """
