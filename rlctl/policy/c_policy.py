@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.environments.dict_spaces import SINGLE, split, split_space
+from rlctl.environments.dict_spaces import split, split_space
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.policy import Policy
@@ -44,14 +44,11 @@ class CPolicy(Policy):
         library.rlctl_state_size.restype = ctypes.c_size_t
         self._keys = list(split_space(self.observation_space))
         size = sum(math.prod(part.shape or ()) for part in split_space(self.observation_space).values())
-        # The C function gets the newest frame and stacks frames itself.
         self._observation = np.zeros(size // info.spec.frame_stack, observation_type(info))
-        self._frames = info.spec.frame_stack
         self._action = np.zeros(math.prod(self.action_space.shape or ()), action_type(info))
         # The C struct of the state; its size is a multiple of four bytes.
         self._memory = np.zeros(library.rlctl_state_size() // 4, np.float32)
         self._pointers = tuple(array.ctypes.data for array in (self._observation, self._memory, self._action))
-        self._shape = self.action_space.shape or ()
         self._dtype = self._action.dtype if isinstance(self.action_space, spaces.Box) else np.dtype(np.int64)
 
     @classmethod
@@ -66,10 +63,10 @@ class CPolicy(Policy):
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
         """Return the action for one observation; a recurrent state is kept until `reset`."""
         if not deterministic:
-            raise UsageError("an exported policy cannot sample: only its deterministic action is in the C file")
+            raise UsageError("an exported policy cannot sample: the C file has only its deterministic action")
         self._fill(observation)
         self._act(*self._pointers)
-        return self._action.reshape(self._shape).astype(self._dtype)
+        return self._action.reshape(self.action_space.shape or ()).astype(self._dtype)
 
     def reset(self) -> None:
         """Begin an episode: forget the recurrent state and earlier frames."""
@@ -82,10 +79,5 @@ class CPolicy(Policy):
 
     def _fill(self, observation: Any) -> None:
         parts = split(observation)
-        if self._frames > 1:
-            value = np.reshape(parts[SINGLE], (self._frames, -1))[-1]
-        elif len(parts) > 1:
-            value = np.concatenate([parts[key] for key in self._keys], axis=None)
-        else:
-            value = np.ravel(parts[self._keys[0]])
-        self._observation[:] = value
+        # The C function stacks frames itself: it gets only the newest, which is the last.
+        self._observation[:] = np.concatenate([parts[key] for key in self._keys], axis=None)[-len(self._observation) :]

@@ -128,18 +128,13 @@ class PolicyFile:
 def list_actor_tensors(algo: str, names: Iterable[str]) -> list[str]:
     """Return the names of the tensors that acting needs: those of the actor and of the normalisation."""
     names = list(names)
-    prefixes = (GRAPH, "normalize/", *(f"policy/{prefix}" for prefix in _list_prefixes(algo)))
-    if GRAPH in names:  # a user's policy may have any names in it
-        prefixes += ("policy/mlp_extractor.",)
+    # A user's policy may have any names in its `mlp_extractor`.
+    trunk = "mlp_extractor." if GRAPH in names else "mlp_extractor.policy_net."
+    actor: tuple[str, ...] = ("pi_features_extractor.", trunk, "action_net.", "log_std", "lstm_actor.")
+    if algo in ACTOR_CRITIC or algo == "dqn":
+        actor = ("q_net." if algo == "dqn" else "actor.",)
+    prefixes = (GRAPH, "normalize/", *(f"policy/{prefix}" for prefix in actor))
     return [name for name in names if name.startswith(prefixes)]
-
-
-def _list_prefixes(algo: str) -> tuple[str, ...]:
-    if algo in ACTOR_CRITIC:
-        return ("actor.",)
-    if algo == "dqn":
-        return ("q_net.",)
-    return ("pi_features_extractor.", "mlp_extractor.policy_net.", "action_net.", "log_std", "lstm_actor.")
 
 
 def compute_digest(info: str, tensors: Tensors) -> str:

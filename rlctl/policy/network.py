@@ -130,8 +130,7 @@ class _Reader:
         if not own and (isinstance(name, dict) or name not in layers.ACTIVATIONS):
             known = ", ".join(layers.ACTIVATIONS)
             name = name["class"] if isinstance(name, dict) else name
-            of = " of a recurrent policy" if info.algo == "recurrent_ppo" else ""
-            raise UsageError(f"a network{of} with activation {name!r} is not supported; supported: {known}")
+            raise UsageError(f"a {info.algo} network with activation {name!r} is not supported; supported: {known}")
         self.activation = Activation("" if own else name)  # a user's graph contains its activations
 
     def own_graph(self) -> OwnGraph | None:
@@ -182,17 +181,12 @@ class _Reader:
             mean, variance = (self.tensors[f"{name}.{part}"] for part in ("ra_mean", "ra_var"))
             scale, bias = (self.tensors[f"{name}.{part}"] for part in ("scale", "bias"))
             return layers.BatchRenorm(name, mean, variance, scale, bias, epsilon)
-        dimensions = self.tensors[f"{name}.weight"].ndim if f"{name}.weight" in self.tensors else 0
-        if dimensions == 2:
-            return self.linear(name)
-        if dimensions == 4:
-            stride = _NATURE_STRIDES[name.rpartition(".")[2]]
-            return layers.Convolution(name, self.tensors[f"{name}.weight"], self.tensors[f"{name}.bias"], stride)
-        raise UsageError(f"layer {name} is not supported: it is neither linear, convolution nor batch renorm")
+        linear = self.linear(name)
+        if linear.weight.ndim != 4:
+            return linear
+        return layers.Convolution(name, linear.weight, linear.bias, _NATURE_STRIDES[name.rpartition(".")[2]])
 
     def lstm(self, name: str) -> layers.Lstm:
-        if f"{name}.weight_ih_l0_reverse" in self.tensors or f"{name}.weight_hr_l0" in self.tensors:
-            raise UsageError("a bidirectional LSTM, or one with a projection, is not supported")
         lstm_layers: list[layers.LstmLayer] = []
         while f"{name}.weight_ih_l{(index := len(lstm_layers))}" in self.tensors:
             of_input, of_hidden = (self.tensors[f"{name}.{kind}_l{index}"] for kind in ("weight_ih", "weight_hh"))

@@ -81,20 +81,13 @@ def find_class(description: Mapping[str, str]) -> type:
     file = Path(str(description["file"]))
     shown = f"{file}:{name}"
     if not file.is_file():
-        raise ArtifactError(f"it was trained with {shown}, and that file is missing; restore it")
-    module = _find_module(file)
-    if module is None:
-        raise ArtifactError(
-            f"it was trained with {shown}, which a policy file alone does not import; give the run, or set "
-            f"{VARIABLE}={file}"
-        )
-    if files.digest(file.read_bytes()) != description["sha256"]:
-        raise ArtifactError(
-            f"it was trained with {shown}, which has changed since; restore the version of the training"
-        )
+        raise ArtifactError(f"it was trained with {shown}; that file is missing: restore it")
+    if (module := _find_module(file)) is None:
+        advice = f"give the run, or set {VARIABLE}={file}"
+        raise ArtifactError(f"it was trained with {shown}, which is not imported for a policy file alone; {advice}")
     cls = getattr(module, name, None)
-    if not inspect.isclass(cls):
-        raise ArtifactError(f"it was trained with {shown}, which has no such class")
+    if files.digest(file.read_bytes()) != description["sha256"] or not inspect.isclass(cls):
+        raise ArtifactError(f"it was trained with {shown}, which has changed; restore the version of the training")
     return cls
 
 

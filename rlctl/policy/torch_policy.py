@@ -44,19 +44,11 @@ ACTIVATIONS: dict[str, type[torch.nn.Module]] = {
     "silu": torch.nn.SiLU,
 }
 
-# Not plain data, and not needed to act.
-_LEFT_OUT = frozenset(
-    {
-        "observation_space",
-        "action_space",
-        "lr_schedule",
-        "optimizer_class",
-        "optimizer_kwargs",
-        "features_extractor_class",
-        "normalize_images",
-        "dist_kwargs",
-    }
+_LEFT_OUT = (
+    *("observation_space", "action_space", "lr_schedule", "optimizer_class", "optimizer_kwargs"),
+    *("features_extractor_class", "normalize_images", "dist_kwargs"),
 )
+"""Arguments that are not plain data and are not needed to act."""
 
 
 def pin_threads() -> None:
@@ -67,11 +59,8 @@ def pin_threads() -> None:
 
 def policy_name(algo: str, observation_space: spaces.Space[Any]) -> str:
     """Return SB3's name of the policy for an observation space."""
-    kind = "Mlp"
-    if isinstance(observation_space, spaces.Dict):
-        kind = "MultiInput"
-    elif is_image_space(observation_space):
-        kind = "Cnn"
+    is_dict = isinstance(observation_space, spaces.Dict)
+    kind = "MultiInput" if is_dict else "Cnn" if is_image_space(observation_space) else "Mlp"
     return f"{kind}{'Lstm' if algo == 'recurrent_ppo' else ''}Policy"
 
 
@@ -130,25 +119,19 @@ def build_network(info: PolicyInfo) -> BasePolicy:
     observation_space, action_space = info.env.spaces()
     if info.algo not in ALGORITHMS:
         raise ArtifactError(f"policy for an unknown algorithm {info.algo!r}")
-    cls = ALGORITHMS[info.algo].policy_aliases.get(info.policy)
+    cls: type[BasePolicy] | None = ALGORITHMS[info.algo].policy_aliases.get(info.policy)
     if cls is None:
         raise ArtifactError(f"policy of an unknown kind {info.policy!r} for {info.algo}")
-    kwargs = dict(info.policy_kwargs)
+    kwargs: dict[str, Any] = {"optimizer_class": _NoOptimizer, **info.policy_kwargs}
     if "activation_fn" in kwargs:
         name = kwargs["activation_fn"]
         kwargs["activation_fn"] = own_modules.find_class(name) if isinstance(name, dict) else ACTIVATIONS[name]
     if "features_extractor_class" in kwargs:
         kwargs["features_extractor_class"] = own_modules.find_class(kwargs["features_extractor_class"])
     if "policy_class" in kwargs:
-        own: type[BasePolicy] = own_modules.find_class(kwargs.pop("policy_class"))
-        return own(network_space(observation_space), action_space, lr_schedule=lambda _: 0.0, **kwargs)
-    return cls(
-        network_space(observation_space),
-        action_space,
-        lr_schedule=lambda _: 0.0,
-        optimizer_class=_NoOptimizer,
-        **kwargs,
-    )
+        cls = own_modules.find_class(kwargs.pop("policy_class"))
+        del kwargs["optimizer_class"]  # a user's own constructor may not have it
+    return cls(network_space(observation_space), action_space, lr_schedule=lambda _: 0.0, **kwargs)
 
 
 class _NoOptimizer:
@@ -179,9 +162,8 @@ class TorchPolicy(Policy):
         except ArtifactError as error:
             raise ArtifactError(f"{path}: {error}") from None
         except Exception as error:  # any exception from torch or SB3: the description is unchecked until here
-            raise ArtifactError(
-                f"{path}: its tensors do not fit its description: {short_repr(str(error), 200)}"
-            ) from None
+            problem = short_repr(str(error), 200)
+            raise ArtifactError(f"{path}: its tensors do not fit its description: {problem}") from None
 
     @classmethod
     def _build(cls, policy: PolicyFile) -> TorchPolicy:

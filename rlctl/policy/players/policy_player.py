@@ -62,7 +62,7 @@ class PolicyPlayer(Player):
         """
         exploration = self.exploration
         if exploration.warmup:
-            return self._act_uniform(*self._noise.draw(seed, step))
+            return self._act_uniform(self._noise.draw(seed, step)[1])
         period = exploration.sde_every
         if period and step % period == 0 and self._uses_sde and exploration.stochastic:
             self._draw_matrix(seed, step)
@@ -101,7 +101,7 @@ class PolicyPlayer(Player):
         action: Array = low + np.float32(0.5) * (value + np.float32(1.0)) * (high - low)
         return action.astype(self._space.dtype, copy=False).reshape(self._space.shape or ())
 
-    def _act_uniform(self, normal: Array, uniform: Array) -> tuple[Any, Any]:
+    def _act_uniform(self, uniform: Array) -> tuple[Any, Any]:
         space = self._space
         if isinstance(space, spaces.Box):
             value = (2.0 * uniform[:-1] - 1.0).astype(np.float32)
@@ -111,11 +111,9 @@ class PolicyPlayer(Player):
 
     def _act_discrete(self, values: Array, seed: int, step: int) -> tuple[Any, Any]:
         exploration, space = self.exploration, self._space
-        normal, uniform = (
-            self._noise.draw(seed, step) if exploration.stochastic or exploration.epsilon else (None, None)
-        )
-        if exploration.epsilon and uniform is not None and normal is not None and uniform[-1] < exploration.epsilon:
-            return self._act_uniform(normal, uniform)
+        uniform = self._noise.draw(seed, step)[1] if exploration.stochastic or exploration.epsilon else None
+        if uniform is not None and uniform[-1] < exploration.epsilon:
+            return self._act_uniform(uniform)
         sampled = None if uniform is None or self._algo == "dqn" else uniform[:-1]
         choice: Any
         if isinstance(space, spaces.MultiBinary):
