@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from rlctl import output
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
@@ -19,14 +20,6 @@ from rlctl.storage import files
 from rlctl.version import collect_versions
 
 
-@dataclasses.dataclass(frozen=True)
-class ImportedPolicy:
-    """The policy file that was written."""
-
-    file: Path
-    info: PolicyInfo
-
-
 def import_model(
     file: Path,
     task: str,
@@ -35,7 +28,7 @@ def import_model(
     algo: str | None = None,
     output: Path | None = None,
     changes: EnvChanges = UNCHANGED,
-) -> ImportedPolicy:
+) -> PolicyFile:
     """Read a model, with its VecNormalize if it has one, and write it as a policy of a task if it acts.
 
     Raises `UsageError` if `output` does not end in .safetensors, or if it is None and the file named after the model
@@ -76,8 +69,9 @@ def import_model(
     except (TypeError, ValueError, AssertionError) as error:
         raise ArtifactError(f"{file}: its policy_kwargs do not make a network for {task}: {error}") from None
     source = f"{file} with {normalization}" if normalization else str(file)
-    _write_checked(target, source, PolicyFile(info, _collect_tensors(model, statistics)))
-    return ImportedPolicy(target, info)
+    policy = PolicyFile(info, _collect_tensors(model, statistics), target)
+    _write_checked(target, source, policy)
+    return policy
 
 
 def _describe_env(spec: EnvSpec) -> EnvInfo:
@@ -104,7 +98,7 @@ def _find_difference(
 ) -> str | None:
     """Return how the spaces of a task differ from a model's; None if the model can act in the task.
 
-    Bounds of actions must agree, because a policy scales actions to them; bounds of observations may differ.
+    Bounds of actions must be equal, because a policy scales actions to them; bounds of observations may differ.
     """
     from rlctl.policy.torch_policy import network_space
 
@@ -150,13 +144,11 @@ def _write_checked(output: Path, source: str, policy: PolicyFile) -> None:
     files.write_with(output, write)
 
 
-def show(result: ImportedPolicy, json: str | None) -> None:
+def show(policy: PolicyFile, json: str | None) -> None:
     """Print what was imported and the next commands, or only JSON for `-`."""
-    from rlctl import output
-
-    info, normalizes = result.info, result.info.clip_observation is not None
+    file, info, normalizes = policy.path, policy.info, policy.info.clip_observation is not None
     content = {
-        "policy": result.file,
+        "policy": file,
         "algo": info.algo,
         "task": info.spec.task,
         "normalizes": normalizes,
@@ -168,9 +160,7 @@ def show(result: ImportedPolicy, json: str | None) -> None:
         return
     out = output.out()
     normalization = "with" if normalizes else "without"
-    out.print(f"{result.file}: {info.algo}, step {info.training_steps:,}, {normalization} observation normalisation")
+    out.print(f"{file}: {info.algo}, step {info.training_steps:,}, {normalization} observation normalisation")
     if info.spec.time_feature:
         out.print("it also observes the remaining fraction of the episode, rl-zoo3's time feature")
-    out.print("next:")
-    for command in (f"rlctl eval {result.file}", f"rlctl export {result.file} --onnx", f"rlctl replay {result.file}"):
-        out.print(f"  {command}")
+    out.print(f"next:\n  rlctl eval {file}\n  rlctl export {file} --onnx\n  rlctl replay {file}")

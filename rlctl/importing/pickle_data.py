@@ -174,10 +174,7 @@ class _Machine:
         return items[::-1]
 
 
-_RECONSTRUCT = frozenset({"numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct"})
-_FROM_BUFFER = frozenset({"numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer"})
-_BYTES = frozenset({"_codecs.encode", "__builtin__.bytes", "builtins.bytes"})
-_SCALAR = frozenset({"numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar"})
+_BYTES = ("_codecs.encode", "__builtin__.bytes", "builtins.bytes")
 
 
 def read_array(value: Any) -> NDArray[Any]:
@@ -189,14 +186,14 @@ def read_array(value: Any) -> NDArray[Any]:
         return array
     if not isinstance(value, Call):
         raise NotPlainData(f"{type(value).__name__} where an array is expected")
-    name = str(value.function)
-    if name in _RECONSTRUCT:
+    name = str(value.function).replace("numpy._core.", "numpy.core.")  # the name before NumPy 2
+    if name == "numpy.core.multiarray._reconstruct":
         _, shape, dtype, in_columns, content = value.state
         return _make_array(content, dtype, shape, "F" if in_columns else "C")
-    if name in _FROM_BUFFER:
+    if name == "numpy.core.numeric._frombuffer":
         content, dtype, shape, order = value.arguments
         return _make_array(content, dtype, shape, order)
-    if name in _SCALAR:
+    if name == "numpy.core.multiarray.scalar":
         dtype, content = value.arguments
         return _make_array(content, dtype, (), "C")
     raise NotPlainData(f"{name} where an array is expected")

@@ -198,9 +198,8 @@ def read_normalization(path: Path) -> SavedNormalization | None:
             raise NotPlainData(f"an epsilon of {epsilon:g}; only Stable-Baselines3's default, 1e-08, is supported")
         statistics = state["obs_rms"]
         parts = statistics if isinstance(statistics, dict) else {"": statistics}
-        fields = {
-            key: _split_object(part, "stable_baselines3.common.running_mean_std.")[1] for key, part in parts.items()
-        }
+        module = "stable_baselines3.common.running_mean_std."
+        fields = {key: _split_object(part, module)[1] for key, part in parts.items()}
         return SavedNormalization(
             mean={key: read_array(values["mean"]).astype(np.float64) for key, values in fields.items()},
             var={key: read_array(values["var"]).astype(np.float64) for key, values in fields.items()},
@@ -211,21 +210,12 @@ def read_normalization(path: Path) -> SavedNormalization | None:
 def read_tensors(content: bytes) -> dict[str, NDArray[Any]]:
     """Return the tensors, by name, of a state dict that `torch.save` wrote as a zip archive (torch 1.6 or newer)."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        prefix = next(
-            (name.removesuffix("data.pkl") for name in archive.namelist() if name.endswith("/data.pkl")), None
-        )
-        if prefix is None:
-            raise NotPlainData("policy.pth has no data.pkl: a torch older than 1.6 wrote it")
-        order = _read_member(archive, f"{prefix}byteorder") if f"{prefix}byteorder" in archive.namelist() else b"little"
-        if order != b"little":
-            raise NotPlainData("tensors of a big-endian machine")
+        prefix = next((name[: -len("data.pkl")] for name in archive.namelist() if name.endswith("/data.pkl")), "")
         state = pickle_data.read(_read_member(archive, f"{prefix}data.pkl"))
-        entries = state.items if isinstance(state, Call) else state
         tensors: dict[str, NDArray[Any]] = {}
-        bytes_left = LARGEST_MEMBER
-        for name, value in dict(entries).items():
-            tensors[str(name)] = tensor = _read_tensor(value, archive, prefix)
-            if (bytes_left := bytes_left - tensor.nbytes) < 0:  # many names may share one storage
+        for name, value in dict(state.items if isinstance(state, Call) else state).items():
+            tensors[str(name)] = _read_tensor(value, archive, prefix)
+            if sum(tensor.nbytes for tensor in tensors.values()) > LARGEST_MEMBER:  # many names may share one storage
                 raise NotPlainData(f"tensors of more than {LARGEST_MEMBER:,} bytes")
         return tensors
 

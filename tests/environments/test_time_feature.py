@@ -102,7 +102,7 @@ def zoo_agent(tmp_path_factory):
 def test_the_zoos_agents_play_as_they_did(zoo_agent):
     model, env, imported = zoo_agent
     assert imported.info.spec.time_feature
-    evaluated = run_evaluation(EvalRequest(str(imported.file), episodes=2), Gates()).played
+    evaluated = run_evaluation(EvalRequest(str(imported.path), episodes=2), Gates()).played
     for seed, episode in zip(episode_seeds(0, Stream.EVAL, 2), evaluated, strict=True):
         env.seed(seed)
         observation, total, done = env.reset(), 0.0, [False]
@@ -115,7 +115,7 @@ def test_the_zoos_agents_play_as_they_did(zoo_agent):
 def test_export_and_replay_honour_it(zoo_agent, tmp_path):
     _, _, imported = zoo_agent
     # It raises unless the file acts the same in closed loop.
-    export_policy(ExportRequest(str(imported.file), ("onnx",), "best", tmp_path / "policy.onnx"))
+    export_policy(ExportRequest(str(imported.path), ("onnx",), "best", tmp_path / "policy.onnx"))
     (episode,) = run_replay(ReplayRequest(str(tmp_path / "policy.onnx"), output=tmp_path)).episodes
     assert run_replay(ReplayRequest(None, verify=episode.episode)).verification.difference is None
 

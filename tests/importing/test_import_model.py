@@ -76,7 +76,7 @@ def test_acts_as_the_model_does(save, algo, observation, action, kwargs):
     model, env, request = save(algo, observation, action, **kwargs)
     imported = import_model(**request)
     assert imported.info.algo == algo
-    policy = load_policy(imported.file)
+    policy = load_policy(imported.path)
     rng, space = np.random.default_rng(0), policy.observation_space
     space.seed(0)
     observations = [

@@ -55,7 +55,7 @@ def test_a_zoo_agent_acts_as_the_model_does(tmp_path, algo, env, task, settings)
     schedules = {"learning_rate": 0.0, "lr_schedule": None, "clip_range": 0.2}
     model = ALGORITHMS["recurrent_ppo" if algo == "ppo_lstm" else algo].load(file, None, "cpu", schedules)
     normalize = pickle.loads(statistics.read_bytes()).normalize_obs if statistics else np.asarray  # noqa: S301 (ours)
-    policy, rng, state = load_policy(imported.file), np.random.default_rng(0), None
+    policy, rng, state = load_policy(imported.path), np.random.default_rng(0), None
     space = policy.observation_space
     for step in range(1000):
         observation = rng.normal(0, 2, space.shape).astype(space.dtype)
