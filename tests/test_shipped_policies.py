@@ -100,11 +100,11 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
     run.write_status({"task": "reach", "git_commit": "abc"})
     run.write_recipe(resolve_packaged("reach"))
     target = tmp_path / "reach.safetensors"
-    report = export_actor(ExportRequest(str(run.path), checkpoint="best", policy=target, episodes=3))
+    exported = export_actor(ExportRequest(str(run.path), checkpoint="best", policy=target, episodes=3))
     policy = PolicyFile.read(target)
     written, actor = policy.info, policy.tensors
     assert actor.keys() == tensors.keys()
-    assert written.provenance == report.provenance
+    assert written == exported.info
     assert written.provenance.run == "reach/2026-01-01_00-00-00_s3"
     assert written.provenance.git_commit == "abc"
     assert written.provenance.recipe["total_timesteps"] == 120_000
@@ -129,7 +129,7 @@ def test_a_shipped_policy_is_measured_anew(tmp_path):
     shipped = PolicyFile.read_info(find_shipped_policy("reach")).provenance
     target = tmp_path / "reach.safetensors"
     for source, checkpoint in (("reach", "pretrained"), (str(target), "best")):  # the second in its own place
-        again = export_actor(ExportRequest(source, checkpoint=checkpoint, policy=target, episodes=2)).provenance
+        again = export_actor(ExportRequest(source, checkpoint=checkpoint, policy=target, episodes=2)).info.provenance
         assert (again.run, again.recipe, again.git_commit) == (shipped.run, shipped.recipe, shipped.git_commit)
         assert again.source_sha256 == shipped.source_sha256
         assert again.score.episodes == 2

@@ -95,18 +95,12 @@ def _write_lerobot(folder: Path, task: str, env: EnvInfo, episodes: list[Episode
     ends, zeros = np.cumsum(lengths), np.zeros(len(lengths), np.int64)
     columns |= {"index": np.arange(ends[-1]), "task_index": np.zeros(ends[-1], np.int64)}
     columns |= {"timestamp": (columns["frame_index"] * dt).astype(np.float32)}
-    features = {
-        name: {"dtype": str(values.dtype), "shape": values.shape[1:] or [1], "names": None}
-        for name, values in columns.items()
-    }
+    types = {name: {"dtype": str(values.dtype), "names": None} for name, values in columns.items()}
+    features = {name: types[name] | {"shape": values.shape[1:] or [1]} for name, values in columns.items()}
     totals = {"total_episodes": len(ends), "total_frames": len(columns["index"]), "total_tasks": 1}
-    described = {
-        "codebase_version": "v3.0",
-        "robot_type": env.robot,
-        "fps": 1 / dt,
-        "splits": {"train": f"0:{len(ends)}"},
-    }
-    files.write_json(folder / "meta/info.json", described | totals | _LAYOUT | _SIZES | {"features": features})
+    described = {"codebase_version": "v3.0", "robot_type": env.robot, "fps": 1 / dt}
+    described |= {"splits": {"train": f"0:{len(ends)}"}, "features": features}
+    files.write_json(folder / "meta/info.json", described | totals | _LAYOUT | _SIZES)
     files.write_json(folder / "meta/stats.json", {name: _summarize(values) for name, values in columns.items()})
     _write_table(folder / "meta/tasks.parquet", {"task_index": zeros[:1], "task": np.array([task])}, index="task")
     rows = {"episode_index": np.arange(len(ends)), "length": np.array(lengths), "tasks": np.full((len(ends), 1), task)}
@@ -143,22 +137,13 @@ def _write_table(path: Path, columns: dict[str, NDArray[Any]], index: str = "") 
     import pyarrow
     from pyarrow import parquet
 
-    table = pyarrow.table(
-        {
-            name: values
-            if values.ndim == 1
-            else pyarrow.FixedSizeListArray.from_arrays(values.ravel(), values.shape[1])
-            for name, values in columns.items()
-        }
-    )
+    def as_column(values: NDArray[Any]) -> Any:
+        return values if values.ndim == 1 else pyarrow.FixedSizeListArray.from_arrays(values.ravel(), values.shape[1])
+
+    table = pyarrow.table({name: as_column(values) for name, values in columns.items()})
     if index:  # pandas reads it as the index of the table
-        column = {
-            "name": index,
-            "field_name": index,
-            "pandas_type": "unicode",
-            "numpy_type": "object",
-            "metadata": None,
-        }
+        types = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+        column = {"name": index, "field_name": index, **types}
         described = {"index_columns": [index], "column_indexes": [], "columns": [column]}
         table = table.replace_schema_metadata({"pandas": json.dumps(described)})
     files.write_with(path, lambda part: parquet.write_table(table, part))

@@ -1,7 +1,6 @@
 """`rlctl export RUN --policy FILE`: the actor only, with its origin and its scores."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 from rich.filesize import decimal as format_bytes
@@ -13,24 +12,14 @@ from rlctl.evaluation.evaluate import measure_score
 from rlctl.evaluation.report import describe_score
 from rlctl.evaluation.request import EvalRequest
 from rlctl.exporting.request import ExportRequest
-from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.policy.file import PolicyFile
 from rlctl.policy.players.named import BASELINES
 from rlctl.policy.shipped import Provenance
 from rlctl.run import lookup
 from rlctl.run.lookup import FoundPolicy
 
 
-@dataclasses.dataclass(frozen=True)
-class PolicyFileReport:
-    """A policy file that was written."""
-
-    path: Path
-    info: PolicyInfo
-    provenance: Provenance
-    size: int  # [bytes]
-
-
-def export_actor(request: ExportRequest) -> PolicyFileReport:
+def export_actor(request: ExportRequest) -> PolicyFile:
     """Measure a run's policy and write its actor to `request.policy`, with score, recipe, task version and commit.
 
     Zero and random actions are measured on the same episodes. A policy file written this way can be measured again,
@@ -43,17 +32,12 @@ def export_actor(request: ExportRequest) -> PolicyFileReport:
     policy = PolicyFile.read(source.file)
     spec = source.locate(policy.info.spec)
     evaluation = EvalRequest(run=str(source.file), episodes=request.episodes)
-    provenance = Provenance(
-        **origin,
-        **identify_task(spec.task),
-        score=measure_score(evaluation),
-        baselines={
-            name: measure_score(dataclasses.replace(evaluation, baseline=name, spec=spec)) for name in BASELINES
-        },
-    )
+    score = measure_score(evaluation)
+    scores = {name: measure_score(dataclasses.replace(evaluation, baseline=name, spec=spec)) for name in BASELINES}
+    provenance = Provenance(**origin, **identify_task(spec.task), score=score, baselines=scores)
     policy = policy.actor_only().with_info(provenance=provenance)
     policy.write(target)
-    return PolicyFileReport(target, policy.info, provenance, target.stat().st_size)
+    return dataclasses.replace(policy, path=target)
 
 
 def _find_origin(source: FoundPolicy) -> dict[str, Any]:
@@ -70,23 +54,17 @@ def _find_origin(source: FoundPolicy) -> dict[str, Any]:
     return provenance.model_dump(include={"run", "git_commit", "recipe"})
 
 
-def show(report: PolicyFileReport, json: str | None) -> None:
-    """Print a report, or only JSON for `-`."""
-    out, info, provenance = output.out(), report.info, report.provenance
-    content = {
-        "path": report.path,
-        "bytes": report.size,
-        "task": info.spec.task,
-        "algo": info.algo,
-        "training_steps": info.training_steps,
-        **provenance.model_dump(),
-    }
-    if output.present(content, json):
+def show(policy: PolicyFile, json: str | None) -> None:
+    """Print what `export_actor` wrote, or only JSON for `-`."""
+    out, path, info, provenance = output.out(), policy.path, policy.info, policy.info.provenance
+    assert path is not None
+    assert provenance is not None  # `export_actor` sets both
+    size, score, task = path.stat().st_size, provenance.score, info.spec.task
+    content = {"path": path, "bytes": size, "task": task, "algo": info.algo, "training_steps": info.training_steps}
+    if output.present(content | provenance.model_dump(), json):
         return
-    out.print(f"exported {report.path} ({format_bytes(report.size)}): the actor of {provenance.run}")
-    out.print(f"{info.algo} for {info.spec.task}, step {info.training_steps:,}")
-    for name, score in {"policy": provenance.score, **provenance.baselines}.items():
-        out.print(f"{name:8} {describe_score(score)}")
-    out.print(
-        f"{output.format_count(provenance.score.episodes, 'episode')}, seed {provenance.score.seed}; 95 % intervals"
-    )
+    out.print(f"exported {path} ({format_bytes(size)}): the actor of {provenance.run}")
+    out.print(f"{info.algo} for {task}, step {info.training_steps:,}")
+    for name, measured in {"policy": score, **provenance.baselines}.items():
+        out.print(f"{name:8} {describe_score(measured)}")
+    out.print(f"{output.format_count(score.episodes, 'episode')}, seed {score.seed}; 95 % intervals")
