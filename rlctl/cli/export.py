@@ -48,8 +48,7 @@ def export(
 
         policy_file.show(policy_file.export_actor(request), json)
         return
-    from rlctl.exporting.export import export_policy
-    from rlctl.exporting.report import show
+    from rlctl.exporting.export import export_policy, show
 
     show(export_policy(request), json)
 

@@ -1,6 +1,6 @@
 """Writes a policy as one ONNX graph, from raw observations to actions of the environment's action space."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,14 +8,15 @@ import onnx
 from gymnasium import spaces
 
 from rlctl.environments.dict_spaces import SINGLE, split_space
-from rlctl.exporting.layers import BATCH, Graph, concatenate, emit, emit_lstm, unsupported
+from rlctl.errors import UsageError
+from rlctl.exporting.layers import BATCH, Graph, concatenate, emit, emit_lstm
 from rlctl.policy import onnx_policy
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.policy.layers import Lstm, Normalize, OneHot
+from rlctl.policy.layers import Normalize, OneHot
 from rlctl.policy.network import Network
 from rlctl.policy.onnx_policy import OwnGraph
-from rlctl.task.joints import Joints
 
+_TAKEN = (onnx_policy.ACTION, *onnx_policy.STATE_INPUTS, *onnx_policy.STATE_OUTPUTS)
 _STATE_MEANING = "LSTM state; zeros when an episode begins, then the output of the step before"
 
 
@@ -34,9 +35,8 @@ def build(policy: PolicyFile) -> onnx.ModelProto:
         value = _emit_own(graph, inputs, network.own)
     state: tuple[str, ...] = ()
     if (lstm := network.lstm) is not None:
-        hidden, cell = (
-            graph.input(name, np.float32, _find_state_shape(lstm), _STATE_MEANING) for name in onnx_policy.STATE_INPUTS
-        )
+        names, shape = onnx_policy.STATE_INPUTS, (len(lstm.layers), BATCH, lstm.state.shape[2])
+        hidden, cell = (graph.input(name, np.float32, shape, _STATE_MEANING) for name in names)
         value, state = emit_lstm(graph, value, (hidden, cell), lstm)
     value = emit(graph, value, [*network.trunk, *network.head])
     if isinstance(action_space, spaces.Box):
@@ -45,11 +45,10 @@ def build(policy: PolicyFile) -> onnx.ModelProto:
         value, dtype = _emit_continuous(graph, value, action_space, network.is_squashed)
     else:
         value, dtype = _emit_discrete(graph, value, action_space), np.dtype(np.int64)
-    shape: tuple[int | str, ...] = (BATCH, *(action_space.shape or ()))
-    graph.output(value, onnx_policy.ACTION, dtype, shape, info.env.action_meaning or "action of the environment")
+    meaning = info.env.action_meaning or "action of the environment"
+    graph.output(value, onnx_policy.ACTION, dtype, (BATCH, *(action_space.shape or ())), meaning)
     for name, part in zip(onnx_policy.STATE_OUTPUTS, state, strict=False):
-        assert lstm is not None  # only an LSTM has a state
-        graph.output(part, name, np.float32, _find_state_shape(lstm), "LSTM state for the next step")
+        graph.output(part, name, np.float32, shape, "LSTM state for the next step")
     description = (
         f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps: raw observations in, "
         "deterministic action out; normalisation and the action's bounds are inside"
@@ -57,24 +56,18 @@ def build(policy: PolicyFile) -> onnx.ModelProto:
     return graph.model(make_metadata(info), description)
 
 
-def _find_state_shape(lstm: Lstm) -> tuple[int, str, int]:
-    return len(lstm.layers), BATCH, lstm.state.shape[2]
-
-
 def _add_input(graph: Graph, info: PolicyInfo, key: str, space: spaces.Space[Any]) -> tuple[str, Any]:
     """Add the input of a part of the observation; return its name and dtype."""
-    name = onnx_policy.SINGLE_INPUT if key == SINGLE else key
-    if space.shape is None or space.dtype is None:
-        raise unsupported(f"observation {name!r}, a {type(space).__name__} space,")
+    name = key or onnx_policy.SINGLE_INPUT
+    if name.startswith("/") or name in _TAKEN:
+        raise UsageError(f"export: an observation named {name!r} cannot be written as ONNX; rename it in the task")
     meaning = _describe_input(info) if key == SINGLE else f"observation {key!r}"
-    return graph.input(name, space.dtype, (BATCH, *space.shape), meaning), space.dtype
+    return graph.input(name, space.dtype, (BATCH, *(space.shape or ())), meaning), space.dtype
 
 
 def _describe_input(info: PolicyInfo) -> str:
     sizes, units = info.env.observation_sizes, info.env.observation_units
-    parts = [
-        f"{name} ({size}) [{units[name]}]" if name in units else f"{name} ({size})" for name, size in sizes.items()
-    ]
+    parts = (f"{name} ({size})" + (f" [{units[name]}]" if name in units else "") for name, size in sizes.items())
     return ", ".join(parts) or "observation"
 
 
@@ -97,7 +90,7 @@ def _emit_own(graph: Graph, inputs: Mapping[str, tuple[str, Any]], own: OwnGraph
 
 def _emit_continuous(graph: Graph, value: str, space: spaces.Box, squashed: bool) -> tuple[str, np.dtype[Any]]:
     if not np.issubdtype(space.dtype, np.floating):
-        raise unsupported(f"an action of type {space.dtype}")
+        raise UsageError(f"export: an action of type {space.dtype} cannot be written as ONNX")
     # As in SB3, bounds in float64 make the action float64.
     dtype = np.result_type(np.float32, space.dtype)
     if len(space.shape) != 1:
@@ -126,7 +119,7 @@ def _emit_discrete(graph: Graph, value: str, space: spaces.Space[Any]) -> str:
     if isinstance(space, spaces.MultiBinary):
         # SB3 rounds the probability: 1 for a logit above 0, and 0 for a logit of exactly 0.
         return graph.cast(graph.add("Greater", value, graph.constant("action/zero", np.float32(0.0))), np.int64)
-    raise unsupported(f"an action of {space}")
+    raise UsageError(f"export: an action of {space} cannot be written as ONNX")
 
 
 def make_metadata(info: PolicyInfo) -> dict[str, str]:
@@ -145,42 +138,33 @@ def make_metadata(info: PolicyInfo) -> dict[str, str]:
         "observation_units": ",".join(env.observation_units.get(name, "") for name in env.observation_sizes),
         "frame_stack": str(info.spec.frame_stack),
         "action_meaning": env.action_meaning,
-        **_format_bounds(info),
-        **_format_joints(info.env.joints),
+        "action_space": "" if isinstance(action_space := env.spaces()[1], spaces.Box) else str(action_space),
+        "joint_names": ",".join(env.joints.names) if env.joints else "",
+        **{key: ",".join(f"{value:.9g}" for value in values) for key, values in _list_numbers(info).items()},
         "control_dt": "" if env.control_dt is None else f"{env.control_dt!r} s",
         "robot": env.robot,
         "state": "state_h and state_c: zeros when an episode begins" if info.algo == "recurrent_ppo" else "",
         "versions": ", ".join(f"{name} {version}" for name, version in info.versions.items()),
     }
-    return {
-        onnx_policy.METADATA_KEY: info.model_dump_json(),
-        **{key: value for key, value in plain.items() if value.strip(",")},
-    }
+    used = {key: value for key, value in plain.items() if value.strip(",")}
+    return {onnx_policy.METADATA_KEY: info.model_dump_json(), **used}
 
 
-def _format_joints(joints: Joints | None) -> dict[str, str]:
-    """Return the keys that the controllers of mjlab and BeyondMimic read, in their form: values and commas."""
-    if joints is None:
-        return {}
-    numbers = {
-        "default_joint_pos": joints.default_positions,
-        "action_scale": joints.action_scale,
-        "joint_stiffness": joints.stiffness,
-        "joint_damping": joints.damping,
-        "joint_pos_lower": joints.low,
-        "joint_pos_upper": joints.high,
-        "joint_max_velocity": joints.max_speed,
-        "joint_max_effort": joints.max_torque,
-    }
-    names = {"joint_names": ",".join(joints.names)}
-    return names | {key: ",".join(f"{value:.9g}" for value in values) for key, values in numbers.items()}
-
-
-def _format_bounds(info: PolicyInfo) -> dict[str, str]:
-    space = info.env.spaces()[1]
-    if not isinstance(space, spaces.Box):
-        return {"action_space": str(space)}
-    return {
-        "action_low": ",".join(f"{value:.9g}" for value in space.low.ravel().tolist()),
-        "action_high": ",".join(f"{value:.9g}" for value in space.high.ravel().tolist()),
-    }
+def _list_numbers(info: PolicyInfo) -> dict[str, Sequence[float]]:
+    """Return bounds of the action, and numbers of the joints by the keys that mjlab and BeyondMimic read."""
+    space, joints = info.env.spaces()[1], info.env.joints
+    numbers: dict[str, Sequence[float]] = {}
+    if isinstance(space, spaces.Box):
+        numbers = {"action_low": space.low.ravel().tolist(), "action_high": space.high.ravel().tolist()}
+    if joints is not None:
+        numbers |= {
+            "default_joint_pos": joints.default_positions,
+            "action_scale": joints.action_scale,
+            "joint_stiffness": joints.stiffness,
+            "joint_damping": joints.damping,
+            "joint_pos_lower": joints.low,
+            "joint_pos_upper": joints.high,
+            "joint_max_velocity": joints.max_speed,
+            "joint_max_effort": joints.max_torque,
+        }
+    return numbers

@@ -13,12 +13,7 @@ from rlctl.policy.layers import Activation, BatchRenorm, Clip, Layer, Linear, Ls
 from rlctl.policy.network import Network
 
 _PER_LINE = 8
-_ACTIVATIONS = {
-    "tanh": "hyperbolic_tangent({x})",
-    "relu": "relu({x})",
-    "elu": "elu({x})",
-    "silu": "{x} * sigmoid({x})",
-}
+_ACTIVATIONS = {"tanh": "hyperbolic_tangent({x})", "relu": "relu({x})", "elu": "elu({x})", "silu": "{x} * sigmoid({x})"}
 
 
 class CWriter:
@@ -43,15 +38,12 @@ class CWriter:
 
         `source` is the C array of the observation; `sizes` are the elements of its parts.
         """
-        first_layers = {key: network.parts[key][0] for key in sizes}
-        counts = {
-            key: int(layer.sizes.sum()) if isinstance(layer, OneHot) else sizes[key]
-            for key, layer in first_layers.items()
-        }
-        value, start, feature = self._declare("features", sum(counts.values())), 0, 0
-        for key, size in sizes.items():
-            self._write_part(first_layers[key], source, start, size, value, feature)
-            start, feature = start + size, feature + counts[key]
+        layers = {key: network.parts[key][0] for key in sizes}
+        counts = [int(layer.sizes.sum()) if isinstance(layer, OneHot) else sizes[key] for key, layer in layers.items()]
+        value, start, feature = self._declare("features", sum(counts)), 0, 0
+        for (key, size), count in zip(sizes.items(), counts, strict=True):
+            self._write_part(layers[key], source, start, size, value, feature)
+            start, feature = start + size, feature + count
         if network.lstm is not None:
             value, feature = self._write_lstm(network.lstm, value, feature)
         return self._write_layers([*network.trunk, *network.head], value, feature)

@@ -1,21 +1,25 @@
 """A policy as C99: a header and a source file without dependencies."""
 
 import dataclasses
+import math
 import os
 import re
 import shlex
 import shutil
 import subprocess
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
+from rlctl.environments.dict_spaces import SINGLE, split_space
 from rlctl.errors import AnswerIsNo, UsageError, short_repr
-from rlctl.exporting.c_header import Layout
-from rlctl.exporting.c_layers import CWriter, write_array
+from rlctl.exporting.c_layers import CWriter, write_array, write_number
 from rlctl.policy import own_modules
-from rlctl.policy.c_policy import LIBRARY_SUFFIX
+from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type, observation_type
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.layers import ScaleImage
 from rlctl.policy.network import Network
@@ -23,7 +27,7 @@ from rlctl.version import __version__
 
 LARGEST = 3_000_000  # most weights in a C file: about 40 MB of text, for which a compiler needs a minute
 FLAGS = ("-std=c99", "-O3", "-Wall", "-Wextra", "-pedantic")
-_TIMEOUT_S = 300.0  # of a compiler
+_NUMBERS = {"float32": "float", "float64": "double"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +39,111 @@ class CSource:
     source: str
     prototype: str  # declaration of the function that acts
     harness: str  # C functions with the same names for every policy, for calls through ctypes
+
+
+@dataclasses.dataclass(frozen=True)
+class Element:
+    """A named part of the observation, or an element of the action."""
+
+    name: str
+    size: int
+    unit: str = ""  # empty if unknown
+
+
+class Layout:
+    """The elements of the C function's observation and action; `name` is the prefix of all names in the header."""
+
+    def __init__(self, name: str, info: PolicyInfo) -> None:
+        self.name = name
+        self.info = info
+        space, self.action_space = info.env.spaces()
+        self.frames = info.spec.frame_stack
+        self.parts = split_space(space)
+        self.sizes = {key: math.prod(part.shape or ()) for key, part in self.parts.items()}
+        self.size = sum(self.sizes.values()) // self.frames
+        self.type = _NUMBERS[observation_type(info).name]
+        self.action_type = _NUMBERS.get(action_type(info).name, "int")
+        self.action_size = math.prod(self.action_space.shape or ())
+        self.observed = self._list_observed()
+        self.actions = self._list_actions()
+
+    def _list_observed(self) -> list[Element]:
+        env = self.info.env
+        sizes = env.observation_sizes
+        if SINGLE not in self.parts:
+            sizes = self.sizes
+        if sum(sizes.values()) != self.size:
+            sizes = {"observation": self.size}
+        return [Element(name, size, env.observation_units.get(name, "")) for name, size in sizes.items()]
+
+    def _list_actions(self) -> list[Element]:
+        joints = self.info.env.joints
+        if joints and len(joints.names) == self.action_size:
+            return [Element(name, 1) for name in joints.names]
+        return [Element(f"action[{index}]", 1) for index in range(self.action_size)]
+
+    def describe_observation(self) -> list[str]:
+        """Return a line per named part of the observation: its indices, name and unit."""
+        lines, first = [], 0
+        for part in self.observed:
+            unit = f" [{part.unit}]" if part.unit else ""
+            index = f"[{first}]" if part.size == 1 else f"[{first}..{first + part.size - 1}]"
+            lines.append(f"  {index:<10} {part.name}{unit}")
+            first += part.size
+        return lines
+
+    def describe_action(self) -> list[str]:
+        """Return lines on the meaning of the action and its bounds."""
+        meaning, space, actions = (
+            self.info.env.action_meaning or "action of the environment",
+            self.action_space,
+            self.actions,
+        )
+        if not isinstance(space, spaces.Box):
+            return [f"  {meaning}: {' '.join(str(space).split())}, counted from 0"]
+        bounds = zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True)
+        ranges = [f"from {low:.6g} to {high:.6g}" for low, high in bounds]
+        if actions[0].name != "action[0]":
+            ranges = [f"{joint.name}, {limits}" for joint, limits in zip(actions, ranges, strict=True)]
+        elif len(set(ranges)) == 1:
+            return [f"  {meaning}; every element {ranges[0]}"]
+        return [f"  {meaning}", *(f"  [{index}] {limits}" for index, limits in enumerate(ranges))]
+
+    def list_arrays(self) -> list[tuple[str, str, str, list[str]]]:
+        """Return the header's constant arrays: type, name, the macro of the length, and the values as C."""
+        low, high = _write_bounds(self.parts.values(), self.size, self.type)
+        action_low, action_high = _write_bounds([self.action_space], self.action_size, self.action_type)
+        return [
+            ("char *const", "observation_names", "OBSERVATION_PARTS", [_quote(part.name) for part in self.observed]),
+            ("char *const", "observation_units", "OBSERVATION_PARTS", [_quote(part.unit) for part in self.observed]),
+            ("int", "observation_sizes", "OBSERVATION_PARTS", [str(part.size) for part in self.observed]),
+            (self.type, "observation_low", "OBSERVATION_SIZE", low),
+            (self.type, "observation_high", "OBSERVATION_SIZE", high),
+            ("char *const", "action_names", "ACTION_SIZE", [_quote(element.name) for element in self.actions]),
+            (self.action_type, "action_low", "ACTION_SIZE", action_low),
+            (self.action_type, "action_high", "ACTION_SIZE", action_high),
+        ]
+
+
+def _write_bounds(parts: Iterable[spaces.Space[Any]], size: int, kind: str) -> list[list[str]]:
+    """Return the lowest and the highest values of the last `size` elements; of stacked frames these are the newest."""
+    sides = zip(*(_find_part_bounds(part) for part in parts), strict=True)
+    return [[write_number(value, kind) for value in np.concatenate(side, axis=None)[-size:]] for side in sides]
+
+
+def _find_part_bounds(space: spaces.Space[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    if isinstance(space, spaces.Box):
+        return space.low, space.high
+    if isinstance(space, spaces.Discrete):
+        return np.array(0), np.array(space.n - 1)
+    highest = space.nvec - 1 if isinstance(space, spaces.MultiDiscrete) else np.ones(space.shape or (), int)
+    return np.zeros_like(highest), highest
+
+
+def _quote(text: str) -> str:
+    """Return a text in UTF-8 as a C string literal."""
+    plain = {*range(32, 127)} - set(b'"\\?')  # two question marks start a trigraph
+    return '"' + "".join(chr(byte) if byte in plain else f"\\{byte:03o}" for byte in text.encode()) + '"'
 
 
 def write_c(policy: PolicyFile, file_name: str) -> CSource:
@@ -105,7 +214,7 @@ def _write_comment(text: str) -> str:
 
 def _make_identifier(text: str) -> str:
     plain = re.sub(r"\W", "_", text, flags=re.ASCII)
-    return plain if re.match(r"[A-Za-z]", plain) else f"policy{plain if plain.startswith('_') else f'_{plain}'}"
+    return plain if re.match(r"[A-Za-z]", plain) else f"policy_{plain}"
 
 
 def find_compiler() -> list[str] | None:
@@ -122,10 +231,7 @@ def build_library(code: CSource, info: PolicyInfo, folder: Path, compiler: list[
     library = folder / f"{code.name}{LIBRARY_SUFFIX}"
     library.with_suffix(".json").write_text(info.model_dump_json())
     command = [*compiler, *FLAGS, "-fPIC", "-shared", "-o", str(library), f"{code.name}.c", "harness.c", "-lm"]
-    try:
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise AnswerIsNo(f"{compiler[0]} cannot compile the policy: {short_repr(str(error))}") from None
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise AnswerIsNo(f"{compiler[0]} cannot compile the policy: {short_repr(done.stderr, 300)}")
     return library

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rlctl import output
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
-from rlctl.exporting.report import ExportReport, format_agreement, format_closed_loop
 from rlctl.exporting.request import ExportRequest
-from rlctl.exporting.verify import MIN_OBSERVATIONS, measure_latency, verify
+from rlctl.exporting.verify import MAX_DIFFERENCE, Agreement, ClosedLoop, Latency, measure_latency, verify
 from rlctl.hub import store
-from rlctl.output import print_notes
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import check_playable
 from rlctl.policy.own_modules import KEYS, import_named
@@ -30,7 +31,101 @@ if TYPE_CHECKING:
     from rlctl.exporting.c_source import CSource
     from rlctl.policy.torch_policy import TorchPolicy
 
-C_OBSERVATIONS = 2000  # number of observations on which a C function is compared
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExportReport:
+    """A file that was exported, and how it was verified."""
+
+    path: Path
+    policy: Path
+    task: str
+    algo: str
+    training_steps: int
+    size: int  # [bytes]
+    details: Mapping[str, Any]  # JSON entries that only this format has
+    agreement: Agreement | None = None
+    closed_loop: ClosedLoop | None = None
+    latency: Latency | None = None
+    not_verified: str = ""  # why it was not verified; empty if it was
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the report as plain data."""
+        result = {**dataclasses.asdict(self), **self.details, "verified": not self.not_verified}
+        del result["details"]
+        if self.agreement and self.latency:
+            result |= {name: getattr(self.agreement, name) for name in ("max_difference", "observations")}
+            result["latency"]["speedup"] = self.latency.speedup
+        return result
+
+    def list_rows(self) -> list[tuple[str, str]]:
+        """Return the lines of the report: pairs of a word and a text."""
+        details, size = self.details, f"{self.size / 1000:,.1f} kB"
+        if "opset" in details:
+            exported, following = f"{self.path} ({size}, opset {details['opset']})", ["rlctl", "eval", str(self.path)]
+            following += ["--task", self.task]
+            interface = [(kind, ", ".join(map(_format_port, details[kind]))) for kind in ("inputs", "outputs")]
+        else:
+            exported, following = f"{self.path} and {details['header'].name} ({size}, C99)", ["cc", "-std=c99"]
+            following += ["-O3", "-c", str(self.path)]
+            interface = [("function", details["prototype"])]
+        policy = f"{self.algo} for {self.task}, {self.training_steps:,} steps, from {self.policy}"
+        verification = [("not verified", self.not_verified)]
+        if self.agreement and self.closed_loop and (latency := self.latency):
+            times = f"{latency.exported_us:.1f} us for one observation; SB3 {latency.sb3_us:.1f} us"
+            verification = [
+                ("verified", format_agreement(self.agreement)),
+                ("closed loop", format_closed_loop(self.closed_loop)),
+                ("latency", f"{times}, {latency.speedup:.1f}x"),
+            ]
+        return [("exported", exported), ("policy", policy), *interface, *verification, ("next", shlex.join(following))]
+
+
+def _format_port(port: Mapping[str, Any]) -> str:
+    return f"{port['name']} {port['dtype']}[{', '.join(map(str, port['shape']))}]"
+
+
+def show(reports: list[ExportReport], json: str | None) -> None:
+    """Print the reports of one policy, or write them as JSON to a file or, for `-`, to stdout.
+
+    The JSON of one report is an object. Several reports are an object with an entry per format, `onnx` and `c`.
+    """
+    by_format = {report.path.suffix[1:]: report.as_json() for report in reports}
+    if output.present(by_format if len(reports) > 1 else reports[0].as_json(), json):
+        return
+    from rich.text import Text
+
+    for number, report in enumerate(reports):
+        if number:
+            output.out().print()
+        rows = [(Text(name, style="bold"), text) for name, text in report.list_rows()]
+        output.print_table(("", ""), rows, left=("",))
+
+
+def format_agreement(agreement: Agreement) -> str:
+    """Return the comparison on observations as one line."""
+    sizes = " and ".join(str(size) for size in agreement.batch_sizes)
+    text = (
+        f"max |difference| {agreement.max_difference:.1e} (limit {MAX_DIFFERENCE:.0e}) "
+        f"on {agreement.observations:,} observations, batches of {sizes}"
+    )
+    if agreement.beyond_limit:
+        text += f"; {agreement.beyond_limit:,} actions beyond the limit"
+    if agreement.near_ties:
+        text += f"; {agreement.near_ties:,} different choices between nearly equal logits"
+    return text
+
+
+def format_closed_loop(loop: ClosedLoop) -> str:
+    """Return the comparison of whole episodes as one line."""
+    episodes = output.format_count(loop.episodes, "episode")
+    success = "" if loop.same_success is None else f"same success in {loop.same_success}, "
+    text = (
+        f"{episodes}: {success}same length in {loop.same_length}, return within {loop.max_return_difference:.1e} "
+        f"(mean {loop.mean_return:.5g} and {loop.mean_return_exported:.5g})"
+    )
+    if loop.magnified:
+        text += "; the episodes are chaotic: a change in the last bits makes the original policy differ as much"
+    return text
 
 
 def export_policy(request: ExportRequest) -> list[ExportReport]:
@@ -39,27 +134,26 @@ def export_policy(request: ExportRequest) -> list[ExportReport]:
     The files of several formats differ in their suffix. Raises `UsageError` for a policy that a format cannot hold,
     and `AnswerIsNo` with the numbers if a file does not act as the policy does; that file is not written.
     """
-    source, formats, output = lookup.find_policy(request.run, request.checkpoint), request.formats, request.output
-    print_notes(source.notes)
+    source, formats, target = lookup.find_policy(request.run, request.checkpoint), request.formats, request.output
+    output.print_notes(source.notes)
     if source.file.suffix == ".onnx":
         raise UsageError(f"{source.file} is an ONNX file already; export the run or its .safetensors file")
-    if output is None:
+    if target is None:
         if source.run is not None:
             refuse_links_out(source.run.path)
         folder = Path() if request.checkpoint == PRETRAINED else source.file.parent
-        output = source.run.onnx_file if source.run else folder / source.file.name
-        output = output.with_suffix(f".{formats[0]}")
-    return _export(source, [output.with_suffix(f".{name}") for name in formats])
+        target = source.run.onnx_file if source.run else folder / source.file.name
+        target = target.with_suffix(f".{formats[0]}")
+    return _export(source, [target.with_suffix(f".{name}") for name in formats])
 
 
 def _export(source: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
     policy = check_playable(PolicyFile.read(source.file))
-    has_own = any(isinstance(policy.info.policy_kwargs.get(key), dict) for key in KEYS)
-    if source.run is not None and has_own and not store.is_cached(source.run.path):
-        import_named(
-            source.run.recipe().policy_kwargs
-        )  # named by the user's run; others write runs that are downloaded
     info = policy.info
+    has_own = any(isinstance(info.policy_kwargs.get(key), dict) for key in KEYS)
+    if source.run is not None and has_own and not store.is_cached(source.run.path):
+        # The user's run names the classes. A downloaded run has a recipe that others wrote.
+        import_named(source.run.recipe().policy_kwargs)
     # The environments are built while torch is imported.
     with Workers(source.locate(info.spec), available_cores()) as workers:
         from rlctl.exporting.actor import build
@@ -93,35 +187,21 @@ def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) ->
 def _export_onnx(policy: TorchPolicy, workers: Workers, target: Path, model: onnx.ModelProto) -> ExportReport:
     from rlctl.policy.onnx_policy import OnnxPolicy, encode
 
-    reports: list[ExportReport] = []
+    content = encode(model)
+    fields: dict[str, Any] = {}
 
     def write(part: Path) -> None:
-        part.write_bytes(encode(model))
+        part.write_bytes(content)
         exported = OnnxPolicy.load(part)
         ports = {"inputs": exported.session.get_inputs(), "outputs": exported.session.get_outputs()}
-        opset, size = model.opset_import[0].version, part.stat().st_size
-        reports.append(
-            ExportReport(
-                **_verify(policy, workers, target, exported, part, "the ONNX file"),
-                size=size,
-                written=f"{target} ({size / 1000:,.1f} kB, opset {opset})",
-                interface=[(kind, ", ".join(map(_format_port, ports[kind]))) for kind in ports],
-                next=shlex.join(["rlctl", "eval", str(target), "--task", policy.info.spec.task]),
-                details={"opset": opset} | {kind: [_describe_port(port) for port in ports[kind]] for kind in ports},
-            )
-        )
+        fields["details"] = {"opset": model.opset_import[0].version} | {
+            kind: [{"name": port.name, "dtype": port.type[len("tensor(") : -1], "shape": port.shape} for port in some]
+            for kind, some in ports.items()
+        }
+        fields.update(_verify(policy, workers, target, exported, part))
 
     files.write_with(target, write)
-    return reports[0]
-
-
-def _describe_port(port: Any) -> dict[str, Any]:
-    return {"name": port.name, "dtype": port.type.removeprefix("tensor(").removesuffix(")"), "shape": port.shape}
-
-
-def _format_port(port: Any) -> str:
-    name, dtype, shape = _describe_port(port).values()
-    return f"{name} {dtype}[{', '.join(map(str, shape))}]"
+    return ExportReport(**_describe(policy, target), **fields, size=len(content))
 
 
 def _export_c(policy: TorchPolicy, workers: Workers, target: Path, code: CSource) -> ExportReport:
@@ -131,54 +211,32 @@ def _export_c(policy: TorchPolicy, workers: Workers, target: Path, code: CSource
     compiler = find_compiler()
     # The source includes the header by the identifier: policy-1.c includes policy_1.h.
     header = target.with_name(f"{code.name}.h")
-    if compiler is None:
-        fields = {**_describe(policy, target), "not_verified": "no C compiler (cc, or $CC) on this machine"}
-    else:
+    fields: dict[str, Any] = {"not_verified": "no C compiler (cc, or $CC) on this machine"}
+    if compiler is not None:
         with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
             library = build_library(code, policy.info, Path(folder), compiler)
-            exported = CPolicy.load(library)
-            fields = _verify(policy, workers, target, exported, library, "the C function", C_OBSERVATIONS)
+            fields = _verify(policy, workers, target, CPolicy.load(library), library)
     files.write_text(header, code.header)
     files.write_text(target, code.source)
     size = len(code.source.encode()) + len(code.header.encode())
-    return ExportReport(
-        **fields,
-        size=size,
-        written=f"{target} and {header.name} ({size / 1000:,.1f} kB, C99)",
-        interface=[("function", code.prototype)],
-        next=shlex.join(["cc", "-std=c99", "-O3", "-c", str(target)]),
-        details={"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0]},
-    )
+    details = {"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0]}
+    return ExportReport(**_describe(policy, target), **fields, size=size, details=details)
 
 
 def _describe(policy: TorchPolicy, target: Path) -> dict[str, Any]:
     info = policy.info
-    return {
-        "path": target,
-        "policy": policy.file.path,
-        "task": info.spec.task,
-        "algo": info.algo,
-        "training_steps": info.training_steps,
-    }
+    about = {"task": info.spec.task, "algo": info.algo, "training_steps": info.training_steps}
+    return {"path": target, "policy": policy.file.path, **about}
 
 
-def _verify(
-    policy: TorchPolicy,
-    workers: Workers,
-    target: Path,
-    exported: Policy,
-    file: Path,
-    what: str,
-    min_observations: int = MIN_OBSERVATIONS,
-) -> dict[str, Any]:
-    """Return the fields of a report on a verified file; raises `AnswerIsNo` if it does not act as the policy does."""
-    agreement, loop = verify(policy, exported, file, workers, min_observations)
+def _verify(policy: TorchPolicy, workers: Workers, target: Path, exported: Policy, file: Path) -> dict[str, Any]:
+    """Return how a file was verified, as fields of its report; raises `AnswerIsNo` if it acts differently."""
+    agreement, loop = verify(policy, exported, file, workers)
     if not (agreement.agrees and (loop.agrees or loop.magnified)):
-        why = f"{what} does not act as {policy.file.path} does"
+        why = f"it does not act as {policy.file.path} does"
         if agreement.agrees:
             task = policy.info.spec.task
             why = f"all actions agree, but the episodes differ; is the environment reproducible? rlctl check-env {task}"
         numbers = f"{format_agreement(agreement)}\n{format_closed_loop(loop)}"
         raise AnswerIsNo(f"{target}: not verified, not written: {why}\n{numbers}")
-    latency = measure_latency(policy, exported)
-    return {**_describe(policy, target), "agreement": agreement, "closed_loop": loop, "latency": latency}
+    return {"agreement": agreement, "closed_loop": loop, "latency": measure_latency(policy, exported)}

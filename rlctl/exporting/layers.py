@@ -8,21 +8,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 
-from rlctl.errors import UsageError
-from rlctl.policy.layers import (
-    Activation,
-    BatchRenorm,
-    Clip,
-    Convolution,
-    Flatten,
-    Layer,
-    Linear,
-    Lstm,
-    LstmLayer,
-    Normalize,
-    OneHot,
-    ScaleImage,
-)
+from rlctl.policy import layers
 from rlctl.version import __version__
 
 OPSET = 17  # onnxruntime 1.12 and newer read it
@@ -43,17 +29,14 @@ class Graph:
         self._outputs: list[onnx.ValueInfoProto] = []
 
     def input(self, name: str, dtype: Any, shape: Sequence[int | str], meaning: str) -> str:
-        """Add an input; raises `UsageError` if its name is empty, taken or starts with a slash."""
-        if not name or name.startswith("/") or name in (port.name for port in self._inputs):
-            raise UsageError(f"export: an observation named {name!r} cannot be written as ONNX; rename it in the task")
+        """Add an input and return its name."""
         self._inputs.append(helper.make_tensor_value_info(name, _find_type(dtype), list(shape), meaning))
         return name
 
     def constant(self, name: str, value: Any) -> str:
         """Add a constant array and return its name."""
-        array: NDArray[Any] = np.asarray(value)
         name = f"/{name}"
-        self._constants[name] = numpy_helper.from_array(np.array(array, order="C"), name)
+        self._constants[name] = numpy_helper.from_array(np.array(value, order="C"), name)
         return name
 
     def add(self, operator: str, *inputs: str, **attributes: Any) -> str:
@@ -88,10 +71,6 @@ class Graph:
 
     def output(self, value: str, name: str, dtype: Any, shape: Sequence[int | str], meaning: str) -> None:
         """Make a value an output with a name."""
-        if name in (port.name for port in self._inputs):
-            raise UsageError(
-                f"export: an observation named {name!r} has the name of an ONNX output; rename it in the task"
-            )
         for node in self._nodes:
             for names in (node.input, node.output):
                 names[:] = [name if other == value else other for other in names]
@@ -114,18 +93,13 @@ class Graph:
         return model
 
 
-def unsupported(what: str) -> UsageError:
-    """Return the error for a part of a policy that cannot be written as ONNX."""
-    return UsageError(f"export: {what} cannot be written as ONNX")
-
-
 def _find_type(dtype: Any) -> int:
     return int(helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
 
 
-def emit(graph: Graph, value: str, layers: Iterable[Layer]) -> str:
+def emit(graph: Graph, value: str, chain: Iterable[layers.Layer]) -> str:
     """Apply layers one after the other to a value of shape (batch, ...) and return the result."""
-    for layer in layers:
+    for layer in chain:
         value = _EMIT[type(layer)](graph, value, layer)
     return value
 
@@ -135,19 +109,18 @@ def concatenate(graph: Graph, parts: list[str]) -> str:
     return graph.add("Concat", *parts, axis=1) if len(parts) > 1 else parts[0]
 
 
-def _emit_linear(graph: Graph, value: str, layer: Linear) -> str:
+def _emit_linear(graph: Graph, value: str, layer: layers.Linear) -> str:
     weight, bias = (graph.constant(f"{layer.name}.{part}", getattr(layer, part)) for part in ("weight", "bias"))
     return graph.add("Gemm", value, weight, bias, transB=1)
 
 
-def _emit_convolution(graph: Graph, value: str, layer: Convolution) -> str:
+def _emit_convolution(graph: Graph, value: str, layer: layers.Convolution) -> str:
     weight, bias = (graph.constant(f"{layer.name}.{part}", getattr(layer, part)) for part in ("weight", "bias"))
-    return graph.add(
-        "Conv", value, weight, bias, kernel_shape=list(layer.weight.shape[2:]), strides=[layer.stride, layer.stride]
-    )
+    shape, strides = list(layer.weight.shape[2:]), [layer.stride, layer.stride]
+    return graph.add("Conv", value, weight, bias, kernel_shape=shape, strides=strides)
 
 
-def _emit_batch_renorm(graph: Graph, value: str, layer: BatchRenorm) -> str:
+def _emit_batch_renorm(graph: Graph, value: str, layer: layers.BatchRenorm) -> str:
     # The same steps as in sb3-contrib: as one multiplication and addition, a mean much larger than its deviation
     # would lose digits.
     value = graph.add("Sub", value, graph.constant(f"{layer.name}.ra_mean", layer.mean))
@@ -156,7 +129,7 @@ def _emit_batch_renorm(graph: Graph, value: str, layer: BatchRenorm) -> str:
     return graph.add("Add", value, graph.constant(f"{layer.name}.bias", layer.bias))
 
 
-def _emit_normalize(graph: Graph, value: str, layer: Normalize) -> str:
+def _emit_normalize(graph: Graph, value: str, layer: layers.Normalize) -> str:
     # In float64, as `Normalize` computes it.
     value = graph.cast(value, np.float64)
     value = graph.add("Sub", value, graph.constant(f"{layer.name}/mean", np.float64(layer.mean)))
@@ -169,7 +142,7 @@ def _emit_normalize(graph: Graph, value: str, layer: Normalize) -> str:
 _ENDS = {"low": -1, "high": 1}
 
 
-def _emit_one_hot(graph: Graph, value: str, layer: OneHot) -> str:
+def _emit_one_hot(graph: Graph, value: str, layer: layers.OneHot) -> str:
     levels = graph.constant(f"{layer.name}/levels", np.array([0.0, 1.0], np.float32))
     if layer.sizes.ndim == 0:
         return graph.add("OneHot", value, graph.constant(f"{layer.name}/depth", np.int64(layer.sizes)), levels)
@@ -181,43 +154,37 @@ def _emit_one_hot(graph: Graph, value: str, layer: OneHot) -> str:
     return concatenate(graph, parts)
 
 
-def _emit_scale_image(graph: Graph, value: str, layer: ScaleImage) -> str:
+def _emit_scale_image(graph: Graph, value: str, layer: layers.ScaleImage) -> str:
     if layer.channels_last:
         value = graph.add("Transpose", value, perm=[0, 3, 1, 2])
     return graph.add("Div", value, graph.constant(layer.name, np.float32(255.0)))
 
 
-def _emit_clip(graph: Graph, value: str, layer: Clip) -> str:
+def _emit_clip(graph: Graph, value: str, layer: layers.Clip) -> str:
     low, high = (graph.constant(f"{layer.name}.{end}", np.float32(at * layer.limit)) for end, at in _ENDS.items())
     return graph.add("Clip", value, low, high)
 
 
-def _emit_activation(graph: Graph, value: str, layer: Activation) -> str:
+def _emit_activation(graph: Graph, value: str, layer: layers.Activation) -> str:
     if layer.name == "silu":
         return graph.add("Mul", value, graph.add("Sigmoid", value))
-    operator, attributes = _OPERATORS[layer.name]
-    return graph.add(operator, value, **attributes)
+    return graph.add(layer.name.capitalize(), value)  # Tanh, Relu or Elu
 
 
-_OPERATORS: dict[str, tuple[str, dict[str, float]]] = {
-    "tanh": ("Tanh", {}),
-    "relu": ("Relu", {}),
-    "elu": ("Elu", {"alpha": 1.0}),
-}
-_EMIT: dict[type[Layer], Callable[[Graph, str, Any], str]] = {
-    Linear: _emit_linear,
-    Convolution: _emit_convolution,
-    BatchRenorm: _emit_batch_renorm,
-    Normalize: _emit_normalize,
-    OneHot: _emit_one_hot,
-    ScaleImage: _emit_scale_image,
-    Flatten: lambda graph, value, layer: graph.add("Flatten", value, axis=1),
-    Clip: _emit_clip,
-    Activation: _emit_activation,
+_EMIT: dict[type[layers.Layer], Callable[[Graph, str, Any], str]] = {
+    layers.Linear: _emit_linear,
+    layers.Convolution: _emit_convolution,
+    layers.BatchRenorm: _emit_batch_renorm,
+    layers.Normalize: _emit_normalize,
+    layers.OneHot: _emit_one_hot,
+    layers.ScaleImage: _emit_scale_image,
+    layers.Flatten: lambda graph, value, layer: graph.add("Flatten", value, axis=1),
+    layers.Clip: _emit_clip,
+    layers.Activation: _emit_activation,
 }
 
 
-def emit_lstm(graph: Graph, value: str, state: tuple[str, str], lstm: Lstm) -> tuple[str, tuple[str, str]]:
+def emit_lstm(graph: Graph, value: str, state: tuple[str, str], lstm: layers.Lstm) -> tuple[str, tuple[str, str]]:
     """Apply one step of an LSTM to a value of shape (batch, size).
 
     `state` names the hidden and the cell state, each of shape (layers, batch, hidden). Returns the value, of shape
@@ -228,17 +195,9 @@ def emit_lstm(graph: Graph, value: str, state: tuple[str, str], lstm: Lstm) -> t
     sequence = graph.add("Unsqueeze", value, time)
     after: list[list[str]] = [[], []]
     for number, layer in enumerate(lstm.layers):
-        outputs, hidden, cell = graph.add_with_outputs(
-            "LSTM",
-            [
-                sequence,
-                *_add_lstm_constants(graph, layer, f"{lstm.name}.{number}"),
-                "",
-                *(part[number] for part in before),
-            ],
-            3,
-            hidden_size=lstm.state.shape[2],
-        )
+        constants = _add_lstm_constants(graph, layer, f"{lstm.name}.{number}")
+        inputs = [sequence, *constants, "", *(part[number] for part in before)]
+        outputs, hidden, cell = graph.add_with_outputs("LSTM", inputs, 3, hidden_size=lstm.state.shape[2])
         sequence = graph.add("Squeeze", outputs, graph.constant(f"{lstm.name}.direction", np.array([1])))
         after[0].append(hidden)
         after[1].append(cell)
@@ -246,15 +205,12 @@ def emit_lstm(graph: Graph, value: str, state: tuple[str, str], lstm: Lstm) -> t
     return graph.add("Squeeze", sequence, time), (joined[0], joined[1])
 
 
-def _add_lstm_constants(graph: Graph, layer: LstmLayer, name: str) -> list[str]:
+def _add_lstm_constants(graph: Graph, layer: layers.LstmLayer, name: str) -> list[str]:
     """Add input weights, recurrent weights and biases of a layer, with ONNX's leading dimension of directions."""
     weights = [_reorder_gates(weight) for weight in (layer.of_input, layer.of_hidden)]
     biases = [_reorder_gates(bias) for bias in layer.biases] or [np.zeros(len(weights[0]), np.float32)] * 2
-    return [
-        graph.constant(f"{name}.weight_ih", weights[0][None]),
-        graph.constant(f"{name}.weight_hh", weights[1][None]),
-        graph.constant(f"{name}.bias", np.concatenate(biases)[None]),
-    ]
+    arrays = {"weight_ih": weights[0], "weight_hh": weights[1], "bias": np.concatenate(biases)}
+    return [graph.constant(f"{name}.{part}", array[None]) for part, array in arrays.items()]
 
 
 def _reorder_gates(values: NDArray[Any]) -> NDArray[Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import operator
 import statistics
-import time
+import timeit
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 MAX_DIFFERENCE = 1e-5  # limit of |difference| of an action element; relative for elements larger than 1
 MAX_RETURN_DIFFERENCE = 1e-3  # limit of the relative difference of an episode's return
-MIN_OBSERVATIONS = 1000
+_MIN_OBSERVATIONS = {"onnx": 1000, "c": 2000}
 EPISODES = 20  # episodes that each of the two policies plays in closed loop
 _LAST_BITS = 2.0**-21
 """Relative change: the last three bits of a float32, about the effect of another order of additions in a network."""
@@ -85,10 +85,8 @@ class Comparison:
         self.agreement.beyond_limit += int(differs.sum())
 
     def _is_near_tie(self, row: int, expected: NDArray[Any], action: NDArray[Any]) -> bool:
-        return all(
-            margin <= MAX_DIFFERENCE * max(1.0, size)
-            for margin, size in _list_margins(self._space, self._logits[row], expected, action)
-        )
+        margins = _list_margins(self._space, self._logits[row], expected, action)
+        return all(margin <= MAX_DIFFERENCE * max(1.0, size) for margin, size in margins)
 
     def close(self) -> None:
         """Stop reading logits."""
@@ -133,8 +131,7 @@ class ClosedLoop:
 class Latency:
     """Median time for one observation [us]."""
 
-    exported_us: float
-    """Normalisation, network and bounds: an ONNX file in onnxruntime, called from Python; C without Python."""
+    exported_us: float  # normalisation, network and bounds: ONNX is called from Python, C from C
     sb3_us: float  # SB3's `policy.predict` of a normalised observation
 
     @property
@@ -143,19 +140,14 @@ class Latency:
         return self.sb3_us / self.exported_us
 
 
-def verify(
-    torch_policy: TorchPolicy,
-    exported: Policy,
-    file: Path,
-    workers: Workers,
-    min_observations: int = MIN_OBSERVATIONS,
-) -> tuple[Agreement, ClosedLoop]:
+def verify(torch_policy: TorchPolicy, exported: Policy, file: Path, workers: Workers) -> tuple[Agreement, ClosedLoop]:
     """Play the same episodes with both policies, and compare their actions on every observation of both.
 
-    `file` is the exported file, ONNX or a compiled library. Plays more episodes until `min_observations` are compared.
+    `file` is the exported file, ONNX or a compiled library. Plays more episodes until enough observations are compared.
     If all actions agree but the episodes differ, it tests whether the episodes are chaotic. Raises `TaskError` if the
     environment fails.
     """
+    min_observations = _MIN_OBSERVATIONS["onnx" if isinstance(exported, OnnxPolicy) else "c"]
     comparison = Comparison(torch_policy)
     seeds = episode_seeds(0, Stream.VERIFY, EPISODES)
     workers.set_policy(torch_policy.file)
@@ -163,16 +155,12 @@ def verify(
     _compare_actions(torch_policy, exported, expected, comparison)
     if isinstance(exported, OnnxPolicy):
         _compare_batch(torch_policy, exported, expected, comparison)
-    played = EPISODES
-    while comparison.agreement.observations < min_observations:
-        missing = min_observations / comparison.agreement.observations - 1.0
-        total = played + max(1, round(1.1 * missing * played))
-        more = play_episodes(workers, episode_seeds(0, Stream.VERIFY, total)[played:], record=True)
-        _compare_actions(torch_policy, exported, more, comparison)
-        played = total
+    while (observations := comparison.agreement.observations) < min_observations:
+        missing = max(1, round(1.1 * len(seeds) * (min_observations / observations - 1.0)))
+        seeds = episode_seeds(0, Stream.VERIFY, len(seeds) + missing)
+        _compare_actions(torch_policy, exported, play_episodes(workers, seeds[-missing:], record=True), comparison)
     workers.set_other_policy(str(file.resolve()))
-    actual = play_episodes(workers, seeds, record=True)
-    observations = comparison.agreement.observations
+    actual = play_episodes(workers, seeds[:EPISODES], record=True)
     _compare_actions(torch_policy, exported, actual, comparison)
     comparison.agreement.observations = observations  # counts the original policy's episodes only
     comparison.close()
@@ -260,16 +248,10 @@ def measure_latency(torch_policy: TorchPolicy, exported: Policy) -> Latency:
     else:
         exported_us = _measure_median_us(lambda: exported.predict(observation))
     return Latency(
-        exported_us, sb3_us=_measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True))
+        exported_us, _measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True))
     )
 
 
 def _measure_median_us(call: Callable[[], Any]) -> float:
-    for _ in range(_WARM_UP):
-        call()
-    times = []
-    for _ in range(_REPETITIONS):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times) * 1e6
+    times = timeit.repeat(call, number=1, repeat=_WARM_UP + _REPETITIONS)
+    return statistics.median(times[_WARM_UP:]) * 1e6

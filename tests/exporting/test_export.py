@@ -9,8 +9,7 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.exporting.export import export_policy
-from rlctl.exporting.report import format_closed_loop, show
+from rlctl.exporting.export import export_policy, format_closed_loop, show
 from rlctl.exporting.request import ExportRequest
 from rlctl.exporting.verify import Comparison, compare_episodes, verify
 from rlctl.policy.onnx_policy import OnnxPolicy
