@@ -23,7 +23,7 @@ ELSEWHERE = ("CONTRIBUTING.md", "CHANGELOG.md", "plugins/*/README.md", "examples
 API = {  # modules, or names with the classes that they return
     "rlctl": [
         *("rlctl.check_env", "rlctl.train", "rlctl.evaluate", "rlctl.load_policy", "rlctl.make"),
-        *("rlctl.checking.finding.RuleFinding", "rlctl.training.request.TrainResult"),
+        *("rlctl.checking.rules.RuleFinding", "rlctl.training.request.TrainResult"),
         *("rlctl.evaluation.evaluate.Evaluation", "rlctl.policy.policy.Policy"),
     ],
     "rlctl.task": ["rlctl.task"],

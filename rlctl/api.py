@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rlctl.checking.finding import RuleFinding
+    from rlctl.checking.rules import RuleFinding
     from rlctl.evaluation.evaluate import Evaluation
     from rlctl.policy.policy import Policy
     from rlctl.training.request import TrainResult
@@ -31,7 +31,7 @@ def check_env(
     excludes the rules that explain why.
     """
     from rlctl.checking.check import check
-    from rlctl.checking.finding import choose_rules
+    from rlctl.checking.rules import choose_rules
     from rlctl.environments.spec import EnvSpec
     from rlctl.errors import RlctlError, TaskError
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_actions
-from rlctl.checking.finding import NotJudged, OutOfTime
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import Leaf, flatten_action, flatten_numbers, name_element, pick
-from rlctl.checking.messages import FIRST_SEED
+from rlctl.checking.records import FIRST_SEED
+from rlctl.checking.rules import NotJudged, OutOfTime
 
 Frame = NDArray[np.float64]
 """What one call of reset or step returned: the observation's numbers, flat, the reward, and the two flags."""

@@ -8,11 +8,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from rlctl.checking import families
-from rlctl.checking.finding import RULES, NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.leaves import name_leaf
-from rlctl.checking.messages import ChildMessage, Mistake
 from rlctl.checking.progress import Position
-from rlctl.checking.records import Experiment, Records
+from rlctl.checking.records import ChildMessage, Mistake, Records
+from rlctl.checking.rules import RULES, Experiment, NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.supervisor import Supervisor
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec

@@ -8,11 +8,10 @@ from multiprocessing.connection import Connection
 
 from rlctl.checking import families
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
-from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.instance import Budget, Context
-from rlctl.checking.messages import CallFailure, ChildMessage, End, Finished, Mistake, Skipped
 from rlctl.checking.progress import CallProgress, read_clock
-from rlctl.checking.records import Experiment
+from rlctl.checking.records import CallFailure, ChildMessage, End, Finished, Mistake, Skipped
+from rlctl.checking.rules import Experiment, NotApplicable, NotJudged, RuleFinding
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.processes.messages import send

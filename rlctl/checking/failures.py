@@ -12,8 +12,8 @@ from types import TracebackType
 from typing import Any
 
 from rlctl.checking.bullet_calls import LIBRARIES
-from rlctl.checking.messages import CallFailure
 from rlctl.checking.progress import CallProgress
+from rlctl.checking.records import CallFailure
 from rlctl.errors import RlctlError
 from rlctl.version import PACKAGE_FOLDER
 

@@ -11,8 +11,8 @@ from typing import Any, Literal
 from rlctl.checking.attributes import GeneratorWatch, find_author, is_task
 from rlctl.checking.failures import EnvironmentRaised, describe, describe_failure
 from rlctl.checking.leaves import find_leaves
-from rlctl.checking.messages import CallFailure
 from rlctl.checking.progress import CallProgress, read_clock
+from rlctl.checking.records import CallFailure
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError

@@ -9,7 +9,7 @@ from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.instance import Budget
 from rlctl.checking.leaves import Leaf, find_numbers, name_type, pick
-from rlctl.checking.messages import MOST_INFOS, CallFailure, CheckedEpisode, Form, Series
+from rlctl.checking.records import MOST_INFOS, CallFailure, CheckedEpisode, Form, Series
 
 
 class Recording:

@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 
 from rlctl.checking import families
-from rlctl.checking.messages import Built, CallFailure, ChildMessage, End, Finished
 from rlctl.checking.progress import CallProgress, Position, read_clock_of
+from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finished
 from rlctl.environments.spec import EnvSpec
 from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill, anonymous_file
 from rlctl.processes.printed_lines import LineReader

@@ -12,10 +12,10 @@ from rlctl.checking import bullet_worlds
 from rlctl.checking.bullet_calls import BulletCalls, Target
 from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Jump, Link, Pair, World, WorldBody
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.finding import NotApplicable
 from rlctl.checking.instance import Instance
 from rlctl.checking.leaves import flatten_numbers
-from rlctl.checking.messages import FIRST_SEED
+from rlctl.checking.records import FIRST_SEED
+from rlctl.checking.rules import NotApplicable
 
 MOST_WORLDS = 4
 DEEPEST_FINE = 0.02  # [m]; Bullet pushes links apart over several steps, heavy robots leave up to 2 cm

@@ -37,8 +37,8 @@ def check_env(
     """Find mistakes in an environment before hours of training are lost."""
     from rlctl.checking import formats
     from rlctl.checking.check import check
-    from rlctl.checking.finding import choose_rules
     from rlctl.checking.formats import plain, structured
+    from rlctl.checking.rules import choose_rules
     from rlctl.environments.spec import EnvSpec
 
     if explain is not None and explain.upper().startswith("Q"):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from rlctl.checking.check import CheckReport, check
 from rlctl.checking.families import find_rules
-from rlctl.checking.finding import Severity
+from rlctl.checking.rules import Severity
 from rlctl.environments import registry
 from rlctl.environments.named_task import RUN
 from rlctl.environments.spec import EnvSpec

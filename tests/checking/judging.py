@@ -11,8 +11,8 @@ import pybullet
 from rlctl.checking import child, families
 from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.check import judge
-from rlctl.checking.finding import RULES
 from rlctl.checking.records import Records
+from rlctl.checking.rules import RULES
 from rlctl.environments.spec import EnvSpec
 
 FOLDER = Path(__file__).parent

@@ -15,11 +15,10 @@ from gymnasium import spaces
 
 from rlctl.checking import families
 from rlctl.checking.check import CheckReport, CheckVerdict, judge
-from rlctl.checking.finding import FAMILIES, RULES, choose_rules, find_rule
 from rlctl.checking.formats import FORMATS, github, plain, sarif, structured
 from rlctl.checking.leaves import find_leaves
-from rlctl.checking.messages import Built
-from rlctl.checking.records import Records
+from rlctl.checking.records import Built, Records
+from rlctl.checking.rules import FAMILIES, RULES, choose_rules, find_rule
 from rlctl.errors import UsageError
 from tests import fork_server
 from tests.checking.judging import records_of

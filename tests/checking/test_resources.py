@@ -4,7 +4,7 @@ import pytest
 
 from rlctl.checking.check import judge
 from rlctl.checking.families import isolation
-from rlctl.checking.finding import NotJudged
+from rlctl.checking.rules import NotJudged
 from tests.checking.judging import case, check_case, findings, records_of
 
 FILE = "broken_resources.py"

@@ -8,8 +8,8 @@ from importlib import import_module
 
 import pytest
 
-from rlctl.checking.finding import RULES
 from rlctl.checking.leaves import find_numbers
+from rlctl.checking.rules import RULES
 from tests.checking.judging import FOLDER, IN_PROCESSES, case, check_case, findings, found, records_of, verdict_of
 
 CASES = [

@@ -9,9 +9,9 @@ import pytest
 
 from rlctl.checking.check import judge
 from rlctl.checking.families.speed import Speed, format_speed, typical
-from rlctl.checking.finding import choose_rules
 from rlctl.checking.profiling import Profile, Stopwatch, TimedCall
 from rlctl.checking.records import Records
+from rlctl.checking.rules import choose_rules
 from tests.checking.judging import case, check_case, shared_records_of
 
 CASES = [

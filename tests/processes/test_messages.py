@@ -10,8 +10,8 @@ import sys
 import numpy as np
 import pytest
 
-from rlctl.checking.finding import RuleFinding, Severity
-from rlctl.checking.messages import Fact, Series
+from rlctl.checking.records import Fact, Series
+from rlctl.checking.rules import RuleFinding, Severity
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.policy.file import PolicyInfo

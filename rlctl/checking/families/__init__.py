@@ -49,8 +49,7 @@ from rlctl.checking.families import (
     state,
     variants,
 )
-from rlctl.checking.finding import RULES
-from rlctl.checking.records import Check, Experiment
+from rlctl.checking.rules import RULES, Check, Experiment
 
 PROCESS_S = 18.0  # for the experiments of one process [s], besides importing and building
 

@@ -10,10 +10,9 @@ import numpy as np
 from rlctl.checking import action_trials
 from rlctl.checking.action_trials import REWARD, ActionNumber, Trials
 from rlctl.checking.failures import EnvironmentRaised
-from rlctl.checking.finding import NotApplicable, NotJudged, OutOfTime, RuleFinding, Severity, list_names
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage
-from rlctl.checking.records import experiment
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage
+from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFinding, Severity, experiment, list_names
 
 MOST_DIMENSIONS = 64
 STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows

@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking import messages
 from rlctl.checking.attributes import find_unequal, read_attributes
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.finding import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import Check, Records, check, experiment
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, SUCCESS, Built, CheckedEpisode, ChildMessage, Fact, Records
+from rlctl.checking.rules import Check, NotJudged, RuleFinding, Severity, check, experiment, list_names
 
 COMPARED_STEPS = 200  # How far comparisons go
 DIRTY_STEPS = 37  # longest unfinished episode before a repetition
@@ -33,19 +32,19 @@ NEARLY = 1e-5  # relative to the value or to 1: a smaller first difference is a 
 
 
 @experiment("comparisons", share=4.0)
-def compare_repetitions(context: Context) -> Iterator[messages.ChildMessage]:
+def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
     """Play the first episode again: at once, after an unfinished other one, and with another seed."""
     instance, budget = context.instance, context.budget
-    longest_s, steps, first = budget.seconds_left / 4, COMPARED_STEPS, messages.FIRST_SEED
+    longest_s, steps, first = budget.seconds_left / 4, COMPARED_STEPS, FIRST_SEED
     for number, role in enumerate(("alone", "reused", "dirty", "seeds")):
         instance.progress.phase(role)
         if role == "dirty":
             unfinished = min(DIRTY_STEPS, max(1, steps // 2))
-            other = EpisodePlayer(instance, messages.SECOND_SEED, "extreme", max_steps=unfinished)
+            other = EpisodePlayer(instance, SECOND_SEED, "extreme", max_steps=unfinished)
             Recording(role, other, budget).run()
         if budget.is_over():
             return
-        seed = messages.SECOND_SEED if role == "seeds" else first
+        seed = SECOND_SEED if role == "seeds" else first
         recording = Recording(
             role,
             EpisodePlayer(
@@ -55,21 +54,21 @@ def compare_repetitions(context: Context) -> Iterator[messages.ChildMessage]:
         )
         yield from recording.run()
         steps = min(steps, recording.steps)
-    yield messages.Fact("kept", _find_kept(instance))
+    yield Fact("kept", _find_kept(instance))
 
 
 def _find_kept(instance: Instance) -> list[str]:
     read = []
     for steps in (0, KEPT_STEPS, 0):
-        instance.reset(messages.FIRST_SEED)
+        instance.reset(FIRST_SEED)
         read.append(read_attributes(instance.env))
-        for _ in EpisodePlayer(instance, messages.SECOND_SEED, max_steps=steps):
+        for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=steps):
             pass
     kept, every_time = find_unequal(*read[1:]), find_unequal(*read[:2])  # a clock differs every time
     return [name for name in kept if name not in every_time] or kept
 
 
-def compare(records: Records, first: str, second: str) -> tuple[messages.CheckedEpisode, FirstDifference | None]:
+def compare(records: Records, first: str, second: str) -> tuple[CheckedEpisode, FirstDifference | None]:
     """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised."""
     built = records.require_built()
     if not built.accepts_seed:
@@ -97,7 +96,7 @@ def require_independent(records: Records) -> None:
 def report(
     rule: str,
     records: Records,
-    trajectory: messages.CheckedEpisode,
+    trajectory: CheckedEpisode,
     difference: FirstDifference,
     what: str,
     cause: str = "",
@@ -179,7 +178,7 @@ class FirstDifference:
         at = "at reset" if self.step == 0 else f"at step {self.step}"
         return f"first difference {at}: {self.element} is {self.first:.9g}, then {self.second:.9g}{size}"
 
-    def evidence(self, trajectory: messages.CheckedEpisode) -> dict[str, Any]:
+    def evidence(self, trajectory: CheckedEpisode) -> dict[str, Any]:
         """Return it with the trajectory's seed, as a finding's evidence."""
         return {
             "seed": trajectory.seed,
@@ -192,9 +191,7 @@ class FirstDifference:
         }
 
 
-def find_difference(
-    built: messages.Built, one: messages.CheckedEpisode, two: messages.CheckedEpisode
-) -> FirstDifference | None:
+def find_difference(built: Built, one: CheckedEpisode, two: CheckedEpisode) -> FirstDifference | None:
     """Compare two trajectories bit for bit as far as both go; NaN equals NaN."""
     differences: list[FirstDifference] = []
     for index in sorted(one.observations.keys() & two.observations.keys()):
@@ -204,9 +201,9 @@ def find_difference(
     differences += _compare(one.rewards, two.rewards, after, lambda _: "reward")
     differences += _compare(one.terminated, two.terminated, after, lambda _: "terminated")
     differences += _compare(one.truncated, two.truncated, after, lambda _: "truncated")
-    if messages.SUCCESS in one.infos and messages.SUCCESS in two.infos:
-        a, b = one.infos[messages.SUCCESS], two.infos[messages.SUCCESS]
-        differences += _compare(a.values, b.values, a.steps, lambda _: messages.SUCCESS)
+    if SUCCESS in one.infos and SUCCESS in two.infos:
+        a, b = one.infos[SUCCESS], two.infos[SUCCESS]
+        differences += _compare(a.values, b.values, a.steps, lambda _: SUCCESS)
     if one.has_ended and two.has_ended and one.steps != two.steps:
         differences.append(FirstDifference(min(one.steps, two.steps), "length", one.steps, two.steps, 1.0, 1.0))
     if not differences:

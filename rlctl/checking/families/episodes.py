@@ -5,11 +5,10 @@ from collections.abc import Iterator
 
 from rlctl.checking.attributes import find_assignment, read_generators
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.finding import NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Budget, Context, Instance
-from rlctl.checking.messages import ENDS, FIRST_SEED, CheckedEpisode, ChildMessage
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import Records, check, experiment
+from rlctl.checking.records import ENDS, FIRST_SEED, CheckedEpisode, ChildMessage, Records
+from rlctl.checking.rules import NotJudged, RuleFinding, Severity, check, experiment
 
 EPISODES = (
     *("random", "zero", "extreme", "rare", "repeated", "random", "random", "random"),

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.families.rewards import WITH_SEARCH
-from rlctl.checking.finding import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.leaves import Leaf
-from rlctl.checking.records import Records, check
+from rlctl.checking.records import Records
+from rlctl.checking.rules import NotJudged, RuleFinding, Severity, check, list_names
 
 Numbers = NDArray[np.float64]
 

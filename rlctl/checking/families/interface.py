@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from rlctl.checking import failures
-from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, SUCCESS, CallFailure, CheckedEpisode, ChildMessage, Form
-from rlctl.checking.records import RECORDING, Records, check, experiment
+from rlctl.checking.records import FIRST_SEED, SUCCESS, CallFailure, CheckedEpisode, ChildMessage, Form, Records
+from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
 from rlctl.errors import RecipeError
 
 NUMBERS = ("float", "int", "numpy.float64")  # Reward types that both libraries accept

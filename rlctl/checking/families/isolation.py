@@ -14,11 +14,10 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.families.determinism import COMPARED_STEPS, compare, report, require_independent
 from rlctl.checking.families.interface import select_failures
-from rlctl.checking.finding import RULES, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context, Instance
-from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage, Skipped
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import Records, check, experiment
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Records, Skipped
+from rlctl.checking.rules import RULES, NotJudged, RuleFinding, Severity, check, experiment
 
 IN_TURNS, AFTER_CLOSE = "two instances stepped in turns", "after another instance was closed"
 MOST_RESETS = 100

@@ -12,10 +12,9 @@ from typing import Any
 from rlctl.checking.attributes import find_author, is_task
 from rlctl.checking.bullet_worlds import ClientCalls, find_clients
 from rlctl.checking.failures import EnvironmentRaised, find_missing_file, iterate_causes, lacks_display
-from rlctl.checking.finding import RuleFinding
 from rlctl.checking.instance import Context, Instance, find_longest_episode
-from rlctl.checking.messages import Built, ChildMessage
-from rlctl.checking.records import RECORDING, Records, check, experiment
+from rlctl.checking.records import Built, ChildMessage, Records
+from rlctl.checking.rules import RECORDING, RuleFinding, check, experiment
 from rlctl.environments import registry
 from rlctl.environments.dict_spaces import format_space
 from rlctl.environments.mujoco_model import describe_mujoco_model

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.finding import RuleFinding, Severity, list_names
 from rlctl.checking.leaves import Leaf, name_leaf
-from rlctl.checking.messages import CheckedEpisode, Form, Series
-from rlctl.checking.records import RECORDING, Records, check
+from rlctl.checking.records import CheckedEpisode, Form, Records, Series
+from rlctl.checking.rules import RECORDING, RuleFinding, Severity, check, list_names
 
 ROUNDING = 1e-6  # Excess over a bound, relative to the bound, up to which it is float rounding
 LARGE_SHARE, SMALL_SHARE = 0.1, 0.005  # of all observations but the last ones, for an error, or a warning

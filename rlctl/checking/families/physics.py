@@ -15,10 +15,9 @@ from rlctl.checking.bullet_calls import BulletCall, record_calls
 from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Joint, Jump, Pair, WorldBody, find_clients
 from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.families.robots import find_misuses
-from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, list_names
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, ChildMessage, Skipped
-from rlctl.checking.records import experiment
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, experiment, list_names
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
 
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))  # actions and logged steps

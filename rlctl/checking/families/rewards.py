@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.failures import EnvironmentRaised, describe
-from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.instance import Context
-from rlctl.checking.messages import FIRST_SEED, SUCCESS, CheckedEpisode, ChildMessage
-from rlctl.checking.records import Records, check, experiment
+from rlctl.checking.records import FIRST_SEED, SUCCESS, CheckedEpisode, ChildMessage, Records
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
 
 WITH_SEARCH = ("comparisons", "episodes", "starts", "search")  # they play the first process's instance
 DISCOUNT = 0.99  # per step: what is hundreds of steps away hardly counts

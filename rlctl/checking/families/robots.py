@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.bullet_calls import FULL_TURN, BulletCalls, ContactQuery
 from rlctl.checking.bullet_worlds import JOINTS, ClientCalls, find_joint
-from rlctl.checking.finding import RuleFinding, Severity
+from rlctl.checking.rules import RuleFinding, Severity
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 
 FAR_RANGES = 3.0  # a target farther outside the limits is not just out of reach

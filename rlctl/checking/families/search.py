@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from rlctl.checking.episode import EpisodePlayer, action_at, zero_action
 from rlctl.checking.families import rewards
 from rlctl.checking.families.state import play_after_ends
-from rlctl.checking.finding import NotJudged, RuleFinding
 from rlctl.checking.instance import Context, find_longest_episode
-from rlctl.checking.messages import FIRST_SEED, CheckedEpisode, ChildMessage, Skipped
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import experiment
+from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Skipped
+from rlctl.checking.rules import NotJudged, RuleFinding, experiment
 
 MOST_STEPS = 4_500  # in all: they find the goal of the bundled `reach` from most seeds
 MOST_EPISODES = 60

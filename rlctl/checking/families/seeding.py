@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from rlctl.checking.attributes import read_generators
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.families.determinism import compare
-from rlctl.checking.finding import NotJudged, RuleFinding
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import flatten_numbers
-from rlctl.checking.messages import FIRST_SEED, ChildMessage
-from rlctl.checking.records import Records, check, experiment
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Records
+from rlctl.checking.rules import NotJudged, RuleFinding, check, experiment
 
 WATCHED_STEPS = 300  # For how many steps the process's random generators are compared
 UNSEEDED_RESETS, UNSEEDED_STEPS = 2, 20  # Of two discrete starts one may be the same by chance

@@ -7,12 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from rlctl.checking.bullet_calls import visible_to_profilers
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.finding import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.instance import Context, Instance, Timer, rebuilds_world
-from rlctl.checking.messages import ChildMessage, Fact
 from rlctl.checking.profiling import Profile, Stopwatch, TimedCall, find_own_code
 from rlctl.checking.progress import read_clock
-from rlctl.checking.records import Records, check, experiment
+from rlctl.checking.records import ChildMessage, Fact, Records
+from rlctl.checking.rules import NotJudged, RuleFinding, Severity, check, experiment, list_names
 from rlctl.output import format_duration
 
 FIRST_SPEED_SEED = 5000

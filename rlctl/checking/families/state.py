@@ -12,12 +12,11 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.failures import EnvironmentRaised
 from rlctl.checking.families.determinism import COMPARED_STEPS, LATE, find_difference, report
 from rlctl.checking.families.rewards import has_succeeded
-from rlctl.checking.finding import NotApplicable, NotJudged, OutOfTime, RuleFinding
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import flatten_numbers
-from rlctl.checking.messages import FIRST_SEED, SECOND_SEED, ChildMessage
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import Records, check, experiment
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Records
+from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFinding, check, experiment
 
 HIDDEN_STEPS = 20  # How many steps are compared with an attribute changed
 FEWEST_COMPARED = 5

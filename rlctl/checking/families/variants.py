@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.failures import EnvironmentRaised, describe
-from rlctl.checking.finding import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.leaves import flatten_numbers
-from rlctl.checking.messages import FIRST_SEED, ChildMessage, Skipped
-from rlctl.checking.records import experiment
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, experiment
 from rlctl.environments import info, registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError

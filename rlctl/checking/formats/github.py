@@ -4,8 +4,8 @@ import os
 from pathlib import Path
 
 from rlctl.checking.check import CheckReport
-from rlctl.checking.finding import RuleFinding, Severity
 from rlctl.checking.formats.plain import summary
+from rlctl.checking.rules import RuleFinding, Severity
 
 COMMANDS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "notice"}
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from rlctl import output
 from rlctl.checking.check import CheckReport
 from rlctl.checking.families.speed import format_speed
-from rlctl.checking.finding import FAMILIES, RULES, RuleFinding, Severity, find_rule
 from rlctl.checking.formats.structured import Row, action_rows, observation_rows
+from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, find_rule
 
 if TYPE_CHECKING:
     from rich.console import Console

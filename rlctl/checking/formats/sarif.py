@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.checking.check import CheckReport
-from rlctl.checking.finding import FAMILIES, RULES, Rule, RuleFinding, Severity
 from rlctl.checking.formats.structured import plain
+from rlctl.checking.rules import FAMILIES, RULES, Rule, RuleFinding, Severity
 from rlctl.version import __version__
 
 LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "note"}

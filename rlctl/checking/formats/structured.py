@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from rlctl.checking.check import CheckReport
 from rlctl.checking.families.speed import Speed
-from rlctl.checking.finding import RuleFinding
 from rlctl.checking.leaves import Leaf, name_leaf
-from rlctl.checking.messages import Built
-from rlctl.checking.records import Records
+from rlctl.checking.records import Built, Records
+from rlctl.checking.rules import RuleFinding
 from rlctl.errors import ArtifactError
 from rlctl.storage import files
 from rlctl.version import __version__

@@ -1,15 +1,21 @@
-"""Rules and what they find. The texts of the rules are data, in `rules.yaml` next to this module."""
+"""Rules, what they find, and the two kinds of code that judge them. The texts of the rules are in `rules.yaml`."""
+
+from __future__ import annotations
 
 import dataclasses
 import enum
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from rlctl.errors import UsageError, did_you_mean
+
+if TYPE_CHECKING:
+    from rlctl.checking.instance import Context
+    from rlctl.checking.records import Records
 
 
 class Severity(enum.StrEnum):
@@ -132,3 +138,51 @@ def _codes(texts: Sequence[str], option: str) -> list[str]:
             closest = did_you_mean(code.replace("O", "0"), RULES) or did_you_mean(code, FAMILIES)
             raise UsageError(f"{option} {code}: no such rule.{closest} rlctl check-env --list shows all.")
     return codes
+
+
+RECORDING = ("comparisons", "episodes", "instances")
+"""The experiments that record episodes for all rules: with random and other actions, alone and beside another."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """One thing to do with an environment in a child process."""
+
+    name: str
+    run: Callable[[Context], Iterator[ChildMessage]]  # yields findings at once, so that a crash loses none
+    rules: tuple[str, ...]  # those it decides if it completes; may be empty
+    share: float  # of the time of its process, relative to the others
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """How the parent process judges a rule from what was recorded."""
+
+    rule: str
+    run: Callable[[Records], Iterable[RuleFinding]]
+    needs: tuple[str, ...]  # The experiments that record what it reads
+    of_absence: bool = False  # it judges what never happened, so its experiments must be complete
+
+
+def experiment(
+    name: str, *rules: str, share: float = 1.0
+) -> Callable[[Callable[[Context], Iterator[ChildMessage]]], Experiment]:
+    """Make an experiment of a function. It decides `rules`; see the package `families` for how."""
+
+    def decorate(run: Callable[[Context], Iterator[ChildMessage]]) -> Experiment:
+        assert all(rule in RULES for rule in rules)
+        return Experiment(name, run, rules, share)
+
+    return decorate
+
+
+def check(
+    rule: str, *needs: str, of_absence: bool = False
+) -> Callable[[Callable[[Records], Iterable[RuleFinding]]], Check]:
+    """Make the check of a rule of a function; by default it reads the recorded episodes."""
+
+    def decorate(run: Callable[[Records], Iterable[RuleFinding]]) -> Check:
+        assert rule in RULES
+        return Check(rule, run, needs or RECORDING, of_absence)
+
+    return decorate
