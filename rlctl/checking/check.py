@@ -8,14 +8,15 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from rlctl.checking import families
+from rlctl.checking.children import Supervisor
 from rlctl.checking.leaves import name_leaf
 from rlctl.checking.progress import Position
 from rlctl.checking.records import ChildMessage, Mistake, Records
 from rlctl.checking.rules import RULES, Experiment, NotApplicable, NotJudged, RuleFinding, Severity
-from rlctl.checking.supervisor import Supervisor
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, did_you_mean
+from rlctl.output import format_count
 from rlctl.recipe import sources
 
 METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6": "step", "RL7": "step"}
@@ -72,6 +73,16 @@ class CheckReport:
     def fingerprint(self, finding: RuleFinding) -> str:
         """Return what identifies a finding in every run: no number of a message, which differ from run to run."""
         return f"{self.task} {finding.rule} {finding.evidence.get('element', '')}".strip()
+
+    def summarize(self) -> str:
+        """Return a line that says what was found."""
+        verdict = self.verdict
+        counts = [(sum(finding.severity is s for finding in verdict.findings), s) for s in Severity]
+        counted = ", ".join(format_count(count, severity) for count, severity in counts if count)
+        waived = f", {len(verdict.waived)} waived" if verdict.waived else ""
+        waived += f", {len(verdict.known)} known from the baseline" if verdict.known else ""
+        rules = format_count(len(verdict.judged), "rule")
+        return f"{self.task}: {counted or 'no findings'}{waived}; {rules} judged in {self.seconds:.1f} s"
 
     def subtract(self, baseline: Collection[str]) -> None:
         """Take out the findings whose fingerprints a baseline has: they are known, and fail nothing."""

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.failures import EnvironmentRaised
-from rlctl.checking.instance import Instance
+from rlctl.checking.instance import EnvironmentRaised, Instance
 from rlctl.checking.leaves import Leaf, Path, find_leaves, name_type, read_flag
 from rlctl.checking.progress import read_clock
 

@@ -33,6 +33,12 @@ class Leaf:
         """Whether rules can look into it."""
         return self.low is not None
 
+    @property
+    def flat_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest value of each number. Shape (elements,)."""
+        low, high = (np.ravel(np.asarray(bound, np.float64)) for bound in (self.low, self.high))
+        return low, high
+
 
 def name_leaf(leaf: Leaf, of: str = "observation") -> str:
     """Return how to write the leaf of an observation or an action: `observation['camera'][0]`."""

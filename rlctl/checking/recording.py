@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, Moment
-from rlctl.checking.failures import EnvironmentRaised, describe_failure
-from rlctl.checking.instance import Budget
+from rlctl.checking.instance import Budget, EnvironmentRaised, describe_failure
 from rlctl.checking.leaves import Leaf, find_numbers, name_type, pick
 from rlctl.checking.records import MOST_INFOS, CallFailure, CheckedEpisode, Form, Series
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -69,6 +70,11 @@ class Series:
 
     steps: NDArray[np.int64]  # Which observation each row is; 0 is the one of `reset`. Shape (n,).
     values: NDArray[Any]  # Shape (n, *leaf.shape)
+
+    @property
+    def rows(self) -> NDArray[np.float64]:
+        """The values as numbers, flat. Shape (n, elements)."""
+        return self.values.reshape(len(self.values), math.prod(self.values.shape[1:])).astype(np.float64)
 
 
 @dataclasses.dataclass(frozen=True)

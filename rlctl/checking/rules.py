@@ -15,7 +15,7 @@ from rlctl.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from rlctl.checking.instance import Context
-    from rlctl.checking.records import Records
+    from rlctl.checking.records import ChildMessage, Records
 
 
 class Severity(enum.StrEnum):

@@ -37,8 +37,8 @@ def check_env(
     """Find mistakes in an environment before hours of training are lost."""
     from rlctl.checking import formats
     from rlctl.checking.check import check
-    from rlctl.checking.formats import plain, structured
     from rlctl.checking.rules import choose_rules
+    from rlctl.checking.tool_formats import read_baseline
     from rlctl.environments.spec import EnvSpec
 
     if explain is not None and explain.upper().startswith("Q"):
@@ -48,13 +48,13 @@ def check_env(
         streams.out().print("\n".join(diagnosis.explain(explain)))
         return
     if list_rules or explain is not None:
-        plain.show_list() if explain is None else plain.explain(explain)
+        formats.show_list() if explain is None else formats.explain(explain)
         return
     if task is None:
         raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")
     if json is not None and (form or output):
         raise UsageError("--json and --format or -o exclude each other")
-    known = set() if baseline is None else structured.read_baseline(Path(baseline))
+    known = set() if baseline is None else read_baseline(Path(baseline))
     spec = parse_changes(settings).apply(EnvSpec(task))
     report = check(spec, rules=choose_rules(select, ignore), strict=strict, env_timeout_s=env_timeout)
     report.subtract(known)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pybullet
 
-from rlctl.checking import child, families
+from rlctl.checking import children, families
 from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.check import judge
 from rlctl.checking.records import Records
@@ -85,7 +85,7 @@ def _run(task, process, experiments):
         pybullet.disconnect(client)
     for module in [module for module in sys.modules if module.startswith("broken_")]:
         del sys.modules[module]
-    return list(child.run(process, EnvSpec(_path(task)), experiments, SECONDS)) if experiments else []
+    return list(children.run(process, EnvSpec(_path(task)), experiments, SECONDS)) if experiments else []
 
 
 def _path(task):

@@ -13,9 +13,9 @@ import pytest
 import sarif_pydantic
 from gymnasium import spaces
 
-from rlctl.checking import families
+from rlctl.checking import families, tool_formats
 from rlctl.checking.check import CheckReport, CheckVerdict, judge
-from rlctl.checking.formats import FORMATS, github, plain, sarif, structured
+from rlctl.checking.formats import FORMATS, to_text
 from rlctl.checking.leaves import find_leaves
 from rlctl.checking.records import Built, Records
 from rlctl.checking.rules import FAMILIES, RULES, choose_rules, find_rule
@@ -38,8 +38,8 @@ def report_of(task, rules=tuple(RULES), experiments=None):
 def test_arrays_without_elements_have_no_row():
     leaves = find_leaves(spaces.Dict(nothing=spaces.Box(-1, 1, (0,)), some=spaces.Box(-1, 1, (2,))))
     records = Records("any", Built(leaves, leaves, "", ""))
-    assert [row.name for row in structured.observation_rows(records)] == ["observation['some']"]
-    assert [row.name for row in structured.action_rows(records)] == ["action['some']"]
+    assert [row.name for row in tool_formats.observation_rows(records)] == ["observation['some']"]
+    assert [row.name for row in tool_formats.action_rows(records)] == ["action['some']"]
 
 
 def rlctl(*arguments, folder=ROOT, **environment):
@@ -74,16 +74,16 @@ def report(request):
 
 
 def test_every_report_fits_the_schema(report):
-    schema = json.loads(structured.SCHEMA.read_text())
+    schema = json.loads(tool_formats.SCHEMA.read_text())
     jsonschema.Draft202012Validator.check_schema(schema)
-    jsonschema.validate(json.loads(structured.text(report)), schema)
+    jsonschema.validate(json.loads(tool_formats.to_json(report)), schema)
 
 
 def test_the_schema_refuses_what_is_no_report(broken):
-    schema = json.loads(structured.SCHEMA.read_text())
+    schema = json.loads(tool_formats.SCHEMA.read_text())
     for change in ({"exit_code": 2}, {"extra": 1}, {"findings": [{"rule": "RL1"}]}, {"speed": {}}):
         with pytest.raises(jsonschema.ValidationError):
-            jsonschema.validate({**structured.content(broken), **change}, schema)
+            jsonschema.validate({**tool_formats.describe(broken), **change}, schema)
 
 
 NOT_IN_THE_VALIDATOR = {"exitCode", "suppressions", "toolExecutionNotifications"}
@@ -101,7 +101,7 @@ def extras(model):
 
 
 def test_every_report_is_valid_sarif(report):
-    log = sarif_pydantic.Sarif.model_validate_json(sarif.text(report))
+    log = sarif_pydantic.Sarif.model_validate_json(tool_formats.to_sarif(report))
     assert extras(log) <= NOT_IN_THE_VALIDATOR
     assert log.version == "2.1.0"
     (run,) = log.runs
@@ -114,7 +114,7 @@ def test_every_report_is_valid_sarif(report):
 
 
 def test_sarif_places_a_finding_at_the_method(broken):
-    result = json.loads(sarif.text(broken))["runs"][0]["results"][0]
+    result = json.loads(tool_formats.to_sarif(broken))["runs"][0]["results"][0]
     place = result["locations"][0]["physicalLocation"]
     file = ROOT / HERE / "broken_envs.py"
     assert file.as_uri().endswith(place["artifactLocation"]["uri"])
@@ -123,7 +123,7 @@ def test_sarif_places_a_finding_at_the_method(broken):
 
 
 def test_sarif_tells_what_is_waived_and_why(waiving):
-    (result,) = json.loads(sarif.text(waiving))["runs"][0]["results"]
+    (result,) = json.loads(tool_formats.to_sarif(waiving))["runs"][0]["results"]
     assert result["suppressions"] == [
         {"kind": "inSource", "justification": "the actions are Newtons, as the real motor has them"}
     ]
@@ -131,7 +131,7 @@ def test_sarif_tells_what_is_waived_and_why(waiving):
 
 def test_annotations_point_at_the_class(broken, monkeypatch):
     monkeypatch.setenv("GITHUB_WORKSPACE", str(ROOT))
-    line, last = github.text(broken).splitlines()
+    line, last = tool_formats.to_annotations(broken).splitlines()
     assert re.match(
         r"::error file=tests/checking/broken_envs.py,line=\d+,title=RL601 reward not finite::"
         r"the reward is nan at step 13%0Afix: ",
@@ -141,17 +141,17 @@ def test_annotations_point_at_the_class(broken, monkeypatch):
 
 
 def test_annotations_escape_what_would_end_them(broken):
-    assert github._property("50 %: a, b\n") == "50 %25%3A a%2C b%0A"
-    assert github._data("50 %: a, b\n") == "50 %25: a, b%0A"
+    assert tool_formats._escape_property("50 %: a, b\n") == "50 %25%3A a%2C b%0A"
+    assert tool_formats._escape_data("50 %: a, b\n") == "50 %25: a, b%0A"
 
 
 def test_outside_the_repository_there_is_no_place_to_annotate(broken, monkeypatch, tmp_path):
     monkeypatch.setenv("GITHUB_WORKSPACE", str(tmp_path))
-    assert github.text(broken).startswith("::error title=RL601")
+    assert tool_formats.to_annotations(broken).startswith("::error title=RL601")
 
 
 def test_text_has_the_finding_its_numbers_and_its_fix(broken):
-    text = plain.text(broken)
+    text = to_text(broken)
     assert text.startswith("error RL601  reward not finite\n  the reward is nan at step 13\n  seed 1000, episode 0, ")
     assert "\n  fix: Find the division, logarithm or diverging simulation that causes it.\n" in text
     assert "\x1b" not in text
@@ -162,9 +162,9 @@ def test_waived_findings_are_listed_with_the_reason_and_do_not_count(waiving):
     assert [finding.rule for finding in waiving.verdict.waived] == ["RL106"]
     assert (
         "waived RL106 (2 of 2 actions are not in [-1, 1]: action[0] is in [-2, 2]): the actions are Newtons"
-        in plain.text(waiving)
+        in to_text(waiving)
     )
-    assert ", 1 waived; " in plain.summary(waiving)
+    assert ", 1 waived; " in waiving.summarize()
 
 
 @pytest.mark.parametrize(

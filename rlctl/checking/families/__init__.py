@@ -42,12 +42,10 @@ from rlctl.checking.families import (
     loading,
     observations,
     physics,
+    reset,
     rewards,
     search,
-    seeding,
     speed,
-    state,
-    variants,
 )
 from rlctl.checking.rules import RULES, Check, Experiment
 
@@ -55,8 +53,8 @@ PROCESS_S = 18.0  # for the experiments of one process [s], besides importing an
 
 
 MODULES = (
-    *(loading, observations, features, interface, determinism, seeding, isolation, episodes),
-    *(rewards, incentives, search, actions, physics, speed, state, variants),
+    *(loading, observations, features, interface, determinism, reset, isolation, episodes),
+    *(rewards, incentives, search, actions, physics, speed),
 )
 _MEMBERS = [value for module in MODULES for value in vars(module).values()]
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from rlctl.checking import action_trials
 from rlctl.checking.action_trials import REWARD, ActionNumber, Trials
-from rlctl.checking.failures import EnvironmentRaised
-from rlctl.checking.instance import Context
+from rlctl.checking.instance import Context, EnvironmentRaised
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage
 from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFinding, Severity, experiment, list_names
 

@@ -7,8 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.checking import failures
-from rlctl.checking.instance import Context
+from rlctl.checking.instance import (
+    NO_DISPLAY,
+    Context,
+    EnvironmentRaised,
+    describe,
+    find_missing_file,
+    iterate_causes,
+    lacks_display,
+)
 from rlctl.checking.records import FIRST_SEED, SUCCESS, CallFailure, CheckedEpisode, ChildMessage, Form, Records
 from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
 from rlctl.errors import RecipeError
@@ -106,7 +113,7 @@ def _find_exceptions(records: Records) -> Iterator[RuleFinding]:
 @check("RL208")
 def _find_ends_of_process(records: Records) -> Iterator[RuleFinding]:
     for failure in select_failures(records, "died"):
-        if not failures.lacks_display(failure):  # RL216 says why
+        if not lacks_display(failure):  # RL216 says why
             yield RuleFinding("RL208", failure.message, failure.place)
 
 
@@ -138,18 +145,18 @@ def render(context: Context) -> Iterator[ChildMessage]:
         with context.fresh("rgb_array") as instance:
             instance.reset(FIRST_SEED)
             picture = instance.call("render", instance.env.render)
-    except failures.EnvironmentRaised as error:
+    except EnvironmentRaised as error:
         cause = error.__cause__ or error
-        if failures.find_missing_file(cause) is not None:
+        if find_missing_file(cause) is not None:
             raise NotJudged("a file that the environment loads is missing (RL007)") from None
         if _lacks_library(cause):
-            raise NotJudged(f"a library that rendering needs is not installed: {failures.describe(cause)}") from None
+            raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None
         call = "the constructor" if error.call == "build" else error.call
-        message = f"with render_mode='rgb_array' {call} raises {failures.describe(cause)}"
+        message = f"with render_mode='rgb_array' {call} raises {describe(cause)}"
         if isinstance(cause, RecipeError):  # the constructor was not even called
             message = f"metadata promises the render mode rgb_array, but {cause}"
-        severity = Severity.INFO if NO_GRAPHICS.search(failures.describe(cause)) else None
-        yield RuleFinding("RL215", message, {"value": failures.describe(cause), "expected": PICTURE}, severity)
+        severity = Severity.INFO if NO_GRAPHICS.search(describe(cause)) else None
+        yield RuleFinding("RL215", message, {"value": describe(cause), "expected": PICTURE}, severity)
         return
     if wrong := _describe_wrong_picture(picture):
         message = f"with render_mode='rgb_array' render returns {wrong}, not {PICTURE}"
@@ -159,7 +166,7 @@ def render(context: Context) -> Iterator[ChildMessage]:
 
 
 def _lacks_library(error: BaseException) -> bool:
-    causes = list(failures.iterate_causes(error))
+    causes = list(iterate_causes(error))
     return any(isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in causes)
 
 
@@ -180,8 +187,8 @@ def _find_end_in_rendering(records: Records) -> Iterator[RuleFinding]:
 @check("RL216", *RECORDING)
 def _find_lost_display(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
-        if failures.lacks_display(failure):
-            lines = [line.strip() for line in (failure.details or "").splitlines() if failures.NO_DISPLAY.search(line)]
+        if lacks_display(failure):
+            lines = [line.strip() for line in (failure.details or "").splitlines() if NO_DISPLAY.search(line)]
             yield RuleFinding("RL216", f"{failure.message}, because there is no display: {lines[0]!r}", failure.place)
             return
     records.require_built()

@@ -11,10 +11,9 @@ from typing import Any
 
 from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.families.determinism import COMPARED_STEPS, compare, report, require_independent
 from rlctl.checking.families.interface import select_failures
-from rlctl.checking.instance import Context, Instance
+from rlctl.checking.instance import Context, EnvironmentRaised, Instance, describe_failure
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Records, Skipped
 from rlctl.checking.rules import RULES, NotJudged, RuleFinding, Severity, check, experiment

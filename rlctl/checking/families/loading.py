@@ -1,24 +1,44 @@
-"""RL0: from the name on the command line to an environment."""
+"""RL0: from the name on the command line to an environment, and to the variants of a task that a recipe switches on."""
+
+from __future__ import annotations
 
 import ast
+import dataclasses
 import difflib
 import inspect
 import re
 import textwrap
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.attributes import find_author, is_task
 from rlctl.checking.bullet_worlds import ClientCalls, find_clients
-from rlctl.checking.failures import EnvironmentRaised, find_missing_file, iterate_causes, lacks_display
-from rlctl.checking.instance import Context, Instance, find_longest_episode
-from rlctl.checking.records import Built, ChildMessage, Records
-from rlctl.checking.rules import RECORDING, RuleFinding, check, experiment
-from rlctl.environments import registry
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.instance import (
+    Context,
+    EnvironmentRaised,
+    Instance,
+    describe,
+    find_longest_episode,
+    find_missing_file,
+    iterate_causes,
+    lacks_display,
+)
+from rlctl.checking.leaves import flatten_numbers
+from rlctl.checking.records import FIRST_SEED, Built, ChildMessage, Records, Skipped
+from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, check, experiment
+from rlctl.environments import info, registry
 from rlctl.environments.dict_spaces import format_space
 from rlctl.environments.mujoco_model import describe_mujoco_model
-from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import NoSuchClassError, OldGymError, RecipeError, RlctlError, TaskError, UsageError
+
+if TYPE_CHECKING:
+    from rlctl.environments.info import EnvInfo
 
 WAIVERS = "rlctl_ignore"  # The class attribute that waives rules: rule id -> reason
 
@@ -209,3 +229,92 @@ def _read_flags(env: Any) -> dict[str, str]:
     names = "|".join(map(re.escape, counters))
     limits = [re.search(rf"\(?(?:{names})\s*(?:>=|>|==)\s*[\w.]+\)?", text) for text in texts if counters]
     return {"truncation": "never", "counter": next((limit[0] for limit in limits if limit), "")}
+
+
+STEPS = 60  # Of each variant: an event at an interval of a second acts in them
+
+
+@experiment("variants", "RL011", "RL012", share=2.0)
+def play_variants(context: Context) -> Iterator[ChildMessage]:
+    """Play the task with all of its events and with none, and each of its stages, and compare equal seeds."""
+    task: Any = getattr(getattr(context.instance.env, "unwrapped", None), "task", None)
+    if not registry.is_task(type(task)):
+        raise NotApplicable("events and stages are those of a rlctl.task.Task")
+    try:
+        repeats = _play(context, context.spec)
+    except EnvironmentRaised:
+        raise NotJudged("the task raises whatever the events (RL2)") from None
+    if task.events:
+        yield from _play_events(context, repeats)
+    else:
+        yield Skipped("RL011", "the task has no events", applies=False)
+    if stages := _find_stages(context.spec.task, task):
+        yield from _play_stages(context, stages)
+    else:
+        yield Skipped("RL012", "the task has no stages", applies=False)
+
+
+def _find_stages(name: str, task: Any) -> Sequence[Any]:
+    file = registry.find_recipe_file(name)
+    stages = task.stages
+    if file is not None and "stages" in file.read_text(encoding="utf-8", errors="replace"):
+        from rlctl.recipe.sources import read  # pydantic's models take a quarter of a second to load
+
+        stages = read(file).get("stages", stages)
+    return stages if isinstance(stages, list | tuple) else ()  # another type is refused with the recipe
+
+
+def _play_events(context: Context, repeats: bool) -> Iterator[RuleFinding]:
+    for randomize in {True, False} - {context.spec.randomize}:
+        where = f"with randomize={str(randomize).lower()}"
+        try:
+            same = _play(context, dataclasses.replace(context.spec, randomize=randomize))
+        except EnvironmentRaised as error:
+            yield RuleFinding("RL011", f"{where}: {_describe_cause(error)}")
+            continue
+        if repeats and not same:
+            yield RuleFinding("RL011", f"{where}: equal seeds and actions give unequal episodes")
+
+
+def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[RuleFinding]:
+    from rlctl.recipe.recipe import validate
+
+    spec, first = context.spec, None
+    settings = {"task": spec.parameters, "events": spec.events, "randomize": spec.randomize, "stages": list(stages)}
+    try:
+        specs = validate(settings, "stages").env_specs(spec.task)
+    except RecipeError as error:
+        yield RuleFinding("RL012", str(error))
+        return
+    for number, stage in enumerate(specs, start=1):
+        try:
+            info = _describe(context, stage)
+        except EnvironmentRaised as error:
+            yield RuleFinding("RL012", f"stage {number} of {len(specs)}: {_describe_cause(error)}")
+            continue
+        first = first or info
+        if difference := info.find_difference(first, "stage 1's"):
+            yield RuleFinding("RL012", f"stage {number} of {len(specs)}: {difference}")
+
+
+def _play(context: Context, spec: EnvSpec) -> bool:
+    with context.fresh(spec=spec) as instance:
+        episodes = [_record(instance) for _ in range(2)]
+    shortest = min(len(episode) for episode in episodes)  # where time was up
+    return bool(np.array_equal(episodes[0][:shortest], episodes[1][:shortest]))
+
+
+def _describe(context: Context, spec: EnvSpec) -> EnvInfo:
+    with context.fresh(spec=spec) as instance:
+        _record(instance)
+        return info.describe(instance.env)
+
+
+def _record(instance: Instance) -> NDArray[np.float64]:
+    episode = EpisodePlayer(instance, FIRST_SEED, max_steps=STEPS)
+    return np.concatenate([flatten_numbers(moment.observation) for moment in episode])
+
+
+def _describe_cause(error: EnvironmentRaised) -> str:
+    cause = error.__cause__ or error
+    return str(cause) if isinstance(cause, RlctlError) else describe(cause)

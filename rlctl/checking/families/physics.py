@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from rlctl.checking.attributes import is_task
 from rlctl.checking.bullet_calls import BulletCall, record_calls
 from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Joint, Jump, Pair, WorldBody, find_clients
-from rlctl.checking.failures import EnvironmentRaised, describe_failure
 from rlctl.checking.families.robots import find_misuses
-from rlctl.checking.instance import Context
+from rlctl.checking.instance import Context, EnvironmentRaised, describe_failure
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, experiment, list_names
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.failures import EnvironmentRaised, describe
-from rlctl.checking.instance import Context
+from rlctl.checking.instance import Context, EnvironmentRaised, describe
 from rlctl.checking.records import FIRST_SEED, SUCCESS, CheckedEpisode, ChildMessage, Records
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, action_at, zero_action
 from rlctl.checking.families import rewards
-from rlctl.checking.families.state import play_after_ends
+from rlctl.checking.families.reset import play_after_ends
 from rlctl.checking.instance import Context, find_longest_episode
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Skipped

@@ -1,20 +1,21 @@
-"""What a terminal shows: a report, the worst first with a block per rule, and the texts of `--list` and `--explain`."""
+"""Prints a report: the worst first with a block per rule, or in a format for programs; and the texts of the rules."""
 
 from __future__ import annotations
 
 import io
 import itertools
+import sys
 import textwrap
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl import output
 from rlctl.checking.check import CheckReport
 from rlctl.checking.families.speed import format_speed
-from rlctl.checking.formats.structured import Row, action_rows, observation_rows
 from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, find_rule
+from rlctl.checking.tool_formats import Row, action_rows, observation_rows, to_annotations, to_json, to_sarif
+from rlctl.storage import files
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,12 +28,25 @@ SHOWN_ITEMS = 4  # How much of a list in the evidence is shown; JSON has it whol
 SHOWN_ROWS = 16  # How many parts of the observation are shown
 
 
-def show(report: CheckReport) -> None:
-    """Print a report to stdout."""
-    _print(output.out(), report)
+def show(report: CheckReport, form: str, target: str | None) -> None:
+    """Print a report in one of `FORMATS`, or write it to a file (`-`: stdout) and say so on stderr."""
+    if target not in (None, "-"):
+        files.write_text(Path(str(target)), FORMATS[form](report))
+        print(f"{report.summarize()}; written to {target}", file=sys.stderr)
+    elif form == "text":
+        _print(output.out(), report)
+    else:
+        output.results().write(FORMATS[form](report))
+        output.results().flush()
 
 
-def text(report: CheckReport) -> str:
+def show_crashes(report: CheckReport) -> None:
+    """Print the tracebacks of rules that crashed to stderr."""
+    for name, trace in report.verdict.crashed.items():
+        print(f"{name} crashed, a bug in rlctl:\n{trace}", file=sys.stderr)
+
+
+def to_text(report: CheckReport) -> str:
     """Return a report as plain text, a line for each thing."""
     from rich.console import Console
 
@@ -42,21 +56,18 @@ def text(report: CheckReport) -> str:
     return stream.getvalue()
 
 
-def summary(report: CheckReport) -> str:
-    """Say in a line what was found."""
-    verdict = report.verdict
-    counts = Counter(finding.severity for finding in verdict.findings)
-    counted = ", ".join(output.format_count(counts[s], s) for s in Severity if counts[s])
-    waived = f", {len(verdict.waived)} waived" if verdict.waived else ""
-    waived += f", {len(verdict.known)} known from the baseline" if verdict.known else ""
-    rules = f"{output.format_count(len(verdict.judged), 'rule')} judged"
-    return f"{report.task}: {counted or 'no findings'}{waived}; {rules} in {report.seconds:.1f} s"
+FORMATS: dict[str, Callable[[CheckReport], str]] = {
+    "text": to_text,
+    "json": to_json,
+    "sarif": to_sarif,
+    "github": to_annotations,
+}
 
 
 def _print(out: Console, report: CheckReport) -> None:
     for _, findings in itertools.groupby(report.verdict.findings, key=lambda finding: (finding.severity, finding.rule)):
         _print_rule(out, list(findings))
-    out.print(summary(report), style="bold" if out.is_terminal else None)
+    out.print(report.summarize(), style="bold" if out.is_terminal else None)
     for line in _facts(report):
         out.print(line)
 
@@ -73,27 +84,21 @@ def _print_rule(out: Console, findings: list[RuleFinding]) -> None:
     for fix in dict.fromkeys(finding.fix for finding in findings):
         body.append("fix: ", "green").append(f"{fix}\n")
     body.rstrip()
-    if out.is_terminal:
-        out.print(Padding(body, (0, 0, 1, 2)))
-        return
     # Not wrapped in files and pipes: one line each is easier to search.
-    out.print(Text("\n").join(Text("  ").append_text(line) for line in body.split("\n")))
-    out.print()
+    lines = [Padding(body, (0, 0, 0, 2))] if out.is_terminal else [Text("  ") + line for line in body.split("\n")]
+    out.print(*lines, "", sep="\n")
 
 
 def _add(body: Text, finding: RuleFinding) -> None:
     body.append(f"{finding.message}\n")
     for line in str(finding.evidence.get("last_output", "")).splitlines()[-SHOWN_LINES:]:
         body.append(f"  {line}\n", "dim")
-    if numbers := _numbers(finding):
-        body.append(f"{numbers}\n", "dim")
-
-
-def _numbers(finding: RuleFinding) -> str:
     shown = {key: value for key, value in finding.evidence.items() if key not in LONG and value not in (None, [], "")}
     if finding.where is not None:
         shown["at"] = f"{Path(finding.where[0]).name}:{finding.where[1]}"
-    return ", ".join(f"{key.replace('_', ' ')} {_short(value)}" for key, value in shown.items())
+    if shown:
+        body.append(", ".join(f"{key.replace('_', ' ')} {_short(value)}" for key, value in shown.items()), "dim")
+        body.append("\n")
 
 
 def _short(value: Any) -> str:
@@ -131,16 +136,16 @@ def _facts(report: CheckReport) -> Iterator[str]:
         yield "not judged: everything else, because no instance could be built"
         return
     if verdict.not_applicable:
-        yield f"does not apply: {', '.join(_families(list(verdict.not_applicable)))} (--json FILE says why)"
-    reasons: dict[str, list[str]] = {}
-    for name, reason in verdict.not_judged.items():
-        reasons.setdefault(reason, []).append(name)
-    yield from (f"not judged: {', '.join(_families(names))}: {reason}" for reason, names in reasons.items())
+        yield f"does not apply: {_list_rules(list(verdict.not_applicable))} (--json FILE says why)"
+    for reason in dict.fromkeys(verdict.not_judged.values()):
+        names = [name for name, why in verdict.not_judged.items() if why == reason]
+        yield f"not judged: {_list_rules(names)}: {reason}"
 
 
-def _families(names: list[str]) -> list[str]:
+def _list_rules(names: list[str]) -> str:
     whole = [f for f in FAMILIES if {rule for rule in RULES if rule.startswith(f)} <= set(names)]
-    return [f"{family} {FAMILIES[family]}" for family in whole] + [n for n in names if not n.startswith(tuple(whole))]
+    others = [name for name in names if not name.startswith(tuple(whole))]
+    return ", ".join([*(f"{family} {FAMILIES[family]}" for family in whole), *others])
 
 
 def _table(rows: list[Row]) -> Iterator[str]:
@@ -165,10 +170,8 @@ def show_list() -> None:
             if rule.id.startswith(family):
                 severity = Text(f"{rule.severity:<8}", STYLES[rule.severity])
                 out.print(Text(f"  {rule.id}  ").append_text(severity).append(rule.name))
-    counts = ", ".join(
-        f"{sum(rule.severity is severity for rule in RULES.values())} {severity}s" for severity in Severity
-    )
-    out.print(f"{len(RULES)} rules: {counts}. rlctl check-env --explain {next(iter(RULES))} says more.")
+    counts = [f"{sum(rule.severity is severity for rule in RULES.values())} {severity}s" for severity in Severity]
+    out.print(f"{len(RULES)} rules: {', '.join(counts)}. rlctl check-env --explain RL001 says more.")
 
 
 def explain(code: str) -> None:

@@ -1,20 +1,102 @@
-"""Starts the child processes, two at a time, and passes on what they send; deaths and hangs become failures.
+"""The child processes of a check: what runs in one, and how the parent starts and watches them, two at a time.
 
-The experiments that a dead or hung process had left run in another one, so that most rules are judged even then.
+Deaths and hangs become failures. The experiments that a dead or hung process had left run in another one, so that most
+rules are judged even then.
 """
 
+import dataclasses
 import functools
 import os
+import time
+import traceback
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 
 from rlctl.checking import families
-from rlctl.checking.progress import CallProgress, Position, read_clock_of
-from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finished
+from rlctl.checking.instance import Budget, Context, EnvironmentRaised, describe_failure
+from rlctl.checking.progress import CallProgress, Position, read_clock, read_clock_of
+from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finished, Mistake, Skipped
+from rlctl.checking.rules import Experiment, NotApplicable, NotJudged, RuleFinding
 from rlctl.environments.spec import EnvSpec
+from rlctl.errors import UsageError
 from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill, anonymous_file
+from rlctl.processes.messages import send
 from rlctl.processes.printed_lines import LineReader
+
+
+def main(
+    connection: Connection, process: str, spec: EnvSpec, experiments: list[str], seconds: float, memory: int
+) -> None:
+    """Run some experiments of one process and send what they yield. `memory`: the descriptor of the progress."""
+    for message in run(process, spec, experiments, seconds, CallProgress(memory)):
+        send(connection, message)
+    send(connection, End())
+
+
+def run(
+    process: str,
+    spec: EnvSpec,
+    names: Collection[str] | None = None,
+    seconds: float = families.PROCESS_S,
+    progress: CallProgress | None = None,
+) -> Iterator[ChildMessage]:
+    """Yield the messages of one process; all its experiments by default, within so many seconds together."""
+    context = Context(spec, progress)
+    experiments = families.PROCESSES[process].experiments
+    chosen = [experiment for experiment in experiments if names is None or experiment.name in names]
+    try:
+        for message in _run_all(context, chosen, seconds):
+            yield dataclasses.replace(message, process=process) if isinstance(message, CallFailure) else message
+    except UsageError as error:
+        yield Mistake(str(error))
+
+
+def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> Iterator[ChildMessage]:
+    end = read_clock() + seconds
+    shares = sum(experiment.share for experiment in chosen)
+    for experiment in chosen:
+        started = read_clock()
+        if experiment.name == "build":
+            yield from _run(experiment, context)
+            if not context.is_built:
+                return
+            end += read_clock() - started  # importing and building comes on top
+        elif context.is_built and not context.instance.can_act:
+            yield Skipped(experiment.name, "its action space is not a Gymnasium space")
+        elif started > end:
+            yield Skipped(experiment.name, f"the experiments before it took the {seconds:g} s there are")
+            yield Finished(experiment.name, 0.0, is_complete=False, is_cut=True)
+        else:
+            context.budget = Budget(started + (end - started) * experiment.share / shares)
+            yield from _run(experiment, context)
+        shares -= experiment.share
+    yield from context.close()
+
+
+def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
+    started = time.monotonic()
+    context.progress.phase(experiment.name)
+    is_complete, crash = True, ""
+    with_finding: set[str] = set()
+    try:
+        for message in experiment.run(context):
+            if isinstance(message, RuleFinding):
+                with_finding.add(message.rule)
+            yield message
+    except (NotJudged, NotApplicable) as reason:
+        for name in (*experiment.rules, experiment.name):
+            if name not in with_finding:
+                yield Skipped(name, str(reason), applies=isinstance(reason, NotJudged))
+    except EnvironmentRaised as error:
+        is_complete = False
+        yield describe_failure(error, context.progress)
+    except UsageError:
+        raise
+    except Exception:  # what the environment raises was caught at the call, so this is a bug of rlctl
+        is_complete, crash = False, traceback.format_exc()
+    yield Finished(experiment.name, time.monotonic() - started, is_complete, context.budget.was_cut, crash)
+
 
 AT_ONCE = 2
 BUILD_TIMEOUT_S = 60.0  # How long importing and building may take, unless a step may take longer
@@ -40,7 +122,7 @@ class Child:
         self._readers = LineReader(functools.partial(self._keep, counts=True)), LineReader(self._keep)
         arguments = {"process": name, "spec": spec, "seconds": seconds, "memory": self._memory}
         self.process = ChildProcess(
-            "rlctl.checking.child:main",
+            "rlctl.checking.children:main",
             {**arguments, "experiments": self.experiments},
             stdout=self._readers[0].descriptor,
             stderr=self._readers[1].descriptor,
