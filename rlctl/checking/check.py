@@ -115,16 +115,10 @@ def check(
         records.add(message)
 
     needed = {"build"} | {name for name in families.find_needs(rules) if only is None or name in only}
-    experiments = {
-        name: [experiment.name for experiment in process.experiments if experiment.name in needed]
-        for name, process in families.PROCESSES.items()
-    }
+    wanted = {process: [n for n in names if n in needed] for process, names in families.PROCESSES.items()}
     supervisor = Supervisor(spec, budget_s, env_timeout_s, receive)
-    try:
-        with _status(spec.task, show_progress) as say:
-            supervisor.run({name: names for name, names in experiments.items() if names}, say)
-    finally:
-        supervisor.close()
+    with _status(spec.task, show_progress) as say:
+        supervisor.run({process: names for process, names in wanted.items() if names}, say)
     records.printed_lines, records.printed_first = supervisor.children[0].printed, supervisor.children[0].first_line
     return CheckReport(spec.task, judge(records, rules), records, time.monotonic() - started, budget_s, strict)
 

@@ -10,7 +10,7 @@ import os
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 
 from rlctl.checking import families
@@ -35,18 +35,12 @@ def main(
 
 
 def run(
-    process: str,
-    spec: EnvSpec,
-    names: Collection[str] | None = None,
-    seconds: float = families.PROCESS_S,
-    progress: CallProgress | None = None,
+    process: str, spec: EnvSpec, experiments: Sequence[str], seconds: float, progress: CallProgress | None = None
 ) -> Iterator[ChildMessage]:
-    """Yield the messages of one process; all its experiments by default, within so many seconds together."""
+    """Yield the messages of some experiments of one process, which may take so many seconds together."""
     context = Context(spec, progress)
-    experiments = families.PROCESSES[process].experiments
-    chosen = [experiment for experiment in experiments if names is None or experiment.name in names]
     try:
-        for message in _run_all(context, chosen, seconds):
+        for message in _run_all(context, [families.EXPERIMENTS[name] for name in experiments], seconds):
             yield dataclasses.replace(message, process=process) if isinstance(message, CallFailure) else message
     except UsageError as error:
         yield Mistake(str(error))
@@ -127,7 +121,7 @@ class Child:
             stdout=self._readers[0].descriptor,
             stderr=self._readers[1].descriptor,
             pass_fds=[self._memory],
-            env={"PYTHONHASHSEED": str(families.PROCESSES[name].hash_seed)},
+            env={"PYTHONHASHSEED": str(families.HASH_SEEDS[name])},
         )
         for reader in self._readers:
             reader.close_descriptor()
@@ -161,13 +155,10 @@ class Child:
             reader.wait()
 
     def close(self, grace_s: float = 0.0) -> None:
-        """End it, and what it has started. A second call does nothing."""
-        if self._memory < 0:
-            return
+        """End it, and what it has started."""
         self.process.close(grace_s)
         self.wait_for_lines()
         os.close(self._memory)
-        self._memory = -1
 
 
 def _limit_s(position: Position, env_timeout_s: float) -> float:
@@ -189,7 +180,7 @@ class Supervisor:
         self._budget_s = budget_s
         self._env_timeout_s = env_timeout_s
         self._receive = receive
-        self._waiting: dict[str, list[str]] = {}
+        self._waiting: dict[str, Sequence[str]] = {}
         self._active: dict[Connection, Child] = {}
         self._has_built = False
         self._started_again: set[str] = set()
@@ -200,23 +191,25 @@ class Supervisor:
 
         `on_poll` is called with the position of each, for how long it has been there and how long it may be [s].
         """
-        self._waiting = {process: list(names) for process, names in experiments.items()}
+        self._waiting = dict(experiments)
         self._start()
-        while self._active:
-            for ready in wait(list(self._active), timeout=_POLL_S):
-                self._read(self._active[ready])  # type: ignore[index]
-            for child in list(self._active.values()):
-                position = child.position
-                limit_s = _limit_s(position, self._env_timeout_s)  # first: if the call ends now, nothing stands still
-                on_poll(position, waited_s := child.wait_s(), limit_s)
-                if waited_s > limit_s:
-                    self._end(child, child.fail("hung", f"did not come back in {limit_s:g} s"))
-            self._start()
+        try:
+            while self._active:
+                self._poll(on_poll)
+                self._start()
+        finally:
+            for child in self._active.values():
+                child.close()
 
-    def close(self) -> None:
-        """End what still runs."""
-        for child in self.children:
-            child.close()
+    def _poll(self, on_poll: Callable[[Position, float, float], None]) -> None:
+        for ready in wait(list(self._active), timeout=_POLL_S):
+            self._read(self._active[ready])  # type: ignore[index]
+        for child in list(self._active.values()):
+            position = child.position
+            limit_s = _limit_s(position, self._env_timeout_s)  # first: if the call ends now, nothing stands still
+            on_poll(position, waited_s := child.wait_s(), limit_s)
+            if waited_s > limit_s:
+                self._end(child, child.fail("hung", f"did not come back in {limit_s:g} s"))
 
     def _start(self) -> None:
         while self._waiting and len(self._active) < (AT_ONCE if self._has_built else 1):
@@ -246,15 +239,12 @@ class Supervisor:
     def _end(self, child: Child, failure: CallFailure | None = None, grace_s: float = 0.0) -> None:
         if failure is not None:
             self._receive(failure)
-            if failure.kind == "died" or not child.position.is_first:  # a first call would hang again
-                self._start_again(child)
+            rest = child.experiments[1:]
+            may_succeed = failure.kind == "died" or not child.position.is_first  # a first call would hang again
+            if may_succeed and rest and child.has_finished_one and child.name not in self._started_again:
+                self._started_again.add(child.name)
+                self._waiting = {child.name: rest, **self._waiting}
         if not self._has_built:
             self._waiting.clear()  # what cannot be built here cannot be built there
         del self._active[child.process.connection]
         child.close(grace_s)
-
-    def _start_again(self, child: Child) -> None:
-        rest = child.experiments[1:]
-        if rest and child.has_finished_one and child.name not in self._started_again:
-            self._started_again.add(child.name)
-            self._waiting = {child.name: rest, **self._waiting}

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.instance import EnvironmentRaised, Instance
+from rlctl.checking.instance import Instance
 from rlctl.checking.leaves import Leaf, Path, find_leaves, name_type, read_flag
 from rlctl.checking.progress import read_clock
 
@@ -71,11 +71,11 @@ class EpisodePlayer:
         self._deadline = min(instance.context.budget.deadline, read_clock() + longest_s)
         self.steps = 0
         self.ended = ""
-        """`terminated`, `truncated`, `both`, `raised`, or what cut it: `steps`, `time`; empty while it goes on."""
+        """`terminated`, `truncated`, `both`, or what cut it: `steps`, `time`, `raised` (a wrong return value)."""
         self.actions = actions
         self._sequence = sequence
         self._action_seed = seed if action_seed is None else action_seed
-        self._next = iter(self._choose_actions())
+        self._next: Iterator[Any] = iter(())
 
     def __iter__(self) -> Iterator[Moment]:
         yield self.reset()
@@ -85,31 +85,19 @@ class EpisodePlayer:
     def reset(self) -> Moment:
         """Begin the episode."""
         self.steps, self.ended = 0, "" if self.max_steps else "steps"
-        self._next = self._choose_actions()
-        try:
-            returned = self.instance.reset(self.seed, self.number)
-        except EnvironmentRaised:
-            self.ended = "raised"
-            raise
+        space, given = self.instance.env.action_space, self._sequence
+        self._next = draw_actions(space, self.actions, self._action_seed) if given is None else iter(given)
+        returned = self.instance.reset(self.seed, self.number)
         if isinstance(returned, tuple) and len(returned) == 2:
             return Moment(0, None, returned[0], info=returned[1])
         return Moment(0, None, returned, form=_form(returned))
-
-    def _choose_actions(self) -> Iterator[Any]:
-        if self._sequence is not None:
-            return iter(self._sequence)
-        return draw_actions(self.instance.env.action_space, self.actions, self._action_seed)
 
     def step(self) -> Moment:
         """Take one step."""
         self.steps += 1
         call, env = self.instance.call, self.instance.env
-        try:
-            action = call("sample", next, self._next, step=self.steps)
-            returned = call("step", env.step, action, step=self.steps)
-        except EnvironmentRaised:
-            self.ended = "raised"
-            raise
+        action = call("sample", next, self._next, step=self.steps)
+        returned = call("step", env.step, action, step=self.steps)
         moment = self._read(action, returned)
         terminated, truncated = moment.flags
         if not moment.is_readable:

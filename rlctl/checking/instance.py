@@ -42,16 +42,16 @@ _MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)
 
 
 class EnvironmentRaised(Exception):
-    """A call into the environment raised; `__cause__` is what."""
+    """A call into the environment raised an exception, its cause."""
 
-    def __init__(self, call: str) -> None:
+    def __init__(self, call: str, cause: BaseException) -> None:
         super().__init__(call)
-        self.call = call
+        self.call, self.cause = call, cause
 
 
 def describe_failure(error: EnvironmentRaised, progress: CallProgress) -> CallFailure:
     """Describe what a call into the environment raised, and when."""
-    at, cause = progress.read(), error.__cause__ or error
+    at, cause = progress.read(), error.cause
     place = (error.call, at.phase, at.episode, at.seed, at.step)
     trace, file = "".join(traceback.format_exception(cause)), find_missing_file(cause)
     return CallFailure("raised", *place, describe(cause), trace, file, find_line(cause))
@@ -83,11 +83,14 @@ def lacks_display(failure: CallFailure) -> bool:
 def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
     """Describe the file behind an exception, or behind what caused it; None if it is about something else."""
     for cause in iterate_causes(error):
+        name, folders = None, [str(Path.cwd())]
         if isinstance(cause, FileNotFoundError):
-            return _describe(str(cause.filename or cause), [])
-        if type(cause).__module__ == "pybullet" and "load" in str(cause).lower():
+            name = str(cause.filename or cause)
+        elif type(cause).__module__ == "pybullet" and "load" in str(cause).lower():
             name, data = _find_model(cause.__traceback__), sys.modules.get("pybullet_data")
-            return None if name is None else _describe(name, [Path(data.getDataPath())] if data else [])
+            folders += [data.getDataPath()] if data else []
+        if name is not None:
+            return {"file": name, "searched": [] if Path(name).is_absolute() else folders}
     return None
 
 
@@ -98,11 +101,6 @@ def iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def _describe(name: str, more: list[Path]) -> dict[str, Any]:
-    searched = [] if Path(name).is_absolute() else [Path.cwd(), *more]
-    return {"file": name, "searched": [str(folder) for folder in searched]}
-
-
 def _find_model(trace: TracebackType | None) -> str | None:
     """Return the model that the failing call was given: a text in its source, or the value of a name there."""
     calls = list(zip(traceback.walk_tb(trace), traceback.extract_tb(trace), strict=True))
@@ -110,8 +108,7 @@ def _find_model(trace: TracebackType | None) -> str | None:
     if not calls:
         return None
     (frame, _), summary = calls[-1]
-    lines = linecache.getlines(summary.filename)[(summary.lineno or 1) - 1 : summary.end_lineno]
-    source = "".join(lines)
+    source = "".join(linecache.getlines(summary.filename)[(summary.lineno or 1) - 1 : summary.end_lineno])
     texts = re.findall(r"[\"']([^\"']+)[\"']", source)
     for name in re.findall(r"[a-zA-Z_][\w.]*", source):
         root, *attributes = name.split(".")
@@ -192,7 +189,7 @@ class Instance:
                 return timer(function, *arguments, **keywords)
             return function(*arguments, **keywords)
         except BaseException as error:
-            raise EnvironmentRaised(name) from error
+            raise EnvironmentRaised(name, error) from error
         finally:
             self.progress.leave()
 
@@ -228,7 +225,7 @@ class Context:
             self.progress.leave()
             return Instance(env, self)
         except BaseException as error:
-            raise EnvironmentRaised("build") from error
+            raise EnvironmentRaised("build", error) from error
 
     @property
     def instance(self) -> Instance:

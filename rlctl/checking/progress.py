@@ -76,14 +76,15 @@ class CallProgress:
 
 
 INTERVAL_S = 0.01  # reading the count takes longer than many an episode's step
+_last_read = {"at": float("-inf"), "waited_s": 0.0}
 
 
 def read_clock() -> float:
     """Return the time of this process [s]; only differences have a meaning."""
     now = time.monotonic()
-    if now - _last.read_at > INTERVAL_S:
-        _last.read_at, _last.waited_s = now, read_waited_s("self")
-    return now - _last.waited_s
+    if now - _last_read["at"] > INTERVAL_S:
+        _last_read.update(at=now, waited_s=read_waited_s())
+    return now - _last_read["waited_s"]
 
 
 def read_clock_of(pid: int) -> float:
@@ -97,11 +98,3 @@ def read_waited_s(process: str = "self") -> float:
         return int(Path(f"/proc/{process}/schedstat").read_text().split()[1]) / 1e9
     except (OSError, IndexError):
         return 0.0
-
-
-class _Last:
-    read_at = float("-inf")
-    waited_s = 0.0
-
-
-_last = _Last()

@@ -46,7 +46,7 @@ class Recording:
             self.failure = describe_failure(error, self.episode.instance.progress)
             self.budget.failures += 1
             return
-        self.budget.bytes_left -= self._add(moment)
+        self._add(moment)
         self._ended = self.episode.ended or ("memory" if self.budget.bytes_left <= 0 and moment.step else "")
 
     @property
@@ -63,20 +63,19 @@ class Recording:
         """Return what to send: the trajectory, and the failure that ended it, if one did."""
         return [self.trajectory, *([self.failure] if self.failure else [])]
 
-    def _add(self, moment: Moment) -> int:
-        """Write down what a call returned; return how much memory that takes [bytes]."""
+    def _add(self, moment: Moment) -> None:
         self._step = moment.step
         if moment.form:
             self._count_form("step" if moment.step else "reset", moment.form)
         if not moment.is_readable:
-            return 0
+            return
         if moment.step:
             self._count_form("terminated", name_type(moment.terminated))
             self._count_form("truncated", name_type(moment.truncated))
             self._flags.append(moment.flags)
             self._add_reward(moment.reward)
         self._add_info(moment.info)
-        return self._add_observation(moment.observation)
+        self._add_observation(moment.observation)
 
     def _count_form(self, what: str, type_name: str, *more: Any) -> None:
         form = self._forms.setdefault((what, type_name, *more), [self._step, 0])
@@ -100,8 +99,7 @@ class Recording:
             self._rewards.append(float("nan"))
             self._is_number.append(False)
 
-    def _add_observation(self, observation: Any) -> int:
-        size = 0
+    def _add_observation(self, observation: Any) -> None:
         for index, leaf in enumerate(self.episode.instance.leaves):
             try:
                 value = pick(observation, leaf.path)
@@ -109,26 +107,24 @@ class Recording:
                 self._count_form("observation", "missing", index, None, None)
                 continue
             if leaf.supported:
-                size += self._add_leaf(index, leaf, value)
+                self._add_leaf(index, leaf, value)
         keys = {leaf.path[0] for leaf in self.episode.instance.leaves if leaf.path}
         if isinstance(observation, dict) and keys and observation.keys() != keys:
             self._count_form("keys", ", ".join(sorted(map(str, observation))))
-        return size
 
-    def _add_leaf(self, index: int, leaf: Leaf, value: Any) -> int:
+    def _add_leaf(self, index: int, leaf: Leaf, value: Any) -> None:
         try:
             array = np.array(value)  # a copy: an environment may write into what it returned
         except Exception:  # a ragged list, or an object of its own kind; its type is noted, and is a finding
             self._count_form("observation", name_type(value), index, None, None)
-            return 0
-        self._count_form("observation", name_type(value), index, array.dtype, array.shape)
+            return
+        self._count_form("observation", name_type(value), index, str(array.dtype), array.shape)
         self._compare_memory(index, value, array)
-        if array.shape != leaf.shape or array.dtype.kind not in "biuf":
-            return 0
-        steps, values = self._values.setdefault(index, ([], []))
-        steps.append(self._step)
-        values.append(array)
-        return array.nbytes + 100
+        if array.shape == leaf.shape and array.dtype.kind in "biuf":
+            steps, values = self._values.setdefault(index, ([], []))
+            steps.append(self._step)
+            values.append(array)
+            self.budget.bytes_left -= array.nbytes + 100
 
     def _compare_memory(self, index: int, value: Any, copy: NDArray[Any]) -> None:
         if not isinstance(value, np.ndarray) or not value.shape:
@@ -141,7 +137,6 @@ class Recording:
     @property
     def trajectory(self) -> CheckedEpisode:
         """What was written down."""
-        names = ("what", "type", "leaf", "dtype", "shape")
         return CheckedEpisode(
             role=self.role,
             episode=self.episode.number,
@@ -161,11 +156,7 @@ class Recording:
                 for name, (steps, values) in self._infos.items()
             },
             forms=[
-                Form(**dict(zip(names, map(_plain, key), strict=False)), step=step, count=count)
-                for key, (step, count) in self._forms.items()
+                Form(what, type_name, step, count, *more)
+                for (what, type_name, *more), (step, count) in self._forms.items()
             ],
         )
-
-
-def _plain(value: Any) -> Any:
-    return str(value) if isinstance(value, np.dtype) else value

@@ -91,7 +91,7 @@ class RuleFinding:
         return RULES[self.rule].name
 
 
-def list_names(names: Sequence[str], most: int) -> str:
+def list_names(names: Sequence[str], most: int = 8) -> str:
     """Return some names, and how many more there are: `hip, knee and 3 more`."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 

@@ -54,9 +54,8 @@ IN_PROCESSES = [
 def records_of(task, *experiments):
     """What some experiments find out, or all."""
     records = Records(_path(task))
-    for name, process in families.PROCESSES.items():
-        wanted = [each.name for each in process.experiments if not experiments or each.name in experiments]
-        for message in _run(task, name, wanted):
+    for process, names in families.PROCESSES.items():
+        for message in _run(task, process, [name for name in names if not experiments or name in experiments]):
             records.add(message)
     return records
 
@@ -73,9 +72,7 @@ def shared_records_of(task, *experiments):
 
 @functools.cache
 def _play(task, experiment):
-    (process,) = [
-        name for name, each in families.PROCESSES.items() if families.EXPERIMENTS[experiment] in each.experiments
-    ]
+    (process,) = [process for process, names in families.PROCESSES.items() if experiment in names]
     return _run(task, process, [experiment])
 
 

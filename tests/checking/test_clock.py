@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rlctl.checking import children
+from rlctl.checking import children, families
 from rlctl.checking.check import judge
 from rlctl.checking.progress import read_clock, read_clock_of
 from rlctl.checking.records import Records
@@ -34,8 +34,8 @@ def test_what_the_clock_cut_off_is_not_judged():
     """As in `NothingHappens`, what never happened is a finding only of experiments that came to their end."""
     of_absence = {"RL110", "RL501", "RL611", "RL612"}
     assert {rule for rule, _ in found("broken_repeats.py:NothingHappens", *of_absence)} == of_absence
-    records = Records("slow")
-    for message in children.run("probe", EnvSpec(f"{FOLDER}/broken_repeats.py:NothingHappensSlowly"), None, 0.5):
+    records, names = Records("slow"), families.PROCESSES["probe"]
+    for message in children.run("probe", EnvSpec(f"{FOLDER}/broken_repeats.py:NothingHappensSlowly"), names, 0.5):
         records.add(message)
     verdict = judge(records)
     assert not {finding.rule for finding in verdict.findings} & of_absence

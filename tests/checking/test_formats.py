@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent.parent.parent
 HERE = "tests/checking"
 
 
-PROBE = [each.name for each in families.PROCESSES["probe"].experiments]
+PROBE = families.PROCESSES["probe"]
 
 
 def report_of(task, rules=tuple(RULES), experiments=None):

@@ -28,14 +28,12 @@ It names the experiments that it needs (by default `RECORDING`, which record the
 from the rule's. All checks of a module in `MODULES` count; `PROCESSES` orders the experiments.
 """
 
-import dataclasses
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 
 from rlctl.checking.families import (
     actions,
     determinism,
     episodes,
-    features,
     incentives,
     interface,
     isolation,
@@ -51,65 +49,34 @@ from rlctl.checking.rules import RULES, Check, Experiment
 
 PROCESS_S = 18.0  # for the experiments of one process [s], besides importing and building
 
-
 MODULES = (
-    *(loading, observations, features, interface, determinism, reset, isolation, episodes),
+    *(loading, observations, interface, determinism, reset, isolation, episodes),
     *(rewards, incentives, search, actions, physics, speed),
 )
 _MEMBERS = [value for module in MODULES for value in vars(module).values()]
-
-CHECKS = {check.rule: check for check in _MEMBERS if isinstance(check, Check)}
-
-_BY_NAME = {experiment.name: experiment for experiment in _MEMBERS if isinstance(experiment, Experiment)}
-
-
-@dataclasses.dataclass(frozen=True)
-class Process:
-    """A child process and what runs in it, in this order: what may crash the environment comes last."""
-
-    names: tuple[str, ...]
-    hash_seed: int = 0
-
-    @property
-    def experiments(self) -> list[Experiment]:
-        """The experiments."""
-        return [_BY_NAME[name] for name in self.names]
-
-
-PROCESSES = {
-    "probe": Process(
-        (
-            *("build", "comparisons", "global random", "speed", "episodes", "starts", "search", "unseeded generators"),
-            *("hindsight", "leaks"),
-        )
-    ),
-    "instances": Process(
-        ("instances", "unseeded", "worlds", "action effects", "hidden state", "nan action", "variants", "rendering"),
-        hash_seed=1,  # differs, so that a dependence on hash order shows
-    ),
-}
-
-EXPERIMENTS = {experiment.name: experiment for process in PROCESSES.values() for experiment in process.experiments}
-
+CHECKS = {member.rule: member for member in _MEMBERS if isinstance(member, Check)}
+EXPERIMENTS = {member.name: member for member in _MEMBERS if isinstance(member, Experiment)}
 DECIDED_BY = {rule: experiment for experiment in EXPERIMENTS.values() for rule in experiment.rules}
 
+PROCESSES = {
+    "probe": (
+        *("build", "comparisons", "global random", "speed", "episodes", "starts", "search", "unseeded generators"),
+        *("hindsight", "leaks"),
+    ),
+    "instances": (
+        *("instances", "unseeded", "worlds", "action effects", "hidden state", "nan action", "variants", "rendering"),
+    ),
+}
+"""The experiments of each child process, in their order: what may crash the environment comes last."""
+HASH_SEEDS = {"probe": 0, "instances": 1}  # of Python's hashes: they differ, so that a dependence on their order shows
 
-def find_needs(rules: Iterable[str]) -> set[str]:
+
+def find_needs(rules: Collection[str]) -> set[str]:
     """Return the names of the experiments that some rules need."""
-    needed: set[str] = set()
-    for rule in rules:
-        if rule in CHECKS:
-            needed.update(CHECKS[rule].needs)
-        if rule in DECIDED_BY:
-            needed.add(DECIDED_BY[rule].name)
-    return needed
+    checked = {name for rule in rules if rule in CHECKS for name in CHECKS[rule].needs}
+    return checked | {DECIDED_BY[rule].name for rule in rules if rule in DECIDED_BY}
 
 
 def find_rules(experiments: Collection[str]) -> list[str]:
     """Return the ids of the rules that some experiments can say something about."""
-    return [
-        rule
-        for rule in RULES
-        if (rule in CHECKS and set(CHECKS[rule].needs) & set(experiments))
-        or (rule in DECIDED_BY and DECIDED_BY[rule].name in experiments)
-    ]
+    return [rule for rule in RULES if find_needs([rule]) & set(experiments)]

@@ -146,17 +146,17 @@ def render(context: Context) -> Iterator[ChildMessage]:
             instance.reset(FIRST_SEED)
             picture = instance.call("render", instance.env.render)
     except EnvironmentRaised as error:
-        cause = error.__cause__ or error
-        if find_missing_file(cause) is not None:
+        if find_missing_file(error.cause) is not None:
             raise NotJudged("a file that the environment loads is missing (RL007)") from None
-        if _lacks_library(cause):
-            raise NotJudged(f"a library that rendering needs is not installed: {describe(cause)}") from None
+        raised = describe(error.cause)
+        if _lacks_library(error.cause):
+            raise NotJudged(f"a library that rendering needs is not installed: {raised}") from None
         call = "the constructor" if error.call == "build" else error.call
-        message = f"with render_mode='rgb_array' {call} raises {describe(cause)}"
-        if isinstance(cause, RecipeError):  # the constructor was not even called
-            message = f"metadata promises the render mode rgb_array, but {cause}"
-        severity = Severity.INFO if NO_GRAPHICS.search(describe(cause)) else None
-        yield RuleFinding("RL215", message, {"value": describe(cause), "expected": PICTURE}, severity)
+        message = f"with render_mode='rgb_array' {call} raises {raised}"
+        if isinstance(error.cause, RecipeError):  # the constructor was not even called
+            message = f"metadata promises the render mode rgb_array, but {error.cause}"
+        severity = Severity.INFO if NO_GRAPHICS.search(raised) else None
+        yield RuleFinding("RL215", message, {"value": raised, "expected": PICTURE}, severity)
         return
     if wrong := _describe_wrong_picture(picture):
         message = f"with render_mode='rgb_array' render returns {wrong}, not {PICTURE}"

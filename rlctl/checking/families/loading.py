@@ -49,7 +49,7 @@ def build(context: Context) -> Iterator[ChildMessage]:
     try:
         instance = context.instance
     except EnvironmentRaised as raised:
-        error = raised.__cause__ or raised
+        error = raised.cause
         is_mistake = isinstance(error, UsageError) and not isinstance(error, NoSuchClassError | OldGymError)
         if is_mistake or not isinstance(error, RlctlError):
             raise error from None  # a name that does not exist, or a bug
@@ -316,5 +316,4 @@ def _record(instance: Instance) -> NDArray[np.float64]:
 
 
 def _describe_cause(error: EnvironmentRaised) -> str:
-    cause = error.__cause__ or error
-    return str(cause) if isinstance(cause, RlctlError) else describe(cause)
+    return str(error.cause) if isinstance(error.cause, RlctlError) else describe(error.cause)

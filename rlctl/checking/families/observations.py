@@ -1,27 +1,31 @@
-"""RL101 to RL109: spaces that learners can use, and observations inside their space."""
+"""RL1: spaces that learners can use; observations inside them; numbers that say nothing, jump, or are large."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.families.rewards import WITH_SEARCH
 from rlctl.checking.leaves import Leaf, name_leaf
 from rlctl.checking.records import CheckedEpisode, Form, Records, Series
-from rlctl.checking.rules import RECORDING, RuleFinding, Severity, check, list_names
+from rlctl.checking.rules import RECORDING, NotJudged, RuleFinding, Severity, check, list_names
 
 ROUNDING = 1e-6  # Excess over a bound, relative to the bound, up to which it is float rounding
 LARGE_SHARE, SMALL_SHARE = 0.1, 0.005  # of all observations but the last ones, for an error, or a warning
 OFF_CENTRE = 0.05  # part of the range that zero may be off its middle, for an info
-MOST_NAMED = 8
 SMALLEST_SIDE = 36  # smaller images do not fit the default network's filters [pixels]
+FEWEST_ROWS, FEWEST_SEEDS = 50, 3
+NEAR_TURN, SMALL_TURN = 1.0, 1.5  # a step of an angle is 2 pi +- NEAR_TURN, or small [rad]
+FEWEST_JUMPS = 2
+LARGE_SIZE = 100.0  # root mean square; networks expect inputs around 1
 
 
-def _forms(records: Records) -> Iterator[tuple[Leaf, list[tuple[CheckedEpisode, Form]]]]:
-    forms = records.forms("observation")
-    for index, leaf in enumerate(records.require_built().leaves):
-        if leaf.supported:
-            yield leaf, [pair for pair in forms if pair[1].leaf == index]
+def _forms(records: Records) -> Iterator[tuple[int, Leaf, CheckedEpisode, Form]]:
+    leaves = records.require_built().leaves
+    for episode, form in sorted(records.forms("observation"), key=lambda pair: pair[1].leaf or 0):
+        index = form.leaf or 0
+        if leaves[index].supported:
+            yield index, leaves[index], episode, form
 
 
 def _when(step: int) -> str:
@@ -30,14 +34,14 @@ def _when(step: int) -> str:
 
 @check("RL101")
 def _find_wrong_shape(records: Records) -> Iterator[RuleFinding]:
-    for leaf, forms in _forms(records):
-        for trajectory, form in forms:
-            if what := _wrong_shape(leaf, form):
-                shape = None if form.shape is None else list(form.shape)
-                message = f"{name_leaf(leaf)} {_when(form.step)} {what}"
-                evidence = trajectory.at(form.step, type=form.type, shape=shape, expected=list(leaf.shape))
-                yield RuleFinding("RL101", message, evidence)
-                break
+    reported = set()
+    for index, leaf, trajectory, form in _forms(records):
+        if index not in reported and (what := _wrong_shape(leaf, form)):
+            reported.add(index)
+            shape = None if form.shape is None else list(form.shape)
+            message = f"{name_leaf(leaf)} {_when(form.step)} {what}"
+            evidence = trajectory.at(form.step, type=form.type, shape=shape, expected=list(leaf.shape))
+            yield RuleFinding("RL101", message, evidence)
     for trajectory, form in records.forms("keys")[:1]:
         message = f"observation has the keys {form.type}; the space has other ones"
         yield RuleFinding("RL101", message, trajectory.at(form.step))
@@ -54,14 +58,9 @@ def _wrong_shape(leaf: Leaf, form: Form) -> str:
 
 @check("RL102")
 def _find_wrong_dtype(records: Records) -> Iterator[RuleFinding]:
-    wrong = [
-        (leaf, trajectory, form)
-        for leaf, forms in _forms(records)
-        for trajectory, form in forms
-        if _has_wrong_dtype(leaf, form)
-    ]
-    parts = len({leaf.path for leaf, *_ in wrong})
-    for leaf, trajectory, form in wrong[:1]:
+    wrong = [record for record in _forms(records) if _has_wrong_dtype(record[1], record[3])]
+    parts = len({index for index, *_ in wrong})
+    for _, leaf, trajectory, form in wrong[:1]:
         more = f"; {parts - 1} other parts differ too" if parts > 1 else ""
         message = f"{name_leaf(leaf)} {_when(form.step)} is {form.dtype}; the space is {leaf.dtype}{more}"
         is_number = np.dtype(form.dtype).kind in "biuf"
@@ -82,13 +81,13 @@ def _has_wrong_dtype(leaf: Leaf, form: Form) -> bool:
 def _find_out_of_range(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     for index, leaf in enumerate(built.leaves):
-        recorded = [(*pair, _excess(leaf, pair[1].values)) for pair in records.series(index) if leaf.supported]
+        recorded = [(*pair, _excess(leaf, pair[1])) for pair in records.series(index) if leaf.supported]
         if not any(excess.any() for *_, excess in recorded):
             continue
         trajectory, series, excess = max(recorded, key=lambda record: float(record[2].max(initial=0.0)))
         row, flat = divmod(int(excess.argmax()), excess.shape[1])
-        step, value = int(series.steps[row]), float(series.values[row].flat[flat])
-        low, high = (float(np.ravel(np.asarray(bound))[flat]) for bound in (leaf.low, leaf.high))
+        step, value = int(series.steps[row]), float(series.rows[row, flat])
+        low, high = (float(bound[flat]) for bound in leaf.flat_bounds)
         bound = low if value < low else high
         is_rounding = np.dtype(leaf.dtype).kind == "f" and abs(value - bound) <= ROUNDING * max(abs(bound), 1e-3)
         outside = np.concatenate([excess.any(axis=1) for *_, excess in recorded])
@@ -96,22 +95,20 @@ def _find_out_of_range(records: Records) -> Iterator[RuleFinding]:
         element = built.element(index, flat)
         columns = np.flatnonzero(np.any([record[2].any(axis=0) for record in recorded], axis=0))
         others = [built.element(index, int(column)) for column in columns if column != flat]
-        more = f"; so are {list_names(others, MOST_NAMED)}" if others else ""
-        yield RuleFinding(
-            "RL103",
+        more = f"; so are {list_names(others)}" if others else ""
+        message = (
             f"{element} is {value:.9g} {_when(step)}; the space allows [{low:.9g}, {high:.9g}]"
-            f"{' (float rounding)' if is_rounding else ''}; {count} of {total} observations are outside{more}",
-            trajectory.at(
-                step, element=element, value=value, expected=[low, high], observations_outside=count, observations=total
-            ),
-            Severity.WARNING if is_rounding else _severity_of_outside(recorded, outside),
+            f"{' (float rounding)' if is_rounding else ''}; {count} of {total} observations are outside{more}"
         )
+        counts = {"observations_outside": count, "observations": total}
+        evidence = trajectory.at(step, element=element, value=value, expected=[low, high], **counts)
+        severity = Severity.WARNING if is_rounding else _severity_of_outside(recorded, outside)
+        yield RuleFinding("RL103", message, evidence, severity)
 
 
 def _severity_of_outside(
     recorded: list[tuple[CheckedEpisode, Series, NDArray[np.float64]]], outside: NDArray[np.bool_]
 ) -> Severity:
-    """Return how bad it is that some observations are outside. Shape of `outside`: all that were recorded."""
     is_first = np.concatenate([series.steps == 0 for _, series, _ in recorded])
     is_last = np.concatenate([(series.steps == episode.steps) & episode.has_ended for episode, series, _ in recorded])
     share = float((outside & ~is_last).mean())
@@ -120,29 +117,24 @@ def _severity_of_outside(
     return Severity.WARNING if share >= SMALL_SHARE else Severity.INFO
 
 
-def _excess(leaf: Leaf, values: NDArray[Any]) -> NDArray[np.float64]:
+def _excess(leaf: Leaf, series: Series) -> NDArray[np.float64]:
     """How far values are outside their bounds; 0 inside, and for NaN, which is another rule's. Shape: (n, elements)."""
-    low, high = np.asarray(leaf.low, np.float64), np.asarray(leaf.high, np.float64)
-    wide = values.astype(np.float64)
+    (low, high), rows = leaf.flat_bounds, series.rows
     with np.errstate(invalid="ignore"):
-        excess = np.maximum(np.maximum(low - wide, wide - high), 0.0)
-    return np.where(np.isfinite(wide), excess, 0.0).reshape(len(values), -1)
+        return np.where(np.isfinite(rows), np.maximum(np.maximum(low - rows, rows - high), 0.0), 0.0)
 
 
 @check("RL104")
-def find_not_finite(records: Records) -> Iterator[RuleFinding]:
-    """Find the first NaN or infinity, per leaf."""
+def _find_not_finite(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     for index, _ in enumerate(built.leaves):
-        for trajectory, series in records.series(index):
-            if series.values.dtype.kind != "f" or np.isfinite(series.values).all():
-                continue
-            values = series.values.reshape(len(series.values), -1)
-            row, flat = np.argwhere(~np.isfinite(values))[0].tolist()
-            step, element, value = int(series.steps[row]), built.element(index, flat), str(values[row, flat])
+        first = next((pair for pair in records.series(index) if not np.isfinite(pair[1].rows).all()), None)
+        if first is not None:
+            trajectory, series = first
+            row, flat = np.argwhere(~np.isfinite(series.rows))[0].tolist()
+            step, element, value = int(series.steps[row]), built.element(index, flat), str(series.rows[row, flat])
             evidence = trajectory.at(step, element=element, value=value, expected="finite")
             yield RuleFinding("RL104", f"{element} is {value} {_when(step)}", evidence)
-            break
 
 
 @check("RL105")
@@ -161,7 +153,7 @@ def _find_unusual_actions(records: Records) -> Iterator[RuleFinding]:
 
 
 def _unusual_actions(leaf: Leaf) -> Iterator[RuleFinding]:
-    low, high = np.ravel(np.asarray(leaf.low, np.float64)), np.ravel(np.asarray(leaf.high, np.float64))
+    low, high = leaf.flat_bounds
     is_open = ~np.isfinite(low) | ~np.isfinite(high)
     is_thrust = (low == 0) & (high <= 1)  # or a pedal: by nature to one side
     with np.errstate(invalid="ignore"):
@@ -174,9 +166,8 @@ def _unusual_actions(leaf: Leaf) -> Iterator[RuleFinding]:
     ):
         if wrong.any():
             i = int(wrong.argmax())
-            name = f"action[{i}]"
-            message = f"{int(wrong.sum())} of {wrong.size} actions {what}: {name} is in [{low[i]:g}, {high[i]:g}]"
-            evidence = {"element": name, "value": [float(low[i]), float(high[i])], "expected": [-1.0, 1.0]}
+            message = f"{int(wrong.sum())} of {wrong.size} actions {what}: action[{i}] is in [{low[i]:g}, {high[i]:g}]"
+            evidence = {"element": f"action[{i}]", "value": [float(low[i]), float(high[i])], "expected": [-1.0, 1.0]}
             yield RuleFinding("RL106", message, evidence, severity)
             return
     if leaf.dtype != "float32":
@@ -190,18 +181,19 @@ def _find_unusual_images(records: Records) -> Iterator[RuleFinding]:
         name, shape = name_leaf(leaf), list(leaf.shape)
         if leaf.kind == "Box" and (problem := _image_problem(leaf)):
             yield RuleFinding("RL108", f"{name} {problem}", {"element": name, "value": shape, "dtype": leaf.dtype})
-        elif leaf.kind == "Box" and _is_in_image_format(leaf) and (brightest := _brightest(records, index)) in (0, 1):
+        elif leaf.kind == "Box" and _is_in_image_format(leaf) and (seen := records.series(index)):
+            brightest = max(int(series.values.max(initial=0)) for _, series in seen)
             message = f"{name} is uint8 up to 255, and its brightest pixel was {brightest}: scaled twice?"
-            yield RuleFinding("RL108", message, {"element": name, "value": brightest, "expected": 255})
+            if brightest <= 1:
+                yield RuleFinding("RL108", message, {"element": name, "value": brightest, "expected": 255})
 
 
 def _is_in_image_format(leaf: Leaf) -> bool:
-    in_range = np.all(leaf.low == 0) and np.all(leaf.high == 255)
-    return len(leaf.shape) == 3 and leaf.dtype == "uint8" and bool(in_range)
+    is_full_range = bool(np.all(leaf.low == 0) and np.all(leaf.high == 255))
+    return len(leaf.shape) == 3 and leaf.dtype == "uint8" and is_full_range
 
 
 def _image_problem(leaf: Leaf) -> str:
-    """Say what is wrong with what is as large as a picture, or has the format of one; nothing for anything else."""
     is_large = sum(size >= SMALLEST_SIDE for size in leaf.shape) >= 2
     is_table = len(leaf.shape) == 2 and leaf.dtype != "uint8"
     if is_large and not is_table and not _is_in_image_format(leaf):
@@ -209,10 +201,6 @@ def _image_problem(leaf: Leaf) -> str:
     if _is_in_image_format(leaf) and not is_large:
         return f"has the shape of an image, {leaf.shape}, smaller than {SMALLEST_SIDE} x {SMALLEST_SIDE}"
     return ""
-
-
-def _brightest(records: Records, index: int) -> int | None:
-    return max((int(series.values.max()) for _, series in records.series(index) if series.values.size), default=None)
 
 
 @check("RL109", "build")
@@ -239,3 +227,77 @@ def _unsupported_kind(leaf: Leaf, depth: int) -> str:
     if leaf.kind in ("Discrete", "MultiDiscrete") and np.any(leaf.low):
         return f"{leaf.kind} space that does not count from 0"
     return ""
+
+
+def _rows(records: Records, index: int) -> NDArray[np.float64]:
+    recorded = records.series(index)
+    if not recorded:
+        raise NotJudged("no observation of the declared shape was recorded")
+    rows = np.concatenate([series.rows for _, series in recorded])
+    seeds = len({trajectory.seed for trajectory, _ in recorded})
+    if len(rows) < FEWEST_ROWS or seeds < FEWEST_SEEDS:
+        raise NotJudged(f"only {len(rows)} observations with {seeds} seeds were recorded")
+    return rows
+
+
+def _leaves(records: Records, kinds: str = "f") -> Iterator[tuple[int, Leaf]]:
+    """Yield the arrays of the observation that are no images."""
+    for index, leaf in enumerate(records.require_built().leaves):
+        smallest = min(leaf.shape[0], leaf.shape[-1]) if leaf.shape else 0
+        is_image = len(leaf.shape) == 3 and (leaf.dtype == "uint8" or smallest in (1, 3, 4))
+        if leaf.supported and 0 not in leaf.shape and np.dtype(leaf.dtype).kind in kinds and not is_image:
+            yield index, leaf
+
+
+@check("RL110", *WITH_SEARCH, of_absence=True)
+def _find_constant_elements(records: Records) -> Iterator[RuleFinding]:
+    built = records.require_built()
+    names: list[str] = []
+    total, has_constant_leaf = 0, False
+    for index, leaf in _leaves(records, "biuf"):
+        rows = _rows(records, index)
+        constant = _constant(rows, leaf)
+        total += rows.shape[1]
+        has_constant_leaf |= len(constant) == rows.shape[1]
+        names += [f"{built.element(index, int(column))} ({float(rows[0, column]):.4g})" for column in constant]
+    if names:
+        message = f"{len(names)} of {total} elements of the observation never changed: {list_names(names)}"
+        evidence = {"value": len(names), "expected": 0, "elements": [name.partition(" (")[0] for name in names[:8]]}
+        yield RuleFinding("RL110", message, evidence, Severity.WARNING if has_constant_leaf else Severity.INFO)
+
+
+def _constant(rows: NDArray[np.float64], leaf: Leaf) -> NDArray[np.intp]:
+    """Return what never changes and could; of whole numbers, such as flags, only if none of the leaf does."""
+    low, high = leaf.flat_bounds
+    still = (rows == rows[0]).all(axis=0)
+    if np.dtype(leaf.dtype).kind != "f" and not still.all():
+        return np.zeros(0, np.intp)
+    return np.flatnonzero(still & (low < high))
+
+
+@check("RL117", *WITH_SEARCH)
+def _find_wrapped_angles(records: Records) -> Iterator[RuleFinding]:
+    for index, _ in _leaves(records):
+        rows = _rows(records, index)
+        changes = np.concatenate([np.abs(np.diff(series.rows, axis=0)) for _, series in records.series(index)])
+        jumps = np.abs(changes - 2 * np.pi) < NEAR_TURN
+        is_angle = (np.abs(rows) <= 2 * np.pi).all(axis=0) & (jumps | (changes < SMALL_TURN)).all(axis=0)
+        for column in np.flatnonzero(is_angle & (jumps.sum(axis=0) >= FEWEST_JUMPS))[:1]:
+            name = records.require_built().element(index, int(column))
+            count = f"{int(jumps[:, column].sum())} of {len(changes)} steps"
+            message = f"{name} jumps by 2 pi in {count}: an angle that wraps"
+            yield RuleFinding("RL117", message, {"element": name, "expected": "sin and cos"})
+
+
+@check("RL118", *WITH_SEARCH)
+def _find_large_elements(records: Records) -> Iterator[RuleFinding]:
+    built = records.require_built()
+    large: dict[str, float] = {}
+    for index, _ in _leaves(records):
+        sizes = np.sqrt(np.mean(np.square(np.nan_to_num(_rows(records, index))), axis=0))
+        large |= {built.element(index, int(i)): float(sizes[i]) for i in np.flatnonzero(sizes > LARGE_SIZE)}
+    if large and not records.normalizes("observation"):
+        names = [f"{name} ({size:.3g})" for name, size in sorted(large.items(), key=lambda pair: -pair[1])]
+        message = f"elements of the observation are large (root mean square): {list_names(names)}"
+        evidence = {"value": max(large.values()), "expected": f"up to {LARGE_SIZE:g}", "elements": list(large)[:8]}
+        yield RuleFinding("RL118", message, evidence)

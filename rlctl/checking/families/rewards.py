@@ -252,8 +252,8 @@ def recompute_rewards(context: Context) -> Iterator[ChildMessage]:
     try:
         computed = instance.call("compute_reward", lambda: np.asarray(compute(*goals, infos), np.float64))
     except EnvironmentRaised as error:
-        raised = describe(error.__cause__ or error)
-        yield RuleFinding("RL614", f"compute_reward, of many goals at once, raises {raised}", {"steps": len(taken)})
+        message = f"compute_reward, of many goals at once, raises {describe(error.cause)}"
+        yield RuleFinding("RL614", message, {"steps": len(taken)})
         return
     if computed.shape != rewards.shape:
         shapes = f"of {len(taken)} goals at once it returns shape {computed.shape}, not {rewards.shape}"
