@@ -32,10 +32,10 @@ class Recording:
         self._previous: dict[int, tuple[Any, NDArray[Any]]] = {}
 
     def run(self) -> list[CheckedEpisode | CallFailure]:
-        """Play the episode to its end; return what to send."""
+        """Play the episode to its end; return what to send: the trajectory, and the failure that ended it, if any."""
         while self.running:
             self.advance()
-        return self.messages()
+        return [self.trajectory, *([self.failure] if self.failure else [])]
 
     def advance(self) -> None:
         """Begin the episode, or take its next step."""
@@ -58,10 +58,6 @@ class Recording:
     def steps(self) -> int:
         """How many steps were taken."""
         return len(self._rewards)
-
-    def messages(self) -> list[CheckedEpisode | CallFailure]:
-        """Return what to send: the trajectory, and the failure that ended it, if one did."""
-        return [self.trajectory, *([self.failure] if self.failure else [])]
 
     def _add(self, moment: Moment) -> None:
         self._step = moment.step

@@ -1,25 +1,32 @@
 """RL3: equal seeds and equal actions give equal episodes.
 
-Without it no result can be repeated, no failed episode reproduced, and no run resumed exactly. The rules go from the
-simplest cause to the farthest; where a nearer one explains a difference, the farther ones are not judged.
+The rules go from the simplest cause to the farthest; where a nearer one explains a difference, the farther ones are not
+judged.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlctl.checking.attributes import find_unequal, read_attributes
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import FIRST_SEED, SECOND_SEED, SUCCESS, Built, CheckedEpisode, ChildMessage, Fact, Records
+from rlctl.checking.records import (
+    FIRST_SEED,
+    SECOND_SEED,
+    SUCCESS,
+    Built,
+    CheckedEpisode,
+    ChildMessage,
+    Fact,
+    Records,
+    Series,
+)
 from rlctl.checking.rules import Check, NotJudged, RuleFinding, Severity, check, experiment, list_names
 
 COMPARED_STEPS = 200  # How far comparisons go
@@ -27,7 +34,6 @@ DIRTY_STEPS = 37  # longest unfinished episode before a repetition
 KEPT_STEPS = 10  # So many steps are between two resets whose attributes are compared
 LATE = 20  # a later difference is a residue, not the episode's start [steps]
 LAST_BITS = 1e-12  # largest difference that the order of additions explains
-MOST_KEPT = 3
 NEARLY = 1e-5  # relative to the value or to 1: a smaller first difference is a numerical residue
 
 
@@ -35,7 +41,7 @@ NEARLY = 1e-5  # relative to the value or to 1: a smaller first difference is a 
 def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
     """Play the first episode again: at once, after an unfinished other one, and with another seed."""
     instance, budget = context.instance, context.budget
-    longest_s, steps, first = budget.seconds_left / 4, COMPARED_STEPS, FIRST_SEED
+    longest_s, steps = budget.seconds_left / 4, COMPARED_STEPS
     for number, role in enumerate(("alone", "reused", "dirty", "seeds")):
         instance.progress.phase(role)
         if role == "dirty":
@@ -44,14 +50,9 @@ def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
             Recording(role, other, budget).run()
         if budget.is_over():
             return
-        seed = SECOND_SEED if role == "seeds" else first
-        recording = Recording(
-            role,
-            EpisodePlayer(
-                instance, seed, number=number, action_seed=first, max_steps=COMPARED_STEPS, longest_s=longest_s
-            ),
-            budget,
-        )
+        seeds = {"seed": SECOND_SEED if role == "seeds" else FIRST_SEED, "action_seed": FIRST_SEED}
+        episode = EpisodePlayer(instance, **seeds, number=number, max_steps=COMPARED_STEPS, longest_s=longest_s)
+        recording = Recording(role, episode, budget)
         yield from recording.run()
         steps = min(steps, recording.steps)
     yield Fact("kept", _find_kept(instance))
@@ -68,7 +69,7 @@ def _find_kept(instance: Instance) -> list[str]:
     return [name for name in kept if name not in every_time] or kept
 
 
-def compare(records: Records, first: str, second: str) -> tuple[CheckedEpisode, FirstDifference | None]:
+def compare(records: Records, first: str, second: str) -> FirstDifference | None:
     """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised."""
     built = records.require_built()
     if not built.accepts_seed:
@@ -78,37 +79,29 @@ def compare(records: Records, first: str, second: str) -> tuple[CheckedEpisode, 
         raise NotJudged("the episode broke off (RL201, RL207)")
     if not any(series.values.size for series in a.observations.values()):
         raise NotJudged("no observation could be compared")
-    return a, find_difference(built, a, b)
-
-
-def require_repeatable(records: Records) -> None:
-    """Raise `NotJudged` if an instance's own repetition of an episode differs."""
-    if compare(records, "alone", "reused")[1] is not None:
-        raise NotJudged("the same instance already differs from itself (RL301, RL302)")
+    return find_difference(built, a, b)
 
 
 def require_independent(records: Records) -> None:
     """Raise `NotJudged` if an episode depends on the one before it."""
-    if compare(records, "alone", "reused")[1] is not None or compare(records, "alone", "dirty")[1] is not None:
+    if compare(records, "alone", "reused") is not None or compare(records, "alone", "dirty") is not None:
         raise NotJudged("an episode depends already on the one before it (RL301 to RL303)")
 
 
 def report(
     rule: str,
     records: Records,
-    trajectory: CheckedEpisode,
     difference: FirstDifference,
     what: str,
     cause: str = "",
     fix: str = "",
-    *,
-    is_mild: bool = False,
+    mild: bool = False,
 ) -> RuleFinding:
     """Return the finding that two recordings differ; an info if they are registered to, and no cause is known."""
-    severity = Severity.WARNING if difference.is_small or is_mild else None
+    severity = Severity.WARNING if difference.is_small or mild else None
     if (records.require_built().nondeterministic and not cause) or difference.largest < LAST_BITS:
         severity = Severity.INFO
-    return RuleFinding(rule, f"{what}: {difference.text()}{cause}", difference.evidence(trajectory), severity, fix)
+    return RuleFinding(rule, f"{what}: {difference.text()}{cause}", difference.evidence(), severity, fix)
 
 
 def _find_cause(records: Records) -> tuple[str, str]:
@@ -116,9 +109,12 @@ def _find_cause(records: Records) -> tuple[str, str]:
     names: list[str] = records.facts.get("kept", [])
     if not fresh or find_difference(records.require_built(), records.require_role("alone"), fresh[0]) is not None:
         return "", ""  # a new process differs too: chance
-    shown = f" ({list_names(names, MOST_KEPT)})" if names else ""
-    what = list_names(names, MOST_KEPT) if names else "every attribute that step changes, and the whole simulation"
-    return f"; a new process repeats it, so reset keeps state{shown}", f"Set back in reset: {what}."
+    kept = list_names(names, most=3)
+    what = kept or "every attribute that step changes, and the whole simulation"
+    return (
+        f"; a new process repeats it, so reset keeps state{f' ({kept})' if kept else ''}",
+        f"Set back in reset: {what}.",
+    )
 
 
 def _compare_itself(rule: str, what: str, *, at_reset: bool) -> Check:
@@ -126,9 +122,9 @@ def _compare_itself(rule: str, what: str, *, at_reset: bool) -> Check:
 
     @check(rule, "comparisons", "instances")
     def compare_itself(records: Records) -> Iterator[RuleFinding]:
-        episode, difference = compare(records, "alone", "reused")
+        difference = compare(records, "alone", "reused")
         if difference is not None and (difference.step == 0) is at_reset:
-            yield report(rule, records, episode, difference, what, *_find_cause(records))
+            yield report(rule, records, difference, what, *_find_cause(records))
 
     return compare_itself
 
@@ -138,11 +134,12 @@ def _compare_other(rule: str, first: str, second: str, what: str, *needs: str) -
 
     @check(rule, "comparisons", *needs)
     def compare_other(records: Records) -> Iterator[RuleFinding]:
-        episode, difference = compare(records, first, second)
+        difference = compare(records, first, second)
         if difference is not None:
-            require_repeatable(records)
+            if compare(records, "alone", "reused") is not None:
+                raise NotJudged("the same instance already differs from itself (RL301, RL302)")
             is_late = second == "dirty" and difference.step > LATE
-            yield report(rule, records, episode, difference, what, is_mild=is_late)
+            yield report(rule, records, difference, what, mild=is_late)
 
     return compare_other
 
@@ -158,7 +155,7 @@ compare_processes = _compare_other("RL305", "alone", "fresh process", "played by
 
 @dataclasses.dataclass(frozen=True)
 class FirstDifference:
-    """Where two trajectories begin to differ."""
+    """Where two recordings begin to differ."""
 
     step: int  # 0 is the observation of reset
     element: str  # what differs most there: an element, the reward, a flag, or the length
@@ -166,6 +163,7 @@ class FirstDifference:
     second: float
     size: float  # The largest difference at that step, relative to the larger value or to 1
     largest: float  # The same over all steps that were compared
+    seed: int
 
     @property
     def is_small(self) -> bool:
@@ -178,51 +176,48 @@ class FirstDifference:
         at = "at reset" if self.step == 0 else f"at step {self.step}"
         return f"first difference {at}: {self.element} is {self.first:.9g}, then {self.second:.9g}{size}"
 
-    def evidence(self, trajectory: CheckedEpisode) -> dict[str, Any]:
-        """Return it with the trajectory's seed, as a finding's evidence."""
-        return {
-            "seed": trajectory.seed,
-            "step": self.step,
-            "element": self.element,
-            "value": self.second,
-            "expected": self.first,
-            "relative_difference": self.size,
-            "largest_relative_difference": self.largest,
-        }
+    def evidence(self) -> dict[str, Any]:
+        """Return it as a finding's evidence."""
+        place = {"seed": self.seed, "step": self.step, "element": self.element}
+        sizes = {"relative_difference": self.size, "largest_relative_difference": self.largest}
+        return {**place, "value": self.second, "expected": self.first, **sizes}
 
 
 def find_difference(built: Built, one: CheckedEpisode, two: CheckedEpisode) -> FirstDifference | None:
-    """Compare two trajectories bit for bit as far as both go; NaN equals NaN."""
-    differences: list[FirstDifference] = []
-    for index in sorted(one.observations.keys() & two.observations.keys()):
-        a, b = one.observations[index], two.observations[index]
-        differences += _compare(a.values, b.values, a.steps, functools.partial(built.element, index))
-    after = np.arange(1, one.steps + 1)
-    differences += _compare(one.rewards, two.rewards, after, lambda _: "reward")
-    differences += _compare(one.terminated, two.terminated, after, lambda _: "terminated")
-    differences += _compare(one.truncated, two.truncated, after, lambda _: "truncated")
-    if SUCCESS in one.infos and SUCCESS in two.infos:
-        a, b = one.infos[SUCCESS], two.infos[SUCCESS]
-        differences += _compare(a.values, b.values, a.steps, lambda _: SUCCESS)
+    """Compare two recordings bit for bit as far as both go; NaN equals NaN."""
+    others = _list_series(two)
+    pairs = [(key, series, others[key]) for key, series in _list_series(one).items() if key in others]
+    differences = [difference for pair in pairs if (difference := _compare(built, *pair, one.seed))]
     if one.has_ended and two.has_ended and one.steps != two.steps:
-        differences.append(FirstDifference(min(one.steps, two.steps), "length", one.steps, two.steps, 1.0, 1.0))
+        end = min(one.steps, two.steps)
+        differences.append(FirstDifference(end, "length", one.steps, two.steps, 1.0, 1.0, one.seed))
     if not differences:
         return None
     earliest = min(differences, key=lambda difference: (difference.step, -difference.size))
     return dataclasses.replace(earliest, largest=max(difference.largest for difference in differences))
 
 
-def _compare(
-    a: NDArray[Any], b: NDArray[Any], steps: NDArray[np.int64], name_of: Callable[[int], str]
-) -> Iterator[FirstDifference]:
-    rows = min(len(a), len(b))
-    a, b = (values[:rows].reshape(rows, math.prod(values.shape[1:])).astype(np.float64) for values in (a, b))
+def _list_series(episode: CheckedEpisode) -> dict[int | str, Series]:
+    after = np.arange(1, episode.steps + 1)
+    series: dict[int | str, Series] = {
+        **dict(sorted(episode.observations.items())),
+        "reward": Series(after, episode.rewards),
+    }
+    series |= {"terminated": Series(after, episode.terminated), "truncated": Series(after, episode.truncated)}
+    return series | ({SUCCESS: episode.infos[SUCCESS]} if SUCCESS in episode.infos else {})
+
+
+def _compare(built: Built, key: int | str, one: Series, two: Series, seed: int) -> FirstDifference | None:
+    rows = min(len(one.values), len(two.values))
+    a, b = one.rows[:rows], two.rows[:rows]
     unequal = (a != b) & ~(np.isnan(a) & np.isnan(b))
-    if unequal.any():
-        row = int(unequal.any(axis=1).argmax())
-        with np.errstate(invalid="ignore", over="ignore"):
-            relative = np.where(unequal, np.abs(a - b), 0.0) / np.maximum(np.maximum(np.abs(a), np.abs(b)), 1.0)
-        relative = np.nan_to_num(relative, nan=np.inf, posinf=np.inf)
-        flat = int(np.where(unequal[row], relative[row], -1.0).argmax())
-        values, largest = (float(a[row, flat]), float(b[row, flat])), float(relative.max())
-        yield FirstDifference(int(steps[row]), name_of(flat), *values, float(relative[row, flat]), largest)
+    if not unequal.any():
+        return None
+    row = int(unequal.any(axis=1).argmax())
+    with np.errstate(invalid="ignore", over="ignore"):
+        relative = np.where(unequal, np.abs(a - b), 0.0) / np.maximum(np.maximum(np.abs(a), np.abs(b)), 1.0)
+    relative = np.nan_to_num(relative, nan=np.inf, posinf=np.inf)
+    flat = int(np.where(unequal[row], relative[row], -1.0).argmax())
+    name = key if isinstance(key, str) else built.element(key, flat)
+    values = float(a[row, flat]), float(b[row, flat]), float(relative[row, flat]), float(relative.max())
+    return FirstDifference(int(one.steps[row]), name, *values, seed)

@@ -33,7 +33,6 @@ LEAKS = {
     "open file descriptors": Severity.WARNING,
     "threads": Severity.WARNING,
 }
-"""What is counted; a client brings its own bodies, files, threads and memory."""
 _PROCESS = Path("/proc/self")
 
 
@@ -71,30 +70,24 @@ def compare_instances(context: Context) -> Iterator[ChildMessage]:
         yield Skipped("RL404", "it is not a gymnasium.Env (RL003)")
     pair = begin(survivor, "interleaved", FIRST_SEED), begin(neighbour, "interleaved second", SECOND_SEED)
     progress.phase("interleaved")
-    while any(recording.running for recording in pair):
-        for recording in pair:
-            if recording.running:
-                recording.advance()
+    while running := [recording for recording in pair if recording.running]:
+        for recording in running:
+            recording.advance()
     for recording in pair:
-        yield from recording.messages()
-    yield from _close_in_between(context, begin(survivor, "after close", SECOND_SEED), neighbour)
+        yield from recording.run()
+    recording = begin(survivor, "after close", SECOND_SEED)
+    for _ in range(2):
+        if recording.running:
+            recording.advance()
+    progress.phase("close")
+    yield from context.close(neighbour)
+    progress.phase("after close")
+    yield from recording.run()
     yield from context.close(survivor)
 
 
-def _close_in_between(context: Context, recording: Recording, neighbour: Instance) -> Iterator[ChildMessage]:
-    recording.advance()
-    if recording.running:
-        recording.advance()
-    context.progress.phase("close")
-    yield from context.close(neighbour)
-    context.progress.phase("after close")
-    while recording.running:
-        recording.advance()
-    yield from recording.messages()
-
-
 def _require_same_alone(records: Records) -> None:
-    if compare(records, "fresh process", "fresh instance")[1] is not None:
+    if compare(records, "fresh process", "fresh instance") is not None:
         raise NotJudged("two instances differ already when they are alone (RL301 to RL304)")
     require_independent(records)
 
@@ -115,11 +108,11 @@ def _find_shared_world(records: Records) -> Iterator[RuleFinding]:
         yield finding
         return
     for alone, beside in (("fresh process", "interleaved"), ("second alone", "interleaved second")):
-        trajectory, difference = compare(records, alone, beside)
+        difference = compare(records, alone, beside)
         if difference is not None:
             draws = any(finding.rule == "RL309" for finding in records.findings)
             because = ("; both draw from a global random generator (RL309)", RULES["RL309"].fix) if draws else ()
-            yield report("RL401", records, trajectory, difference, f"{IN_TURNS}, against one alone", *because)
+            yield report("RL401", records, difference, f"{IN_TURNS}, against one alone", *because)
             return
 
 
@@ -131,9 +124,9 @@ def _find_effect_of_closing(records: Records) -> Iterator[RuleFinding]:
         return
     if list(_find_shared_world.run(records)):
         raise NotJudged("the instances already disturb each other while both are open (RL401)")
-    trajectory, difference = compare(records, "second alone", "after close")
+    difference = compare(records, "second alone", "after close")
     if difference is not None:
-        yield report("RL402", records, trajectory, difference, f"{AFTER_CLOSE}, against one alone")
+        yield report("RL402", records, difference, f"{AFTER_CLOSE}, against one alone")
 
 
 @check("RL403", "instances")

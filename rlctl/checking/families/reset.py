@@ -58,12 +58,9 @@ def _find_drawn(instance: Instance, trials: Trials) -> dict[str, Attribute]:
 
 
 def _play_changed(instance: Instance, trials: Trials, name: str, other: Attribute) -> list[Frame] | None:
-
-    def change() -> None:
-        read_attributes(instance.env)[name].assign(other.value)
-
+    actions = trials.actions(FIRST_SEED, HIDDEN_STEPS)
     try:
-        return trials.play(FIRST_SEED, trials.actions(FIRST_SEED, HIDDEN_STEPS), after_reset=change)
+        return trials.play(FIRST_SEED, actions, lambda: read_attributes(instance.env)[name].assign(other.value))
     except OutOfTime:
         raise
     except (EnvironmentRaised, AttributeError, TypeError, ValueError, KeyError, NotJudged):
@@ -80,9 +77,8 @@ def _hides(plain: Sequence[Frame], changed: Sequence[Frame]) -> bool:
 def _is_shown(instance: Instance, name: str) -> bool:
     rows, values = [], []
     for number in range(REGRESSED_RESETS):
-        returned = instance.reset(FIRST_SEED + number)
-        observation = returned[0] if isinstance(returned, tuple) else returned
-        rows.append(flatten_numbers(observation).astype(np.float64))
+        start = EpisodePlayer(instance, FIRST_SEED + number, max_steps=0).reset()
+        rows.append(flatten_numbers(start.observation).astype(np.float64))
         values.append(read_attributes(instance.env)[name].numbers)
     return explains(np.nan_to_num(np.stack(rows)), np.stack(values))
 
@@ -109,16 +105,14 @@ def _hidden(
         f"the same episode has the same observations, and at step {step} the reward {changed[step][REWARD]:.4g} "
         f"instead of {plain[step][REWARD]:.4g}"
     )
-    evidence: dict[str, Any] = {"element": name, "seed": FIRST_SEED, "step": step}
-    evidence |= {"value": float(changed[step][REWARD]), "expected": float(plain[step][REWARD])}
+    rewards = {"value": float(changed[step][REWARD]), "expected": float(plain[step][REWARD])}
+    evidence = {"element": name, "seed": FIRST_SEED, "step": step, **rewards}
     return RuleFinding("RL114", message, evidence, where=find_assignment(instance.env, name))
 
 
 def play_after_ends(context: Context, success: Sequence[Any] | None) -> Iterator[ChildMessage]:
-    """Record one episode on a new instance: alone, repeated, and after episodes that ended in every way there is.
-
-    `success` are the actions that succeeded in the search, with the first seed.
-    """
+    """Record one episode on a new instance: alone, repeated, and after episodes that ended in every way there is;
+    `success` are the actions that succeeded in the search, with the first seed."""
     ended: set[str] = set()
     instance = context.build()  # not closed: closing may break the kept instance (RL402), which later experiments use
 
@@ -128,7 +122,7 @@ def play_after_ends(context: Context, success: Sequence[Any] | None) -> Iterator
         return recording
 
     def repeat(role: str) -> Iterator[ChildMessage]:
-        yield from record(role, FIRST_SEED, COMPARED_STEPS).messages()
+        yield from record(role, FIRST_SEED, COMPARED_STEPS).run()
 
     yield from repeat("before ends")
     yield from repeat("before ends again")
@@ -153,13 +147,10 @@ def _compare_after_ends(records: Records) -> Iterator[RuleFinding]:
             difference = find_difference(built, again, episode)
             if difference is not None and "raised" not in (again.ended, episode.ended):
                 is_mild = difference.step > LATE and difference.size < FAINT
-                what = f"played again {_name_end(role)}"
-                yield report("RL310", records, again, difference, what, is_mild=is_mild)
+                ending = "that succeeded" if role == "after success" else f"that ended in {role[6:]}"
+                what = f"played again after an episode {ending}"
+                yield report("RL310", records, difference, what, mild=is_mild)
                 return
-
-
-def _name_end(role: str) -> str:
-    return {"after success": "after an episode that succeeded"}.get(role, f"after an episode that ended in {role[6:]}")
 
 
 WATCHED_STEPS = 300  # For how many steps the process's random generators are compared
@@ -170,14 +161,9 @@ FEWEST_SEEDS = 4
 @check("RL306", "comparisons", "episodes", of_absence=True)
 def _compare_seeds(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
-    trajectory, difference = compare(records, "alone", "seeds")
-    if difference is not None:
+    if compare(records, "alone", "seeds") is not None:
         return
-    starts = [
-        episode
-        for episode in records.require_alone()
-        if 0 in episode.observations and len(episode.observations[0].steps)
-    ]
+    starts = [episode for episode in records.require_alone() if 0 in episode.observations]
     seeds = len({start.seed for start in starts})
     if seeds < FEWEST_SEEDS:
         raise NotJudged(f"fewer than {FEWEST_SEEDS} seeds were tried")
@@ -185,7 +171,8 @@ def _compare_seeds(records: Records) -> Iterator[RuleFinding]:
         values = [start.observations[index].values[0] for start in starts if index in start.observations]
         if any(not np.array_equal(values[0], other) for other in values[1:]):
             return
-    message = f"{seeds} seeds give one start, and with the same actions one trajectory of {trajectory.steps} steps"
+    steps = records.require_role("alone").steps
+    message = f"{seeds} seeds give one start, and with the same actions one trajectory of {steps} steps"
     yield RuleFinding("RL306", message, {"seeds": seeds, "value": 1, "expected": seeds})
 
 
