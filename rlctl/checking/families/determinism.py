@@ -16,17 +16,7 @@ from rlctl.checking.attributes import find_unequal, read_attributes
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import (
-    FIRST_SEED,
-    SECOND_SEED,
-    SUCCESS,
-    Built,
-    CheckedEpisode,
-    ChildMessage,
-    Fact,
-    Records,
-    Series,
-)
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, SUCCESS, CheckedEpisode, ChildMessage, Fact, Records, Series
 from rlctl.checking.rules import Check, NotJudged, RuleFinding, Severity, check, experiment, list_names
 
 COMPARED_STEPS = 200  # How far comparisons go
@@ -50,8 +40,10 @@ def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
             Recording(role, other, budget).run()
         if budget.is_over():
             return
-        seeds = {"seed": SECOND_SEED if role == "seeds" else FIRST_SEED, "action_seed": FIRST_SEED}
-        episode = EpisodePlayer(instance, **seeds, number=number, max_steps=COMPARED_STEPS, longest_s=longest_s)
+        seed, first = SECOND_SEED if role == "seeds" else FIRST_SEED, FIRST_SEED
+        episode = EpisodePlayer(
+            instance, seed, number=number, action_seed=first, max_steps=COMPARED_STEPS, longest_s=longest_s
+        )
         recording = Recording(role, episode, budget)
         yield from recording.run()
         steps = min(steps, recording.steps)
@@ -71,15 +63,14 @@ def _find_kept(instance: Instance) -> list[str]:
 
 def compare(records: Records, first: str, second: str) -> FirstDifference | None:
     """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised."""
-    built = records.require_built()
-    if not built.accepts_seed:
+    if not records.require_built().accepts_seed:
         raise NotJudged("reset takes no seed (RL202)")
     a, b = records.require_role(first), records.require_role(second)
     if "raised" in (a.ended, b.ended):
         raise NotJudged("the episode broke off (RL201, RL207)")
     if not any(series.values.size for series in a.observations.values()):
         raise NotJudged("no observation could be compared")
-    return find_difference(built, a, b)
+    return find_difference(records, a, b)
 
 
 def require_independent(records: Records) -> None:
@@ -89,32 +80,24 @@ def require_independent(records: Records) -> None:
 
 
 def report(
-    rule: str,
-    records: Records,
-    difference: FirstDifference,
-    what: str,
-    cause: str = "",
-    fix: str = "",
-    mild: bool = False,
+    rule: str, records: Records, found: FirstDifference, what: str, cause: str = "", fix: str = "", mild: bool = False
 ) -> RuleFinding:
     """Return the finding that two recordings differ; an info if they are registered to, and no cause is known."""
-    severity = Severity.WARNING if difference.is_small or mild else None
-    if (records.require_built().nondeterministic and not cause) or difference.largest < LAST_BITS:
+    severity = Severity.WARNING if found.is_small or mild else None
+    if (records.require_built().nondeterministic and not cause) or found.largest < LAST_BITS:
         severity = Severity.INFO
-    return RuleFinding(rule, f"{what}: {difference.text()}{cause}", difference.evidence(), severity, fix)
+    return RuleFinding(rule, f"{what}: {found.text()}{cause}", found.evidence(), severity, fix)
 
 
 def _find_cause(records: Records) -> tuple[str, str]:
     fresh = records.role("fresh process")
     names: list[str] = records.facts.get("kept", [])
-    if not fresh or find_difference(records.require_built(), records.require_role("alone"), fresh[0]) is not None:
+    if not fresh or find_difference(records, records.require_role("alone"), fresh[0]) is not None:
         return "", ""  # a new process differs too: chance
     kept = list_names(names, most=3)
     what = kept or "every attribute that step changes, and the whole simulation"
-    return (
-        f"; a new process repeats it, so reset keeps state{f' ({kept})' if kept else ''}",
-        f"Set back in reset: {what}.",
-    )
+    shown = f" ({kept})" if kept else ""
+    return f"; a new process repeats it, so reset keeps state{shown}", f"Set back in reset: {what}."
 
 
 def _compare_itself(rule: str, what: str, *, at_reset: bool) -> Check:
@@ -183,11 +166,11 @@ class FirstDifference:
         return {**place, "value": self.second, "expected": self.first, **sizes}
 
 
-def find_difference(built: Built, one: CheckedEpisode, two: CheckedEpisode) -> FirstDifference | None:
+def find_difference(records: Records, one: CheckedEpisode, two: CheckedEpisode) -> FirstDifference | None:
     """Compare two recordings bit for bit as far as both go; NaN equals NaN."""
     others = _list_series(two)
     pairs = [(key, series, others[key]) for key, series in _list_series(one).items() if key in others]
-    differences = [difference for pair in pairs if (difference := _compare(built, *pair, one.seed))]
+    differences = [difference for pair in pairs if (difference := _compare(records, *pair, one.seed))]
     if one.has_ended and two.has_ended and one.steps != two.steps:
         end = min(one.steps, two.steps)
         differences.append(FirstDifference(end, "length", one.steps, two.steps, 1.0, 1.0, one.seed))
@@ -199,15 +182,12 @@ def find_difference(built: Built, one: CheckedEpisode, two: CheckedEpisode) -> F
 
 def _list_series(episode: CheckedEpisode) -> dict[int | str, Series]:
     after = np.arange(1, episode.steps + 1)
-    series: dict[int | str, Series] = {
-        **dict(sorted(episode.observations.items())),
-        "reward": Series(after, episode.rewards),
-    }
-    series |= {"terminated": Series(after, episode.terminated), "truncated": Series(after, episode.truncated)}
-    return series | ({SUCCESS: episode.infos[SUCCESS]} if SUCCESS in episode.infos else {})
+    flags = {"terminated": Series(after, episode.terminated), "truncated": Series(after, episode.truncated)}
+    success = {SUCCESS: episode.infos[SUCCESS]} if SUCCESS in episode.infos else {}
+    return {**dict(sorted(episode.observations.items())), "reward": Series(after, episode.rewards), **flags, **success}
 
 
-def _compare(built: Built, key: int | str, one: Series, two: Series, seed: int) -> FirstDifference | None:
+def _compare(records: Records, key: int | str, one: Series, two: Series, seed: int) -> FirstDifference | None:
     rows = min(len(one.values), len(two.values))
     a, b = one.rows[:rows], two.rows[:rows]
     unequal = (a != b) & ~(np.isnan(a) & np.isnan(b))
@@ -218,6 +198,6 @@ def _compare(built: Built, key: int | str, one: Series, two: Series, seed: int) 
         relative = np.where(unequal, np.abs(a - b), 0.0) / np.maximum(np.maximum(np.abs(a), np.abs(b)), 1.0)
     relative = np.nan_to_num(relative, nan=np.inf, posinf=np.inf)
     flat = int(np.where(unequal[row], relative[row], -1.0).argmax())
-    name = key if isinstance(key, str) else built.element(key, flat)
+    name = key if isinstance(key, str) else records.require_built().element(key, flat)
     values = float(a[row, flat]), float(b[row, flat]), float(relative[row, flat]), float(relative.max())
     return FirstDifference(int(one.steps[row]), name, *values, seed)

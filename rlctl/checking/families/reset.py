@@ -138,13 +138,12 @@ def play_after_ends(context: Context, success: Sequence[Any] | None) -> Iterator
 
 @check("RL310", "search")
 def _compare_after_ends(records: Records) -> Iterator[RuleFinding]:
-    built, first = records.require_built(), records.require_role("before ends")
-    again = records.require_role("before ends again")
-    if not built.accepts_seed or find_difference(built, first, again) is not None:
+    first, again = records.require_role("before ends"), records.require_role("before ends again")
+    if not records.require_built().accepts_seed or find_difference(records, first, again) is not None:
         raise NotJudged("an episode depends already on the one before it (RL301 to RL303)")
     for role in AFTER_ENDS:
         for episode in records.role(role):
-            difference = find_difference(built, again, episode)
+            difference = find_difference(records, again, episode)
             if difference is not None and "raised" not in (again.ended, episode.ended):
                 is_mild = difference.step > LATE and difference.size < FAINT
                 ending = "that succeeded" if role == "after success" else f"that ended in {role[6:]}"
