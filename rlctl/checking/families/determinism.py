@@ -182,9 +182,10 @@ def find_difference(records: Records, one: CheckedEpisode, two: CheckedEpisode) 
 
 def _list_series(episode: CheckedEpisode) -> dict[int | str, Series]:
     after = np.arange(1, episode.steps + 1)
-    flags = {"terminated": Series(after, episode.terminated), "truncated": Series(after, episode.truncated)}
-    success = {SUCCESS: episode.infos[SUCCESS]} if SUCCESS in episode.infos else {}
-    return {**dict(sorted(episode.observations.items())), "reward": Series(after, episode.rewards), **flags, **success}
+    numbers = {"reward": episode.rewards, "terminated": episode.terminated, "truncated": episode.truncated}
+    series: dict[int | str, Series] = {index: episode.observations[index] for index in sorted(episode.observations)}
+    series |= {name: Series(after, values) for name, values in numbers.items()}
+    return series | {name: values for name, values in episode.infos.items() if name == SUCCESS}
 
 
 def _compare(records: Records, key: int | str, one: Series, two: Series, seed: int) -> FirstDifference | None:
