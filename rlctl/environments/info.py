@@ -13,7 +13,7 @@ from gymnasium import spaces
 
 from rlctl.environments.dict_spaces import LARGEST_SPACE, format_space
 from rlctl.errors import ArtifactError, UsageError, short_repr
-from rlctl.task.joints import Joints
+from rlctl.task.motors import Joints
 
 _ONE_HOT = 10  # each value of a discrete space counts as this many elements of a Box
 

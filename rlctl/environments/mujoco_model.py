@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlctl.task.joints import Joints
+from rlctl.task.motors import Joints
 
 if TYPE_CHECKING:
     import gymnasium

@@ -7,7 +7,7 @@ from rlctl.task import events, rewards
 from rlctl.task.body import Body
 from rlctl.task.constraints import Attachment
 from rlctl.task.events import Event
-from rlctl.task.joints import Joints
+from rlctl.task.motors import Joints
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task
 from rlctl.task.terrain import rough_heights
