@@ -292,7 +292,8 @@ def test_the_page_on_tasks_has_all_that_a_task_has():
     functions = {name for name in vars(rewards) if getattr(vars(rewards)[name], "__module__", "") == rewards.__name__}
     assert {name for name in functions if name.islower()} <= shown
     shown = set(CODE.findall(section("docs/task.md", "Events: randomisation, pushes, noise, delay")))
-    assert {name for name in events.__all__ if name.islower() and name != "acts_at"} <= shown
+    changes = "rlctl.task.events.changes"
+    assert {name for name, value in vars(events).items() if getattr(value, "__module__", "") == changes} <= shown
 
 
 def test_the_page_on_runs_has_every_file(tmp_path):

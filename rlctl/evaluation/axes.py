@@ -14,7 +14,7 @@ from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import UsageError, did_you_mean, short_repr
 from rlctl.run.robustness import Axis
 from rlctl.task.events import Event, RangeLimits, set_color
-from rlctl.task.events.ranges import read_range
+from rlctl.task.events.event import read_range
 from rlctl.task.task import Task
 
 ALL = "all"

@@ -1,30 +1,17 @@
 """What a plugin author needs: `Task`, `Sim`, `Body`, `Joints`, `Event`, `TaskError`, reward terms and spaces."""
 
-from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
+from gymnasium.spaces import Box as Box
+from gymnasium.spaces import Discrete as Discrete
+from gymnasium.spaces import MultiBinary as MultiBinary
+from gymnasium.spaces import MultiDiscrete as MultiDiscrete
 
-from rlctl.errors import TaskError
-from rlctl.task import events, rewards
-from rlctl.task.body import Body
-from rlctl.task.constraints import Attachment
-from rlctl.task.events import Event
-from rlctl.task.motors import Joints
-from rlctl.task.sim import Sim
-from rlctl.task.task import Task
-from rlctl.task.terrain import rough_heights
-
-__all__ = [
-    "Attachment",
-    "Body",
-    "Box",
-    "Discrete",
-    "Event",
-    "Joints",
-    "MultiBinary",
-    "MultiDiscrete",
-    "Sim",
-    "Task",
-    "TaskError",
-    "events",
-    "rewards",
-    "rough_heights",
-]
+from rlctl.errors import TaskError as TaskError
+from rlctl.task import events as events
+from rlctl.task import rewards as rewards
+from rlctl.task.body import Body as Body
+from rlctl.task.constraints import Attachment as Attachment
+from rlctl.task.events import Event as Event
+from rlctl.task.motors import Joints as Joints
+from rlctl.task.sim import Sim as Sim
+from rlctl.task.task import Task as Task
+from rlctl.task.terrain import rough_heights as rough_heights

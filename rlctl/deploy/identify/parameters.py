@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 
 from rlctl.errors import UsageError, check_name
 from rlctl.task.events import Event, delay, set_color, shift_gravity
-from rlctl.task.events.ranges import Widening
+from rlctl.task.events.event import Widening
 
 _WIDER = 2.0  # factor by which the search range is wider than the event's range
 _SMALLEST = 0.01  # of the upper end, where a range begins at 0
