@@ -23,11 +23,8 @@ def seed_streams(events: Iterable[str], seed: int) -> Streams:
     An event's random numbers depend only on the seed and its name: an episode starts the same with and without events,
     and a change to one event does not change the draws of the others.
     """
-    return {name: np.random.default_rng(np.random.SeedSequence(seed, spawn_key=_to_key(name))) for name in events}
-
-
-def _to_key(name: str) -> tuple[int, ...]:
-    return tuple(name.encode())
+    sequences = {name: np.random.SeedSequence(seed, spawn_key=tuple(name.encode())) for name in events}
+    return {name: np.random.default_rng(sequence) for name, sequence in sequences.items()}
 
 
 class ActingEvents:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import RecipeError, RlctlError, TaskError, check_name, did_you_mean
+from rlctl.errors import RecipeError, RlctlError, TaskError, check_name
 
 Range = tuple[float, float]
 """A range of random values, as a parameter of an event function: lowest and highest value.
@@ -67,12 +67,8 @@ def read_range(where: str, value: Any, limits: RangeLimits, error: type[Exceptio
     if not isinstance(value, Mapping):
         pair = _pair(where, value, limits, error)
         return Widening(pair, pair, limits.whole)
-    for key in value:
-        if key not in ("from", "to"):
-            raise error(f"{where}: no key {key!r} in a range.{did_you_mean(str(key), ['from', 'to'])} {_EXPECTED}")
-    for key in ("from", "to"):
-        if key not in value:
-            raise error(f"{where}: {key!r} is missing. {_EXPECTED}")
+    if value.keys() != {"from", "to"}:
+        raise error(f"{where}: a range has the keys 'from' and 'to', not {', '.join(map(repr, value))}. {_EXPECTED}")
     start = _pair(f"{where}.from", value["from"], limits, error)
     return Widening(start, _pair(f"{where}.to", value["to"], limits, error), limits.whole)
 
@@ -190,18 +186,16 @@ class Event:
 
     def bind(self, name: str, error: type[RlctlError] = TaskError) -> BoundEvent:
         """Check everything that needs no world; raises `error` with a message that begins with `events.<name>`."""
-        where = f"events.{name}"
+        where, function = f"events.{name}", getattr(self.function, "__name__", str(self.function))
         check_name(self.when, _MOMENTS, f"{where}: no moment", error, listed="There are")
         possible = _acts_at.get(self.function, _MOMENTS)
         if self.when not in possible:
-            function = getattr(self.function, "__name__", str(self.function))
             raise error(f"{where}: {function} does not act at {self.when!r}, but at: {', '.join(possible)}.")
         if not any(p.kind is p.VAR_KEYWORD for p in inspect.signature(self.function).parameters.values()):
             for key in self.parameters:
                 check_name(key, self.parameter_names, f"{where}: no parameter", error)
         for key, parameter in self._signature.items():
             if parameter.annotation is parameter.empty:
-                function = getattr(self.function, "__name__", str(self.function))
                 raise TaskError(
                     f"{where}: {key!r} of {function} has no type, so it cannot be checked. Write `{key}: Range` for "
                     "a range of random values, else its type."
@@ -219,18 +213,13 @@ class Event:
 
     @cached_property
     def _hints(self) -> dict[str, Any]:
-        try:
-            return typing.get_type_hints(self.function, include_extras=True)
-        except NameError:  # types that the function's module does not have at run time
-            return {}
+        return typing.get_type_hints(self.function, include_extras=True)
 
     def _read(self, where: str, key: str, value: Any, error: type[RlctlError]) -> Any:
         hint = self._hints.get(key)
-        limits = _find_limits(hint)
-        widens = hint is None and isinstance(value, Mapping) and value.keys() == {"from", "to"}
-        if widens or limits is not None:
-            return read_range(where, value, limits or RangeLimits(), error)
-        if hint is not None:
+        if (limits := _find_limits(hint)) is not None:
+            return read_range(where, value, limits, error)
+        if hint is not None:  # else the function takes any keywords
             _check_type(where, hint, value, error)
         return value
 
