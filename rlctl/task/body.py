@@ -162,28 +162,22 @@ class Body(Properties):
         )
         return np.array(solution)
 
-    def _read_link(self, link: str) -> Any:
-        state = self._cache.get(("link", link))
-        if state is None:
-            state = self._cache["link", link] = pybullet.getLinkState(
-                self.id, self._link_index(link), computeForwardKinematics=1, physicsClientId=self.client
-            )
-        return state
+    def _link_pose(self, link: str) -> tuple[Array, Array]:
+        pose = self._cache.get(("link", link))  # a pair: a link may be called "base" or "joints"
+        if pose is None:
+            index = self._link_index(link)
+            state = pybullet.getLinkState(self.id, index, computeForwardKinematics=1, physicsClientId=self.client)
+            # Items 4 and 5 are the link frame; 0 and 1 are the centre of mass.
+            pose = self._cache["link", link] = (np.array(state[4]), np.array(state[5]))
+        return pose
 
     def link_position(self, link: str) -> Array:
         """Position of the link frame [m], world frame, shape (3,)."""
-        position: Array | None = self._cache.get(("position", link))  # a pair: a link may be called "base" or "joints"
-        if position is None:
-            # Items 4 and 5 are the link frame; 0 and 1 are the centre of mass.
-            position = self._cache["position", link] = np.array(self._read_link(link)[4])
-        return position
+        return self._link_pose(link)[0]
 
     def link_orientation(self, link: str) -> Array:
         """Orientation of the link frame, quaternion (x, y, z, w), world frame, shape (4,)."""
-        orientation: Array | None = self._cache.get(("orientation", link))
-        if orientation is None:
-            orientation = self._cache["orientation", link] = np.array(self._read_link(link)[5])
-        return orientation
+        return self._link_pose(link)[1]
 
     def mass_state(self, link: str) -> MassState:
         """Return where the centre of mass of a link, or of the base, is and how it moves.
@@ -247,8 +241,7 @@ class Body(Properties):
         state = self._cache.get("base")
         if state is None:
             position, orientation = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
-            state = (np.array(position), np.array(orientation))
-            self._cache["base"] = state
+            state = self._cache["base"] = (np.array(position), np.array(orientation))
         return state
 
     @property

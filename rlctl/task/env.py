@@ -18,7 +18,7 @@ from rlctl.task.motors import Joints
 from rlctl.task.mujoco_sim import MujocoSim, read_solref
 from rlctl.task.observation import Observation, ObservationFormat
 from rlctl.task.sim import Sim
-from rlctl.task.task import Task, check_definition, check_methods, check_parameters
+from rlctl.task.task import Task, check_definition, check_parameters
 
 
 class TaskEnv(gymnasium.Env[Observation, Any]):
@@ -38,7 +38,6 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         sim: str = "pybullet",
     ) -> None:
         check_parameters(type(task))
-        check_methods(type(task))
         check_definition(task)
         self.task = task
         self.name = type(task).__name__
@@ -181,10 +180,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         except (TypeError, ValueError):
             raise _not_a_number(self.name, raw, self._step) from None
         if not math.isfinite(reward):
-            bad = next((name for name, value in raw.items() if not math.isfinite(value)), None)
-            if bad is None:
-                raise TaskError(f"{self.name}: the weighted reward terms overflow at step {self._step}: {terms}")
-            raise TaskError(f"{self.name}: reward term {bad!r} is {raw[bad]} at step {self._step}")
+            bad = next((name for name, term in terms.items() if not math.isfinite(term)), "sum")
+            raise TaskError(f"{self.name}: reward term {bad!r} is {terms.get(bad, reward)} at step {self._step}")
         info: dict[str, Any] = {"reward_terms": terms, "metrics": {name: raw[name] for name in weights}}
         if self._acting.has_intervals:
             drawn = self._acting.run_due(self._step, self.sim, self._streams, self._episode_level)
@@ -232,10 +229,10 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 
     def render(self) -> Any:
         """Return an RGB image of shape (240, 320, 3) in `rgb_array` mode; the window shows itself in `human`."""
-        if self.render_mode == "rgb_array":
-            self.move_markers()
-            return self.sim.render()
-        return None
+        if self.render_mode != "rgb_array":
+            return None
+        self.move_markers()
+        return self.sim.render()
 
     def close(self) -> None:
         """End the simulation."""
@@ -281,9 +278,6 @@ def _not_a_number(task: str, raw: Mapping[str, Any], step: int) -> TaskError:
 
 
 def _term_mismatch(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:
-    extra, missing = (
-        [name for name in ours if name not in theirs] for ours, theirs in ((raw, weights), (weights, raw))
-    )
-    problems = [f"rewards() returns {extra[0]!r}, which has no weight"] if extra else []
-    problems += [f"reward_weights names {missing[0]!r}, which rewards() does not return"] if missing else []
-    return TaskError(f"{task}: {'; '.join(problems)}")
+    problems = [f"rewards() returns {name!r}, which has no weight" for name in raw if name not in weights]
+    problems += [f"reward_weights has {name!r}, which rewards() does not return" for name in weights if name not in raw]
+    return TaskError(f"{task}: {problems[0]}")

@@ -43,21 +43,15 @@ class ObservationFormat:
                     f"{self._name}: bounds or units for {name!r}, which is not observed."
                     f"{did_you_mean(name, self._shapes)}"
                 )
-        bounds = {name: self._bounds.get(name, (-math.inf, math.inf)) for name in self._shapes}
+        parts: dict[str, Any] = {}
+        for name, shape in self._shapes.items():
+            is_picture = self._dtypes[name] is np.uint8 and self._task.observation_layout == "dict"
+            low, high = (0, 255) if is_picture else self._bounds.get(name, (-math.inf, math.inf))
+            parts[name] = spaces.Box(low, high, shape, np.uint8 if is_picture else np.float32)
         if self._task.observation_layout == "dict":
-            return spaces.Dict(
-                {
-                    name: spaces.Box(0, 255, shape, np.uint8)
-                    if self._dtypes[name] is np.uint8
-                    else spaces.Box(*bounds[name], shape, np.float32)
-                    for name, shape in self._shapes.items()
-                }
-            )
-        low, high = (
-            np.concatenate([np.full(size, bounds[name][end], np.float32) for name, size in self.sizes.items()])
-            for end in (0, 1)
-        )
-        return spaces.Box(low, high, dtype=np.float32)
+            return spaces.Dict(parts)
+        lows, highs = ([getattr(part, end).ravel() for part in parts.values()] for end in ("low", "high"))
+        return spaces.Box(np.concatenate(lows), np.concatenate(highs), dtype=np.float32)
 
     def assemble(self, parts: Mapping[str, Any], step: int) -> Observation:
         """Return the observation made of its parts; raises `TaskError`, with the step, if it is not in the space."""
@@ -67,8 +61,8 @@ class ObservationFormat:
                 raise self._shape_mismatch(parts, step)
             if not all(math.isfinite(value.sum()) for value in observed.values()):
                 raise self._not_finite(parts, step)
-            for name, (lowest, highest) in self._bounds.items():
-                observed[name] = self._clip_rounding(observed[name], lowest, highest, parts, step)
+            for name, (low, high) in self._bounds.items():
+                observed[name] = self._clip_rounding(observed[name], low, high, parts, step)
             return observed
         try:
             observation = np.concatenate([*parts.values()], axis=None, dtype=np.float32)
@@ -107,7 +101,7 @@ class ObservationFormat:
 
     def _out_of_bounds(self, parts: Mapping[str, Any], step: int) -> TaskError:
         for name, (low, high) in self._bounds.items():
-            worst = max(np.ravel(parts[name]).tolist(), key=lambda value: max(low - value, value - high), default=low)
+            worst = max(np.ravel(parts[name]).tolist(), key=lambda value: max(low - value, value - high))
             if max(low - worst, worst - high) > _ROUNDING:
                 return TaskError(
                     f"{self._name}: observation {name!r} is {worst:g} at step {step}, "

@@ -30,33 +30,30 @@ class Properties(Motors):
 
     def __init__(self) -> None:
         super().__init__()
-        self._dynamics_changed = self._damping_changed = self._colors_changed = self._contacts_changed = False
+        self._changed: set[str] = set()  # kinds of properties that events have changed
 
     # PyBullet's saved states have positions and velocities, but none of these values.
 
     def _save_nominal(self) -> None:
         super()._save_nominal()
-        self._dynamics_changed = self._damping_changed = self._colors_changed = False
+        self._changed &= {"_contacts"}
         for values in ("_dynamics", "_damping", "_colors"):
             self.__dict__.pop(values, None)  # read again when needed: `build` may have set others
 
     def _restore_nominal(self) -> None:
         super()._restore_nominal()
-        if self._dynamics_changed:
-            self._dynamics_changed = False
+        if "_dynamics" in self._changed:
             for link, (mass, friction, inertia) in self._dynamics.items():
                 self._change(link, mass=mass, lateralFriction=friction, localInertiaDiagonal=inertia)
-        if self._damping_changed:
-            self._damping_changed = False
+        if "_damping" in self._changed:
             for link, damping in zip(self.joint_indices, self._damping, strict=True):
                 self._change(link, jointDamping=damping)
-        if self._colors_changed:
-            self._colors_changed = False
+        if "_colors" in self._changed:
             for (link, shape), color in self._colors.items():
                 self._paint(link, shape, color)
-        if self._contacts_changed:
-            self._contacts_changed = False
+        if "_contacts" in self._changed:
             self.set_contact_stiffness(_RIGID)
+        self._changed.clear()
 
     @cached_property
     def _dynamics(self) -> dict[int, _Dynamics]:
@@ -120,7 +117,7 @@ class Properties(Motors):
     def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:
         """Set mass and inertia to `factor` times the built world's values, until the next reset."""
         chosen, nominal = self._select_links(links), self._dynamics
-        self._dynamics_changed = True
+        self._changed.add("_dynamics")
         for link in chosen:
             mass, _, inertia = nominal[link]
             self._change(link, mass=mass * factor, localInertiaDiagonal=[element * factor for element in inertia])
@@ -128,7 +125,7 @@ class Properties(Motors):
     def set_friction(self, friction: float, links: Sequence[str] = ()) -> None:
         """Set the lateral friction, until the next reset."""
         chosen, _ = self._select_links(links), self._dynamics
-        self._dynamics_changed = True
+        self._changed.add("_dynamics")
         for link in chosen:
             self._change(link, lateralFriction=friction)
 
@@ -138,7 +135,7 @@ class Properties(Motors):
         Contacts are rigid by default. After the first call they are springs, if very stiff ones: PyBullet cannot
         return to rigid contacts.
         """
-        self._contacts_changed = stiffness != _RIGID
+        self._changed.add("_contacts")
         engine = pybullet.getPhysicsEngineParameters(physicsClientId=self.client)
         # With this damping a physics step removes a fifth of the overlap, as in rigid contacts.
         damping = 4.0 * engine["fixedTimeStep"] / engine["numSubSteps"] * stiffness
@@ -161,14 +158,14 @@ class Properties(Motors):
 
     def _set_damping(self, values: dict[int, float]) -> None:
         _ = self._damping  # nominal values are read before the first change
-        self._damping_changed = True
+        self._changed.add("_damping")
         for index, damping in values.items():
             self._change(self.joint_indices[index], jointDamping=damping)
 
     def set_color(self, rgb: Sequence[float], links: Sequence[str] = ()) -> None:
         """Paint the links, until the next reset: red, green, blue in [0, 1]; their opacity does not change."""
         chosen, nominal = self._select_links(links), self._colors
-        self._colors_changed = True
+        self._changed.add("_colors")
         for (link, shape), color in nominal.items():
             if link in chosen:
                 self._paint(link, shape, (*rgb, color[3]))

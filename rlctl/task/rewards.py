@@ -15,7 +15,7 @@ Terms are unsigned: a weight gives the sign.
 
 import math
 from collections.abc import Callable
-from typing import Literal, overload
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,25 +128,16 @@ def penetration(distances: Array) -> float:
 Falloff = Literal["gaussian", "linear", "long_tail"]
 
 
-@overload
-def tolerance(
-    x: float, bounds: tuple[float, float] = ..., margin: float = ..., falloff: Falloff = ..., at_margin: float = ...
-) -> float: ...
-
-
-@overload
-def tolerance(
-    x: Array, bounds: tuple[float, float] = ..., margin: float = ..., falloff: Falloff = ..., at_margin: float = ...
-) -> NDArray[np.float64]: ...
+Values = TypeVar("Values", float, NDArray[np.float64])
 
 
 def tolerance(
-    x: float | Array,
+    x: Values,
     bounds: tuple[float, float] = (0.0, 0.0),
     margin: float = 0.0,
     falloff: Falloff = "gaussian",
     at_margin: float = 0.1,
-) -> float | NDArray[np.float64]:
+) -> Values:
     """Return 1 where x is inside `bounds`, falling to `at_margin` at a distance of `margin` outside them.
 
     With v = `at_margin` and d = distance / margin, outside the bounds the value is

@@ -30,13 +30,10 @@ class _Push:
 
 def _check_joint_names(path: Path) -> None:
     """Raise `TaskError` for two joints of one name, which crash PyBullet."""
-    with contextlib.suppress(
-        ElementTree.ParseError, LookupError, ValueError
-    ):  # PyBullet reports files that it cannot read
+    with contextlib.suppress(ElementTree.ParseError, LookupError, ValueError):  # PyBullet reads more than XML allows
         names = [joint.get("name") for joint in ElementTree.fromstring(path.read_bytes().strip()).findall("joint")]
-        for name in names:
-            if names.count(name) > 1:
-                raise TaskError(f"{path}: {names.count(name)} joints are called {name!r}; give each its own name")
+        if (name := next((name for name in names if names.count(name) > 1), None)) is not None:
+            raise TaskError(f"{path}: {names.count(name)} joints are called {name!r}; give each its own name")
 
 
 class Sim(Constraints):
@@ -104,8 +101,7 @@ class Sim(Constraints):
         path = find_model_file(file)
         if path.suffix == ".urdf":
             _check_joint_names(path)
-        if path.suffix == ".urdf" and inertia == "file":
-            flags |= pybullet.URDF_USE_INERTIA_FROM_FILE
+            flags |= pybullet.URDF_USE_INERTIA_FROM_FILE if inertia == "file" else 0
         if self_collision:
             flags |= pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS
         if path.suffix in (".xml", ".sdf"):
@@ -126,10 +122,8 @@ class Sim(Constraints):
         return body
 
     def _load_scene(self, path: Path, flags: int) -> int:
-        if path.suffix == ".xml":
-            ids = self._call_loader(path, pybullet.loadMJCF, flags=flags)
-        else:
-            ids = self._call_loader(path, pybullet.loadSDF)
+        load, options = (pybullet.loadMJCF, {"flags": flags}) if path.suffix == ".xml" else (pybullet.loadSDF, {})
+        ids = self._call_loader(path, load, **options)
         if len(ids) != 1:
             raise TaskError(f"{path} contains {len(ids)} bodies; split it into files of one body each")
         return int(ids[0])

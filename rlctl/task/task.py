@@ -132,16 +132,11 @@ def check_parameters(task: type[Task]) -> None:
             )
 
 
-def check_methods(task: type[Task]) -> None:
-    """Raise `TaskError` for a class without a method that every task needs."""
-    missing = [f"{method}()" for method in _REQUIRED if getattr(task, method) is getattr(Task, method)]
-    if missing:
-        raise TaskError(f"{task.__name__} does not define {', '.join(missing)}; a task needs {', '.join(_REQUIRED)}")
-
-
 def check_definition(task: Task) -> None:
-    """Raise `TaskError` for an invalid attribute of a task."""
-    name = type(task).__name__
+    """Raise `TaskError` for an invalid attribute of a task, and for a missing method."""
+    name, required = type(task).__name__, ("build", "act", "observe", "rewards")
+    if missing := [f"{method}()" for method in required if getattr(type(task), method) is getattr(Task, method)]:
+        raise TaskError(f"{name} does not define {', '.join(missing)}; a task needs {', '.join(required)}")
     if not isinstance(getattr(task, "action_space", None), spaces.Space):
         raise TaskError(f"{name} does not define action_space: Box(-1.0, 1.0, (7,), np.float32), for example")
     for key in ("control_dt", "episode_s"):
@@ -162,6 +157,3 @@ def check_definition(task: Task) -> None:
     for key, event in task.events.items():
         if not isinstance(event, Event):
             raise TaskError(f"{name}: events.{key} is not an Event: Event('reset', scale_mass, body=...), for example")
-
-
-_REQUIRED = ("build", "act", "observe", "rewards")
