@@ -15,7 +15,7 @@ from typing import Any
 import pydantic
 from pydantic import Field
 
-from rlctl.environments.task_version import identify_task
+from rlctl.environments.registry import identify_task
 from rlctl.errors import ArtifactError, RlctlError
 from rlctl.run.directory import RunDirectory
 from rlctl.run.group import find_run_of_seed

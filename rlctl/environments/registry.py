@@ -1,4 +1,4 @@
-"""Resolve a task's name to the constructor of its environment, and to the task's files.
+"""Resolve a task's name to the constructor of its environment, the task's files and its version.
 
 A task is written as an installed name (`reach`), `package.module:Class`, `path/to/file.py:Class`, or a Gymnasium id
 (`Pendulum-v1`, `package:Env-v0`).
@@ -8,14 +8,16 @@ import ast
 import inspect
 import os
 import re
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from rlctl.environments import installed
 from rlctl.environments.plugin_code import append_to_path, find_module_file, import_file, import_module
 from rlctl.errors import NoSuchClassError, OldGymError, TaskError, UsageError, did_you_mean
+from rlctl.storage import files
 
 _GYMNASIUM_ID = re.compile(r"^(?:[\w.]+:)?(?:[\w.-]+/)?[\w.-]+-v\d+$")
 
@@ -99,6 +101,36 @@ def find_origin(task: str) -> dict[str, str]:
     if entry := installed.find(task):
         return {"distribution": entry.distribution, "version": entry.version}
     return {}
+
+
+def identify_task(task: str) -> dict[str, Any]:
+    """Return `origin` (distribution and version of an installed task) and `source_sha256` of the task's file."""
+    source = find_source_file(task)
+    digest = files.digest(source.read_bytes()) if source is not None and source.is_file() else None
+    return {"origin": find_origin(task), "source_sha256": digest}
+
+
+def describe_task_changes(before: Mapping[str, Any], task: str, since: str = "the run began") -> list[str]:
+    """Describe how a task differs from an earlier result of `identify_task`; empty if it does not."""
+    now = identify_task(task)
+    earlier, later = (origin if isinstance(origin, dict) else {} for origin in (before.get("origin"), now["origin"]))
+    if earlier != later:
+        names = (" ".join(map(str, origin.values())) or "no installed package" for origin in (earlier, later))
+        return ["task {} came from {} when {since}, and comes from {} now".format(task, *names, since=since)]
+    if before.get("source_sha256") != now["source_sha256"]:
+        file = find_source_file(task)
+        gone = file is not None and not file.is_file()
+        return [f"{file or task} {'no longer exists' if gone else f'has changed since {since}'}"]
+    return []
+
+
+def find_git_commit() -> str | None:
+    """Return the commit of the current folder's repository; None outside of one."""
+    try:
+        result = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5.0, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return result.stdout.strip() or None
 
 
 def make_slug(task: str) -> str:

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.environments.parameters import read_parameters
 from rlctl.environments.registry import is_task
-from rlctl.environments.spec import EnvChanges, EnvSpec
+from rlctl.environments.spec import EnvChanges, EnvSpec, read_parameters
 from rlctl.errors import UsageError, did_you_mean, short_repr
 from rlctl.run.robustness import Axis
 from rlctl.task.events import Event, RangeLimits, set_color

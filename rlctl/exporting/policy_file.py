@@ -6,7 +6,7 @@ from typing import Any
 from rich.filesize import decimal as format_bytes
 
 from rlctl import output
-from rlctl.environments.task_version import identify_task
+from rlctl.environments.registry import identify_task
 from rlctl.errors import UsageError
 from rlctl.evaluation.evaluate import measure_score
 from rlctl.evaluation.report import describe_score

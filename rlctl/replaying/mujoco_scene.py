@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.environments.mujoco_model import find_mujoco, joint_name
+from rlctl.environments.info import find_mujoco, joint_name
 from rlctl.replaying.mjcf import Mesh, Shape, ShapeKind
 from rlctl.replaying.scene import BodyMotion, Env, Scene
 from rlctl.task.env import TaskEnv

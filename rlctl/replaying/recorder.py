@@ -12,8 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.environments import dict_spaces, registry
-from rlctl.environments.info import EnvInfo, describe
-from rlctl.environments.mujoco_model import find_mujoco
+from rlctl.environments.info import EnvInfo, describe, find_mujoco
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.replaying.mujoco_scene import MujocoReader

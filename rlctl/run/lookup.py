@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rlctl.environments import installed, registry
+from rlctl.environments.registry import describe_task_changes
 from rlctl.environments.spec import EnvSpec
-from rlctl.environments.task_version import describe_task_changes
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
 from rlctl.hub import store
 from rlctl.output import format_duration

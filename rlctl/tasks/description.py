@@ -75,7 +75,7 @@ def _convert(value: Any) -> Any:
 
 
 def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
-    from rlctl.environments.mujoco_model import describe_model, find_mujoco, total_mass
+    from rlctl.environments.info import describe_model, find_mujoco, total_mass
     from rlctl.environments.wrappers import find_time_limit
     from rlctl.task.env import TaskEnv
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlctl.environments.task_version import describe_task_changes
+from rlctl.environments.registry import describe_task_changes
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.hub import store
 from rlctl.policy import own_modules

@@ -9,7 +9,7 @@ import sys
 import uuid
 from typing import TYPE_CHECKING, Any
 
-from rlctl.environments.task_version import find_git_commit, identify_task
+from rlctl.environments.registry import find_git_commit, identify_task
 from rlctl.errors import DivergedError, Interrupted, RlctlError, RunTaken
 from rlctl.recipe.recipe import Recipe, find_difference
 from rlctl.recipe.sources import resolve_packaged

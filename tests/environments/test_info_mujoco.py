@@ -4,8 +4,7 @@ from contextlib import closing
 
 import pytest
 
-from rlctl.environments.info import describe
-from rlctl.environments.mujoco_model import describe_mujoco_model
+from rlctl.environments.info import describe, describe_mujoco_model
 from rlctl.environments.spec import EnvSpec
 
 pytest.importorskip("mujoco")
