@@ -23,7 +23,6 @@ EPISODE = "a recorded episode"
 RUN = "run.json"
 
 _MODULE_ID = re.compile(r"^([\w.]+):(?:[\w.-]+/)?[\w.-]+-v\d+$")
-_LARGEST = 10 * 2**20  # [bytes] of a source file that is looked into
 
 
 def load(task: str, named_by: str) -> Callable[..., Any]:
@@ -57,7 +56,7 @@ def _look_before_import(task: str, named_by: str) -> None:
         return  # nothing to import; `registry.load` raises the error
     if file.suffix != ".py" or _is_of_python(file):
         raise _make_error(task, named_by, "it is part of Python or rlctl")
-    source = _read_source(file)
+    source = file.read_text(encoding="utf-8", errors="replace")
     if by_id is not None:
         if "gymnasium" not in source:
             raise _make_error(task, named_by, "its module does not mention Gymnasium")
@@ -68,9 +67,7 @@ def _look_before_import(task: str, named_by: str) -> None:
 def _is_of_python(file: Path) -> bool:
     """Return whether a file belongs to rlctl or the standard library; installed packages do not count."""
     library, file = Path(sysconfig.get_paths()["stdlib"]).resolve(), file.resolve()
-    if file.is_relative_to(PACKAGE_FOLDER.resolve()):
-        return True
-    return file.is_relative_to(library) and not _is_installed(file)
+    return file.is_relative_to(PACKAGE_FOLDER.resolve()) or (file.is_relative_to(library) and not _is_installed(file))
 
 
 def is_own_file(file: Path) -> bool:
@@ -80,11 +77,6 @@ def is_own_file(file: Path) -> bool:
 
 def _is_installed(file: Path) -> bool:
     return bool({"site-packages", "dist-packages"} & set(file.resolve().parts))
-
-
-def _read_source(file: Path) -> str:
-    with file.open("rb") as opened:
-        return opened.read(_LARGEST).decode(errors="replace")
 
 
 def _defines(source: str, name: str) -> bool:
@@ -118,4 +110,4 @@ def _may_be_called(task: str, constructor: Any) -> bool:
         return False
     source = registry.find_source_file(task)
     own = source is not None and source.expanduser().resolve() == file.resolve() and is_own_file(file)
-    return own and bool(re.search("gymnasium|rlctl", _read_source(file)))
+    return own and bool(re.search(b"gymnasium|rlctl", file.read_bytes()))

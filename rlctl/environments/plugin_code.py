@@ -1,15 +1,14 @@
 """Imports and calls the code of plugins. Any exception from it becomes an error of one line."""
 
-import contextlib
 import importlib
 import importlib.util
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.machinery import PathFinder
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from rlctl import errors
 from rlctl.errors import TaskError, UsageError
@@ -60,8 +59,7 @@ def import_module(task: str, name: str) -> Any:
     is_installed = name in sys.modules or find_module_file(name) is not None
     if not is_installed and find_module_file(name, in_current_folder=True) is None:
         raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
-    with _refuse_exit():
-        return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
+    return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
 
 
 def import_file(task: str, file: Path) -> Any:
@@ -84,8 +82,7 @@ def import_file(task: str, file: Path) -> Any:
     sys.modules[name] = module
     loader = spec.loader
     try:
-        with _refuse_exit():
-            call_plugin(task, lambda: loader.exec_module(module), doing="import failed: ")
+        call_plugin(task, lambda: loader.exec_module(module), doing="import failed: ")
     except BaseException:
         sys.modules.pop(name, None)
         raise
@@ -96,23 +93,6 @@ def append_to_path(folder: str) -> None:
     """Append a folder to `sys.path`; it comes last so that a `torch.py` in it does not hide torch."""
     if folder not in sys.path:
         sys.path.append(folder)
-
-
-@contextlib.contextmanager
-def _refuse_exit() -> Iterator[None]:
-    """Turn `os._exit` into an exception during an import: it would end the process without a message."""
-    leave, process = os._exit, os.getpid()
-
-    def refuse(status: int) -> NoReturn:
-        if os.getpid() != process:  # a child process that the module forked may do this
-            leave(status)
-        raise SystemExit(f"os._exit({status})")
-
-    os._exit = refuse
-    try:
-        yield
-    finally:
-        os._exit = leave
 
 
 def _find_loaded(file: Path) -> Path:

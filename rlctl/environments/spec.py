@@ -190,17 +190,6 @@ def make(
     return env
 
 
-def make_several(spec: EnvSpec, count: int) -> list[gymnasium.Env[Any, Any]]:
-    """Build environments, each from the same working directory even if a constructor changes it."""
-    load(spec.task)
-    folder = os.getcwd()
-    envs = []
-    for _ in range(count):
-        os.chdir(folder)
-        envs.append(spec.make())
-    return envs
-
-
 def _name_by(kind: str) -> Callable[[EnvSpec], EnvSpec]:
     return lambda spec: dataclasses.replace(spec, named_by=kind)
 

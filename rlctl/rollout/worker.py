@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import SINGLE
 from rlctl.environments.info import EnvInfo, describe
-from rlctl.environments.spec import EnvSpec, make_several
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import describe_exception
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.players.named import SERVER, make_player
@@ -78,7 +78,7 @@ class Worker:
             self.close()
             gc.unfreeze()
             gc.collect()  # environments may hold themselves in cycles
-        envs = make_several(spec, self._job.count)
+        envs = [spec.make() for _ in range(self._job.count)]
         self._info = describe(envs[0])
         metrics = [name for name, weight in self._info.reward_weights.items() if weight == 0]
         self._episodes = [RunningEpisode(env, self._job.first + index, metrics) for index, env in enumerate(envs)]
