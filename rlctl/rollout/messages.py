@@ -1,15 +1,19 @@
-"""Messages from the main process to a worker, and the worker's answer."""
+"""Messages from the main process to a worker, the worker's answer, and failures of environments."""
 
 import dataclasses
+import shlex
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl import errors
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
+from rlctl.errors import EpisodeFailed, RlctlError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.players.player import Exploration
+from rlctl.processes.pool import WorkerException
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,3 +132,45 @@ class Answer:
     """Environments whose episode ended or failed while its actions were replayed."""
     info: EnvInfo | None = None  # description of the environments, if it has changed
     rewards: NDArray[np.float64] | None = None  # those of `ComputeRewards`, shape (n,)
+
+
+class FailedInEpisode(Exception):
+    """An exception (the cause) was raised in a known episode."""
+
+    def __init__(self, env: int, seed: int, step: int) -> None:
+        super().__init__()
+        self.where = env, seed, step
+
+    def __str__(self) -> str:
+        cause = "" if self.__cause__ is None else f"{describe_exception(self.__cause__)} "
+        return "{}in environment {}, episode seed {}, step {},".format(cause, *self.where)
+
+
+def describe_failure(error: BaseException) -> WorkerException:
+    """Return an exception, and where it was raised, as plain data."""
+    where: tuple[int, int, int] | None = None
+    if isinstance(error, FailedInEpisode):
+        where, error = error.where, error.__cause__ or error
+    if isinstance(error, RlctlError):
+        return WorkerException(str(error), type(error).__name__, error.details, where)
+    return WorkerException(describe_exception(error), "", format_plugin_traceback(error) or None, where)
+
+
+def make_error(failure: WorkerException, task: str) -> RlctlError:
+    """Return the error to raise for a failure; it names the task, and the episode if there is one."""
+    message, details = failure.message, failure.details
+    kind = getattr(errors, failure.kind) if failure.kind else TaskError
+    if kind is TaskError and task not in message.partition("\n")[0]:
+        message = f"task {task!r}: {message}"
+    if failure.where is not None:
+        if kind is TaskError:
+            return EpisodeFailed(message, *failure.where, hint=format_hint(task), details=details)
+        # The policy or its server failed: check-env would not show it.
+        message += "\nin environment {}, episode seed {}, step {}".format(*failure.where)
+    result: RlctlError = kind(message, details=details)
+    return result
+
+
+def format_hint(task: str) -> str:
+    """Return the command that tests an environment without a training."""
+    return f"to see it alone: rlctl check-env {shlex.quote(task)}"

@@ -1,15 +1,22 @@
-"""An environment in a worker, and its running episode."""
+"""An environment in a worker and its running episode; checks the values that environments return."""
 
 import math
-from collections.abc import Sequence
+import reprlib
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
-from rlctl.rollout import returned_values
+from rlctl.environments.dict_spaces import SINGLE, split, split_space
+from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
+from rlctl.output import format_count
 from rlctl.rollout.messages import EpisodeResult
-from rlctl.rollout.returned_values import InvalidReturn
+from rlctl.rollout.shared_arrays import observation_fields
+
+_STEP = ("observation", "reward", "terminated", "truncated", "info")
+_RESET = ("observation", "info")
 
 
 class RunningEpisode:
@@ -35,25 +42,25 @@ class RunningEpisode:
         self._return, self._sums, self._deepest_contact = 0.0, {}, None
         self._raw_sums = dict.fromkeys(self._metrics, 0.0)
         self.acting_s, self.stepping_s = 0.0, 0.0
-        observation, info = returned_values.check_tuple(self.env.reset(seed=seed), returned_values.RESET, "reset")
-        returned_values.check_info(info)
+        observation, info = check_tuple(self.env.reset(seed=seed), _RESET, "reset")
+        check_info(info)
         return observation
 
     def take_step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step the environment; return its checked result."""
         result = self.env.step(int(action) if self._discrete else action.copy())
         if result.__class__ is not tuple or len(result) != 5:
-            result = returned_values.check_tuple(result, returned_values.STEP, "step")
+            result = check_tuple(result, _STEP, "step")
         observation, reward, terminated, truncated, info = result
         if reward.__class__ is not float:
-            reward = returned_values.to_float(reward, "reward")
+            reward = to_float(reward, "reward")
         if not math.isfinite(reward):
-            raise InvalidReturn(f"reward is {reward}")
+            raise ValueError(f"reward is {reward}")
         if info.__class__ is not dict:
-            returned_values.check_info(info)
+            check_info(info)
         if terminated.__class__ is not bool or truncated.__class__ is not bool:
-            terminated = returned_values.to_bool(terminated, "terminated")
-            truncated = returned_values.to_bool(truncated, "truncated")
+            terminated = to_bool(terminated, "terminated")
+            truncated = to_bool(truncated, "truncated")
         self._count(reward, info)
         return observation, reward, terminated, truncated, info
 
@@ -64,7 +71,7 @@ class RunningEpisode:
             for name, value in info.get("reward_terms", {}).items():
                 sums[name] = sums.get(name, 0.0) + value
         except (TypeError, AttributeError):
-            raise InvalidReturn(f"info['reward_terms'] is {info['reward_terms']!r}, not a dict of numbers") from None
+            raise ValueError(f"info['reward_terms'] is {info['reward_terms']!r}, not a dict of numbers") from None
         for name in self._metrics:
             self._raw_sums[name] += info["metrics"][name]
 
@@ -80,15 +87,13 @@ class RunningEpisode:
         # "distance" may be anything in a plain environment.
         if not isinstance(distance, int | float | np.number) or not math.isfinite(distance):
             distance = None
-        terms = {
-            str(name): returned_values.to_float(value, f"reward term {name}") for name, value in self._sums.items()
-        }
+        terms = {str(name): to_float(value, f"reward term {name}") for name, value in self._sums.items()}
         return EpisodeResult(
             self.index,
             self.seed,
             self._return,
             self.step,
-            None if success is None else returned_values.to_bool(success, "info['is_success']"),
+            None if success is None else to_bool(success, "info['is_success']"),
             terms,
             None if distance is None else float(distance),
             row,
@@ -97,3 +102,105 @@ class RunningEpisode:
             self.acting_s / max(self.acting_s + self.stepping_s, 1e-9),
             {name: float(total) / self.step for name, total in self._raw_sums.items()},
         )
+
+
+def check_tuple(returned: Any, names: tuple[str, ...], call: str) -> Any:
+    """Return the result of a call if it is a tuple with a value for each name, else raise `ValueError`."""
+    if isinstance(returned, tuple | list) and len(returned) == len(names):
+        return returned
+    what = format_count(len(returned), "value") if isinstance(returned, tuple | list) else reprlib.repr(returned)
+    raise ValueError(f"{call} returned {what}; Gymnasium requires ({', '.join(names)})")
+
+
+def to_float(value: Any, name: str) -> float:
+    """Return a number as a float; raises `ValueError`, which mentions `name`, for anything else."""
+    try:
+        if isinstance(value, str | bytes):
+            raise TypeError
+        return float(value.item() if isinstance(value, np.ndarray) else value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is {reprlib.repr(value)}, not a number") from None
+
+
+def to_bool(value: Any, name: str) -> bool:
+    """Return a flag as a bool; numpy's bools and the numbers 0 and 1 are accepted, else raises `ValueError`."""
+    if np.size(value) == 1 and (single := np.ravel(value)[0]) in (0, 1):
+        return bool(single)
+    raise ValueError(f"{name} is {reprlib.repr(value)}, not a bool")
+
+
+def check_info(info: Any) -> None:
+    """Raise `ValueError` if an info is not a dictionary."""
+    if not isinstance(info, Mapping):
+        raise ValueError(f"info is {reprlib.repr(info)}, not a dict")
+
+
+class ObservationWriter:
+    """Checks observations and writes them into arrays, one per key; `checked`: the environment has checked them."""
+
+    def __init__(self, space: spaces.Space[Any], *, checked: bool) -> None:
+        self._checked = checked
+        self._fields = observation_fields(space)
+        self._categories = {key: _category_bounds(part) for key, part in split_space(space).items()}
+
+    def write(self, target: Mapping[str, NDArray[Any]], index: int, observation: Any) -> None:
+        """Write an observation into row `index` of each array; raises `ValueError` for one that does not fit."""
+        if self._checked:
+            target[SINGLE][index] = observation
+            return
+        parts = split(observation)
+        if parts.keys() != target.keys():
+            raise ValueError(f"observation has the keys {sorted(parts)}, the space has {sorted(target)}")
+        for key, value in parts.items():
+            value = np.asarray(value)
+            self._check(key, value)
+            target[key][index] = value
+
+    def _check(self, key: str, value: NDArray[Any]) -> None:
+        shape, dtype = self._fields[key]
+        if value.shape != shape:
+            raise ValueError(f"{_named(key)} has shape {value.shape}, the space has {shape}")
+        if value.dtype is not dtype and value.dtype.kind not in "biuf":
+            raise ValueError(f"{_named(key)} is {reprlib.repr(value.tolist())}, not numbers")
+        # The sum is finite if all elements are, unless it overflows: then the slow check decides.
+        if value.dtype.kind == "f" and not math.isfinite(np.add.reduce(value, None)):
+            bad = np.flatnonzero(~np.isfinite(value))
+            if bad.size:
+                raise ValueError(f"{_named(key)} is not finite: element {bad[0]} is {value.ravel()[bad[0]]}")
+        limits = self._categories[key]
+        if limits is not None and not ((limits[0] <= value) & (value <= limits[1])).all():
+            raise ValueError(f"{_named(key)} is {value}, the space has {limits[0]} to {limits[1]}")
+
+
+def _named(key: str) -> str:
+    return f"observation {key!r}" if key else "observation"
+
+
+def _category_bounds(space: spaces.Space[Any]) -> NDArray[Any] | None:
+    """Return the first and last value, shape (2, ...), of a space of categories; a network accepts no others."""
+    if isinstance(space, spaces.Discrete):
+        return np.array([space.start, space.start + space.n - 1])
+    if isinstance(space, spaces.MultiDiscrete):
+        start = np.asarray(space.start)
+        return np.stack([start, start + space.nvec - 1])
+    return None
+
+
+def compute_rewards(env: Any, achieved: NDArray[Any], desired: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the rewards, shape (n,), that an environment computes for goals of shape (n, *goal); else `TaskError`."""
+    count = len(achieved)
+    infos: list[dict[str, Any]] = [{} for _ in range(count)]
+    try:
+        rewards = np.asarray(env.unwrapped.compute_reward(achieved, desired, infos))
+    except BaseException as error:  # a plugin may raise anything, SystemExit too
+        raise TaskError(
+            f"compute_reward raised {describe_exception(error)}", details=format_plugin_traceback(error)
+        ) from error
+    if rewards.dtype.kind not in "fiub":
+        raise TaskError(f"compute_reward returned an array of {rewards.dtype}, not of numbers")
+    if rewards.shape != (count,):
+        raise TaskError(f"compute_reward returned shape {rewards.shape} for {count} goals at once, not ({count},)")
+    if not np.isfinite(rewards).all():
+        bad = int(np.flatnonzero(~np.isfinite(rewards))[0])
+        raise TaskError(f"compute_reward is {rewards[bad]} for achieved {achieved[bad]}, desired {desired[bad]}")
+    return rewards.astype(np.float64)

@@ -28,10 +28,8 @@ from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.processes.pool import answer_messages
 from rlctl.processes.printed_lines import write_stderr
 from rlctl.rollout import messages
-from rlctl.rollout.failures import FailedInEpisode, describe_failure
-from rlctl.rollout.messages import Answer, EpisodeResult, Message
-from rlctl.rollout.returned_values import ObservationWriter, compute_rewards
-from rlctl.rollout.running_episode import RunningEpisode
+from rlctl.rollout.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
+from rlctl.rollout.running_episode import ObservationWriter, RunningEpisode, compute_rewards
 from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
 from rlctl.task.env import TaskEnv

@@ -24,8 +24,7 @@ from rlctl.processes.child_process import anonymous_file
 from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault
 from rlctl.processes.printed_lines import write_stderr
 from rlctl.rollout import messages
-from rlctl.rollout.failures import format_hint, make_error
-from rlctl.rollout.messages import Answer, EpisodeResult, Message
+from rlctl.rollout.messages import Answer, EpisodeResult, Message, format_hint, make_error
 from rlctl.rollout.shared_arrays import PolicyNumbers, SharedArrays
 
 BUILD_TIMEOUT_S = 300.0

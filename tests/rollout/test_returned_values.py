@@ -5,8 +5,16 @@ import pytest
 from rlctl.environments.spec import EnvSpec
 from rlctl.processes.child_process import anonymous_file
 from rlctl.processes.pool import WorkerException
-from rlctl.rollout.failures import FailedInEpisode, describe_failure, format_hint
-from rlctl.rollout.messages import Attach, Build, LoadPolicy, Play, WorkerJob
+from rlctl.rollout.messages import (
+    Attach,
+    Build,
+    FailedInEpisode,
+    LoadPolicy,
+    Play,
+    WorkerJob,
+    describe_failure,
+    format_hint,
+)
 from rlctl.rollout.worker import Worker
 from tests.training import faulty_envs
 

@@ -17,7 +17,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault, answer_messages
 from rlctl.processes.printed_lines import write_stderr
-from rlctl.rollout.failures import describe_failure, make_error
+from rlctl.rollout.messages import describe_failure, make_error
 
 _TRIALS = 12  # per unknown, and for one unknown more
 _STARTS = 3
