@@ -85,17 +85,15 @@ def play_episodes(
     while running:
         before = workers.playing
         try:
-            ended = {
-                result.env: result for result in workers.finish_playing(first=True, check=lambda: watch(len(episodes)))
-            }
+            results = workers.finish_playing(first=True, check=lambda: watch(len(episodes)))
         except EpisodeFailed as error:
             if record and error.env in running:
                 error.actions = running[error.env].failed_actions(workers, error)
             raise
+        ended = {result.env: result for result in results}
         for worker in sorted(before - workers.playing):
             env = workers.first_envs[worker]
-            result = ended.get(env)
-            recorder = running[env]
+            result, recorder = ended.get(env), running[env]
             recorder.add(workers, env, steps if result is None else result.row + 1)
             if result is None:
                 if workers.info.max_steps is None and recorder.steps >= MOST_STEPS:
@@ -144,14 +142,9 @@ class _Recorder:
         """Return the whole episode; None if it was not recorded."""
         if not self._record:
             return None
-        parts = self._parts
-        observations = {
-            key: np.concatenate([split(part.observations)[key] for part in parts])
-            for key in split(parts[0].observations)
-        }
-        return Trajectory(
-            np.concatenate([part.actions for part in parts]),
-            join(observations),
-            np.concatenate([part.rewards for part in parts]),
-            np.concatenate([part.terms for part in parts]),
+        rows = [split(part.observations) for part in self._parts]
+        observations = {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
+        actions, rewards, terms = (
+            np.concatenate([getattr(part, name) for part in self._parts]) for name in ("actions", "rewards", "terms")
         )
+        return Trajectory(actions, join(observations), rewards, terms)

@@ -26,41 +26,41 @@ class RunningEpisode:
         self.env = env
         self.index = index  # number of the environment
         self._metrics = metrics  # reward terms of weight 0
-        self.seed = -1
+        self._discrete = isinstance(env.action_space, spaces.Discrete)
+        self._clear(-1)
+
+    def _clear(self, seed: int) -> None:
+        self.seed = seed
         self.step = 0  # steps begun in the episode
         self.acting_s, self.stepping_s = 0.0, 0.0
         """Time that the policy and the environment took in the episode's steps [s]."""
-        self._discrete = isinstance(env.action_space, spaces.Discrete)
         self._return = 0.0
         self._sums: dict[str, float] = {}
-        self._raw_sums = dict.fromkeys(metrics, 0.0)
+        self._raw_sums = dict.fromkeys(self._metrics, 0.0)
         self._deepest_contact: float | None = None
 
     def start(self, seed: int) -> Any:
         """Begin the episode of a seed; return its first observation."""
-        self.seed, self.step = seed, 0
-        self._return, self._sums, self._deepest_contact = 0.0, {}, None
-        self._raw_sums = dict.fromkeys(self._metrics, 0.0)
-        self.acting_s, self.stepping_s = 0.0, 0.0
-        observation, info = check_tuple(self.env.reset(seed=seed), _RESET, "reset")
-        check_info(info)
+        self._clear(seed)
+        observation, info = _check_tuple(self.env.reset(seed=seed), _RESET, "reset")
+        _check_info(info)
         return observation
 
     def take_step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step the environment; return its checked result."""
         result = self.env.step(int(action) if self._discrete else action.copy())
         if result.__class__ is not tuple or len(result) != 5:
-            result = check_tuple(result, _STEP, "step")
+            result = _check_tuple(result, _STEP, "step")
         observation, reward, terminated, truncated, info = result
         if reward.__class__ is not float:
-            reward = to_float(reward, "reward")
+            reward = _to_float(reward, "reward")
         if not math.isfinite(reward):
             raise ValueError(f"reward is {reward}")
         if info.__class__ is not dict:
-            check_info(info)
+            _check_info(info)
         if terminated.__class__ is not bool or truncated.__class__ is not bool:
-            terminated = to_bool(terminated, "terminated")
-            truncated = to_bool(truncated, "truncated")
+            terminated = _to_bool(terminated, "terminated")
+            truncated = _to_bool(truncated, "truncated")
         self._count(reward, info)
         return observation, reward, terminated, truncated, info
 
@@ -81,19 +81,18 @@ class RunningEpisode:
 
     def summarize(self, info: dict[str, Any], row: int, report: dict[str, Any]) -> EpisodeResult:
         """Return the result of the episode from the `info` of its last step, which is in a row of a segment."""
-        success = info.get("is_success")
-        metrics = info.get("metrics")  # may be anything in a plain environment
+        success, metrics = info.get("is_success"), info.get("metrics")
+        # In a plain environment "metrics" and "distance" may be anything.
         distance = (metrics if isinstance(metrics, dict) else info).get("distance")
-        # "distance" may be anything in a plain environment.
         if not isinstance(distance, int | float | np.number) or not math.isfinite(distance):
             distance = None
-        terms = {str(name): to_float(value, f"reward term {name}") for name, value in self._sums.items()}
+        terms = {str(name): _to_float(value, f"reward term {name}") for name, value in self._sums.items()}
         return EpisodeResult(
             self.index,
             self.seed,
             self._return,
             self.step,
-            None if success is None else to_bool(success, "info['is_success']"),
+            None if success is None else _to_bool(success, "info['is_success']"),
             terms,
             None if distance is None else float(distance),
             row,
@@ -104,16 +103,14 @@ class RunningEpisode:
         )
 
 
-def check_tuple(returned: Any, names: tuple[str, ...], call: str) -> Any:
-    """Return the result of a call if it is a tuple with a value for each name, else raise `ValueError`."""
+def _check_tuple(returned: Any, names: tuple[str, ...], call: str) -> Any:
     if isinstance(returned, tuple | list) and len(returned) == len(names):
         return returned
     what = format_count(len(returned), "value") if isinstance(returned, tuple | list) else reprlib.repr(returned)
     raise ValueError(f"{call} returned {what}; Gymnasium requires ({', '.join(names)})")
 
 
-def to_float(value: Any, name: str) -> float:
-    """Return a number as a float; raises `ValueError`, which mentions `name`, for anything else."""
+def _to_float(value: Any, name: str) -> float:
     try:
         if isinstance(value, str | bytes):
             raise TypeError
@@ -122,15 +119,14 @@ def to_float(value: Any, name: str) -> float:
         raise ValueError(f"{name} is {reprlib.repr(value)}, not a number") from None
 
 
-def to_bool(value: Any, name: str) -> bool:
-    """Return a flag as a bool; numpy's bools and the numbers 0 and 1 are accepted, else raises `ValueError`."""
+def _to_bool(value: Any, name: str) -> bool:
+    """Return a flag as a bool; NumPy's bools and the numbers 0 and 1 are accepted."""
     if np.size(value) == 1 and (single := np.ravel(value)[0]) in (0, 1):
         return bool(single)
     raise ValueError(f"{name} is {reprlib.repr(value)}, not a bool")
 
 
-def check_info(info: Any) -> None:
-    """Raise `ValueError` if an info is not a dictionary."""
+def _check_info(info: Any) -> None:
     if not isinstance(info, Mapping):
         raise ValueError(f"info is {reprlib.repr(info)}, not a dict")
 

@@ -58,11 +58,9 @@ class Worker:
             case messages.ComputeRewards():
                 return Answer(rewards=compute_rewards(self._episodes[0].env, message.achieved, message.desired))
             case messages.Build():
-                self._build(message.spec)
-                return Answer(info=self._info)
+                return Answer(info=self._build(message.spec))
             case messages.SetEvents():
-                self._set_events(message)
-                return Answer(info=self._info)
+                return Answer(info=self._set_events(message))
             case messages.Attach():
                 self._arrays = SharedArrays(self._job.memory, self._info, self._job.total, message.steps)
             case messages.LoadPolicy():
@@ -71,7 +69,7 @@ class Worker:
                 self._limit_actions(message)
         return Answer()
 
-    def _build(self, spec: EnvSpec) -> None:
+    def _build(self, spec: EnvSpec) -> EnvInfo:
         if self._episodes:
             self.close()
             gc.unfreeze()
@@ -85,8 +83,9 @@ class Worker:
         checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
         self._writer = ObservationWriter(space, checked=checked)
         gc.freeze()  # present objects live long: later collections skip them
+        return self._info
 
-    def _set_events(self, message: messages.SetEvents) -> None:
+    def _set_events(self, message: messages.SetEvents) -> EnvInfo:
         """Replace the events of all environments; a new episode must begin afterwards."""
         spec, added = message.spec, {}
         if message.push is not None:
@@ -98,14 +97,13 @@ class Worker:
             env.set_events(EventSettings(spec.randomize, spec.events), added)
             env.set_level(spec.level)
         self._info = describe(self._episodes[0].env)
+        return self._info
 
     def _load_policy(self, message: messages.LoadPolicy) -> None:
-        """Replace the policy."""
         self._states = None
         self._close_player()
         if message.info is None:
-            env = self._episodes[0].env
-            self._player = _make_player(message.other, env.action_space, env.observation_space)
+            self._player = _make_player(message.other, self._episodes[0].env)
         else:
             layout = {name: (shape, np.dtype(dtype)) for name, shape, dtype in message.layout}
             tensors = map_arrays(self._job.numbers, layout)
@@ -113,7 +111,6 @@ class Worker:
             self._player = PolicyPlayer(PolicyFile(message.info, tensors))
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
-        """Pass the policy's actions through a safety filter."""
         from rlctl.deploy.filter.limited_player import LimitedPlayer  # few evaluations need it
         from rlctl.deploy.filter.limits import Limits
 
@@ -165,7 +162,7 @@ class Worker:
         for env, seed in message.begin.items():
             episode = self._episodes[env - self._job.first]
             number = message.next_episodes.get(env)
-            next_seeds = None if number is None else _training_seeds(message.run_seed, env, number)
+            next_seeds = None if number is None else _list_training_seeds(message.run_seed, env, number)
             with self._within(episode):
                 if seed >= 0:
                     self._begin(episode, seed)
@@ -251,18 +248,16 @@ class Worker:
         self._episodes = []
 
 
-def _training_seeds(run_seed: int, env: int, episode: int) -> Iterator[int]:
-    """Yield the seeds of an environment's training episodes, beginning with a number."""
-    for number in itertools.count(episode):
-        yield episode_seed(run_seed, Stream.TRAIN, env, number)
+def _list_training_seeds(run_seed: int, env: int, first: int) -> Iterator[int]:
+    return (episode_seed(run_seed, Stream.TRAIN, env, number) for number in itertools.count(first))
 
 
-def _make_player(name: str, space: spaces.Space[Any], observation_space: spaces.Space[Any]) -> Player:
-    if name.startswith(SERVER):
-        from rlctl.deploy.server.client import RemotePlayer  # only here: it imports aiohttp
+def _make_player(name: str, env: Any) -> Player:
+    if not name.startswith(SERVER):
+        return make_player(name, env.action_space)
+    from rlctl.deploy.server.client import RemotePlayer  # only here: it imports aiohttp
 
-        return RemotePlayer(name, observation_space, space)
-    return make_player(name, space)
+    return RemotePlayer(name, env.observation_space, env.action_space)
 
 
 def main(connection: Connection, job: messages.WorkerJob) -> None:
