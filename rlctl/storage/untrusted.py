@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 from rich.filesize import decimal as format_bytes
 
 from rlctl.errors import ArtifactError, short_repr
-from rlctl.storage import memory
 from rlctl.version import __version__
 
 if TYPE_CHECKING:
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
 
 Model = TypeVar("Model", bound="BaseModel")
 
+_CGROUPS = Path("/sys/fs/cgroup")
 JSON_LIMIT = 16 * 2**20  # [bytes]
 _ALWAYS_READ = 1_000_000  # [bytes]
 _MEMBERS = 1000  # maximum number of arrays in a file
@@ -63,7 +63,7 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
 def _check_size(path: Path, size: int, what: str = "") -> None:
     """Raise `ArtifactError` if `size` bytes are more than half of the available memory."""
     # Measuring memory costs as much as reading a small file, and `rlctl runs` reads thousands of them.
-    if size > _ALWAYS_READ and (free := memory.available()) is not None and size > free // 2:
+    if size > _ALWAYS_READ and (free := measure_free_memory()) is not None and size > free // 2:
         needs = f"{what}it needs {format_bytes(size)} of memory, and {format_bytes(free)} are free"
         raise ArtifactError(f"{path}: too large: {needs}")
 
@@ -93,18 +93,13 @@ def parse_model(text: str | bytes, model: type[Model], path: Path, what: str) ->
             known = f"this rlctl {__version__} can read ({newest}); upgrade rlctl"
             raise ArtifactError(f"{path}: {what} format {file_format} is newer than {known}")
         return model.model_validate(content)
-    except ValueError as error:  # pydantic's is one
-        raise ArtifactError(f"{path}: damaged: {_explain_error(error, model, content)}") from None
+    except ValueError as error:
+        import pydantic
 
+        from rlctl.storage import validation
 
-def _explain_error(error: ValueError, model: Any, content: Any) -> str:
-    import pydantic
-
-    from rlctl.storage import validation
-
-    if isinstance(error, pydantic.ValidationError):
-        return short_repr(validation.explain_invalid(error, model, content), 200)
-    return short_repr(str(error), 200)
+        explained = isinstance(error, pydantic.ValidationError) and validation.explain_invalid(error, model, content)
+        raise ArtifactError(f"{path}: damaged: {short_repr(explained or str(error), 200)}") from None
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -128,3 +123,51 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         if not isinstance(content, np.ndarray):  # without a header numpy returns bytes
             raise ValueError(f"{name!r} is not an array")
     return arrays
+
+
+def measure_free_memory() -> int | None:
+    """Return how many bytes this process can still use, by machine and control groups; None if unknown.
+
+    NumPy and torch reserve memory without touching it: an allocation that is too large succeeds, and the system kills
+    the process later.
+    """
+    limits = [value for value in (_read_machine(), *_read_control_groups()) if value is not None]
+    return max(min(limits), 0) if limits else None
+
+
+def _read_machine() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration, ValueError):  # not Linux: only the installed memory is known
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError):
+        return None
+
+
+def _read_control_groups() -> list[int]:
+    """Return the memory left in each control group (container, job); a group's limit includes its subgroups."""
+    try:
+        entries = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return []
+    own = next((entry[3:] for entry in entries if entry.startswith("0::")), "/")
+    folder = _CGROUPS / own.strip("/")
+    groups = [group for group in (folder, *folder.parents) if group.is_relative_to(_CGROUPS)]
+    limits = [_read_group(group, "memory.max", "memory.current", "file") for group in groups]
+    limits.append(_read_group(_CGROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "cache"))
+    return [value for value in limits if value is not None]
+
+
+def _read_group(group: Path, limit: str, used: str, cache_name: str) -> int | None:
+    try:
+        ceiling = int((group / limit).read_text(encoding="ascii"))  # "max" without a limit
+        taken = int((group / used).read_text(encoding="ascii"))
+        rows = (group / "memory.stat").read_text(encoding="ascii").splitlines()
+    except (OSError, ValueError):
+        return None
+    # The system counts cached files as used, but frees them when memory is short.
+    cached = next((int(row.split()[1]) for row in rows if row.startswith(f"{cache_name} ")), 0)
+    return ceiling - taken + cached

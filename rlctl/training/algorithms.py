@@ -17,7 +17,7 @@ from rlctl.errors import RecipeError, RlctlError, UsageError, short_repr
 from rlctl.policy.own_modules import import_named
 from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
 from rlctl.recipe.recipe import ON_POLICY, NormalizeSettings, Recipe
-from rlctl.storage import memory
+from rlctl.storage.untrusted import measure_free_memory
 from rlctl.training.hindsight import replay_arguments
 from rlctl.training.own_networks import check_policy_class, write_graph
 from rlctl.training.snapshot import pack
@@ -189,7 +189,7 @@ def _is_real(space: spaces.Space[Any]) -> bool:
 
 def _check_memory(recipe: Recipe, env: VecEnv) -> None:
     """Raise `RecipeError` for a buffer that does not fit into the free memory."""
-    free, (key, size) = memory.available(), _measure_buffer(recipe, env)
+    free, (key, size) = measure_free_memory(), _measure_buffer(recipe, env)
     if free is not None and size > _USABLE_SHARE * free:
         needs, are = format_bytes(size), format_bytes(free)
         given = recipe.algo_kwargs.get(key)
