@@ -5,12 +5,11 @@ import importlib.util
 import keyword
 import os
 import re
-import shutil
 import string
 from pathlib import Path
 
 from rlctl.environments import installed
-from rlctl.errors import ArtifactError, UsageError
+from rlctl.errors import UsageError
 from rlctl.recipe import json_schema
 from rlctl.storage import files as storage_files
 
@@ -57,7 +56,10 @@ def create(name: str) -> NewPlugin:
     }
     # The recipe's schema is copied next to it, since a path to this machine's packages is wrong on other machines.
     content[Path(package, json_schema.FILE.name)] = json_schema.FILE.read_text(encoding="utf-8")
-    write_files(folder, content)
+    with storage_files.whole_folder(folder) as temporary:
+        for path, text in content.items():
+            (temporary / path).parent.mkdir(parents=True, exist_ok=True)
+            (temporary / path).write_text(text, encoding="utf-8")
     return NewPlugin(name, folder, package, cls, list(content))
 
 
@@ -108,8 +110,6 @@ def _check(name: str, package: str) -> None:
 
 def _read_sources() -> dict[Path, str]:
     files = sorted(TEMPLATE.rglob(f"*{_SUFFIX}"))
-    if not files:
-        raise ArtifactError(f"{TEMPLATE}: the template is missing; reinstall rlctl")
     return {file.relative_to(TEMPLATE).with_suffix(""): file.read_text(encoding="utf-8") for file in files}
 
 
@@ -117,17 +117,3 @@ def _make_class_name(name: str, used: str) -> str:
     """`my-arm` -> `MyArm`; `MyArmTask` if the template or Python already uses that word."""
     cls = "".join(part[:1].upper() + part[1:] for part in re.split("[-_]+", name))
     return f"{cls}Task" if keyword.iskeyword(cls) or re.search(rf"\b{cls}\b", used) else cls
-
-
-def write_files(folder: Path, content: dict[Path, str]) -> None:
-    """Write files into a new folder atomically; raises `OSError` if the folder exists or a write fails."""
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")
-    try:
-        with storage_files.name_in_errors(folder):
-            for path, text in content.items():
-                file = temporary / path
-                file.parent.mkdir(parents=True, exist_ok=True)
-                file.write_text(text, encoding="utf-8")
-            temporary.rename(folder)  # fails if the folder now exists and has files
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

@@ -143,20 +143,6 @@ def test_an_existing_folder_is_left_alone(rlctl, tmp_path):
     assert written(tmp_path) == set()
 
 
-def test_whole_or_not_at_all(tmp_path):
-    with pytest.raises(OSError):  # noqa: PT011 (which one depends on the system)
-        new.write_files(tmp_path / "arm", {Path("a"): "a file", Path("a/b"): "in a folder of the same name"})
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_another_process_wrote_meanwhile_stays(tmp_path):
-    (tmp_path / "arm").mkdir()
-    (tmp_path / "arm" / "theirs").write_text("precious")
-    with pytest.raises(OSError):  # noqa: PT011
-        new.write_files(tmp_path / "arm", {Path("ours"): ""})
-    assert written(tmp_path) == {"arm/theirs"}
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_from_the_wheel_to_a_policy(tmp_path):
