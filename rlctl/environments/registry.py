@@ -191,10 +191,8 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
                 ) from None
             close = did_you_mean(name, gymnasium.registry)
             raise UsageError(f"Gymnasium has no environment {task!r}.{close}") from None
-        except gymnasium.error.DeprecatedEnv as error:
-            raise UsageError(f"Gymnasium: {task}: {error}") from None
-        except ModuleNotFoundError as error:
-            missing = getattr(error.__cause__, "name", None) or error.name
+        except (gymnasium.error.DeprecatedEnv, ModuleNotFoundError) as error:
+            missing = getattr(error.__cause__, "name", None) or getattr(error, "name", None)
             if missing and missing != task.partition(":")[0]:
                 raise  # the module exists, but one of its own imports does not
             raise UsageError(f"Gymnasium: {task}: {error}") from None

@@ -106,7 +106,7 @@ def report_unexpected(error: Exception) -> int:
         return 2
     if _is_out_of_memory(error):
         text = short_repr(str(error), 120)
-        print(f"error: not enough memory ({_read_limit()}){text and f': {text}'}", file=sys.stderr)
+        print(f"error: not enough memory{text and f': {text}'}", file=sys.stderr)
         print("close other programs, or use fewer --n-envs or a smaller algo_kwargs.buffer_size", file=sys.stderr)
         return 5
     if isinstance(error, OSError) and error.strerror:
@@ -129,12 +129,3 @@ def _is_out_of_memory(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
-
-
-def _read_limit() -> str:
-    import resource
-
-    from rich.filesize import decimal as format_bytes
-
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return "the system refused more" if limit == resource.RLIM_INFINITY else f"its limit is {format_bytes(limit)}"

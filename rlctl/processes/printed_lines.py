@@ -77,7 +77,8 @@ class LineFilter:
         if self._lines > MAX_LINES_PER_S:
             self._left_out += 1
         else:
-            self._report(replace_control_characters(text))
+            # Control characters could change a terminal's state.
+            self._report("".join(char if char.isprintable() or char == "\t" else "\ufffd" for char in text))
 
     def end(self) -> None:
         """Report how many lines were left out, if any."""
@@ -91,11 +92,6 @@ class LineFilter:
                 self._receive(text)
         except OSError:
             self._closed = True
-
-
-def replace_control_characters(text: str) -> str:
-    """Return a line without control characters, which could change a terminal's state."""
-    return "".join(character if character.isprintable() or character == "\t" else "\ufffd" for character in text)
 
 
 def write_stderr(text: str) -> None:

@@ -172,13 +172,9 @@ def append(path: Path, content: bytes, size: int) -> None:
 
 def truncate(path: Path, size: int) -> None:
     """Truncate a file to `size` bytes."""
-    descriptor = os.open(path, os.O_WRONLY)
-    try:
-        with name_in_errors(path):
-            os.ftruncate(descriptor, size)
-            os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    with name_in_errors(path), path.open("r+b") as file:
+        file.truncate(size)
+        os.fsync(file.fileno())
 
 
 def _write_all(descriptor: int, content: bytes) -> None:

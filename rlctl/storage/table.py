@@ -58,11 +58,7 @@ class Table:
         if self._pending:
             # If a user edits or removes the file during a training, rows are lost, but the training continues.
             size = min(self.size, _read_size(self.path))
-            columns = self._read_columns() if size else None
-            if columns is not None and next(iter(self._pending[0])) not in columns:
-                files.set_aside(self.path)
-                size, columns = 0, None
-            content = self._format_rows(columns).encode()
+            content = self._format_rows(self._read_columns() if size else None).encode()
             files.append(self.path, content, size)
             self.size, self._pending = size + len(content), []
         if sync and self.size:
@@ -83,7 +79,6 @@ class Table:
 
 
 def _read_first_number(row: str) -> float:
-    """Return the number in the first column of a row; infinity if there is none."""
     try:
         return float(row.partition(",")[0])
     except ValueError:

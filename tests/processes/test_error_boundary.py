@@ -88,4 +88,4 @@ def test_an_interruption_is_said():
 )
 def test_memory_that_is_refused(error, capsys):
     assert error_boundary.report_unexpected(error) == 5
-    assert capsys.readouterr().err.startswith("error: not enough memory (")
+    assert capsys.readouterr().err.startswith("error: not enough memory")

@@ -2,13 +2,7 @@
 
 import os
 
-from rlctl.processes.printed_lines import (
-    MAX_LINE_BYTES,
-    MAX_LINES_PER_S,
-    LineFilter,
-    LineReader,
-    replace_control_characters,
-)
+from rlctl.processes.printed_lines import MAX_LINE_BYTES, MAX_LINES_PER_S, LineFilter, LineReader
 
 
 def forward_lines(content: bytes, receive=None):
@@ -41,7 +35,7 @@ def test_what_would_upset_a_terminal():
     assert forward_lines(b"\x1b[2J\x07\x00 caf\xc3\xa9 \xff\tend\r\n") == [
         "\ufffd[2J\ufffd\ufffd caf\u00e9 \ufffd\tend"
     ]
-    assert replace_control_characters("\u202eabc") == "\ufffdabc"
+    assert forward_lines("\u202eabc".encode()) == ["\ufffdabc"]
 
 
 def test_a_flood_is_counted():
