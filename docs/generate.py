@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import json
 import pathlib
 from collections.abc import Iterator
+from typing import Any
 
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
-from rlctl.recipe.json_schema import render_json_schema
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
-from rlctl.recipe.recipe import build_schema
+from rlctl.recipe.recipe import ALGORITHMS, SCHEMA_FILE, build_schema
 from rlctl.recipe.sources import list_presets
 from rlctl.storage import validation, yaml_text
 from rlctl.storage.validation import Schema
@@ -18,6 +19,13 @@ Path = tuple[str | int, ...]
 
 _OWN_TABLES = ("stages", "algo_kwargs", "policy_kwargs")
 
+_GROUPED_DIGITS = {"type": "string", "pattern": r"^-?[0-9][0-9_]*(\.[0-9_]+)?$"}
+"""`200_000`: rlctl reads a number, editors read text."""
+_BOUNDS = {"ge": "minimum", "gt": "exclusiveMinimum", "le": "maximum", "lt": "exclusiveMaximum"}
+_NUMBER = r"[0-9.]+(e[+-]?[0-9]+)?"
+_FOR_IMAGES = {"$ref": "#/$defs/_FeaturesExtractor"}
+_LINE = 120  # [characters]
+_KWARGS = ("algo_kwargs", "policy_kwargs")
 _HEAD = """# Recipes
 
 A recipe says how to train a task. It is made from the defaults on this page, then the task's own recipe (a YAML file
@@ -105,11 +113,68 @@ def _render_default(part: Schema) -> str:
     return "" if isinstance(default, dict) else yaml_text.dump(default).partition("\n")[0]
 
 
+def build_json_schema() -> dict[str, Any]:
+    """Return the schema of a recipe, whose `algo_kwargs` and `policy_kwargs` depend on `algo`."""
+    root = dict(build_schema(None))
+    definitions = dict(root.pop("$defs", {}))
+    conditions = []
+    for algo in ALGORITHMS:
+        schema = build_schema(algo)
+        definitions |= schema.get("$defs", {})
+        condition: dict[str, Any] = {"properties": {"algo": {"const": algo}}}
+        if algo != "ppo":  # the default
+            condition["required"] = ["algo"]
+        parameters = {key: schema["properties"][key] for key in _KWARGS}
+        conditions.append({"if": condition, "then": {"properties": parameters}})
+    described = {**root, "allOf": conditions, "$defs": definitions}
+    converted: dict[str, Any] = _convert(described)
+    converted["$defs"]["GroupedDigits"] = _GROUPED_DIGITS
+    return {"$schema": "http://json-schema.org/draft-07/schema#", **converted}
+
+
+def render_json_schema() -> str:
+    """Return the schema as text: keys sorted, each property of a recipe on a line of its own."""
+    return _format_json(build_json_schema()) + "\n"
+
+
+def _format_json(node: Any, indent: str = "", *, expand: bool = False) -> str:
+    text = json.dumps(node, sort_keys=True)
+    if len(indent + text) <= _LINE or not (expand or '"properties"' in text):
+        return text
+    inner = f"{indent} "
+    if isinstance(node, list):
+        return "[\n" + ",\n".join(inner + _format_json(part, inner) for part in node) + f"\n{indent}]"
+    lines = (
+        f"{inner}{json.dumps(key)}: {_format_json(node[key], inner, expand=key == 'properties')}"
+        for key in sorted(node)
+    )
+    return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
+
+
+def _convert(node: Any) -> Any:
+    """Return part of a schema with standard keywords only, and with numbers that may have grouped digits."""
+    if isinstance(node, list):
+        return [_convert(part) for part in node]
+    if not isinstance(node, dict):
+        return node
+    known = {_BOUNDS.get(key, key): value for key, value in node.items() if key != "default_text"}
+    if isinstance(known.get("title"), str):  # the key itself in other letters
+        del known["title"]
+    if isinstance(pattern := node.get("pattern"), str):  # written for people: lin_NUMBER
+        known["pattern"] = f"^{pattern.replace('NUMBER', _NUMBER)}$"
+    if _FOR_IMAGES in node.get("anyOf", ()):  # the arguments of a user's class have any names
+        known["anyOf"] = [*node["anyOf"], {"type": "object"}]
+    if node.get("type") in ("integer", "number"):
+        about = {key: known.pop(key) for key in ("description", "default") if key in known}
+        return {**about, "anyOf": [known, {"$ref": "#/$defs/GroupedDigits"}]}
+    return {key: _convert(value) for key, value in known.items()}
+
+
 def render_pages() -> dict[str, str]:
     """Return the generated files by name."""
     return {
         "recipe.md": render_recipe_page(),
-        "../rlctl/recipe/recipe.schema.json": render_json_schema(),
+        str(SCHEMA_FILE): render_json_schema(),
     }
 
 

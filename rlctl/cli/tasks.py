@@ -58,9 +58,9 @@ def recipe(
     from rlctl import output
 
     if schema:
-        from rlctl.recipe.json_schema import render_json_schema
+        from rlctl.recipe.recipe import SCHEMA_FILE
 
-        output.results().write(render_json_schema())
+        output.results().write(SCHEMA_FILE.read_text(encoding="utf-8"))
         return
     if task is None:
         raise UsageError("give a task, such as rlctl recipe reach, or --schema")

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from rlctl.recipe.quantities import Number, NumberAfter, Section, Switch, Whole
+from rlctl.storage.validation import Number, NumberAfter, Section, Switch, Whole
 
 ON_POLICY = frozenset({"ppo", "a2c", "recurrent_ppo"})
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PlainSerializer, ValidationInfo, WrapValidator
 
 from rlctl.recipe.hyperparameters import Parameters
-from rlctl.recipe.quantities import Number, Switch, Whole
+from rlctl.storage.validation import Number, Switch, Whole
 
 _Width = Annotated[Whole, Field(ge=1, le=65_536)]
 _Few = Annotated[Whole, Field(ge=1, le=100)]

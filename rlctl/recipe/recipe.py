@@ -16,14 +16,17 @@ from rlctl.errors import RecipeError, short_repr
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS, decide_by
 from rlctl.recipe.hyperparameters import ON_POLICY as ON_POLICY
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
-from rlctl.recipe.quantities import Number, Section, Switch, Whole
 from rlctl.recipe.stages import Stage, check_promotions
 from rlctl.storage import validation, yaml_text
+from rlctl.storage.validation import Number, Section, Switch, Whole
 
 Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
 """Algorithms with hindsight replay: those with a replay buffer, except crossq, which has no network for Dict spaces."""
+
+SCHEMA_FILE = Path(__file__).with_name("recipe.schema.json")
+"""The JSON schema of recipes for editors; `docs/generate.py` writes it."""
 
 NOT_SET = "(not set)"
 """Stands for a missing key in the result of `find_difference`."""

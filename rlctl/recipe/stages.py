@@ -8,7 +8,7 @@ from typing import Any
 import pydantic
 from pydantic import Field
 
-from rlctl.recipe.quantities import Number, Section, Whole
+from rlctl.storage.validation import Number, Section, Whole
 
 
 class Promotion(Section):

@@ -99,11 +99,11 @@ class RunDirectory:
 
     def write_recipe(self, recipe: Recipe) -> None:
         """Write the resolved recipe with its SHA-256, which reveals later changes."""
-        from rlctl.recipe.json_schema import FILE
+        from rlctl.recipe.recipe import SCHEMA_FILE
 
         # Next to the recipe, so that editors find it on any machine.
-        files.write_bytes(self.path / FILE.name, FILE.read_bytes())
-        files.write_sealed(self.recipe_file, f"# yaml-language-server: $schema={FILE.name}\n{recipe.to_yaml()}")
+        files.write_bytes(self.path / SCHEMA_FILE.name, SCHEMA_FILE.read_bytes())
+        files.write_sealed(self.recipe_file, f"# yaml-language-server: $schema={SCHEMA_FILE.name}\n{recipe.to_yaml()}")
 
     def status(self) -> dict[str, Any]:
         """Read `run.json`."""

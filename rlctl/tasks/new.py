@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rlctl.environments import installed
 from rlctl.errors import UsageError
-from rlctl.recipe import json_schema
+from rlctl.recipe.recipe import SCHEMA_FILE
 from rlctl.storage import files as storage_files
 
 TEMPLATE = Path(__file__).with_name("template")
@@ -55,7 +55,7 @@ def create(name: str) -> NewPlugin:
         for path, text in sources.items()
     }
     # The recipe's schema is copied next to it, since a path to this machine's packages is wrong on other machines.
-    content[Path(package, json_schema.FILE.name)] = json_schema.FILE.read_text(encoding="utf-8")
+    content[Path(package, SCHEMA_FILE.name)] = SCHEMA_FILE.read_text(encoding="utf-8")
     with storage_files.whole_folder(folder) as temporary:
         for path, text in content.items():
             (temporary / path).parent.mkdir(parents=True, exist_ok=True)

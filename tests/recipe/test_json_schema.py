@@ -6,13 +6,12 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from rlctl.recipe.json_schema import build_json_schema
-from rlctl.recipe.recipe import ALGORITHMS
+from rlctl.recipe.recipe import ALGORITHMS, SCHEMA_FILE
 from rlctl.storage import yaml_text
 
 ROOT = Path(__file__).parents[2]
 RECIPES = [*ROOT.glob("plugins/*/*.yaml"), *ROOT.glob("rlctl/recipe/presets/*.yaml"), *ROOT.glob("examples/*/*.yaml")]
-VALIDATOR = jsonschema.Draft7Validator(build_json_schema())
+VALIDATOR = jsonschema.Draft7Validator(json.loads(SCHEMA_FILE.read_text()))
 
 
 @pytest.mark.parametrize("file", RECIPES, ids=lambda file: file.stem)

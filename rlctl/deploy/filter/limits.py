@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 import pydantic
 from pydantic import Field
 
-from rlctl.recipe.quantities import Number, Section
 from rlctl.storage import yaml_text
+from rlctl.storage.validation import Number, Section
 
 Positive = Annotated[Number, Field(gt=0)]
 
