@@ -33,7 +33,7 @@ from rlctl.checking.records import FIRST_SEED, Built, ChildMessage, Records, Ski
 from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, check, experiment
 from rlctl.environments import info, registry
 from rlctl.environments.dict_spaces import format_space
-from rlctl.environments.mujoco_model import describe_mujoco_model
+from rlctl.environments.info import describe_mujoco_model
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import NoSuchClassError, OldGymError, RecipeError, RlctlError, TaskError, UsageError
 
