@@ -51,8 +51,7 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
         checked = None
         if request.check and start.run is None:
             checked = _begin_check(specs[-1], request.env_timeout_s)
-        from rlctl.training.evaluation_episodes import EvaluationEpisodes
-        from rlctl.training.evaluator import Evaluator
+        from rlctl.training.evaluator import EvaluationEpisodes, Evaluator
         from rlctl.training.loop import TrainingLoop
 
         learner = _build_learner(start, specs, workers, display)

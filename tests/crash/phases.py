@@ -8,7 +8,7 @@ import psutil
 
 import rlctl.rollout.workers
 import rlctl.storage.files
-import rlctl.training.evaluation_episodes
+import rlctl.training.evaluator
 import rlctl.training.loop
 import rlctl.training.status
 import rlctl.training.vec_env
@@ -20,11 +20,11 @@ PHASES = {
     "run folder": (rlctl.training.status, "write_start", 1),
     "first rollout": (rlctl.training.vec_env.WorkerVecEnv, "finish", 1),
     "boundary": (rlctl.training.loop.TrainingLoop, "boundary", 2),
-    "evaluation": (rlctl.training.evaluation_episodes.EvaluationEpisodes, "play", 1),
+    "evaluation": (rlctl.training.evaluator.EvaluationEpisodes, "play", 1),
     "first checkpoint": (rlctl.storage.files, "os.rename", 1),
     "checkpoint": (rlctl.storage.files, "os.rename", 2),
     "evaluated checkpoint": (rlctl.storage.files, "os.rename", 4),
-    "final evaluation": (rlctl.training.evaluation_episodes.EvaluationEpisodes, "play", 2),
+    "final evaluation": (rlctl.training.evaluator.EvaluationEpisodes, "play", 2),
     "the end": (rlctl.training.loop.TrainingLoop, "boundary", 4),
     "last checkpoint": (rlctl.storage.files, "os.rename", 6),
     "done": (rlctl.training.status, "write_end", 1),
