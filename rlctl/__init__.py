@@ -25,12 +25,12 @@ from rlctl.version import __version__
 if TYPE_CHECKING:
     from rlctl.api import check_env, evaluate, load_policy, train
     from rlctl.environments.spec import make
-    from rlctl.training.callback import Callback
+    from rlctl.training.callbacks import Callback
 
 __all__ = ["Callback", "__version__", "check_env", "evaluate", "load_policy", "make", "train"]
 
 _DEFINED_IN = {
-    "Callback": "rlctl.training.callback",
+    "Callback": "rlctl.training.callbacks",
     "check_env": "rlctl.api",
     "evaluate": "rlctl.api",
     "load_policy": "rlctl.api",

@@ -1,9 +1,10 @@
-"""The callbacks of a training: imports them, calls them, and saves their state."""
+"""A class of the user that is called during a training: see `docs/callbacks.md`. Imports nothing heavy."""
 
 from __future__ import annotations
 
 import copy
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,11 +14,106 @@ from rlctl.environments.plugin_code import call_plugin
 from rlctl.errors import ArtifactError, RecipeError, RlctlError, TaskError
 from rlctl.recipe.recipe import Recipe
 from rlctl.rollout.messages import EpisodeResult
-from rlctl.training.callback import Callback, Training
 
 if TYPE_CHECKING:
+    from rlctl.rollout.messages import EpisodeResult
+    from rlctl.rollout.shared_arrays import SegmentArrays
     from rlctl.training.learner import Learner
     from rlctl.training.snapshot import Tensors
+
+_SCHEDULES = {"learning_rate": "lr_schedule", "clip_range": "clip_range"}  # attribute of SB3's model by parameter
+_NUMBERS = ("ent_coef", "vf_coef")
+"""Parameters that PPO and A2C read at each update; SAC reads its `ent_coef` only at the start."""
+
+
+class Training:
+    """What a callback reads and changes. Steps are environment steps, all environments together."""
+
+    def __init__(self, learner: Learner, folder: Path) -> None:
+        self.folder = folder  # the run's folder
+        self.recipe = learner.recipe
+        self.model = learner.model  # the Stable-Baselines3 model
+        self.metrics: Mapping[str, Any] = {}
+        """In `on_segment`: the row of `metrics.csv` that is written next; empty if none is due."""
+        self.evaluation: Mapping[str, Any] = {}  # in `on_evaluation`: the row of `evals.csv`
+        self.episodes: Sequence[EpisodeResult] = ()
+        """In `on_segment`: the training episodes that ended since the last call."""
+        self._learner = learner
+
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return self._learner.steps
+
+    @property
+    def policy(self) -> Any:
+        """The networks, a torch module."""
+        return self.model.policy
+
+    @property
+    def segment(self) -> SegmentArrays | None:
+        """The last segment: arrays of shape (n_envs, steps, ...); None before the first."""
+        return self._learner.env.last_segment
+
+    def log(self, name: str, value: float | None) -> None:
+        """Write a number as `callback/NAME` into the next row of `metrics.csv`, and to TensorBoard.
+
+        The first row decides which columns the table has: log None until there is a number.
+        """
+        self._learner.progress.logged[f"callback/{name}"] = None if value is None else float(value)
+
+    def stop(self, reason: str) -> None:
+        """End the training at this boundary; the last policy is evaluated and everything is saved."""
+        self._learner.progress.stop_reason = reason
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set `learning_rate` or `clip_range`, for PPO and A2C also `ent_coef` or `vf_coef`, from now on.
+
+        Raises `ValueError` for another name, and for a value that is not a number of at least 0.
+        """
+        numbers = _NUMBERS if hasattr(self.model, "rollout_buffer") else ()
+        known = [name for name in (*_SCHEDULES, *numbers) if hasattr(self.model, name)]
+        if name not in known or not (math.isfinite(value) and value >= 0):
+            raise ValueError(f"set_parameter({name!r}, {value!r}): set one of {', '.join(known)} to a number >= 0")
+        self._learner.progress.parameters[name] = float(value)
+        self.apply_parameters()
+
+    def apply_parameters(self) -> None:
+        """Set the parameters that callbacks have changed; a resume does so too."""
+        for name, value in self._learner.progress.parameters.items():
+            schedule = _SCHEDULES.get(name)
+            setattr(self.model, schedule or name, (lambda _, value=value: value) if schedule else value)
+
+
+class Callback:
+    """Base class of a user's callback; it overrides the moments that it needs.
+
+    Its attributes are its state. Checkpoints store them, except those whose name begins with `_`, as plain data:
+    numbers, texts, arrays, tensors, lists and dicts of these. For others override `state_dict` and `load_state_dict`.
+    """
+
+    def on_start(self, training: Training) -> None:
+        """Called before the first step, and again after a resume, which then restores the state."""
+
+    def on_segment(self, training: Training) -> None:
+        """Called after every segment of steps and its updates, before its row of metrics is written."""
+
+    def on_evaluation(self, training: Training) -> None:
+        """Called after every evaluation."""
+
+    def on_checkpoint(self, training: Training) -> None:
+        """Called when a checkpoint was written. The clock decides when, so nothing that matters may change here."""
+
+    def on_end(self, training: Training) -> None:
+        """Called when the training is done and everything is written."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint stores."""
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        vars(self).update(state)
 
 
 _OF_SB3 = "stable_baselines3.common.callbacks"

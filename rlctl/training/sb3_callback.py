@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from rlctl.environments.dict_spaces import join
 from rlctl.rollout.shared_arrays import SegmentArrays
-from rlctl.training.callback import Callback, Training
+from rlctl.training.callbacks import Callback, Training
 
 _REFERENCES = ("model", "locals", "globals", "parent", "pbar")  # attributes that are no state
 _WATCHED = ("learning_rate", "lr_schedule", "clip_range", "ent_coef", "vf_coef", "target_kl", "gamma", "tau")

@@ -24,8 +24,7 @@ from rlctl.recipe.sources import describe_rounding, resolve_with_stages
 from rlctl.run import lookup
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.train_request import TrainRequest
-from rlctl.training.callback import Callback
-from rlctl.training.callbacks import load_callbacks
+from rlctl.training.callbacks import Callback, load_callbacks
 from rlctl.training.demonstrations import describe_source
 from rlctl.training.tracking import check_installed
 from rlctl.training.warm_start import find_source
