@@ -28,7 +28,7 @@ from rlctl.run.directory import RunDirectory
 from rlctl.storage import files, validation
 from rlctl.training import replay_segments, snapshot
 from rlctl.training.callbacks import Callbacks
-from rlctl.training.curriculum import begin_next_episodes
+from rlctl.training.learner import begin_next_episodes
 from rlctl.training.progress import Progress
 from rlctl.training.replay_segments import ReplaySegments, Segment
 from rlctl.training.snapshot import Tensors

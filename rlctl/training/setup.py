@@ -102,8 +102,7 @@ def _warn_of_opposite_weights(specs: list[EnvSpec], display: Display) -> None:
 def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display: Display) -> Learner:
     from rlctl.policy.torch_policy import pin_threads
     from rlctl.training.algorithms import build_model
-    from rlctl.training.curriculum import Curriculum, check_stages
-    from rlctl.training.learner import Learner
+    from rlctl.training.learner import Curriculum, Learner, check_stages
     from rlctl.training.off_policy import OffPolicyRollouts
     from rlctl.training.on_policy import OnPolicyRollouts
     from rlctl.training.progress import Progress

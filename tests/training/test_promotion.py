@@ -2,7 +2,7 @@
 
 from rlctl.recipe.recipe import validate
 from rlctl.rollout.messages import EpisodeResult
-from rlctl.training.curriculum import Curriculum
+from rlctl.training.learner import Curriculum
 from rlctl.training.progress import Progress
 
 
