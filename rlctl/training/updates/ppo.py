@@ -17,8 +17,7 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution, Sta
 from stable_baselines3.common.utils import explained_variance
 
 from rlctl.environments.dict_spaces import join, split
-from rlctl.training.updates.mlp import LOG_SQRT_TAU, Floats, MlpStack, allocate_gradient, clip_norm, is_mlp
-from rlctl.training.updates.side_by_side import SideBySide
+from rlctl.training.updates.mlp import LOG_SQRT_TAU, Floats, MlpStack, SideBySide, allocate_gradient, clip_norm, is_mlp
 
 _FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
 

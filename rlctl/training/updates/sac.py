@@ -12,8 +12,7 @@ import torch
 from stable_baselines3 import SAC
 
 from rlctl.training.updates.batches import Batch, sample_batches
-from rlctl.training.updates.mlp import Floats, is_mlp
-from rlctl.training.updates.side_by_side import SideBySide
+from rlctl.training.updates.mlp import Floats, SideBySide, is_mlp
 from rlctl.training.updates.squashed_actor import Sample, SquashedGaussianActor
 
 _LOSS_EVERY = 8  # every so many updates the losses are computed, for the log only

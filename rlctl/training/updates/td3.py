@@ -13,8 +13,7 @@ import torch
 from stable_baselines3 import DDPG, TD3
 
 from rlctl.training.updates.batches import Batch, sample_batches
-from rlctl.training.updates.mlp import Floats, MlpStack, is_mlp
-from rlctl.training.updates.side_by_side import SideBySide
+from rlctl.training.updates.mlp import Floats, MlpStack, SideBySide, is_mlp
 
 
 class Td3Update:
