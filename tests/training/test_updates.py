@@ -19,9 +19,8 @@ from rlctl.errors import RecipeError
 from rlctl.training.updates import choose_learner
 from rlctl.training.updates.dqn import DqnUpdate
 from rlctl.training.updates.ppo import PpoUpdate
-from rlctl.training.updates.sac import SacUpdate
+from rlctl.training.updates.sac import SacUpdate, TqcUpdate
 from rlctl.training.updates.td3 import Td3Update
-from rlctl.training.updates.tqc import TqcUpdate
 
 pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 

@@ -9,9 +9,8 @@ from rlctl.errors import RecipeError
 from rlctl.training.own_networks import has_own_parts
 from rlctl.training.updates.dqn import DqnUpdate
 from rlctl.training.updates.ppo import PpoUpdate
-from rlctl.training.updates.sac import SacUpdate
+from rlctl.training.updates.sac import SacUpdate, TqcUpdate
 from rlctl.training.updates.td3 import Td3Update
-from rlctl.training.updates.tqc import TqcUpdate
 
 
 def choose_learner(model: Any) -> Any:

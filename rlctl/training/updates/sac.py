@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from sb3_contrib import TQC
 from stable_baselines3 import SAC
 
 from rlctl.training.updates.batches import Batch, sample_batches
@@ -151,3 +152,45 @@ class SacUpdate:
         lowest = outputs.argmin(0)
         to_outputs = (np.arange(len(outputs))[:, None, None] == lowest).astype(np.float32)
         return outputs.min(0), to_outputs
+
+
+class TqcUpdate(SacUpdate):
+    """SAC's update with critics that estimate quantiles of the return; the highest are dropped from targets."""
+
+    algorithm: ClassVar[Any] = TQC
+
+    def _choose_estimates(self, outputs: Floats) -> Floats:
+        dropped = self._model.top_quantiles_to_drop_per_net * len(outputs)
+        estimates = np.sort(np.concatenate(list(outputs), 1), axis=1)
+        return estimates[:, : estimates.shape[1] - dropped]
+
+    def _compute_loss(self, outputs: Floats, target: Floats) -> float:
+        """Compare each quantile with each estimate by the quantile Huber loss."""
+        errors = target[:, None, :] - outputs[..., None]
+        sizes = np.abs(errors)
+        sizes = np.where(sizes <= 1, 0.5 * np.square(sizes), sizes - 0.5)
+        shares = _quantile_shares(outputs)[:, None]
+        return float((sizes * np.where(errors < 0, 1 - shares, shares)).mean())
+
+    def _differentiate_loss(self, outputs: Floats, target: Floats) -> Floats:
+        # The derivative of the Huber loss is the error, clipped to [-1, 1]. Its weight is the
+        # quantile's share if positive, else 1 - share; both sums follow from the slopes' sum and absolute sum.
+        slopes = target[:, None, :] - outputs[..., None]
+        np.clip(slopes, -1, 1, out=slopes)
+        ones = np.ones(target.shape[1], np.float32)  # short sums are faster as products
+        total = slopes @ ones
+        size = np.abs(slopes, out=slopes) @ ones
+        count = np.float32(-2 * slopes[0].size * len(self._model.critic.q_networks))
+        gradient: Floats = (total + (2 * _quantile_shares(outputs) - 1) * size) / count
+        return gradient
+
+    def _value(self, outputs: Floats) -> tuple[Floats, Floats]:
+        count = outputs.shape[0] * outputs.shape[2]
+        value: Floats = outputs.mean((0, 2))[:, None]
+        return value, np.full_like(outputs, 1 / count)
+
+
+def _quantile_shares(outputs: Floats) -> Floats:
+    """Return the share of returns below each quantile, shape (quantiles,)."""
+    count = outputs.shape[-1]
+    return (np.arange(count, dtype=np.float32) + np.float32(0.5)) / np.float32(count)
