@@ -138,7 +138,7 @@ def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Displa
     """Restore the checkpoint, if any, and return the writer of the run folder."""
     from rlctl.training.callbacks import Callbacks
     from rlctl.training.checkpoints import Checkpoints
-    from rlctl.training.tensorboard import list_parameters, make_logger
+    from rlctl.training.metrics import list_parameters, make_logger
 
     resumed_at = None if start.run is None else start.step
     learner.model.set_logger(make_logger(run.tensorboard, display.message, resumed_at, list_parameters(start.recipe)))

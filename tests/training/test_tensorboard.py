@@ -3,7 +3,7 @@
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
-from rlctl.training.tensorboard import make_logger
+from rlctl.training.metrics import make_logger
 from tests.training.conftest import TINY
 
 
