@@ -99,8 +99,7 @@ def train(
         raise UsageError("--on and --detach need several seeds: give --seeds 0-4 or --resume GROUP")
     if jobs is not None:
         raise UsageError("--jobs needs several seeds: give --seeds 0-4 or --resume GROUP")
-    from rlctl.training.request import run_training
-    from rlctl.training.summary import show
+    from rlctl.training.request import run_training, show
 
     return show(run_training(request), json)
 
