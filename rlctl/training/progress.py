@@ -1,8 +1,26 @@
 """The counters that a resume restores in addition to the model."""
 
-import dataclasses
+from __future__ import annotations
 
+import dataclasses
+import datetime
+import os
+import platform
+import sys
+import uuid
+from typing import TYPE_CHECKING, Any
+
+from rlctl.environments.registry import find_git_commit, identify_task
+from rlctl.errors import DivergedError, Interrupted, RlctlError, RunTaken
+from rlctl.recipe.recipe import Recipe, find_difference
+from rlctl.recipe.sources import resolve_packaged
 from rlctl.rollout.messages import EpisodeResult
+from rlctl.run.directory import RunDirectory
+from rlctl.version import collect_versions
+
+if TYPE_CHECKING:
+    from rlctl.policy.file import PolicyInfo
+    from rlctl.training.start import Start
 
 
 @dataclasses.dataclass
@@ -36,3 +54,83 @@ class Progress:
     stop_reason: str = ""  # why a callback ended the training
     stage_episodes: list[float | None] = dataclasses.field(default_factory=list)
     """Success (0 or 1; None if not reported) or return of the stage's last episodes, as its promotion rule needs."""
+
+
+_STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
+
+
+def write_start(run: RunDirectory, start: Start) -> None:
+    """Write the recipe and the status `running`."""
+    recipe = start.recipe
+    run.write_recipe(recipe)
+    changes: dict[str, Any] = {
+        "status": "running",
+        "error": None,
+        "task": start.task,
+        **identify_task(start.task),
+        "callbacks": {name: identify_task(name) for name in recipe.callbacks},
+        "algo": recipe.algo,
+        "seed": recipe.seed,
+        "recipe_changes": find_recipe_changes(start.task, recipe),
+        "device": start.request.device,
+        "versions": collect_versions(),
+        "git_commit": find_git_commit(),
+        "command": ["rlctl", *sys.argv[1:]],
+        "host": platform.node(),
+        "pid": os.getpid(),
+    }
+    if start.run is not None:
+        changes |= {"resumed": _now(), "resumed_at_step": start.step}
+    else:
+        changes |= {
+            "id": uuid.uuid4().hex,
+            "started": _now(),
+            "folder": os.environ.get("RLCTL_FOLDER") or os.getcwd(),  # a task's path may be relative to it
+        }
+        if start.source is not None:
+            changes["from"] = start.source
+        if start.demos is not None:
+            changes["demos"] = start.demos
+    run.write_status(changes)
+
+
+def find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
+    """Return the keys and values in which a recipe differs from the task's own, without values derived from these."""
+    chosen = {key: getattr(recipe, key) for key in ("algo", "n_envs", "total_timesteps")}
+    try:
+        packaged, adapted = resolve_packaged(task), resolve_packaged(task, chosen)
+    except RlctlError:  # the packaged recipe is invalid; --config or --set corrected it
+        return {}
+    own = {key: value for key, value in chosen.items() if value != getattr(packaged, key)}
+    return own | {key: value for key, (value, _) in find_difference(recipe, adapted).items()}
+
+
+def write_failure(run: RunDirectory, error: BaseException) -> None:
+    """Write the status and error of a training that ended early."""
+    kind = _STATUS.get(type(error), "failed")
+    if run.status_file.exists() and not isinstance(error, RunTaken):  # else the run was removed or taken over
+        run.write_status({"status": kind, "error": str(error) or repr(error), "ended": _now()})
+
+
+def write_end(run: RunDirectory, steps: int, progress: Progress, best: PolicyInfo | None) -> None:
+    """Write the status `finished` and the results; `best` is the best policy."""
+    score = best.evaluation if best else None
+    run.write_status(
+        {
+            "status": "finished",
+            "ended": _now(),
+            "steps": steps,
+            "seconds": round(progress.seconds, 3),
+            "best_step": best.training_steps if best else None,
+            "best_success": score.success if score else None,
+            "best_return": score.mean_return if score else None,
+            "observations_outside": progress.observations_outside,
+            "failed_evaluations": progress.failed_evaluations,
+            **({"stop_reason": progress.stop_reason} if progress.stop_reason else {}),
+            **({"stage": progress.stage} if progress.stage else {}),
+        }
+    )
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
