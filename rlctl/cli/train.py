@@ -120,8 +120,8 @@ def tune(
 ) -> None:
     """Find hyperparameters: the learning rate, then rollout and minibatch, then the discount, with Optuna."""
     from rlctl.cluster.executors import choose_executor
-    from rlctl.tuning import report
     from rlctl.tuning.tune import tune as run_tuning
+    from rlctl.tuning.tuning import show
 
     request = dataclasses.replace(request, settings=flags.merge())
-    return report.show(run_tuning(request, jobs=jobs, make_trainings=choose_executor(on, cluster, verb="tune")), json)
+    return show(run_tuning(request, jobs=jobs, make_trainings=choose_executor(on, cluster, verb="tune")), json)

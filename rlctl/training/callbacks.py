@@ -1,22 +1,19 @@
-"""A class of the user that is called during a training: see `docs/callbacks.md`. Imports nothing heavy."""
+"""Callbacks: the user's classes that are called during a training, see `docs/callbacks.md`. Imports no torch."""
 
 from __future__ import annotations
 
 import copy
-import inspect
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlctl.environments import named_task, registry
 from rlctl.environments.plugin_code import call_plugin
-from rlctl.errors import ArtifactError, RecipeError, RlctlError, TaskError
-from rlctl.recipe.recipe import Recipe
+from rlctl.errors import TaskError
 from rlctl.rollout.messages import EpisodeResult
 
 if TYPE_CHECKING:
-    from rlctl.rollout.messages import EpisodeResult
     from rlctl.rollout.shared_arrays import SegmentArrays
     from rlctl.training.learner import Learner
     from rlctl.training.snapshot import Tensors
@@ -116,46 +113,8 @@ class Callback:
         vars(self).update(state)
 
 
-_OF_SB3 = "stable_baselines3.common.callbacks"
-_NO_CALLBACK = "neither a rlctl.Callback nor a BaseCallback of Stable-Baselines3"
-
-
-def load_callbacks(recipe: Recipe) -> dict[str, Callback]:
-    """Import and build the callbacks of a recipe, by name.
-
-    Raises `RecipeError` for a name that is no callback, `TaskError` for an exception of its constructor.
-    """
-    return {name: _load(name, arguments or {}) for name, arguments in recipe.callbacks.items()}
-
-
-def _load(name: str, arguments: Mapping[str, Any]) -> Callback:
-    try:
-        if ":" not in name:
-            raise RecipeError("give the class too: FILE.py:CLASS or MODULE:CLASS")
-        constructor = registry.load(name)
-    except RlctlError as error:
-        problem = str(error).removeprefix(f"task {name!r}: ")
-        raise RecipeError(f"callbacks: {name}: {problem}", details=error.details) from None
-    if not _may_be_called(constructor):
-        raise RecipeError(f"callbacks: {name}: {_NO_CALLBACK}, or a function of your own file that returns one")
-    callback: Any = _call(name, lambda: constructor(**arguments))
-    if _OF_SB3 in (base.__module__ for base in type(callback).__mro__):
-        from rlctl.training.sb3_callback import Sb3Callback
-
-        return Sb3Callback(callback)
-    if isinstance(callback, Callback):
-        return callback
-    raise RecipeError(f"callbacks: {name}: {_NO_CALLBACK}")
-
-
-def _may_be_called(constructor: Any) -> bool:
-    # A recipe may come from somebody else: it must not call `os:system`.
-    if inspect.isclass(constructor):
-        return any(base is Callback or base.__module__ == _OF_SB3 for base in constructor.__mro__)
-    return inspect.isfunction(constructor) and named_task.is_own_file(Path(inspect.getfile(constructor)))
-
-
-def _call(name: str, call: Callable[[], Any], doing: str = "") -> Any:
+def call_callback(name: str, call: Callable[[], Any], doing: str = "") -> Any:
+    """Call code of a callback; raises `TaskError` for any exception."""
     try:
         return call_plugin(name, call, doing)
     except TaskError as error:
@@ -200,8 +159,8 @@ class Callbacks:
         for name, callback in self._callbacks.items():
             self.running = f"callback {name}, {moment}"
             try:
-                doing = f"{moment} at step {self._training.steps:,}: "
-                _call(name, lambda callback=callback: getattr(callback, moment)(self._training), doing)  # type: ignore[misc]
+                method = functools.partial(getattr(callback, moment), self._training)
+                call_callback(name, method, f"{moment} at step {self._training.steps:,}: ")
             finally:
                 self.running = ""
 
@@ -213,7 +172,7 @@ class Callbacks:
         entries: list[dict[str, Any]] = []
         for number, (name, callback) in enumerate(self._callbacks.items()):
             structure, unsaved = {}, []
-            for key, value in _call(name, callback.state_dict, "state_dict: ").items():
+            for key, value in call_callback(name, callback.state_dict, "state_dict: ").items():
                 try:
                     arrays, structure[key] = flatten(value, f"callbacks/{number}/{key}")
                     tensors |= arrays
@@ -231,10 +190,7 @@ class Callbacks:
         from rlctl.training.snapshot import unflatten
 
         for (name, callback), entry in zip(self._callbacks.items(), entries, strict=False):
-            try:
-                state = {key: unflatten(structure, tensors) for key, structure in entry["state"].items()}
-            except (KeyError, ValueError, TypeError, AttributeError) as error:
-                raise ArtifactError(f"state of callback {name}: damaged: {error!r}") from None
-            _call(name, lambda callback=callback, state=state: callback.load_state_dict(state), "load_state_dict: ")  # type: ignore[misc]
+            state = {key: unflatten(structure, tensors) for key, structure in entry["state"].items()}
+            call_callback(name, functools.partial(callback.load_state_dict, state), "load_state_dict: ")
         self._training.apply_parameters()
         return [entry["inexact"] for entry in entries if entry.get("inexact")]

@@ -5,8 +5,8 @@ statistics, the actions of running episodes) and `state.json` (plain data, and e
 The replay buffer of an off-policy algorithm is in segments next to the folders.
 """
 
+import contextlib
 import dataclasses
-import functools
 import json
 import platform
 from pathlib import Path
@@ -16,7 +16,6 @@ import numpy as np
 import pydantic
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -25,13 +24,13 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile
 from rlctl.run.directory import RunDirectory
-from rlctl.storage import files, validation
+from rlctl.storage import files
 from rlctl.training import replay_segments, snapshot
 from rlctl.training.callbacks import Callbacks
 from rlctl.training.learner import begin_next_episodes
-from rlctl.training.progress import Progress
 from rlctl.training.replay_segments import ReplaySegments, Segment
 from rlctl.training.snapshot import Tensors
+from rlctl.training.status import Progress
 from rlctl.training.vec_env import WorkerVecEnv
 from rlctl.version import collect_versions
 
@@ -61,11 +60,6 @@ class Checkpoint:
     state: State
     tensors: Tensors = dataclasses.field(repr=False)
 
-    @property
-    def progress(self) -> Progress:
-        """The counters of the training at this step."""
-        return self.state.progress
-
 
 class CheckpointFolders:
     """Writes the checkpoint folders of a run, and restores the training from one."""
@@ -82,10 +76,6 @@ class CheckpointFolders:
         if isinstance(model, OffPolicyAlgorithm):
             assert model.replay_buffer is not None  # SB3 makes it in its constructor
             self._replay = ReplaySegments(run.replay_segments, model.replay_buffer)
-
-    @functools.cached_property
-    def _run_id(self) -> str:
-        return self._run.id()
 
     @property
     def _added(self) -> int:
@@ -106,7 +96,7 @@ class CheckpointFolders:
             _TENSORS: save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()}),
         }
         state = State(
-            run=self._run_id,
+            run=self._run.id(),
             step=self._model.num_timesteps,
             model=plain,
             progress=progress,
@@ -118,7 +108,8 @@ class CheckpointFolders:
         with files.whole_folder(self._run.checkpoint(state.step)) as folder:
             for name, content in contents.items():
                 files.write_new(folder / name, content)
-            files.write_new(folder / _STATE, _encode_state(state.model_dump(mode="json")))
+            plain_state = state.model_dump(mode="json")
+            files.write_new(folder / _STATE, json.dumps({"sha256": _seal(plain_state), "state": plain_state}).encode())
 
     def computed_with(self) -> dict[str, str]:
         """Return what bit-exact results of this training depend on."""
@@ -169,7 +160,7 @@ def read_newest(run: RunDirectory) -> tuple[Checkpoint | None, list[str]]:
     for folder in reversed(run.checkpoints()):
         try:
             checkpoint = read(folder)
-            if checkpoint.state.run not in ("", run.id()):
+            if checkpoint.state.run != run.id():
                 raise ArtifactError(f"{folder}: this checkpoint belongs to another run and is not used")
             return checkpoint, damage
         except ArtifactError as error:
@@ -184,37 +175,26 @@ def read(folder: Path) -> Checkpoint:
     state = _read_state(folder)
     for name in (_POLICY, _TENSORS):
         files.check_digest(folder / name, state.sha256.get(name, ""))
-    replay_segments.check(folder.parent / "replay", state.segments)
-    try:
-        tensors = load_tensors((folder / _TENSORS).read_bytes())
-    except (OSError, SafetensorError) as error:
-        raise ArtifactError(f"{folder / _TENSORS}: damaged: {error}") from None
-    return Checkpoint(folder, state, tensors)
+    for segment in state.segments:
+        files.check_digest(folder.parent / "replay" / segment.name, segment.sha256)
+    return Checkpoint(folder, state, load_tensors((folder / _TENSORS).read_bytes()))
 
 
 def _read_state(folder: Path) -> State:
     file = folder / _STATE
     sealed = files.read_json(file)
-    if not isinstance(sealed, dict) or not isinstance(sealed.get("state"), dict):
-        raise ArtifactError(f"{file}: damaged, or not a checkpoint of rlctl")
-    content = sealed["state"]
-    if isinstance(content.get("format"), int) and content["format"] > FORMAT:
-        raise ArtifactError(f"{file}: checkpoint format {content['format']} is newer than this rlctl reads ({FORMAT})")
-    if sealed.get("sha256") != _seal(content):
-        raise ArtifactError(f"{file}: damaged: its content does not match its sha256")
     try:
+        content = sealed["state"]
+        if (version := content["format"]) > FORMAT:
+            raise ArtifactError(f"{file}: checkpoint format {version} is newer than this rlctl reads ({FORMAT})")
+        if sealed["sha256"] != _seal(content):
+            raise ArtifactError(f"{file}: damaged: its content does not match its sha256")
         state = State.model_validate(content)
-    except pydantic.ValidationError as error:
-        raise ArtifactError(
-            f"{file}: not a checkpoint of rlctl: {validation.explain_invalid(error, State, content)}"
-        ) from None
+    except (TypeError, LookupError, pydantic.ValidationError):
+        raise ArtifactError(f"{file}: damaged, or not a checkpoint of rlctl") from None
     if state.step != int(folder.name):
         raise ArtifactError(f"{folder}: the folder's name is wrong: it holds the checkpoint of step {state.step}")
     return state
-
-
-def _encode_state(state: dict[str, Any]) -> bytes:
-    return json.dumps({"sha256": _seal(state), "state": state}).encode()
 
 
 def _seal(state: Any) -> str:
@@ -224,10 +204,8 @@ def _seal(state: Any) -> str:
 def _named_segments(run: RunDirectory) -> list[Segment]:
     named: list[Segment] = []
     for folder in run.checkpoints():
-        try:
+        with contextlib.suppress(ArtifactError):  # a damaged checkpoint needs no segments any more
             named += _read_state(folder).segments
-        except ArtifactError:  # a damaged checkpoint needs no segments any more
-            continue
     return named
 
 
@@ -243,25 +221,20 @@ def _cpu_vendor() -> str:
 
 def find_differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
     """Return `torch 2.13.0 -> 2.14.0` for each entry that has changed."""
-    names = dict.fromkeys([*before, *now])
-    return [
-        f"{name} {before.get(name, 'none')} -> {now.get(name, 'none')}"
-        for name in names
-        if before.get(name) != now.get(name)
-    ]
+    pairs = {name: (before.get(name, "none"), now.get(name, "none")) for name in [*before, *now]}
+    return [f"{name} {old} -> {new}" for name, (old, new) in pairs.items() if old != new]
 
 
 def _environment_tensors(env: WorkerVecEnv) -> Tensors:
     """Return the numbers, actions and last observations of the running episodes."""
     histories = [env.history.of(index) for index in range(env.num_envs)]
-    tensors = {
+    last = env.workers.arrays.observation
+    return {
         "environments/episodes_started": np.array(env.episodes_started, np.int64),
         "environments/steps": np.array([len(actions) for actions in histories], np.int64),
         "environments/actions": np.concatenate(histories),
+        **{f"environments/observation/{key}": observation for key, observation in last.items()},
     }
-    for key, observation in env.workers.arrays.observation.items():
-        tensors[f"environments/observation/{key}"] = observation
-    return tensors
 
 
 def _restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:

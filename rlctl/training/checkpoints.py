@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from rlctl.errors import ArtifactError
@@ -53,15 +54,12 @@ class Checkpoints:
         try:
             write()
         except OSError as error:
-            self._report(f"{what}: {error.strerror or error}")
+            self.problem = f"{what}: {error.strerror or error}"
+            if self.problem not in self._reported:
+                self._warn(f"warning: not saved: {self.problem}; training continues")
+            self._reported.add(self.problem)
             return False
         return True
-
-    def _report(self, problem: str) -> None:
-        if problem not in self._reported:
-            self._warn(f"warning: not saved: {problem}; training continues")
-        self._reported.add(problem)
-        self.problem = problem
 
     def row(self, table: Table, row: dict[str, Any]) -> None:
         """Add a row to a table; a row that cannot be written now is written with the next one."""
@@ -97,18 +95,15 @@ class Checkpoints:
         policy = self._learner.pack()
         is_saved = self.attempt("checkpoint", lambda: self._write(policy))
         if is_saved:
-            self._report_saved_again()
+            if self._reported:
+                self._warn(f"saved again, at step {self.saved_step:,}")
+            self._reported.clear()
             self.attempt("old checkpoints", self._folders.remove_old)
             self.callbacks.call("on_checkpoint")
         now = time.monotonic()
         self._next_s = now + (1 + self._uncounted_checkpoints) * (now - began) / CHECKPOINT_TIME_SHARE
         self._uncounted_checkpoints = 0
         return is_saved
-
-    def _report_saved_again(self) -> None:
-        if self._reported:
-            self._warn(f"saved again, at step {self.saved_step:,}")
-        self._reported.clear()
 
     def _write(self, policy: PolicyFile) -> None:
         # A resume does not repeat earlier writes, so they must be on the disk before the checkpoint.
@@ -148,7 +143,9 @@ class Checkpoints:
         for folder in self.run.checkpoints():
             if int(folder.name) > step:
                 files.set_aside(folder)
-        _remove_episodes_after(self.run, step)
+        for file in self.run.episodes.glob("*.npz"):
+            if _is_later(file, step):
+                files.remove(file)
         progress = self._learner.progress
         tables = (
             (self.metrics, progress.metrics_bytes, progress.metrics_sha256),
@@ -162,13 +159,10 @@ class Checkpoints:
         ]
 
 
-def _remove_episodes_after(run: RunDirectory, step: int) -> None:
-    """Remove the episodes of evaluations after a training step: a resumed run repeats them."""
-    for file in run.episodes.glob("*.npz"):
-        try:
-            policy = load_episode(file).info.policy
-        except ArtifactError:
-            continue  # damaged, or not written by a training
-        number = policy.removeprefix(STEP_LABEL)
-        if policy.startswith(STEP_LABEL) and number.isdigit() and int(number) > step:
-            files.remove(file)
+def _is_later(file: Path, step: int) -> bool:
+    """Return whether a file is an episode of an evaluation after a training step: a resumed run repeats it."""
+    try:
+        _, label, number = load_episode(file).info.policy.rpartition(STEP_LABEL)
+    except ArtifactError:
+        return False  # damaged
+    return label != "" and number.isdigit() and int(number) > step

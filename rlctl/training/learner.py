@@ -22,9 +22,81 @@ from rlctl.recipe.stages import Promotion, Stage, format_title
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.workers import Workers
 from rlctl.training.display import percent
-from rlctl.training.progress import Progress
 from rlctl.training.rollouts import Rollouts
 from rlctl.training.snapshot import pack
+from rlctl.training.status import Progress
+
+
+class Curriculum:
+    """The stages of a training; without any, no stage is ever due.
+
+    Its state is in `progress`, which checkpoints keep.
+    """
+
+    def __init__(self, stages: Sequence[Stage], specs: Sequence[EnvSpec], goal: EnvInfo, progress: Progress) -> None:
+        self.stages = stages
+        self.specs = list(specs) if stages else []  # of each stage
+        self.goal_spec = specs[-1]  # the last stage, in which evaluations are played and which policies store
+        self.goal = goal  # description of the environments of `goal_spec`
+        self._progress = progress
+        if stages and not progress.stage:
+            progress.stage = 1
+
+    @property
+    def number(self) -> int:
+        """The current stage, from 1; 0 without stages."""
+        return self._progress.stage
+
+    @property
+    def _rule(self) -> Promotion | None:
+        """Promotion rule of the current stage; None for the last."""
+        return self.stages[self.number - 1].promote if self.stages else None
+
+    @property
+    def title(self) -> str:
+        """The current stage as text: `stage 2 of 3: tolerance 0.1`."""
+        return format_title(self.number, self.stages)
+
+    def columns(self) -> dict[str, int]:
+        """Return the table column `stage`; empty without stages."""
+        return {"stage": self.number} if self.stages else {}
+
+    def count(self, ended: Sequence[EpisodeResult]) -> None:
+        """Count finished training episodes of the current stage, in the order in which they ended."""
+        rule = self._rule
+        if rule is None:
+            return
+        if rule.success is not None:
+            values = [None if episode.success is None else float(episode.success) for episode in ended]
+        else:
+            values = [episode.total_reward for episode in ended]
+        self._progress.stage_episodes = [*self._progress.stage_episodes, *values][-rule.window :]
+
+    def measured(self) -> float | None:
+        """Return the success rate or mean return that the rule compares; None until its window is full."""
+        rule = self._rule
+        values = self._progress.stage_episodes
+        if rule is None or len(values) < rule.window:
+            return None
+        # Some environments report success only when there is one.
+        return statistics.fmean(0.0 if value is None else value for value in values)
+
+    def is_due(self, steps: int) -> bool:
+        """Return whether the current stage is done after `steps` environment steps."""
+        rule, measured = self._rule, self.measured()
+        if rule is None or measured is None:
+            return False
+        return steps - self._progress.stage_began >= rule.min_steps and measured >= rule.threshold
+
+    def enter_next_stage(self, steps: int) -> tuple[str, str]:
+        """Enter the next stage; return its title and the reason."""
+        rule, measured = self._rule, self.measured()
+        assert rule is not None  # else `is_due` is False
+        assert measured is not None
+        reason = f"success {percent(measured)}" if rule.success is not None else f"return {measured:.2f}"
+        progress = self._progress
+        progress.stage, progress.stage_began, progress.stage_episodes = progress.stage + 1, steps, []
+        return self.title, f"after {steps:,} steps: {reason} over {format_count(rule.window, 'episode')}"
 
 
 class Learner:
@@ -61,94 +133,13 @@ class Learner:
     def pack(self) -> PolicyFile:
         """Return the current policy, with the last stage of the curriculum as its environment."""
         policy = pack(self.model, self.recipe.algo, self.curriculum.goal_spec, self.curriculum.goal)
-        return policy.with_info(stages=self.curriculum.specs())
+        return policy.with_info(stages=self.curriculum.specs)
 
     def begin_next_stage(self) -> tuple[str, str]:
         """Cut the running episodes short and begin the next stage; return its title and the reason."""
-        self.env.workers.rebuild(self.curriculum.next_spec())
+        self.env.workers.rebuild(self.curriculum.specs[self.curriculum.number])
         begin_next_episodes(self.model)
         return self.curriculum.enter_next_stage(self.steps)
-
-
-class Curriculum:
-    """The stages of a training; without any, no stage is ever due.
-
-    Its state is in `progress`, which checkpoints keep.
-    """
-
-    def __init__(self, stages: Sequence[Stage], specs: Sequence[EnvSpec], goal: EnvInfo, progress: Progress) -> None:
-        self.stages = stages
-        self.goal_spec = specs[-1]  # the last stage, in which evaluations are played and which policies store
-        self.goal = goal  # description of the environments of `goal_spec`
-        self._specs = specs
-        self._progress = progress
-        if stages and not progress.stage:
-            progress.stage = 1
-
-    @property
-    def number(self) -> int:
-        """The current stage, from 1; 0 without stages."""
-        return self._progress.stage
-
-    @property
-    def _rule(self) -> Promotion | None:
-        """Promotion rule of the current stage; None for the last."""
-        return self.stages[self.number - 1].promote if self.stages else None
-
-    @property
-    def title(self) -> str:
-        """The current stage as text: `stage 2 of 3: tolerance 0.1`."""
-        return format_title(self.number, self.stages)
-
-    def columns(self) -> dict[str, int]:
-        """Return the table column `stage`; empty without stages."""
-        return {"stage": self.number} if self.stages else {}
-
-    def specs(self) -> list[EnvSpec]:
-        """Return the spec of each stage; empty without stages."""
-        return list(self._specs) if self.stages else []
-
-    def count(self, ended: Sequence[EpisodeResult]) -> None:
-        """Count finished training episodes of the current stage, in the order in which they ended."""
-        rule = self._rule
-        if rule is None:
-            return
-        if rule.success is not None:
-            values = [None if episode.success is None else float(episode.success) for episode in ended]
-        else:
-            values = [episode.total_reward for episode in ended]
-        self._progress.stage_episodes = [*self._progress.stage_episodes, *values][-rule.window :]
-
-    def measured(self) -> float | None:
-        """Return the success rate or mean return that the rule compares; None until its window is full."""
-        rule = self._rule
-        values = self._progress.stage_episodes
-        if rule is None or len(values) < rule.window:
-            return None
-        # Some environments report success only when there is one.
-        return statistics.fmean(0.0 if value is None else value for value in values)
-
-    def is_due(self, steps: int) -> bool:
-        """Return whether the current stage is done after `steps` environment steps."""
-        measured = self.measured()
-        rule = self._rule
-        if rule is None or measured is None:
-            return False
-        return steps - self._progress.stage_began >= rule.min_steps and measured >= rule.threshold
-
-    def next_spec(self) -> EnvSpec:
-        """Return the spec of the next stage."""
-        return self._specs[self.number]
-
-    def enter_next_stage(self, steps: int) -> tuple[str, str]:
-        """Enter the next stage; return its title and the reason."""
-        rule, measured = self._rule, self.measured()
-        assert rule is not None  # else `is_due` is False
-        assert measured is not None
-        reason = f"success {percent(measured)}" if rule.success is not None else f"return {measured:.2f}"
-        progress = self._progress
-        progress.stage, progress.stage_began, progress.stage_episodes = progress.stage + 1, steps, []
-        return self.title, f"after {steps:,} steps: {reason} over {format_count(rule.window, 'episode')}"
 
 
 def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
@@ -157,14 +148,13 @@ def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
     `workers` have the first stage. Raises `RecipeError` or `TaskError` with the number of a stage that cannot be
     built, and `RecipeError` if a stage's spaces or reward terms differ from the first's.
     """
-    first = info = None
-    for number, spec in enumerate(specs, start=1):
+    first = info = workers.info
+    for number, spec in enumerate(specs[1:], start=2):
         where = f"stage {number} of {len(specs)}"
         try:
-            info = workers.info if number == 1 else workers.rebuild(spec)
+            info = workers.rebuild(spec)
         except RlctlError as error:
             raise type(error)(f"{where}: {error}", details=error.details) from None
-        first = first or info
         if difference := info.find_difference(first, "stage 1's"):
             raise RecipeError(
                 f"{where}: {difference}. One policy learns in all stages: leave out the task parameter that changes it"
@@ -174,7 +164,6 @@ def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
                 f"{where}: its reward terms are {', '.join(info.reward_weights)}, "
                 f"stage 1's are {', '.join(first.reward_weights)}; all stages need the same"
             )
-    assert info is not None  # there is a first
     return info
 
 
@@ -182,18 +171,16 @@ def begin_next_episodes(model: BaseAlgorithm) -> None:
     """Cut the running episodes short and start new ones, as SB3 does at the start of a training."""
     env: Any = model.env
     if isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
-        _cut_episodes(model.replay_buffer)
+        _cut_episodes_short(model.replay_buffer)
     model._last_obs = env.reset()
     model._last_episode_starts = np.ones(env.num_envs, np.bool_)
 
 
-def _cut_episodes(buffer: ReplayBuffer) -> None:
+def _cut_episodes_short(buffer: ReplayBuffer) -> None:
     """Mark the running episodes as truncated: no return and no hindsight goal extends into the next stage."""
     if isinstance(buffer, HerReplayBuffer):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # SB3 warns that this truncates episodes
             buffer.truncate_last_trajectory()
-        return
-    last = buffer.pos - 1
-    running = buffer.dones[last] == 0.0  # the others have ended already
-    buffer.timeouts[last, running] = 1.0
+    else:
+        buffer.timeouts[buffer.pos - 1, buffer.dones[buffer.pos - 1] == 0.0] = 1.0

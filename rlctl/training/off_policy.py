@@ -9,8 +9,8 @@ from rlctl.policy.file import DETERMINISTIC
 from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import Recipe
 from rlctl.training.hindsight import has_whole_episode
-from rlctl.training.progress import Progress
 from rlctl.training.rollouts import Check, Rollouts, to_network_layout
+from rlctl.training.status import Progress
 from rlctl.training.vec_env import WorkerVecEnv
 
 

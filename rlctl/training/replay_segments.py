@@ -5,14 +5,12 @@ all environments is one transition. A segment holds a range of them, and a check
 oldest first. Where two overlap the later one is valid. Segments that no checkpoint lists are removed.
 """
 
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pydantic
-from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -25,7 +23,6 @@ from rlctl.training.snapshot import Tensors
 
 SEGMENT_BYTES = 8 * 2**20  # size of a segment [bytes]; the last one is written again until it has this size
 _FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-_NAME = re.compile(r"^\d{12}-\d{12}\.safetensors$")
 
 
 class Segment(pydantic.BaseModel):
@@ -51,9 +48,7 @@ class ReplaySegments:
         self.buffer = buffer
         self._segments: list[Segment] = []
         self._written = 0
-        arrays = _arrays(buffer).values()
-        self._row_bytes = sum(array[:1].nbytes for array in arrays)
-        self._most_rows = max(1, SEGMENT_BYTES // self._row_bytes)
+        self._most_rows = max(1, SEGMENT_BYTES // sum(array[:1].nbytes for array in _arrays(buffer).values()))
 
     def mark_last_changed(self, added: int) -> None:
         """Note that the last of `added` transitions was changed after it was added."""
@@ -99,26 +94,16 @@ class ReplaySegments:
         try:
             stored = load_tensors(file.read_bytes())
             for name, array in _arrays(self.buffer).items():
-                if stored[name].shape != (len(indices), *array.shape[1:]) or stored[name].dtype != array.dtype:
-                    raise ValueError(f"{name} has shape {stored[name].shape} and type {stored[name].dtype}")
                 array[indices] = stored[name]
-        except (OSError, SafetensorError, KeyError, ValueError) as error:
+        except (OSError, KeyError, ValueError) as error:
             raise ArtifactError(f"{file}: does not fit this recipe: {error}") from None
 
 
-def check(folder: Path, segments: Iterable[Segment]) -> None:
-    """Raise `ArtifactError` if a segment is missing or damaged."""
-    for segment in segments:
-        files.check_digest(folder / segment.name, segment.sha256)
-
-
 def remove_unnamed(folder: Path, named: Iterable[Segment]) -> None:
-    """Remove the segments that no checkpoint names; other files are left alone."""
-    if not folder.is_dir():
-        return
+    """Remove the segments that no checkpoint names."""
     names = {segment.name for segment in named}
-    for file in folder.iterdir():
-        if _NAME.match(file.name) and file.name not in names:
+    for file in folder.glob("*.safetensors"):
+        if file.name not in names:
             files.remove(file)
 
 

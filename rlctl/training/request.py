@@ -16,10 +16,10 @@ from rlctl.run.train_request import TrainRequest
 from rlctl.runs.diagnosis import Finding, diagnose, format_end
 from rlctl.training import status
 from rlctl.training.display import duration, make_display, percent
-from rlctl.training.progress import Progress
 from rlctl.training.setup import set_up
 from rlctl.training.signals import StopSignals
 from rlctl.training.start import Start, find_start
+from rlctl.training.status import Progress
 from rlctl.training.tracking import track
 
 
@@ -50,23 +50,25 @@ def run_training(request: TrainRequest) -> TrainResult:
     Raises `Interrupted` after a signal, and `TaskError` if evaluations failed.
     """
     with StopSignals() as signals, find_start(request) as start:
-        if start.run is not None and start.checkpoint is not None and start.checkpoint.progress.done:
-            return _report_finished(start, start.run, start.checkpoint.progress)
+        if start.run is not None and start.checkpoint is not None and start.checkpoint.state.progress.done:
+            return _report_finished(start, start.run, start.checkpoint.state.progress)
         title = f"{'train' if start.run is None else 'resume'} {start.task} ({start.recipe.algo})"
         with make_display(title, start.recipe.total_timesteps) as display, set_up(start, display) as training:
             signals.begin(training)
             training.run()
             signals.end()
             recordings = training.write_end(request.record)
-    run, progress = training.checkpoints.run, training.learner.progress
-    _raise_if_evaluations_failed(run, progress)
+    run, learner, best = training.checkpoints.run, training.learner, training.evaluator.best
+    _raise_if_evaluations_failed(run, learner.progress)
     seconds = time.monotonic() - start.began
-    best, steps = training.evaluator.best, training.learner.steps
-    return TrainResult(run, start.task, start.recipe, steps, progress, best, seconds, recordings)
+    return TrainResult(run, start.task, start.recipe, learner.steps, learner.progress, best, seconds, recordings)
 
 
 def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> TrainResult:
-    best = _read_best(run)
+    try:
+        best = PolicyFile.read_info(run.best_policy)
+    except ArtifactError:
+        best = None
     if run.status().get("status") != "finished":  # killed before the end was written
         status.write_end(run, start.step, progress, best)
     if start.recipe.track is not None:
@@ -78,13 +80,6 @@ def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> Tra
         note += f"; to record episodes: rlctl replay {run.path}"
     seconds = time.monotonic() - start.began
     return TrainResult(run, start.task, start.recipe, start.step, progress, best, seconds, note=note)
-
-
-def _read_best(run: RunDirectory) -> PolicyInfo | None:
-    try:
-        return PolicyFile.read_info(run.best_policy)
-    except ArtifactError:
-        return None
 
 
 def _raise_if_evaluations_failed(run: RunDirectory, progress: Progress) -> None:

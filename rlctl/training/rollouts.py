@@ -15,8 +15,8 @@ from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.recipe.recipe import Recipe
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.training.own_networks import write_graph
-from rlctl.training.progress import Progress
 from rlctl.training.snapshot import observation_statistics, pack
+from rlctl.training.status import Progress
 from rlctl.training.updates import choose_learner
 from rlctl.training.vec_env import WorkerVecEnv
 

@@ -16,16 +16,18 @@ from rlctl.checking.rules import Severity
 from rlctl.environments import registry
 from rlctl.environments.named_task import RUN
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import AnswerIsNo, TaskError
+from rlctl.errors import AnswerIsNo, RecipeError, TaskError
 from rlctl.output import format_count
 from rlctl.recipe.recipe import ON_POLICY
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory
 from rlctl.training import status
+from rlctl.training.callbacks import Callbacks
 from rlctl.training.display import Display
 from rlctl.training.start import Start
 from rlctl.training.tracking import track
+from rlctl.training.warm_start import load_source
 
 if TYPE_CHECKING:
     from rlctl.training.checkpoints import Checkpoints
@@ -48,9 +50,7 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
     with contextlib.ExitStack() as stack:
         # The workers build their environments, and the check runs, while this process imports torch.
         workers = stack.enter_context(_make_workers(specs[start.stage - 1], recipe.n_envs, start, display))
-        checked = None
-        if request.check and start.run is None:
-            checked = _begin_check(specs[-1], request.env_timeout_s)
+        checked = _begin_check(specs[-1], request.env_timeout_s) if request.check and start.run is None else None
         from rlctl.training.evaluator import EvaluationEpisodes, Evaluator
         from rlctl.training.loop import TrainingLoop
 
@@ -105,9 +105,7 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
     from rlctl.training.learner import Curriculum, Learner, check_stages
     from rlctl.training.off_policy import OffPolicyRollouts
     from rlctl.training.on_policy import OnPolicyRollouts
-    from rlctl.training.progress import Progress
     from rlctl.training.vec_env import WorkerVecEnv
-    from rlctl.training.warm_start import load_source
 
     pin_threads()
     recipe, goal = start.recipe, workers.info
@@ -115,11 +113,12 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
         with _make_workers(specs[0], 1, start, display) as probe:
             goal = check_stages(specs, probe)
     # A plain Gymnasium environment shows only at the end of an episode whether it reports success.
-    start.check_may_succeed(workers.info.has_success or not workers.info.reward_weights)
+    if workers.info.reward_weights and not workers.info.has_success:
+        _refuse_success_rates(start)
     # A policy that begins trained is evaluated first: it may be better than all later ones.
-    progress = Progress(next_eval=0 if start.is_trained else recipe.eval.every_steps or recipe.total_timesteps)
+    progress = status.Progress(next_eval=0 if start.is_trained else recipe.eval.every_steps or recipe.total_timesteps)
     if start.checkpoint is not None:
-        progress = start.checkpoint.progress
+        progress = start.checkpoint.state.progress
     env = WorkerVecEnv(workers, recipe.seed)
     model = build_model(recipe, env, start.request.device)
     rollouts = (OnPolicyRollouts if recipe.algo in ON_POLICY else OffPolicyRollouts)(model, env, recipe, progress)
@@ -134,9 +133,21 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
     return Learner(recipe, rollouts, Curriculum(recipe.stages, specs, goal, progress), progress)
 
 
+def _refuse_success_rates(start: Start) -> None:
+    """Raise `RecipeError` if the recipe needs success rates, which the task does not report."""
+    recipe, problem = start.recipe, f"{start.task} does not report success"
+    if recipe.stop_success is not None:
+        raise RecipeError(f"stop_success: {problem}; leave it out")
+    for number, stage in enumerate(recipe.stages, start=1):
+        if stage.promote is not None and stage.promote.success is not None:
+            raise RecipeError(
+                f"stage {number} of {len(recipe.stages)}: promote.success: {problem}; "
+                "promote by return: promote: {return: 50.0}"
+            )
+
+
 def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Checkpoints:
     """Restore the checkpoint, if any, and return the writer of the run folder."""
-    from rlctl.training.callbacks import Callbacks
     from rlctl.training.checkpoints import Checkpoints
     from rlctl.training.metrics import list_parameters, make_logger
 
@@ -182,17 +193,13 @@ def _refuse_errors(report: CheckReport, display: Display) -> None:
     if report.records.built is None:
         return  # the workers build it too, and report the error
     task, findings = shlex.quote(report.task), report.verdict.findings
-    for name in report.verdict.crashed:
-        display.message(f"check before training: {name} crashed because of a bug in rlctl; this rule was not checked")
     errors = [finding for finding in findings if finding.severity is Severity.ERROR]
     if errors:
         text = "; ".join(f"{finding.rule} {finding.name} ({finding.message})" for finding in errors)
-        count = format_count(len(errors), "error")
         failed = any(finding.rule in _FAILURES for finding in errors)
         raise (TaskError if failed else AnswerIsNo)(
-            f"the check before training found {count}: {text}\n"
+            f"the check before training found {format_count(len(errors), 'error')}: {text}\n"
             f"rlctl check-env {task} shows details; --no-check trains anyway."
         )
-    warnings = [finding.rule for finding in findings if finding.severity is Severity.WARNING]
-    if warnings:
+    if warnings := [finding.rule for finding in findings if finding.severity is Severity.WARNING]:
         display.message(f"check before training: warnings {', '.join(warnings)}; rlctl check-env {task} shows details")

@@ -1,7 +1,4 @@
-"""Saves and restores the model's state as tensors and plain data; packs its policy.
-
-`checkpoint.py` does this for the environments, `replay_segments.py` for the replay buffer.
-"""
+"""Saves and restores the model's state as tensors and plain data; packs its policy."""
 
 from pathlib import Path
 from typing import Any
@@ -34,12 +31,11 @@ _MUST_BE_FINITE = ("loss", "value_loss", "policy_gradient_loss", "policy_loss", 
 
 def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> PolicyFile:
     """Return a copy of a model's policy, with its current normalisation."""
-    tensors = {f"policy/{key}": value.cpu().numpy().copy() for key, value in model.policy.state_dict().items()}
-    statistics = observation_statistics(model.get_vec_normalize_env())
-    for key, rms in statistics.items():
-        tensors[f"normalize/{key}/mean"] = rms.mean.copy()
-        tensors[f"normalize/{key}/var"] = rms.var.copy()
     normalizer = model.get_vec_normalize_env()
+    statistics = observation_statistics(normalizer)
+    tensors = {f"policy/{key}": value.cpu().numpy().copy() for key, value in model.policy.state_dict().items()}
+    for key, rms in statistics.items():
+        tensors |= {f"normalize/{key}/mean": rms.mean.copy(), f"normalize/{key}/var": rms.var.copy()}
     info = PolicyInfo(
         algo=algo,
         policy=policy_name(algo, env.spaces()[0]),
@@ -64,18 +60,15 @@ def observation_statistics(normalizer: VecNormalize | None) -> dict[str, Running
 def learned_tensors(model: BaseAlgorithm) -> tuple[Tensors, Any]:
     """Return all learned tensors of a model and its normalisation, and the structure of its state dicts."""
     weights, structure = flatten(model.get_parameters(), "parameters")
-    return {**weights, **_variables(model), **_normalizer_tensors(model)}, structure
+    variables = {name: _array(tensor) for name, tensor in _variables(model).items()}
+    return weights | variables | _normalizer_tensors(model), structure
 
 
 def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
     """Return the state of a model at a boundary between updates."""
     tensors, structure = learned_tensors(model)
-    tensors |= _randomness_tensors() | _rollout_tensors(model)
-    plain = {
-        "counters": {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)},
-        "parameters": structure,
-    }
-    return tensors, plain
+    counters = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
+    return tensors | _randomness_tensors() | _rollout_tensors(model), {"counters": counters, "parameters": structure}
 
 
 def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
@@ -83,12 +76,12 @@ def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> No
     try:
         parameters = unflatten(plain["parameters"], tensors)
         model.set_parameters(parameters, exact_match=True, device=model.device)
-        _restore_variables(model, tensors)
+        for name, variable in _variables(model).items():
+            variable.copy_(torch.from_numpy(tensors[name].copy()))  # in place: the optimiser holds the same tensor
         _restore_normalizer(model, tensors)
         _restore_rollout(model, tensors)
-        for name in _COUNTERS:  # only these: a file must not choose attributes to set
-            if name in plain["counters"]:
-                setattr(model, name, plain["counters"][name])
+        for name in plain["counters"].keys() & set(_COUNTERS):  # only these: a file must not choose attributes to set
+            setattr(model, name, plain["counters"][name])
         _restore_randomness(tensors)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise ArtifactError(f"does not fit this recipe: {' '.join(str(error).split())[:200]}") from None
@@ -105,8 +98,7 @@ _NUMPY = ("keys", "position", "has_gauss", "cached")
 
 
 def _randomness_tensors() -> Tensors:
-    name, *state = np.random.get_state()  # noqa: NPY002 (SB3 draws from it)
-    assert name == "MT19937"  # numpy's global generator has no other kind
+    _, *state = np.random.get_state()  # noqa: NPY002 (SB3 draws from it)
     tensors = {f"randomness/numpy/{part}": np.asarray(value) for part, value in zip(_NUMPY, state, strict=True)}
     tensors["randomness/torch"] = torch.get_rng_state().numpy()
     return tensors
@@ -136,8 +128,7 @@ def flatten(value: Any, path: str) -> tuple[Tensors, Any]:
         return tensors, {"dict": entries}
     if isinstance(value, list | tuple):
         below, structure = flatten(dict(enumerate(value)), path)
-        kind = "list" if isinstance(value, list) else "tuple"
-        return below, {kind: [item for _, item in structure["dict"]]}
+        return below, {"list" if isinstance(value, list) else "tuple": [item for _, item in structure["dict"]]}
     if isinstance(value, np.generic):
         value = value.item()
     if value is not None and not isinstance(value, bool | int | float | str):
@@ -160,17 +151,10 @@ def unflatten(structure: Any, tensors: Tensors) -> Any:
     return content
 
 
-def _variables(model: BaseAlgorithm) -> Tensors:
+def _variables(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
     """Return what SB3 trains besides the networks: SAC's entropy coefficient, which `get_parameters` omits."""
     _, names = model._get_torch_save_params()
-    return {f"variables/{name}": _array(getattr(model, name)) for name in names}
-
-
-def _restore_variables(model: BaseAlgorithm, tensors: Tensors) -> None:
-    _, names = model._get_torch_save_params()
-    for name in names:
-        # In place: the optimiser holds the same tensor.
-        getattr(model, name).data.copy_(torch.from_numpy(tensors[f"variables/{name}"].copy()))
+    return {f"variables/{name}": getattr(model, name).data for name in names}
 
 
 def _normalizer_tensors(model: BaseAlgorithm) -> Tensors:
@@ -189,8 +173,7 @@ def _restore_normalizer(model: BaseAlgorithm, tensors: Tensors) -> None:
         return
     normalizer.returns = tensors["normalize/returns"].copy()
     for key, rms in {**observation_statistics(normalizer), "return": normalizer.ret_rms}.items():
-        rms.mean = tensors[f"normalize/{key}/mean"].copy()
-        rms.var = tensors[f"normalize/{key}/var"].copy()
+        rms.mean, rms.var = (tensors[f"normalize/{key}/{part}"].copy() for part in ("mean", "var"))
         rms.count = float(tensors[f"normalize/{key}/count"])
 
 
@@ -199,8 +182,7 @@ def _rollout_tensors(model: BaseAlgorithm) -> Tensors:
     tensors: Tensors = {"rollout/starts": np.asarray(model._last_episode_starts)}
     states: Any = getattr(model, "_last_lstm_states", None)
     for kind, pair in zip(("pi", "vf"), states or (), strict=False):
-        for index, state in enumerate(pair):
-            tensors[f"rollout/lstm/{kind}/{index}"] = _array(state)
+        tensors |= {f"rollout/lstm/{kind}/{index}": _array(state) for index, state in enumerate(pair)}
     return tensors
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import inspect
 import os
 import re
 import shlex
@@ -15,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rlctl.environments import named_task, registry
 from rlctl.environments.registry import describe_task_changes
-from rlctl.errors import ArtifactError, RecipeError, UsageError
+from rlctl.errors import ArtifactError, RecipeError, RlctlError, UsageError
 from rlctl.hub import store
 from rlctl.policy import own_modules
 from rlctl.recipe.recipe import Recipe, validate
@@ -24,7 +26,7 @@ from rlctl.recipe.sources import describe_rounding, resolve_with_stages
 from rlctl.run import lookup
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.train_request import TrainRequest
-from rlctl.training.callbacks import Callback, load_callbacks
+from rlctl.training.callbacks import Callback, call_callback
 from rlctl.training.demonstrations import describe_source
 from rlctl.training.tracking import check_installed
 from rlctl.training.warm_start import find_source
@@ -32,6 +34,8 @@ from rlctl.training.warm_start import find_source
 if TYPE_CHECKING:
     from rlctl.training.checkpoint import Checkpoint
 
+_OF_SB3 = "stable_baselines3.common.callbacks"
+_NO_CALLBACK = "neither a rlctl.Callback nor a BaseCallback of Stable-Baselines3"
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
 
 
@@ -62,7 +66,7 @@ class Start:
     @property
     def stage(self) -> int:
         """Stage of the curriculum, from 1."""
-        return (self.checkpoint.progress.stage or 1) if self.checkpoint else 1
+        return (self.checkpoint.state.progress.stage or 1) if self.checkpoint else 1
 
     @property
     def is_trained(self) -> bool:
@@ -74,32 +78,17 @@ class Start:
         """Environment steps that are done."""
         return self.checkpoint.state.step if self.checkpoint else 0
 
-    def check_may_succeed(self, may_succeed: bool) -> None:
-        """Raise `RecipeError` if the recipe needs success rates and the task does not report success."""
-        recipe = self.recipe
-        if may_succeed:
-            return
-        if recipe.stop_success is not None:
-            raise RecipeError(f"stop_success: {self.task} does not report success; leave it out")
-        for number, stage in enumerate(recipe.stages, start=1):
-            if stage.promote is not None and stage.promote.success is not None:
-                raise RecipeError(
-                    f"stage {number} of {len(recipe.stages)}: promote.success: {self.task} does not report success; "
-                    "promote by return: promote: {return: 50.0}"
-                )
-
 
 def find_start(request: TrainRequest) -> Start:
     """Check a request and return its start; nothing is changed yet."""
     check_arguments(request)
-    return _find_new(request) if request.task is not None else _find_checkpoint(request)
+    return _find_checkpoint(request) if request.task is None else _find_new(request, request.task)
 
 
 def check_arguments(request: TrainRequest) -> None:
     """Raise `UsageError` for arguments that exclude each other, and for a device that cannot exist."""
     if (request.task is None) == (request.resume is None):
-        both = request.task is not None
-        problem = "TASK and --resume exclude each other" if both else "neither TASK nor --resume is given"
+        problem = "TASK and --resume exclude each other" if request.task else "neither TASK nor --resume is given"
         raise UsageError(f"{problem}: give a task to train, or a run to resume")
     if request.demos is not None and request.initial_policy is not None:
         raise UsageError("--demos and --from exclude each other: cloning would replace the policy of --from")
@@ -111,29 +100,23 @@ def check_arguments(request: TrainRequest) -> None:
         _check_resume(request)
 
 
-def _find_new(request: TrainRequest) -> Start:
-    task = request.task or ""
+def _find_new(request: TrainRequest, task: str) -> Start:
     with preserve_process_state():
-        recipe = resolve_with_stages(task, request.config, request.settings)
-        recipe = own_modules.locate(recipe)
-        callbacks = load_callbacks(recipe)
+        recipe = own_modules.locate(resolve_with_stages(task, request.config, request.settings))
+        callbacks = _load_callbacks(recipe)
     check_installed(recipe)
-    note = describe_rounding(recipe)
     source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
     if request.demos is not None and recipe.algo in ("dqn", "recurrent_ppo"):
         raise RecipeError(
             f"--demos: {recipe.algo} cannot clone demonstrations; use ppo, a2c, sac, tqc, crossq, td3 or ddpg"
         )
-    notes = (note,) if note else ()
+    notes = tuple(filter(None, [describe_rounding(recipe)]))
     demos = describe_source(Path(request.demos)) if request.demos is not None else None
     return Start(request, task, recipe, notes=notes, callbacks=callbacks, source=source, demos=demos)
 
 
 def _find_checkpoint(request: TrainRequest) -> Start:
-    """Find a run, lock it, and read its newest undamaged checkpoint.
-
-    Raises `UsageError` for settings that a resume cannot change, and, without --force, for a changed task.
-    """
+    """Find a run, lock it, and read its newest undamaged checkpoint; refuse a changed task without --force."""
     from rlctl.training import checkpoint
 
     run = lookup.find_run(request.resume, request.root, to_train=True)
@@ -167,7 +150,7 @@ def _find_checkpoint(request: TrainRequest) -> Start:
                 f"{run.path}: its recipe names {names[0]}, and a run that was downloaded imports nothing; "
                 f"to train further with it: rlctl train {task} --config {run.recipe_file} --from {run.path}"
             )
-        callbacks, source, demos = load_callbacks(recipe), status.get("from"), status.get("demos")
+        callbacks, source, demos = _load_callbacks(recipe), status.get("from"), status.get("demos")
         return Start(request, task, recipe, run, lock, newest, tuple(notes), callbacks, source, demos, tuple(changes))
     except BaseException:
         lock.release()
@@ -175,12 +158,10 @@ def _find_checkpoint(request: TrainRequest) -> Start:
 
 
 def _check_resume(request: TrainRequest) -> None:
-    if request.config is not None:
-        raise UsageError("--resume uses the run's own recipe: leave out --config")
-    if request.demos is not None:
-        raise UsageError("--demos and --resume exclude each other: the run has cloned its demonstrations")
-    if request.initial_policy is not None:
-        raise UsageError("--from and --resume exclude each other: --from starts a new run, --resume continues one")
+    given = {"--config": request.config, "--demos": request.demos, "--from": request.initial_policy}
+    for option, value in given.items():
+        if value is not None:
+            raise UsageError(f"{option} and --resume exclude each other: the run has its own recipe and policy")
     for key in request.settings:
         if key != "total_timesteps":
             raise UsageError(f"--resume uses the run's own recipe: {key} cannot be changed; only -n can")
@@ -188,19 +169,47 @@ def _check_resume(request: TrainRequest) -> None:
 
 def _reopen(newest: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:
     """Mark a finished training as not done if the request asks for more steps."""
-    if not newest.progress.done or recipe.total_timesteps <= max(newest.state.step, before.total_timesteps):
+    if not newest.state.progress.done or recipe.total_timesteps <= max(newest.state.step, before.total_timesteps):
         return newest
-    progress = dataclasses.replace(newest.progress, done=False, good_in_a_row=0, stop_reason="")
+    progress = dataclasses.replace(newest.state.progress, done=False, good_in_a_row=0, stop_reason="")
     return dataclasses.replace(newest, state=newest.state.model_copy(update={"progress": progress}))
+
+
+def _load_callbacks(recipe: Recipe) -> dict[str, Callback]:
+    """Import and build the callbacks of a recipe; raises `RecipeError` for a name that is no callback."""
+    return {name: _load_callback(name, arguments or {}) for name, arguments in recipe.callbacks.items()}
+
+
+def _load_callback(name: str, arguments: Mapping[str, Any]) -> Callback:
+    try:
+        if ":" not in name:
+            raise RecipeError("give the class too: FILE.py:CLASS or MODULE:CLASS")
+        constructor = registry.load(name)
+    except RlctlError as error:
+        problem = str(error).removeprefix(f"task {name!r}: ")
+        raise RecipeError(f"callbacks: {name}: {problem}", details=error.details) from None
+    if not _may_be_called(constructor):
+        raise RecipeError(f"callbacks: {name}: {_NO_CALLBACK}, or a function of your own file that returns one")
+    callback: Any = call_callback(name, lambda: constructor(**arguments))
+    if _OF_SB3 in (base.__module__ for base in type(callback).__mro__):
+        from rlctl.training.sb3_callback import Sb3Callback
+
+        return Sb3Callback(callback)
+    if isinstance(callback, Callback):
+        return callback
+    raise RecipeError(f"callbacks: {name}: {_NO_CALLBACK}")
+
+
+def _may_be_called(constructor: Any) -> bool:
+    # A recipe may come from somebody else: it must not call `os:system`.
+    if inspect.isclass(constructor):
+        return any(base is Callback or base.__module__ == _OF_SB3 for base in constructor.__mro__)
+    return inspect.isfunction(constructor) and named_task.is_own_file(Path(inspect.getfile(constructor)))
 
 
 @contextlib.contextmanager
 def preserve_process_state() -> Iterator[None]:
-    """Restore global state that importing a user's module may change.
-
-    Working directory, NumPy's error handling, torch's default type, device and gradients. The training sets signal
-    handlers later.
-    """
+    """Restore global state that importing a user's module may change; the training sets signal handlers later."""
     try:
         with contextlib.chdir("."), np.errstate():
             yield

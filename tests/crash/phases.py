@@ -10,14 +10,14 @@ import rlctl.rollout.workers
 import rlctl.storage.files
 import rlctl.training.evaluator
 import rlctl.training.loop
-import rlctl.training.progress
+import rlctl.training.status
 import rlctl.training.vec_env
 from rlctl.processes import child_process
 
 PHASES = {
     "workers start": (child_process, "start_process", 1),
     "workers build": (rlctl.rollout.workers.Workers, "info", 1),
-    "run folder": (rlctl.training.progress, "write_start", 1),
+    "run folder": (rlctl.training.status, "write_start", 1),
     "first rollout": (rlctl.training.vec_env.WorkerVecEnv, "finish", 1),
     "boundary": (rlctl.training.loop.TrainingLoop, "boundary", 2),
     "evaluation": (rlctl.training.evaluator.EvaluationEpisodes, "play", 1),
@@ -27,7 +27,7 @@ PHASES = {
     "final evaluation": (rlctl.training.evaluator.EvaluationEpisodes, "play", 2),
     "the end": (rlctl.training.loop.TrainingLoop, "boundary", 4),
     "last checkpoint": (rlctl.storage.files, "os.rename", 6),
-    "done": (rlctl.training.progress, "write_end", 1),
+    "done": (rlctl.training.status, "write_end", 1),
 }
 """Phase -> the function that is in it, and which call of it.
 

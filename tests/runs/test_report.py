@@ -16,7 +16,7 @@ from rlctl.run.directory import RunDirectory
 from rlctl.run.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.runs.report import content
 from rlctl.runs.report.write import write_report
-from rlctl.training.progress import find_recipe_changes
+from rlctl.training.status import find_recipe_changes
 
 LARGEST = 2_000_000  # [bytes]
 HEADER = "steps,seconds,return,success,term/alive\n"

@@ -42,7 +42,9 @@ def assert_same_run(one: RunDirectory, other: RunDirectory) -> None:
     assert different == []
     assert repr(ours.state.model) == repr(theirs.state.model)
     timeless = {"seconds": 0.0, "metrics_bytes": 0, "evals_bytes": 0, "metrics_sha256": "", "evals_sha256": ""}
-    assert dataclasses.replace(ours.progress, **timeless) == dataclasses.replace(theirs.progress, **timeless)
+    assert dataclasses.replace(ours.state.progress, **timeless) == dataclasses.replace(
+        theirs.state.progress, **timeless
+    )
     _assert_same_transitions(replay_buffer(one, ours.state.segments), replay_buffer(other, theirs.state.segments))
     assert load_best(one).keys() == load_best(other).keys()
     for name, values in load_best(one).items():

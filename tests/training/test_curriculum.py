@@ -67,7 +67,11 @@ def test_evaluation_is_always_in_the_last_stage(staged):
 
 def test_checkpoints_know_the_stage_and_addresses_go_on(staged):
     found = saved(staged.run)
-    assert (found.progress.stage, found.progress.stage_began, found.progress.stage_episodes) == (2, 128, [])
+    assert (found.state.progress.stage, found.state.progress.stage_began, found.state.progress.stage_episodes) == (
+        2,
+        128,
+        [],
+    )
     # 32 steps: three episodes ended, the fourth was left; the fifth begins the stage. Then three ended again.
     assert found.tensors["environments/episodes_started"].tolist() == [8] * 4
     assert found.tensors["environments/steps"].tolist() == [2] * 4
@@ -151,7 +155,7 @@ def test_resume_goes_on_in_the_middle_of_a_stage(train, resume, small_ppo):
         {"task": HARD},
     ]
     result = train("Staged", {**small_ppo, "total_timesteps": 192, "stages": stages})
-    progress = saved(result.run).progress
+    progress = saved(result.run).state.progress
     # Stage 2 began at 64; 32 steps later three episodes of each environment are over.
     assert (progress.stage, progress.stage_began, progress.stage_episodes) == (2, 64, [1.0] * 12)
     resume(result, total_timesteps=384)
@@ -164,7 +168,7 @@ def test_resume_goes_on_in_the_middle_of_a_stage(train, resume, small_ppo):
 def test_a_stage_that_is_done_with_the_training_is_left_by_its_resume(train, resume, small_ppo):
     stages = [{"task": EASY, "promote": {"success": 1.0, "window": 4}}, {"task": HARD}]
     result = train("Staged", {**small_ppo, "total_timesteps": 64, "stages": stages})
-    assert (result.progress.stage, saved(result.run).progress.stage_began) == (2, 64)
+    assert (result.progress.stage, saved(result.run).state.progress.stage_began) == (2, 64)
     resume(result, total_timesteps=128)
     assert column(result.run.metrics_file, "stage") == [1, 2]
     assert column(result.run.metrics_file, "success", float) == [1.0, 0.0]

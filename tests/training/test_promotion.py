@@ -3,7 +3,7 @@
 from rlctl.recipe.recipe import validate
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.training.learner import Curriculum
-from rlctl.training.progress import Progress
+from rlctl.training.status import Progress
 
 
 def curriculum(*stages):

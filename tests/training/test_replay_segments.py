@@ -6,7 +6,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from rlctl.training.replay_segments import ReplaySegments, check
+from rlctl.storage import files
+from rlctl.training.replay_segments import ReplaySegments
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
@@ -27,7 +28,8 @@ def test_what_is_removed_while_training_is_written_again(tmp_path):
     segments.folder.mkdir()
     fill(buffer, 5)
     named = segments.save(25)
-    check(segments.folder, named)
+    for segment in named:
+        files.check_digest(segments.folder / segment.name, segment.sha256)
     read = ReplaySegments(segments.folder, ReplayBuffer(50, BOX, BOX, device="cpu"))
     read.load(named, 25)
     np.testing.assert_array_equal(read.buffer.observations[:25], buffer.observations[:25])

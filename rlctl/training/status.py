@@ -1,4 +1,4 @@
-"""The counters that a resume restores in addition to the model."""
+"""How far a training is: the counters that checkpoints store, and what `run.json` says of its start and end."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlctl.environments.registry import find_git_commit, identify_task
 from rlctl.errors import DivergedError, Interrupted, RlctlError, RunTaken
+from rlctl.policy.file import PolicyInfo
 from rlctl.recipe.recipe import Recipe, find_difference
 from rlctl.recipe.sources import resolve_packaged
 from rlctl.rollout.messages import EpisodeResult
@@ -19,8 +20,9 @@ from rlctl.run.directory import RunDirectory
 from rlctl.version import collect_versions
 
 if TYPE_CHECKING:
-    from rlctl.policy.file import PolicyInfo
     from rlctl.training.start import Start
+
+_STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
 
 
 @dataclasses.dataclass
@@ -54,9 +56,6 @@ class Progress:
     stop_reason: str = ""  # why a callback ended the training
     stage_episodes: list[float | None] = dataclasses.field(default_factory=list)
     """Success (0 or 1; None if not reported) or return of the stage's last episodes, as its promotion rule needs."""
-
-
-_STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
 
 
 def write_start(run: RunDirectory, start: Start) -> None:
