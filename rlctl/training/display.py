@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import csv
 import os
 import signal
 import sys
@@ -58,10 +56,8 @@ class Display:
     def __init__(self, title: str, total: int) -> None:
         self.title = title
         self.total = total
-        self._steps = 0
-        self._first: tuple[float, int] | None = None
-        self._stage = ""
-        self._last_line = 0.0
+        self._first: tuple[float, int] | None = None  # time and steps of the first segment
+        self._steps, self._stage, self._last_line = 0, "", 0.0
 
     def __enter__(self) -> Display:
         self.message(self.title)
@@ -107,7 +103,7 @@ class Display:
     def stage(self, title: str, why: str = "") -> None:
         """A stage of the curriculum begins or is resumed."""
         self._stage = title.partition(":")[0]
-        self.message(_format_stage(title, why))
+        self.message(f"{title}  ({why})" if why else title)
 
     def evaluation(self, steps: int, success: float | None, mean_return: float, best: bool) -> None:
         """An evaluation is done."""
@@ -122,10 +118,6 @@ class Display:
                 os.dup2(nowhere.fileno(), sys.stderr.fileno())
             if callable(stop := signal.getsignal(signal.SIGTERM)):
                 stop(signal.SIGPIPE, None)
-
-
-def _format_stage(title: str, why: str) -> str:
-    return f"{title}  ({why})" if why else title
 
 
 def _format_evaluation(steps: int, success: float | None, mean_return: float, best: bool) -> str:
@@ -163,15 +155,14 @@ class LiveDisplay(Display):
     def run_folder(self, run: RunDirectory) -> None:
         """Show the folder; draw the earlier rows of a resumed run."""
         self._folder = str(run.path)
-        with contextlib.suppress(OSError, csv.Error):  # unreadable rows are not drawn
-            for row in read_table(run.metrics_file):
-                self._add_to_curves(row)
-            evaluations = read_table(run.evals_file)
-            best = find_best_row(evaluations)
-            for row in evaluations:
-                steps, success, mean = row.get("steps"), row.get("success"), row.get("return")
-                if steps is not None and mean is not None:
-                    self.evaluation(int(steps), success, mean, row is best)
+        for row in read_table(run.metrics_file):
+            self._add_to_curves(row)
+        evaluations = read_table(run.evals_file)
+        best = find_best_row(evaluations)
+        for row in evaluations:
+            steps, mean = row.get("steps"), row.get("return")
+            if steps is not None and mean is not None:
+                self.evaluation(int(steps), row.get("success"), mean, row is best)
 
     def steps(self, steps: int) -> None:
         """Move the bar to `steps`, the environment steps so far."""
@@ -193,7 +184,7 @@ class LiveDisplay(Display):
 
     def stage(self, title: str, why: str = "") -> None:
         """Show the stage of the curriculum."""
-        self._stage = _format_stage(title, why)
+        self._stage = f"{title}  ({why})" if why else title
 
     def evaluation(self, steps: int, success: float | None, mean_return: float, best: bool) -> None:
         """Add an evaluation to the list, of which the last five are shown."""
@@ -202,20 +193,15 @@ class LiveDisplay(Display):
 
     def message(self, text: str) -> None:
         """Print a line above the bar."""
-        from rich.text import Text
-
-        self._live.console.print(Text(text))
+        self._live.console.print(text, markup=False, highlight=False, emoji=False)
 
     def __rich_console__(self, console: Any, options: Any) -> Any:
         """Draw for a terminal of this width."""
-        yield self._draw_bar(options.max_width)
-        yield from self._draw_lines(options.max_width)
-
-    def _draw_bar(self, width: int) -> Any:
         from rich.progress_bar import ProgressBar
         from rich.table import Table
         from rich.text import Text
 
+        width = options.max_width
         bar = Table.grid(padding=(0, 1))
         bar.add_row(
             Text(self.title, style="bold"),
@@ -225,32 +211,26 @@ class LiveDisplay(Display):
             *([f"{duration(time.monotonic() - self._began)} elapsed"] if width >= _WIDE else []),
             f"{self.time_left() or '-:--'} left",
         )
-        return bar
-
-    def _draw_lines(self, width: int) -> list[Any]:
-        from rich.text import Text
-
-        lines: list[Any] = []
+        yield bar
         if self._folder and width >= _WIDE:
-            lines.append(Text(f"  {self._folder}", no_wrap=True, overflow="ellipsis"))
+            yield Text(f"  {self._folder}", no_wrap=True, overflow="ellipsis")
         if self._phase is not None:
             text, since = self._phase
-            lines.append(Text(f"  {text} ... {duration(time.monotonic() - since)}", style="yellow"))
+            yield Text(f"  {text} ... {duration(time.monotonic() - since)}", style="yellow")
         if self._stage:
-            lines.append(Text(f"  {self._stage}"))
+            yield Text(f"  {self._stage}")
         successes, returns = ([*curve][-max(width - 30, 32) :] for curve in self._curves.values())
         if successes:
             curve = sparkline(successes, 0.0, 1.0)
-            lines.append(Text.assemble("  success ", (curve, "green"), f" {percent(successes[-1])}"))
+            yield Text.assemble("  success ", (curve, "green"), f" {percent(successes[-1])}")
         if returns:
-            lines.append(Text.assemble("  return  ", (sparkline(returns), "cyan"), f" {returns[-1]:.2f}"))
+            yield Text.assemble("  return  ", (sparkline(returns), "cyan"), f" {returns[-1]:.2f}")
         if self._terms and width >= _WIDE:
             terms = "  ".join(f"{name} {value:.4g}" for name, value in self._terms.items())
-            lines.append(Text(f"  terms   {terms}", no_wrap=True, overflow="ellipsis"))
+            yield Text(f"  terms   {terms}", no_wrap=True, overflow="ellipsis")
         mark = "✓" if output.is_utf8() else "+"
         for evaluation in self._evaluations[-5:]:
-            lines.append(Text(f"  {mark} {_format_evaluation(*evaluation)}", style="green" if evaluation[3] else ""))
-        return lines
+            yield Text(f"  {mark} {_format_evaluation(*evaluation)}", style="green" if evaluation[3] else "")
 
 
 def make_display(title: str, total: int) -> Display:

@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, EpisodeFailed, RlctlError, TaskError, UsageError
 from rlctl.evaluation.episode_statistics import mean_return, success_rate
 from rlctl.policy.file import PolicyFile, PolicyInfo, Score
 from rlctl.policy.players.player import Exploration
-from rlctl.recipe.recipe import Recipe
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
@@ -30,18 +28,13 @@ _FINAL_EPISODES = 30  # minimum number of new episodes that compare the best pol
 
 
 class EvaluationEpisodes:
-    """Plays the evaluation episodes of a run, and saves some of them, without any effect on the training.
+    """Plays the evaluation episodes of a run, and saves some of them, without any effect on the training."""
 
-    `goal` describes the environments of the evaluations.
-    """
-
-    def __init__(
-        self, recipe: Recipe, make_workers: Callable[[], Workers], checkpoints: Checkpoints, goal: EnvInfo
-    ) -> None:
-        self._recipe = recipe
+    def __init__(self, learner: Learner, make_workers: Callable[[], Workers], checkpoints: Checkpoints) -> None:
+        self._recipe = learner.recipe
         self._make_workers = make_workers
         self._checkpoints = checkpoints
-        self._goal = goal
+        self._goal = learner.curriculum.goal  # description of the environments of the evaluations
         # They build their environments during the first updates, which leave a core idle.
         self._workers: Workers | None = make_workers()
         self._spec = self._workers.spec
@@ -76,10 +69,8 @@ class EvaluationEpisodes:
         """Save the first and the worst episode of an evaluation; remember all for `record`."""
         policy = f"{STEP_LABEL}{steps}"
         self._latest = recorded = [episode.describe(self._spec, self._goal, policy) for episode in episodes]
-        worst = min(
-            range(len(episodes)), key=lambda i: (episodes[i].result.success is True, episodes[i].result.total_reward)
-        )
-        for index in dict.fromkeys((0, worst)):
+        scores = [(episode.result.success is True, episode.result.total_reward) for episode in episodes]
+        for index in dict.fromkeys((0, scores.index(min(scores)))):
             self._write(recorded[index])
 
     def record(self, count: int) -> list[Path]:
@@ -111,8 +102,8 @@ class EvaluationEpisodes:
             failure=str(error).partition("\n")[0],
         )
         nothing = np.zeros(0)
-        # If the reset failed there are no actions with a shape.
-        actions = np.asarray(error.actions).reshape(-1, *(self._goal.spaces()[1].shape or ()))
+        shape = self._goal.spaces()[1].shape or ()
+        actions = np.asarray(error.actions).reshape(-1, *shape)  # if the reset failed there are no actions
         episode = RecordedEpisode(actions, nothing, nothing, nothing.reshape(0, 0), info)
         written: list[Path] = []
         self._checkpoints.attempt("failed episode", lambda: written.append(self._write(episode)))
@@ -205,7 +196,9 @@ class Evaluator:
         self._highest_success = max(self._highest_success, score.success or 0.0)
         if better:
             self._keep_as_best(policy, score)
-        self._count_good(score)
+        threshold = self._recipe.stop_success
+        is_good = threshold is not None and score.success is not None and score.success >= threshold
+        learner.progress.good_in_a_row = learner.progress.good_in_a_row + 1 if is_good else 0
         row = {
             "steps": steps,
             "seconds": round(learner.seconds, 3),
@@ -213,24 +206,14 @@ class Evaluator:
             **measurements.evaluation_row(results),
         }
         self._checkpoints.row(self._checkpoints.evals, row)
-        self._log(score, sum(result.length for result in results) / len(results))
+        tags = {"mean_reward": row["return"], "mean_ep_length": row["length"], "success_rate": row["success"]}
+        for tag, value in tags.items():  # those of SB3's own evaluations
+            if value is not None:
+                learner.model.logger.record(f"eval/{tag}", value)
+        learner.model.logger.dump(steps)
         self._checkpoints.attempt("episodes", lambda: self.episodes.keep(episodes, steps))
         self._display.evaluation(steps, score.success, score.mean_return, better)
         return row
-
-    def _count_good(self, score: Score) -> None:
-        progress, threshold = self._learner.progress, self._recipe.stop_success
-        is_good = threshold is not None and score.success is not None and score.success >= threshold
-        progress.good_in_a_row = progress.good_in_a_row + 1 if is_good else 0
-
-    def _log(self, score: Score, mean_steps: float) -> None:
-        """Write to TensorBoard, with the tags of SB3's own evaluations."""
-        logger = self._learner.model.logger
-        logger.record("eval/mean_reward", score.mean_return)
-        logger.record("eval/mean_ep_length", mean_steps)
-        if score.success is not None:
-            logger.record("eval/success_rate", score.success)
-        logger.dump(self._learner.steps)
 
     def compare_best_with_last(self, check: Callable[[], None]) -> None:
         """Play new episodes with the best and the last policy; keep the last as best if it is better in them.
@@ -246,10 +229,8 @@ class Evaluator:
         self._display.phase("best or last")
         last = self._learner.pack()
         try:
-            before, after = (
-                _score(self.episodes.play(policy, check, unseen=count))
-                for policy in (self._checkpoints.read_best(), last)
-            )
+            before = _score(self.episodes.play(self._checkpoints.read_best(), check, unseen=count))
+            after = _score(self.episodes.play(last, check, unseen=count))
         except (TaskError, UsageError, ArtifactError) as error:
             self._display.message(f"warning: the best and the last policy were not compared: {error}")
             return

@@ -52,10 +52,8 @@ def measure(model: BaseAlgorithm, env: WorkerVecEnv, last_row: int, total_timest
     """Return columns for the environment steps since the last row; log them, and histograms at intervals."""
     steps = model.num_timesteps
     last = _read_last_steps(model, env, steps - last_row)
-    row = {
-        **summarize_steps(last, model.action_space, model.logger.name_to_value),
-        "gradient_norm": _gradient_norm(model),
-    }
+    row = summarize_steps(last, model.action_space, model.logger.name_to_value)
+    row["gradient_norm"] = _gradient_norm(model)
     for name, value in row.items():
         if value is not None:
             model.logger.record(f"rollout/{name}", value)
@@ -72,9 +70,8 @@ def _read_last_steps(model: BaseAlgorithm, env: WorkerVecEnv, steps: int) -> Las
     """Return at most the last `steps` steps, None before the first: the last segment, or from the replay buffer."""
     replay: Any = getattr(model, "replay_buffer", None)
     if replay is not None:
-        return _read_replay_buffer(model, replay, max(1, steps // env.num_envs))
-    segment = env.last_segment
-    if segment is None:
+        return _read_replay_buffer(replay, max(1, steps // env.num_envs))
+    if (segment := env.last_segment) is None:
         return None
     rollout: Any = model.rollout_buffer  # type: ignore[attr-defined]
     observation = {key: rows[:, :-1] for key, rows in segment.observation.items()}
@@ -84,7 +81,7 @@ def _read_last_steps(model: BaseAlgorithm, env: WorkerVecEnv, steps: int) -> Las
     return LastSteps(observation, action, segment.terminated, segment.truncated, rollout.values.ravel())
 
 
-def _read_replay_buffer(model: BaseAlgorithm, buffer: Any, steps: int) -> LastSteps | None:
+def _read_replay_buffer(buffer: Any, steps: int) -> LastSteps | None:
     stored = buffer.buffer_size if buffer.full else buffer.pos
     rows = np.arange(buffer.pos - min(stored, steps, _ROWS), buffer.pos)
     if not len(rows):
@@ -107,29 +104,22 @@ def summarize_steps(
     last: LastSteps | None, space: spaces.Space[Any], log: Mapping[str, Any]
 ) -> dict[str, float | None]:
     """Return measurements of steps with actions of a space; `log` holds the values that SB3 logged in the update."""
-    limited = _half_range(space) is not None
-    actions = None if last is None or not isinstance(space, spaces.Box) else last.action.astype(np.float32)
-    return {
-        "terminated": None if last is None else _terminated_share(last),
-        "action_saturation": None if actions is None or not limited else float((np.abs(actions) > _AT_LIMIT).mean()),
-        "action_change": None if actions is None or last is None else _mean_change(actions, last),
-        "exploration": _exploration(space, log.get("train/entropy_loss")),
-        "value": _expected_value(last, log),
-    }
+    row: dict[str, float | None] = dict.fromkeys(("terminated", "action_saturation", "action_change"))
+    if last is not None:
+        ended = last.terminated | last.truncated
+        if ended.any():
+            row["terminated"] = float(last.terminated.sum() / ended.sum())
+        if isinstance(space, spaces.Box):
+            actions = last.action.astype(np.float32)
+            if _half_range(space) is not None:
+                row["action_saturation"] = float((np.abs(actions) > _AT_LIMIT).mean())
+            if not ended[:, :-1].all():  # the change from one action to the next of the same episode, in half ranges
+                row["action_change"] = float(np.abs(np.diff(actions, axis=1))[~ended[:, :-1]].mean())
+    row["exploration"] = _measure_exploration(space, log.get("train/entropy_loss"))
+    return row | {"value": _read_value(last, log)}
 
 
-def _terminated_share(last: LastSteps) -> float | None:
-    ended = int((last.terminated | last.truncated).sum())
-    return float(last.terminated.sum()) / ended if ended else None
-
-
-def _mean_change(actions: NDArray[np.float32], last: LastSteps) -> float | None:
-    """Return the mean size of the change from one action to the next of the same episode, in half ranges."""
-    same = ~(last.terminated | last.truncated)[:, :-1]
-    return float(np.abs(np.diff(actions, axis=1))[same].mean()) if same.any() else None
-
-
-def _exploration(space: spaces.Space[Any], entropy_loss: Any) -> float | None:
+def _measure_exploration(space: spaces.Space[Any], entropy_loss: Any) -> float | None:
     """Return how widely an on-policy algorithm explores, as a fraction of half the action range or of all choices.
 
     For a normal distribution it is the standard deviation that has the logged entropy; the one that SB3 logs for gSDE
@@ -145,7 +135,7 @@ def _exploration(space: spaces.Space[Any], entropy_loss: Any) -> float | None:
     return math.exp(min(per_element - 0.5 * math.log(2 * math.pi * math.e), 50.0)) / float(np.exp(np.log(half).mean()))
 
 
-def _expected_value(last: LastSteps | None, log: Mapping[str, Any]) -> float | None:
+def _read_value(last: LastSteps | None, log: Mapping[str, Any]) -> float | None:
     """Return the critic's mean value over a rollout, or over the minibatches of an off-policy update.
 
     The off-policy actor's loss is minus this value; SAC's includes the entropy bonus.
@@ -164,8 +154,6 @@ def _gradient_norm(model: BaseAlgorithm) -> float | None:
     """
     if (critic := getattr(model, "critic", None)) is not None:
         return recent_gradient_norm(critic.optimizer)
-    if not hasattr(model, "max_grad_norm"):
-        return None
     gradients = [parameter.grad for parameter in model.policy.parameters() if parameter.grad is not None]
     return float(torch.nn.utils.get_total_norm(gradients)) if gradients else None
 
@@ -183,16 +171,15 @@ def recent_gradient_norm(optimizer: torch.optim.Optimizer) -> float | None:
 
 def collect_histograms(last: LastSteps, info: EnvInfo) -> dict[str, torch.Tensor]:
     """Return the samples of TensorBoard's histograms: actions, values, and observations by name."""
-    samples = {"actions": last.action, **_named_observations(last.observation, info)}
-    if last.values is not None:
-        samples["values"] = last.values
-    return {f"histograms/{name}": _sample(values) for name, values in samples.items()}
-
-
-def _named_observations(observation: Mapping[str, NDArray[Any]], info: EnvInfo) -> dict[str, NDArray[Any]]:
-    rows = join({key: values.reshape(-1, *values.shape[2:]) for key, values in observation.items()})
+    rows = join({key: values.reshape(-1, *values.shape[2:]) for key, values in last.observation.items()})
     named = split_names(rows, info.observation_sizes)
-    return {name: values for name, values in named.items() if name and np.issubdtype(values.dtype, np.floating)}
+    samples = {name: values for name, values in named.items() if name and np.issubdtype(values.dtype, np.floating)}
+    samples |= {"actions": last.action} | ({} if last.values is None else {"values": last.values})
+    flat = {name: np.asarray(values, np.float32).ravel() for name, values in samples.items()}
+    return {
+        f"histograms/{name}": torch.from_numpy(values[:: max(1, len(values) // _SAMPLES)].copy())
+        for name, values in flat.items()
+    }
 
 
 def estimate_values(model: BaseAlgorithm, last: LastSteps) -> NDArray[Any]:
@@ -213,11 +200,6 @@ def estimate_values(model: BaseAlgorithm, last: LastSteps) -> NDArray[Any]:
             values = estimates if isinstance(estimates, torch.Tensor) else torch.cat(estimates, dim=1)
     result: NDArray[Any] = values.flatten(1).mean(1).cpu().numpy()
     return result
-
-
-def _sample(values: NDArray[Any]) -> torch.Tensor:
-    flat = np.asarray(values, np.float32).ravel()
-    return torch.from_numpy(flat[:: max(1, len(flat) // _SAMPLES)].copy())
 
 
 def training_row(
@@ -244,8 +226,8 @@ def tensorboard_values(row: Mapping[str, Any]) -> dict[str, float]:
     """Return the values of a metrics row by TensorBoard tag, without those that SB3 and `measure` log."""
     tags = {"return": "rollout/ep_rew_mean", "length": "rollout/ep_len_mean", "success": "rollout/success_rate"}
     tags |= {"distance": "rollout/final_distance", "stage": "curriculum/stage"}
-    tags |= {name: f"reward_terms/{name.removeprefix('term/')}" for name in row if name.startswith("term/")}
-    tags |= {name: f"metrics/{name.removeprefix('metric/')}" for name in row if name.startswith("metric/")}
+    for column, tag in (("term/", "reward_terms/"), ("metric/", "metrics/")):
+        tags |= {name: name.replace(column, tag, 1) for name in row if name.startswith(column)}
     return {tag: row[name] for name, tag in tags.items() if row.get(name) is not None}
 
 

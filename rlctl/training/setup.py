@@ -67,7 +67,7 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
         checkpoints = _open_run(run, start, learner, display)
         n_envs = min(recipe.eval.episodes, available_cores())
         make_workers = functools.partial(_make_workers, specs[-1], n_envs, start, display)
-        episodes = EvaluationEpisodes(recipe, make_workers, checkpoints, learner.curriculum.goal)
+        episodes = EvaluationEpisodes(learner, make_workers, checkpoints)
         stack.callback(episodes.close)
         evaluator = Evaluator(learner, episodes, checkpoints, display)
         if start.run is not None:
