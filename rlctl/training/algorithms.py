@@ -44,7 +44,9 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     check_spaces(recipe.algo, env.observation_space, env.action_space)
     _check_memory(recipe, env)
     keep_compiler_out()
-    policy_kwargs = _policy_kwargs(recipe)
+    policy_kwargs = {**recipe.policy_kwargs, **import_named(recipe.policy_kwargs)}
+    if isinstance(activation := policy_kwargs.get("activation_fn"), str):
+        policy_kwargs["activation_fn"] = ACTIVATIONS[activation]
     own_policy = policy_kwargs.pop("policy_class", None)
     base = next(iter(cls.policy_aliases.values()))
     if own_policy is not None and not issubclass(own_policy, base):
@@ -63,11 +65,8 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         _use_fused_adam(model)
         write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # reports faults of a user's network
         if own_policy is not None:
-            own_arguments: Any = {
-                **model.policy_kwargs,
-                **({"use_sde": True} if getattr(model, "use_sde", False) else {}),
-            }
-            model.policy.own_arguments = own_arguments
+            use_sde = {"use_sde": True} if getattr(model, "use_sde", False) else {}
+            model.policy.own_arguments = model.policy_kwargs | use_sde  # type: ignore[assignment]
             check_policy_class(model, recipe.algo, pack(model, recipe.algo, env.workers.spec, env.workers.info))
         return model
     except (RlctlError, KeyboardInterrupt):
@@ -114,13 +113,13 @@ def _check_device(device: str) -> None:
 
 def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """Raise `RecipeError` for spaces that SB3 refuses with an unclear message, or only during training."""
-    actions = short_repr(action_space)
-    if algo == "dqn" and not isinstance(action_space, spaces.Discrete):
-        others = "ppo or sac" if isinstance(action_space, spaces.Box) else "ppo"
-        raise RecipeError(f"dqn cannot be used here: it needs Discrete actions, these are {actions}; try {others}")
-    if algo in _CONTINUOUS and not isinstance(action_space, spaces.Box):
-        others = "ppo or dqn" if isinstance(action_space, spaces.Discrete) else "ppo"
-        raise RecipeError(f"{algo} cannot be used here: it needs Box actions, these are {actions}; try {others}")
+    needed = spaces.Discrete if algo == "dqn" else spaces.Box if algo in _CONTINUOUS else spaces.Space
+    if not isinstance(action_space, needed):
+        others = {spaces.Box: "ppo or sac", spaces.Discrete: "ppo or dqn"}.get(type(action_space), "ppo")
+        raise RecipeError(
+            f"{algo} cannot be used here: it needs {needed.__name__} actions, these are {short_repr(action_space)}; "
+            f"try {others}"
+        )
     for what, space, advice in (
         ("observation", observation_space, "observe values less start"),
         ("action", action_space, "add start in step"),
@@ -139,9 +138,7 @@ def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: 
 
 
 def _algorithm_kwargs(recipe: Recipe) -> dict[str, Any]:
-    ours = {"action_noise"}  # workers add it
-    if recipe.algo in _DELAYED_BY_US:
-        ours.add("policy_delay")
+    ours = ("action_noise", "policy_delay") if recipe.algo in _DELAYED_BY_US else ("action_noise",)  # SB3 gets neither
     return {name: _make_schedule(value) for name, value in recipe.algo_kwargs.items() if name not in ours}
 
 
@@ -154,22 +151,12 @@ def _make_schedule(value: Any) -> Any:
     return lambda remaining: max(remaining, 0.0) * start
 
 
-def _policy_kwargs(recipe: Recipe) -> dict[str, Any]:
-    kwargs = {**recipe.policy_kwargs, **import_named(recipe.policy_kwargs)}
-    if isinstance(name := kwargs.get("activation_fn"), str):
-        kwargs["activation_fn"] = ACTIVATIONS[name]
-    return kwargs
-
-
 def wrap_normalize(env: VecEnv, settings: NormalizeSettings | None, gamma: float) -> VecEnv:
     """Wrap environments in SB3's VecNormalize; only observations of real numbers are normalised."""
     if settings is None:
         return env
-    space = env.observation_space
-    keys = None
-    if isinstance(space, spaces.Dict):
-        keys = [key for key, box in space.spaces.items() if _is_real(box)]
-    observation = settings.observation and (bool(keys) if keys is not None else _is_real(space))
+    keys = [key for key, box in split_space(env.observation_space).items() if _is_real(box)]
+    observation = settings.observation and bool(keys)
     if not observation and not settings.reward:
         return env
     return VecNormalize(
@@ -179,7 +166,7 @@ def wrap_normalize(env: VecEnv, settings: NormalizeSettings | None, gamma: float
         clip_obs=settings.clip_observation,
         clip_reward=settings.clip_reward,
         gamma=gamma,
-        norm_obs_keys=keys if observation else None,
+        norm_obs_keys=keys if observation and isinstance(env.observation_space, spaces.Dict) else None,
     )
 
 
@@ -189,21 +176,18 @@ def _is_real(space: spaces.Space[Any]) -> bool:
 
 def _check_memory(recipe: Recipe, env: VecEnv) -> None:
     """Raise `RecipeError` for a buffer that does not fit into the free memory."""
-    free, (key, size) = measure_free_memory(), _measure_buffer(recipe, env)
-    if free is not None and size > _USABLE_SHARE * free:
-        needs, are = format_bytes(size), format_bytes(free)
-        given = recipe.algo_kwargs.get(key)
-        raise RecipeError(f"algo_kwargs.{key}: {given} needs {needs} of memory, but only {are} are free; reduce it")
-
-
-def _measure_buffer(recipe: Recipe, env: VecEnv) -> tuple[str, int]:
-    """Return the parameter that sets the size of the buffer, and this size [bytes]."""
-    kwargs = recipe.algo_kwargs
     parts = [(math.prod(part.shape or ()), part.dtype) for part in split_space(env.observation_space).values()]
     action = math.prod(env.action_space.shape or ()) * _FLOAT32
     if recipe.algo in ON_POLICY:
+        key, rows = "n_steps", int(recipe.algo_kwargs.get("n_steps", 5)) * env.num_envs
         row = sum(elements for elements, _ in parts) * _FLOAT32 + action + 6 * _FLOAT32
-        return "n_steps", int(kwargs.get("n_steps", 5)) * env.num_envs * row
-    # Observations before and after, in the space's dtype, action, reward and two flags.
-    observation = sum(elements * np.dtype(dtype or np.float32).itemsize for elements, dtype in parts)
-    return "buffer_size", int(kwargs["buffer_size"]) * (2 * observation + action + 3 * _FLOAT32)
+    else:  # observations before and after, in the space's dtype, action, reward and two flags
+        key, rows = "buffer_size", int(recipe.algo_kwargs["buffer_size"])
+        observation = sum(elements * np.dtype(dtype or np.float32).itemsize for elements, dtype in parts)
+        row = 2 * observation + action + 3 * _FLOAT32
+    free = measure_free_memory()
+    if free is not None and rows * row > _USABLE_SHARE * free:
+        raise RecipeError(
+            f"algo_kwargs.{key}: {recipe.algo_kwargs.get(key)} needs {format_bytes(rows * row)} of memory, but only "
+            f"{format_bytes(free)} are free; reduce it"
+        )

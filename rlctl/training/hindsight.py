@@ -25,9 +25,13 @@ def replay_arguments(recipe: Recipe, her: Hindsight, env: EnvInfo) -> dict[str, 
     Raises `RecipeError` for an environment without goals, and for settings that hindsight excludes.
     """
     _check_goals(env)
-    _check_rewards(recipe)
-    steps = (env.max_steps or 0) * recipe.n_envs
-    _check_room(recipe, steps)
+    if recipe.reward_weights or any(stage.reward_weights for stage in recipe.stages):
+        raise RecipeError("her: compute_reward does not use the recipe's reward_weights; remove her or reward_weights")
+    if recipe.algo_kwargs.get("n_steps", 1) != 1:
+        raise RecipeError("algo_kwargs.n_steps: hindsight does not support n-step returns; remove her or n_steps")
+    steps, size = (env.max_steps or 0) * recipe.n_envs, int(recipe.algo_kwargs["buffer_size"])
+    if size < min(2 * steps, recipe.total_timesteps):
+        raise RecipeError(_no_room(size, recipe.n_envs, f"{2 * steps} is enough"))
     return {
         "replay_buffer_class": HerReplayBuffer,
         "replay_buffer_kwargs": her.model_dump(),
@@ -52,19 +56,6 @@ def _check_goals(env: EnvInfo) -> None:
             f"her: achieved_goal is {achieved}, desired_goal {desired}: hindsight exchanges them, so both must "
             "be a Box of the same shape, not an image"
         )
-
-
-def _check_rewards(recipe: Recipe) -> None:
-    if recipe.reward_weights or any(stage.reward_weights for stage in recipe.stages):
-        raise RecipeError("her: compute_reward does not use the recipe's reward_weights; remove her or reward_weights")
-    if recipe.algo_kwargs.get("n_steps", 1) != 1:
-        raise RecipeError("algo_kwargs.n_steps: hindsight does not support n-step returns; remove her or n_steps")
-
-
-def _check_room(recipe: Recipe, steps: int) -> None:
-    size = int(recipe.algo_kwargs["buffer_size"])
-    if size < min(2 * steps, recipe.total_timesteps):
-        raise RecipeError(_no_room(size, recipe.n_envs, f"{2 * steps} is enough"))
 
 
 def _no_room(size: int, n_envs: int, advice: str) -> str:
