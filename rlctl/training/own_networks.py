@@ -40,12 +40,10 @@ def check_policy_class(model: Any, algo: str, policy: PolicyFile) -> None:
     space = policy.info.env.spaces()[0]
     space.seed(0)
     try:
-        for method, owner in (
-            ("_get_action_dist_from_latent", network),
-            ("get_action_dist_params", getattr(network, "actor", None)),
-        ):
-            if (own := getattr(owner, method, None)) is not None and is_own(own):
-                raise ValueError(f"it overrides {method}")
+        for owner in (network, getattr(network, "actor", None)):
+            for method in ("_get_action_dist_from_latent", "get_action_dist_params"):
+                if (own := getattr(owner, method, None)) is not None and is_own(own):
+                    raise ValueError(f"it overrides {method}")
         reference, player = TorchPolicy(policy, network), PolicyPlayer(policy.actor_only())
         for step in range(_COMPARED):
             sample = space.sample()
@@ -110,19 +108,19 @@ class _Actor(torch.nn.Module):
 def _write_graph(actor: _Actor, model: Any) -> NDArray[np.uint8]:
     was_training = model.policy.training
     model.policy.set_training_mode(False)
-    normalized = _list_normalized(model)
-    sample = tuple(
-        torch.from_numpy(
-            np.zeros((2, *(part.shape or ())), np.float32 if key in normalized else part.dtype)  # a batch of two
-        ).to(model.device)
+    normalizer = model.get_vec_normalize_env()
+    normalized = split(normalizer.obs_rms) if normalizer is not None and normalizer.norm_obs else {}
+    types = {key: np.float32 if key in normalized else part.dtype for key, part in actor.parts.items()}
+    batch_of_two = tuple(
+        torch.from_numpy(np.zeros((2, *(part.shape or ())), types[key])).to(model.device)
         for key, part in actor.parts.items()
     )
     try:
         with torch.no_grad():
-            _check_features(actor, sample)
-        return _export(actor, sample)
-    except RecipeError:
-        raise
+            shape, expected = tuple(actor.compute_features(*batch_of_two).shape), (2, actor.extractor.features_dim)
+        if shape != expected:
+            raise ValueError(f"features of shape {shape} for 2 observations; features_dim requires {expected}")
+        return _export(actor, batch_of_two)
     except Exception as error:  # any exception from the user's module or torch's exporter
         name = type(actor.extractor).__name__
         raise RecipeError(
@@ -130,20 +128,6 @@ def _write_graph(actor: _Actor, model: Any) -> NDArray[np.uint8]:
         ) from error
     finally:
         model.policy.set_training_mode(was_training)
-
-
-def _list_normalized(model: Any) -> list[str]:
-    normalizer = model.get_vec_normalize_env()
-    return list(split(normalizer.obs_rms)) if normalizer is not None and normalizer.norm_obs else []
-
-
-def _check_features(actor: _Actor, sample: tuple[torch.Tensor, ...]) -> None:
-    features, expected = actor.compute_features(*sample), (2, actor.extractor.features_dim)
-    if tuple(features.shape) != expected:
-        raise RecipeError(
-            f"policy_kwargs.features_extractor_class: {type(actor.extractor).__name__} returns features of shape "
-            f"{tuple(features.shape)} for 2 observations, but its features_dim requires {expected}"
-        )
 
 
 def _export(actor: _Actor, sample: tuple[torch.Tensor, ...]) -> NDArray[np.uint8]:

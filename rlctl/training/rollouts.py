@@ -40,7 +40,7 @@ class Rollouts(abc.ABC):
         self._learner = choose_learner(model)
         self._policy_info: PolicyInfo | None = None
         self.rehearse: Callable[[int], None] = lambda updates: None
-        """Called after so many off-policy updates; see `rlctl.training.cloning`."""
+        """Called after so many off-policy updates; see `rlctl.training.demonstrations`."""
 
     def begin(self, total_timesteps: int) -> None:
         """Prepare the model to learn up to a step; start the first episodes of a new training."""

@@ -126,7 +126,7 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
     if start.source is not None and start.checkpoint is None:
         display.message(load_source(start.source, model, goal))
     if start.demos is not None:
-        from rlctl.training.cloning import clone
+        from rlctl.training.demonstrations import clone
 
         display.phase("cloning demonstrations")
         clone(start, rollouts, goal, display.message)

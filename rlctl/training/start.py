@@ -26,8 +26,8 @@ from rlctl.recipe.sources import describe_rounding, resolve_with_stages
 from rlctl.run import lookup
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.train_request import TrainRequest
+from rlctl.storage import files
 from rlctl.training.callbacks import Callback, call_callback
-from rlctl.training.demonstrations import describe_source
 from rlctl.training.tracking import check_installed
 from rlctl.training.warm_start import find_source
 
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 _OF_SB3 = "stable_baselines3.common.callbacks"
 _NO_CALLBACK = "neither a rlctl.Callback nor a BaseCallback of Stable-Baselines3"
+_DEMONSTRATIONS = (".npz", ".parquet", ".hdf5", ".arrow", ".json")  # suffixes of files
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
 
 
@@ -52,7 +53,7 @@ class Start:
     notes: tuple[str, ...] = ()  # messages for the user, before the first step
     callbacks: Mapping[str, Callback] = dataclasses.field(default_factory=dict)
     source: Mapping[str, Any] | None = None  # the policy of `--from`; see `warm_start.find_source`
-    demos: Mapping[str, str] | None = None  # the demonstrations of `--demos`; see `demonstrations.describe_source`
+    demos: Mapping[str, str] | None = None  # the demonstrations of `--demos`; see `describe_demonstrations`
     inexact: tuple[str, ...] = ()  # reasons, known before the start, why the resume cannot be bit-exact
     began: float = dataclasses.field(default_factory=time.monotonic)
 
@@ -111,7 +112,7 @@ def _find_new(request: TrainRequest, task: str) -> Start:
             f"--demos: {recipe.algo} cannot clone demonstrations; use ppo, a2c, sac, tqc, crossq, td3 or ddpg"
         )
     notes = tuple(filter(None, [describe_rounding(recipe)]))
-    demos = describe_source(Path(request.demos)) if request.demos is not None else None
+    demos = describe_demonstrations(Path(request.demos)) if request.demos is not None else None
     return Start(request, task, recipe, notes=notes, callbacks=callbacks, source=source, demos=demos)
 
 
@@ -205,6 +206,13 @@ def _may_be_called(constructor: Any) -> bool:
     if inspect.isclass(constructor):
         return any(base is Callback or base.__module__ == _OF_SB3 for base in constructor.__mro__)
     return inspect.isfunction(constructor) and named_task.is_own_file(Path(inspect.getfile(constructor)))
+
+
+def describe_demonstrations(path: Path) -> dict[str, str]:
+    """Return the absolute path of demonstrations and a hash of their files, without videos."""
+    paths = [path] if path.is_file() else sorted(path.rglob("*"))
+    parts = [files.digest(file.read_bytes()) for file in paths if file.suffix in _DEMONSTRATIONS]
+    return {"path": str(path.absolute()), "sha256": files.digest("".join(parts).encode())}
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 The training only starts and ends this process, so a tracker that is slow or down neither stops nor delays it. What was
 sent is stored in the run folder: what is missing is sent later, also after a resume, and nothing twice.
+The trackers' own environment variables name the address and the key: rlctl neither asks for a key nor stores one.
 """
 
 from __future__ import annotations
@@ -19,18 +20,15 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rlctl.environments import registry
 from rlctl.errors import RlctlError, UsageError, explain_missing_package
 from rlctl.processes.child_process import ChildEndedError, ChildProcess
 from rlctl.processes.printed_lines import LineReader
-from rlctl.recipe.recipe import flatten
+from rlctl.recipe.recipe import Recipe, flatten
 from rlctl.run.directory import TUNE_FILE, RunDirectory, is_group
 from rlctl.storage import files, yaml_text
-
-if TYPE_CHECKING:
-    from rlctl.recipe.recipe import Recipe
 
 _EVERY_S = 3.0
 _FILM_S = 30  # time limit of the film; PyBullet draws 5 to 15 pictures per second
@@ -133,8 +131,6 @@ class _Sender:
         tracker.finish(status["status"])
 
     def _connect(self) -> Tracker:
-        from rlctl.training.tracking import TRACKERS, TrackedRun
-
         run, group = self._run, self._run.path.parent
         if run.tracking_file.exists():
             self._sent = files.read_json(run.tracking_file)

@@ -16,7 +16,7 @@ from rlctl.policy.numpy_policy import load_policy
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from rlctl.run.train_request import TrainRequest
-from rlctl.training import cloning
+from rlctl.training import demonstrations
 from rlctl.training.loop import TrainingLoop
 from rlctl.training.seeds import train_seeds
 from tests.training.comparing import Killed, assert_same_run, rows
@@ -105,14 +105,14 @@ CASES = {
 }
 
 
-QUICK = {"ppo, dict", "sac with gSDE, normalised", "td3"}  # each in another branch of `cloning`
+QUICK = {"ppo, dict", "sac with gSDE, normalised", "td3"}  # each in another branch of the cloning
 
 
 @pytest.mark.parametrize(
     "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
 )
 def test_the_policy_of_step_0_acts_as_the_demonstrations(record, train, monkeypatch, capfd, case):
-    monkeypatch.setattr(cloning, "_UPDATES", 800 if case == "crossq" else 300)
+    monkeypatch.setattr(demonstrations, "_UPDATES", 800 if case == "crossq" else 300)
     env, settings = CASES[case]
     run = train(env, settings, demos=str(record(env))).run
     policy = load_policy(run.policy_file("0"))
@@ -130,7 +130,7 @@ def test_discrete_actions_are_cloned(record, train):
 
 @pytest.mark.parametrize(("case", "name"), [("ppo", "log_std"), ("sac", "actor.log_std.bias")])
 def test_noise_and_normalisation_after_cloning(record, train, monkeypatch, case, name):
-    monkeypatch.setattr(cloning, "_UPDATES", 1)
+    monkeypatch.setattr(demonstrations, "_UPDATES", 1)
     env, settings = CASES[case]
     run = train(env, {**settings, **NORMALIZED, "total_timesteps": 16}, demos=str(record(env))).run
     tensors = PolicyFile.read(run.policy_file("0")).tensors
@@ -142,12 +142,12 @@ def test_noise_and_normalisation_after_cloning(record, train, monkeypatch, case,
 
 
 def test_off_policy_updates_repeat_the_demonstrations(record, train, monkeypatch):
-    monkeypatch.setattr(cloning, "_UPDATES", 300)
+    monkeypatch.setattr(demonstrations, "_UPDATES", 300)
     env, settings = CASES["sac with gSDE, normalised"]
     settings = {**settings, "algo_kwargs": {**settings["algo_kwargs"], "learning_rate": 0.003, "gradient_steps": 8}}
     errors = []
     for share in (0.0, 2.0):
-        monkeypatch.setattr(cloning, "REHEARSAL_SHARE", share)
+        monkeypatch.setattr(demonstrations, "REHEARSAL_SHARE", share)
         run = train(env, settings, demos=str(record(env))).run
         errors.append(measure_error(load_policy(run.last_policy), record(env)))
     without, with_rehearsal = errors
@@ -174,8 +174,8 @@ def kill_at(monkeypatch):
 @pytest.mark.parametrize("case", ["ppo", "sac with gSDE, normalised"])
 @pytest.mark.usefixtures("every_boundary")
 def test_killed_and_resumed(record, changed, train, resume, monkeypatch, kill_at, case):
-    monkeypatch.setattr(cloning, "_UPDATES", 50)
-    monkeypatch.setattr(cloning, "REHEARSAL_SHARE", 1.0)
+    monkeypatch.setattr(demonstrations, "_UPDATES", 50)
+    monkeypatch.setattr(demonstrations, "REHEARSAL_SHARE", 1.0)
     env, settings = CASES[case]
     folder = changed()
     whole = train(env, settings, demos=str(folder)).run
@@ -243,7 +243,7 @@ def test_a_truncated_file(changed, train):
 
 
 def test_failed_episodes_are_left_out(changed, train, monkeypatch, capfd):
-    monkeypatch.setattr(cloning, "_UPDATES", 10)
+    monkeypatch.setattr(demonstrations, "_UPDATES", 10)
     train("Line", TINY, demos=str(changed(info=flip_success)))
     assert "cloned 5 demonstrations (50 steps" in capfd.readouterr().err
 

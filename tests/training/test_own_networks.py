@@ -165,7 +165,7 @@ def test_a_module_that_changed_is_not_resumed(train, resume, tmp_path, key, name
         (f"{NETS}:function", r"_class: .*: not a class of torch\.nn\.Module"),
         (
             f"{NETS}:WrongShape",
-            r"WrongShape returns features of shape \(2, 3\) for 2 observations, but its .* requires \(2, 8\)",
+            r"WrongShape .*: features of shape \(2, 3\) for 2 observations; features_dim requires \(2, 8\)",
         ),
         (f"{NETS}:Raises", r"Raises cannot be used: KeyError: 'gate'"),
         (f"{NETS}:Wave", r"ppo cannot be used here: .*Wave"),
