@@ -21,6 +21,7 @@ from rlctl.recipe import sources
 
 METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6": "step", "RL7": "step"}
 """The method that the findings of a family are about, where nothing more is known."""
+OF_SPACES = ("RL103", "RL106", "RL108", "RL109")  # rules about what a space declares
 SLOW_CALL_S = 5.0  # After so long a call is mentioned [s]
 LOADING = ("RL0", "RL216")  # judged even if no instance could be built
 
@@ -68,6 +69,9 @@ class CheckReport:
             file = registry.find_source_file(self.task)
             return (file, 1) if file else None
         method = finding.evidence.get("call") or METHODS.get(finding.rule[:3], "")
+        if finding.rule in OF_SPACES:
+            kind = "action" if str(finding.evidence.get("element")).startswith("action") else "observation"
+            method = f"{kind}_space" if f"{kind}_space" in built.lines else method
         return Path(built.file), built.lines.get(method) or built.line or 1
 
     def fingerprint(self, finding: RuleFinding) -> str:

@@ -35,9 +35,13 @@ NO_DISPLAY = re.compile(
 """What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
 _LIBRARY = re.compile(
     rf"^<|^{re.escape(sysconfig.get_path('stdlib'))}/(?!site-packages|dist-packages)|"
-    rf"(site|dist)-packages/({'|'.join(LIBRARIES)})(/|\\.)"
+    rf"(site|dist)-packages/({'|'.join(LIBRARIES)}|mujoco|dm_control/_render|dm_control/mujoco|glfw|OpenGL)(/|\\.)"
 )
 """Files of Python itself and of libraries: an exception there comes from a wrong call in the environment."""
+NO_OPENGL = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW", re.IGNORECASE)
+NO_OPENGL_FIX = (
+    "Where there is no display, set MUJOCO_GL=egl (or osmesa). Use OpenGL only to render or to observe images."
+)
 _MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
 
 
@@ -68,10 +72,12 @@ def describe(error: BaseException) -> str:
 
 
 def find_line(error: BaseException) -> tuple[str, int] | None:
-    """Return file and line of the environment's own code that an exception went through last, not a library's."""
+    """Return the last file and line of the environment's own code in a traceback; None if it has only libraries."""
+    if isinstance(error, SyntaxError) and error.filename:
+        return error.filename, error.lineno or 1
     trace = traceback.extract_tb(error.__traceback__)
     frames = [frame for frame in trace if PACKAGE_FOLDER not in Path(frame.filename).parents]
-    own = [frame for frame in frames if not _LIBRARY.search(frame.filename)] or frames
+    own = [frame for frame in frames if not _LIBRARY.search(frame.filename)]
     return (own[-1].filename, own[-1].lineno or 1) if own else None
 
 

@@ -34,7 +34,7 @@ class Built:
     nondeterministic: bool = False  # its registration says that it is not repeatable
     truncation: str = "unknown"  # `truncated` in the code of step: `never`, `computed`, `unknown`
     counter: str = ""  # comparison in step that sets terminated by a counter
-    lines: Mapping[str, int] = dataclasses.field(default_factory=dict)  # method -> line in `file`
+    lines: Mapping[str, int] = dataclasses.field(default_factory=dict)  # method or space -> line in `file`
     accepts_seed: bool = True
     accepts_options: bool = True
     model: str = ""  # Mass, joints and limits of a model in MuJoCo

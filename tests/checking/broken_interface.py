@@ -115,3 +115,17 @@ class FallsInTime(Falls):
         observation, reward, terminated, _, info = super().step(action)
         truncated = self.steps >= 1000 and not terminated
         return observation, reward, terminated, truncated, info
+
+
+class LacksOpenGL(Clean):
+    """Draws what it observes, where there is no OpenGL."""
+
+    def start(self):
+        super().start()
+        raise RuntimeError("an OpenGL platform library has not been loaded into this process")
+
+
+class RaisesInStart(Clean):
+    def start(self):
+        super().start()
+        raise RuntimeError("no licence")

@@ -122,6 +122,22 @@ def test_sarif_places_a_finding_at_the_method(broken):
     assert result["level"] == "error"
 
 
+@pytest.mark.parametrize(
+    ("task", "rule", "line"),
+    [
+        ("broken_waivers.py:Wide", "RL106", "self.action_space = spaces.Box"),
+        ("broken_loading.py:Raising", "RL002", 'raise RuntimeError("no licence")'),
+        ("broken_import.py:Anything", "RL001", "raise ZeroDivisionError"),
+    ],
+)
+def test_a_place_is_the_line_that_declares_or_raises(task, rule, line):
+    report = report_of(task, [rule])
+    (finding,) = [*report.verdict.findings, *report.verdict.waived]
+    file, number = report.locate(finding)
+    assert file.name == task.partition(":")[0]
+    assert file.read_text().splitlines()[number - 1].strip().startswith(line)
+
+
 def test_sarif_tells_what_is_waived_and_why(waiving):
     (result,) = json.loads(tool_formats.to_sarif(waiving))["runs"][0]["results"]
     assert result["suppressions"] == [

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from rlctl.checking.check import check
+from rlctl.checking.rules import RULES
 from rlctl.environments.spec import EnvSpec
 from tests.checking.judging import case, check_case, findings, verdict_of
 
@@ -96,3 +97,10 @@ def test_what_ends_the_process_while_rendering_is_an_error():
 def test_flags_per_agent_are_of_a_wrong_type_and_end_nothing():
     verdict = verdict_of(f"{FILE}:FlagsPerAgent", "RL204", "RL502", "RL504")
     assert [finding.rule for finding in verdict.findings] == ["RL204", "RL204"]
+
+
+def test_missing_opengl_is_fixed_by_another_backend_and_other_exceptions_by_repair():
+    (finding,) = findings(f"{FILE}:LacksOpenGL", "RL207")
+    assert "set MUJOCO_GL=egl (or osmesa)" in finding.fix
+    (finding,) = findings(f"{FILE}:RaisesInStart", "RL207")
+    assert finding.fix == RULES["RL207"].fix

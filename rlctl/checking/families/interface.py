@@ -9,6 +9,8 @@ import numpy as np
 
 from rlctl.checking.instance import (
     NO_DISPLAY,
+    NO_OPENGL,
+    NO_OPENGL_FIX,
     Context,
     EnvironmentRaised,
     describe,
@@ -107,13 +109,15 @@ def select_failures(records: Records, kind: str) -> Iterator[CallFailure]:
 def _find_exceptions(records: Records) -> Iterator[RuleFinding]:
     raised = (failure for failure in select_failures(records, "raised") if failure.file is None)  # the others: RL007
     for failure in itertools.islice(raised, MOST_FAILURES):
-        yield RuleFinding("RL207", failure.message, failure.place, where=failure.where)
+        fix = NO_OPENGL_FIX if NO_OPENGL.search(failure.error) else ""
+        yield RuleFinding("RL207", failure.message, failure.place, fix=fix, where=failure.where)
 
 
 @check("RL208")
 def _find_ends_of_process(records: Records) -> Iterator[RuleFinding]:
+    without_opengl = any(NO_OPENGL.search(failure.error) for failure in select_failures(records, "raised"))
     for failure in select_failures(records, "died"):
-        if not lacks_display(failure):  # RL216 says why
+        if not lacks_display(failure) and not without_opengl:  # RL216 or RL207 says why
             yield RuleFinding("RL208", failure.message, failure.place)
 
 

@@ -15,14 +15,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.attributes import find_author, is_task
+from rlctl.checking.attributes import find_assignment, find_author, is_task
 from rlctl.checking.bullet_worlds import ClientCalls, find_clients
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import (
+    NO_OPENGL,
+    NO_OPENGL_FIX,
     Context,
     EnvironmentRaised,
     Instance,
     describe,
+    find_line,
     find_longest_episode,
     find_missing_file,
     iterate_causes,
@@ -73,15 +76,17 @@ def _explain(context: Context, error: RlctlError) -> RuleFinding:
         return RuleFinding("RL008", str(error), details)
     if (file := find_missing_file(cause)) is not None:
         return _not_found("the constructor", file, error.details)
+    where = find_line(cause) if cause is not None else None
     if context.progress.read().call == "load":
-        return RuleFinding("RL001", str(error), details)
+        return RuleFinding("RL001", str(error), details, where=where)
     if isinstance(cause, TypeError) and (missing := _missing_arguments(str(cause))):
         settings = " ".join(f"--set task.{name}=..." for name in missing)
         fix = f"Give them ({settings}), or give them default values."
         return RuleFinding("RL006", str(error), details, fix=fix)
     if isinstance(error, TaskError) and error.details is None and not _is_task(context.spec.task):
         return RuleFinding("RL003", str(error))  # the registry's; what a constructor raises comes with its traceback
-    return RuleFinding("RL002", str(error), details)
+    fix = NO_OPENGL_FIX if cause is not None and NO_OPENGL.search(str(cause)) else ""
+    return RuleFinding("RL002", str(error), details, fix=fix, where=where)
 
 
 def _imports_old_gym(error: BaseException | None) -> bool:
@@ -171,7 +176,7 @@ def describe_built(instance: Instance) -> Built:
         max_steps=find_longest_episode(env),
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
         **_read_flags(inner),
-        lines=_find_lines(author, file),
+        lines=_find_lines(env, author, file),
         accepts_seed=instance.accepts_seed,
         accepts_options=instance.accepts_options,
         model=describe_mujoco_model(env),
@@ -196,8 +201,12 @@ def _place(author: type) -> tuple[str | None, int | None]:
         return None, None
 
 
-def _find_lines(author: type, file: str | None) -> dict[str, int]:
+def _find_lines(env: Any, author: type, file: str | None) -> dict[str, int]:
     lines = {}
+    for name in ("observation_space", "action_space"):
+        place = find_assignment(env, f"self.{name}")
+        if place is not None and place[0] == file:
+            lines[name] = place[1]
     for name in ("__init__", "reset", "step"):
         code = getattr(inspect.unwrap(getattr(author, name, None) or author), "__code__", None)
         if code is not None and code.co_filename == file:
