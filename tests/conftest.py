@@ -16,7 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from rlctl.processes.child_process import set_start
+from rlctl.processes import child_process
 from tests import fork_server
 
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup what is started here would ignore it
@@ -33,9 +33,9 @@ def pytest_collection_finish():
 @pytest.fixture(scope="session", autouse=True)
 def _forked_workers():
     """Fork workers from a warm process, which is launched when the first is started."""
-    set_start(fork_server.start)
+    child_process.start_process = fork_server.start
     yield
-    set_start(subprocess.Popen)
+    child_process.start_process = subprocess.Popen
     fork_server.close()
 
 

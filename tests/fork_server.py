@@ -24,7 +24,7 @@ import tempfile
 import threading
 from pathlib import Path
 
-from rlctl.processes.child_process import set_start
+from rlctl.processes import child_process
 from tests.forked_process import SIGNALS, become
 
 ROOT = Path(__file__).parents[1]
@@ -256,7 +256,7 @@ def serve(connection, commands=False):
 
 
 def _start_own_server():
-    set_start(ForkServer.fork().start)
+    child_process.start_process = ForkServer.fork().start
 
 
 def _use_huge_pages():

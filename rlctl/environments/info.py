@@ -119,7 +119,7 @@ def describe_mujoco_model(env: gymnasium.Env[Any, Any]) -> str:
         limits = f" {low:.3g} to {high:.3g}" if model.jnt_limited[joint] else ""
         joints.append(f"{joint_name(model, int(joint))}{limits}")
     more = f" and {len(joints) - _SHOWN_JOINTS} more" if len(joints) > _SHOWN_JOINTS else ""
-    return f"{total_mass(model):.4g} kg; joints: {', '.join(joints[:_SHOWN_JOINTS])}{more}"
+    return f"{model.body_mass.sum():.4g} kg; joints: {', '.join(joints[:_SHOWN_JOINTS])}{more}"
 
 
 def _describe_joints(model: mujoco.MjModel) -> Joints | None:
@@ -146,11 +146,6 @@ def _describe_joints(model: mujoco.MjModel) -> Joints | None:
 def joint_name(model: mujoco.MjModel, joint: int) -> str:
     """Return a joint's name, or its number if it has no name."""
     return model.joint(int(joint)).name or f"joint {joint}"
-
-
-def total_mass(model: mujoco.MjModel) -> float:
-    """Return the mass of all bodies [kg]."""
-    return float(model.body_mass.sum())
 
 
 def describe_randomization(events: Mapping[str, bool]) -> str:

@@ -155,22 +155,15 @@ def check_import(entry: TaskEntry, timeout_s: float = 60.0) -> str | None:
     code = (
         "from rlctl.environments import registry; from rlctl.errors import RlctlError\n"
         f"try: registry.load({entry.target!r})\n"
-        "except RlctlError as error: print('\\n@' + str(error).splitlines()[0]); sys.exit(3)\n"
-        "print('\\n@')"
+        "except RlctlError as error: print('\\n@' + str(error).splitlines()[0])\n"
+        "else: print('\\n@')"
     )
+    command = [sys.executable, "-P", "-c", code]
     try:
         child = subprocess.run(
-            [sys.executable, "-P", "-c", code],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            timeout=timeout_s,
-            check=False,
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout_s, errors="replace"
         )
     except subprocess.TimeoutExpired:
         return f"import did not finish within {timeout_s:.0f} s"
     lines = [line[1:] for line in child.stdout.splitlines() if line.startswith("@")]
-    if not lines:
-        return f"import ended the process with exit code {child.returncode}"
-    return lines[-1] or None
+    return (lines[-1] or None) if lines else f"import ended the process with exit code {child.returncode}"

@@ -59,12 +59,10 @@ class TimeFeature(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._append(observation), reward, terminated, truncated, info
 
     def _append(self, observation: Any) -> Any:
+        left = 1 - self._steps / self._limit
         if isinstance(self.observation_space, spaces.Dict):
-            return {**observation, _KEY: self._extend(observation[_KEY], self.observation_space[_KEY])}
-        return self._extend(observation, self.observation_space)
-
-    def _extend(self, observation: Any, space: spaces.Space[Any]) -> Any:
-        return np.append(observation, 1 - self._steps / self._limit).astype(space.dtype)
+            return {**observation, _KEY: np.append(observation[_KEY], left).astype(self.observation_space[_KEY].dtype)}
+        return np.append(observation, left).astype(self.observation_space.dtype)
 
 
 def _append_bounds(space: spaces.Space[Any]) -> spaces.Box:

@@ -1,7 +1,7 @@
 """New Python interpreters as child processes, each with its own process group and a connection.
 
-Never forks: a process with PyBullet or torch cannot be forked safely. (Tests fork from a process that runs no
-environment: `set_start`.) The caller chooses where a child prints, for example to a `LineReader`.
+Never forks: a process with PyBullet or torch cannot be forked safely. The caller chooses where a child prints, for
+example to a `LineReader`.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -35,22 +35,8 @@ _BOOTSTRAP = (
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 """Signals that ask a training to stop; clusters send the last two before a job's time is over."""
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-
-
-StartProcess = Callable[..., "subprocess.Popen[bytes]"]
-"""Takes the arguments of `subprocess.Popen`; returns an object with its `pid`, `poll` and `wait`."""
-_start: StartProcess = subprocess.Popen
-
-
-def start_process(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
-    """Start a process with `subprocess.Popen`, or with the function given to `set_start`."""
-    return _start(command, **options)
-
-
-def set_start(start: StartProcess) -> None:
-    """Set how this process starts others: tests start many, and fork them from a prepared process."""
-    global _start
-    _start = start
+start_process: Callable[..., "subprocess.Popen[bytes]"] = subprocess.Popen
+"""Starts a child. Tests start many: they replace it by a function that forks a prepared process."""
 
 
 class ChildProcess:

@@ -48,11 +48,8 @@ class LineFilter:
     def __init__(self, receive: Callable[[str], None]) -> None:
         self._receive = receive
         self._closed = False
-        self._last = ""
-        self._second = 0
-        self._lines = 0  # in this second
-        self._left_out = 0
-        self._bullet_head = ""
+        self._last = self._bullet_head = ""
+        self._second = self._lines = self._left_out = 0  # lines in this second
         self._bullet_warnings: set[str] = set()
 
     def line(self, text: str) -> None:

@@ -69,19 +69,16 @@ def resolve_packaged(task: str, settings: Mapping[str, Any] | None = None) -> Re
 
 def fill_defaults(recipe: Recipe) -> Recipe:
     """Fill in defaults that depend on other keys: rollout length, normalisation, evaluation interval."""
-    changes: dict[str, Any] = {}
-    kwargs = dict(recipe.algo_kwargs)
-    on_policy = recipe.algo in ON_POLICY
+    kwargs, on_policy = dict(recipe.algo_kwargs), recipe.algo in ON_POLICY
+    changes: dict[str, Any] = {"algo_kwargs": kwargs}
     if recipe.algo in ("ppo", "recurrent_ppo"):
-        n_steps = min(max(_DEFAULT_ROLLOUT // recipe.n_envs, 16), 2048)
-        kwargs.setdefault("n_steps", n_steps)
+        kwargs.setdefault("n_steps", min(max(_DEFAULT_ROLLOUT // recipe.n_envs, 16), 2048))
         kwargs.setdefault("batch_size", min(128, int(kwargs["n_steps"]) * recipe.n_envs))
     if not on_policy:
         # One gradient step per environment step, however many environments there are.
         kwargs.setdefault("gradient_steps", -1)
         kwargs.setdefault("train_freq", 1)
         kwargs.setdefault("buffer_size", min(1_000_000, max(recipe.total_timesteps, 1_000)))
-    changes["algo_kwargs"] = kwargs
     if recipe.normalize is None:
         changes["normalize"] = NormalizeSettings(observation=on_policy, reward=on_policy)
     if recipe.eval.every_steps is None:
@@ -135,13 +132,9 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for text in settings:
         key, equals, value = text.partition("=")
-        if not equals or not key.strip():
-            raise RecipeError(f"--set {short_repr(text)!r}: write key=value, for example --set task.tolerance=0.02")
         *path, last = key.strip().split(".")
-        if len(path) >= _DEEPEST_KEY or not all((*path, last)):
-            raise RecipeError(
-                f"--set {short_repr(text)!r}: write a key as names joined by dots, such as task.tolerance"
-            )
+        if not equals or len(path) >= _DEEPEST_KEY or not all((*path, last)):
+            raise RecipeError(f"--set {short_repr(text)!r}: write key=value, for example --set task.tolerance=0.02")
         place = result
         for part in path:
             place = place.setdefault(part, {})

@@ -58,16 +58,15 @@ class Workers:
         bounds = np.linspace(0, n_envs, n_workers + 1).round().astype(int).tolist()
         self._ranges = list(itertools.pairwise(bounds))
         self._owner = [worker for worker, (low, high) in enumerate(self._ranges) for _ in range(low, high)]
-        self._memory, self._numbers_memory = anonymous_file(), anonymous_file()
-        self._numbers = PolicyNumbers(self._numbers_memory, n_envs)
+        self._memories = [anonymous_file(), anonymous_file()]
+        arrays, numbers = self._memories
+        self._numbers = PolicyNumbers(numbers, n_envs)
         self._steps = 1
         self._ready = False
-        memories = self._memory, self._numbers_memory
-        jobs = [{"job": messages.WorkerJob(*memories, low, high - low, n_envs)} for low, high in self._ranges]
+        jobs = [{"job": messages.WorkerJob(arrays, numbers, low, high - low, n_envs)} for low, high in self._ranges]
+        printed, main = on_output or write_stderr, "rlctl.rollout.worker:main"
         try:
-            self._pool = ProcessPool(
-                "rlctl.rollout.worker:main", jobs, on_output or write_stderr, self._read_progress, memories
-            )
+            self._pool = ProcessPool(main, jobs, printed, self._read_progress, self._memories)
         except BaseException as error:
             self._close_memory()
             if isinstance(error, OSError):
@@ -127,7 +126,7 @@ class Workers:
 
     def _attach(self, steps: int) -> None:
         self._steps = steps
-        self._arrays = SharedArrays(self._memory, self._info, self.n_envs, steps)
+        self._arrays = SharedArrays(self._memories[0], self._info, self.n_envs, steps)
         self._arrays.inside[:] = -1
         self._ask_all(messages.Attach(steps), "attaching")
 
@@ -267,10 +266,8 @@ class Workers:
         self._close_memory()
 
     def _close_memory(self) -> None:
-        for descriptor in (self._memory, self._numbers_memory):
-            if descriptor >= 0:
-                os.close(descriptor)
-        self._memory = self._numbers_memory = -1
+        while self._memories:
+            os.close(self._memories.pop())
 
     def __enter__(self) -> Workers:
         return self

@@ -90,11 +90,10 @@ def check_display() -> None:
     """Raise `UsageError` where PyBullet's window cannot open: PyBullet itself would end the process."""
     if sys.platform != "linux":
         return
-    display, instead = os.environ.get("DISPLAY"), "leave out --gui (in Python: render_mode)"
-    if not display:
-        raise UsageError(f"PyBullet's window needs a display, and DISPLAY is not set; {instead}")
     if not _x_server_answers():
-        raise UsageError(f"PyBullet's window needs a display, and no X server answers at {display}; {instead}")
+        display = os.environ.get("DISPLAY")
+        why = f"no X server answers at {display}" if display else "DISPLAY is not set"
+        raise UsageError(f"PyBullet's window needs a display, and {why}; leave out --gui (in Python: render_mode)")
 
 
 def _x_server_answers() -> bool:

@@ -1,16 +1,6 @@
 """Reward terms that tasks share: pure functions of numbers, without weights.
 
-Terms are unsigned: a weight gives the sign.
-
-| what is measured                  | term                                                        |
-|-----------------------------------|-------------------------------------------------------------|
-| a goal                            | `distance`, `closeness`, `arrival`, `tolerance`             |
-| effort and smoothness             | `squared` (of actions, joint velocities), `power`, `change` |
-| forward motion                    | `forward_velocity`, `forward_while_alive`, `alive`          |
-| an upright body                   | `posture`, `fallen`, `speed` (of an angular velocity)       |
-| a grasp                           | `grasp`                                                     |
-| time                              | `time_spent`                                                |
-| states a robot should not be in   | `near_limits`, `excess_force`, `penetration`                |
+Terms are unsigned: the sign is in the weight.
 """
 
 import math

@@ -75,7 +75,7 @@ def _convert(value: Any) -> Any:
 
 
 def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
-    from rlctl.environments.info import describe_model, find_mujoco, total_mass
+    from rlctl.environments.info import describe_model, find_mujoco
     from rlctl.environments.wrappers import find_time_limit
     from rlctl.task.env import TaskEnv
 
@@ -102,7 +102,7 @@ def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> 
         "max_steps": task_env.max_steps if task_env else find_time_limit(env),
         "control_dt": task_env.task.control_dt if task_env else model.get("control_dt"),
         "joints": task_env.task.describe_joints() if task_env else model.get("joints"),
-        "mass": total_mass(simulated[0]) if simulated else None,
+        "mass": float(simulated[0].body_mass.sum()) if simulated else None,
         "definition": _describe_definition(task_env) if task_env else None,
     }
 
@@ -136,14 +136,8 @@ def _describe_event(name: str, offered: Event, acting: Event | None) -> dict[str
     settings: dict[str, Any] = {"every_s": event.every_s} if event.when == "interval" else {}
     if event.when == "observation" and event.of:
         settings = {"of": event.of}
-    return {
-        "name": name,
-        "when": event.when,
-        "function": event.function,
-        "parameters": {**event.parameters, **settings},
-        "enabled": offered.enabled,
-        "acts": acting is not None,
-    }
+    parameters, acts = {**event.parameters, **settings}, {"enabled": offered.enabled, "acts": acting is not None}
+    return {"name": name, "when": event.when, "function": event.function, "parameters": parameters, **acts}
 
 
 def _list_parameters(constructor: Callable[..., Any]) -> list[dict[str, Any]]:
@@ -157,13 +151,13 @@ def _list_parameters(constructor: Callable[..., Any]) -> list[dict[str, Any]]:
     for p in accepted:
         if p.kind not in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) or p.name == "render_mode":
             continue
-        kind = p.annotation if isinstance(p.annotation, str) else inspect.formatannotation(p.annotation)
+        kind = "" if p.annotation is p.empty else p.annotation
+        kind = kind if isinstance(kind, str) else inspect.formatannotation(kind)
         default = None if p.default is p.empty else p.default
         if p.name in fields and (make := fields[p.name].default_factory) is not dataclasses.MISSING:
             default = make()
         if isinstance(default, float) and not math.isfinite(default):
             default = str(default)
-        kind = "" if p.annotation is p.empty else kind
         parameters.append({"name": p.name, "type": kind, "default": default, "required": p.default is p.empty})
     return parameters
 
@@ -218,12 +212,5 @@ def _describe_part(name: str, leaf: Leaf, shape: list[int], part: Any = ...) -> 
     """Describe a named part of an observation or action; `low` and `high` are the bounds over its elements."""
     low = None if leaf.low is None or 0 in shape else float(np.min(leaf.low[part]))
     high = None if leaf.high is None or 0 in shape else float(np.max(leaf.high[part]))
-    return {
-        "name": name,
-        "kind": leaf.kind,
-        "shape": shape,
-        "dtype": leaf.dtype,
-        "low": low,
-        "high": high,
-        "unit": None,
-    }
+    kind = {"kind": leaf.kind, "shape": shape, "dtype": leaf.dtype}
+    return {"name": name, **kind, "low": low, "high": high, "unit": None}

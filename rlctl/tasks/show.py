@@ -71,26 +71,21 @@ def _print_rows(rows: list[Row], indent: str = "") -> None:
 
 
 def _list_facts(content: Json) -> list[Row]:
-    facts = [("class", content["target"])]
-    if content["distribution"]:
-        facts.append(("origin", f"{content['distribution']} {content['version']}"))
-    if content["file"]:
-        facts.append(("file", content["file"]))
-    definition, steps = content["definition"], content["max_steps"]
-    if definition is None:
-        limit = f"truncated after {steps:,} steps" if steps else "no known time limit"
-        model = [("mass", f"{content['mass']:.4g} kg")] if content["mass"] is not None else []
-        control = [("control", f"{content['control_dt']:.6g} s per action")] if content["control_dt"] else []
-        return [*facts, *model, *control, ("episode", limit)]
-    if definition["robot"]:
-        facts.append(("robot", definition["robot"]))
-    control_dt, substeps = _format_value(definition["control_dt"]), definition["substeps"]
-    return [
-        *facts,
-        ("control", f"{control_dt} s per action, {substeps} physics steps each"),
-        ("episode", f"{_format_value(definition['episode_s'])} s, {steps:,} steps"),
-        ("success", "is_success, at the end of an episode" if definition["has_success"] else "not defined"),
-    ]
+    definition, steps, control_dt = content["definition"], content["max_steps"], content["control_dt"]
+    facts = {
+        "class": content["target"],
+        "origin": f"{content['distribution']} {content['version']}" if content["distribution"] else None,
+        "file": content["file"],
+        "mass": f"{content['mass']:.4g} kg" if content["mass"] is not None else None,
+        "control": f"{control_dt:.6g} s per action" if control_dt else None,
+        "episode": f"truncated after {steps:,} steps" if steps else "no known time limit",
+    }
+    if definition is not None:
+        facts["robot"] = definition["robot"]
+        facts["control"] = f"{control_dt:.6g} s per action, {definition['substeps']} physics steps each"
+        facts["episode"] = f"{definition['episode_s']:.6g} s, {steps:,} steps"
+        facts["success"] = "is_success, at the end of an episode" if definition["has_success"] else "not defined"
+    return [(name, fact) for name, fact in facts.items() if fact]
 
 
 def _shorten(space: str) -> str:
@@ -99,20 +94,12 @@ def _shorten(space: str) -> str:
 
 
 def _list_quantities(quantities: list[Json]) -> list[Row]:
-    return [
-        (
-            quantity["name"],
-            _format_size(quantity),
-            quantity["unit"] or "",
-            _format_bounds(quantity["low"], quantity["high"]),
-        )
-        for quantity in quantities
-        if quantity["name"]  # an unnamed part is the whole space, which is in the title
-    ]
-
-
-def _format_size(quantity: Json) -> str:
-    return "x".join(map(str, quantity["shape"])) if quantity["kind"] == "Box" else str(quantity["kind"])
+    rows = []
+    for quantity in quantities:
+        size = "x".join(map(str, quantity["shape"])) if quantity["kind"] == "Box" else str(quantity["kind"])
+        bounds = _format_bounds(quantity["low"], quantity["high"])
+        rows.append((quantity["name"], size, quantity["unit"] or "", bounds))
+    return [row for row in rows if row[0]]  # an unnamed part is the whole space, which is in the title
 
 
 def _format_bounds(low: float | None, high: float | None) -> str:

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from rlctl.processes.child_process import set_start
+from rlctl.processes import child_process
 from tests.crash import outside_changes
 from tests.crash.faulty_os import FaultyOs, FaultyShutil
 
@@ -19,7 +19,7 @@ def run(arguments, plan):
         # One core, one worker: a trial is a matter of less than a second.
         os.sched_setaffinity(0, {plan["core"]})
     if plan.get("real_workers"):
-        set_start(subprocess.Popen)
+        child_process.start_process = subprocess.Popen
     from rlctl.storage import files
     from rlctl.training import checkpoints
 

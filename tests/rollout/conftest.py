@@ -5,7 +5,7 @@ import psutil
 import pytest
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.processes.child_process import set_start
+from rlctl.processes import child_process
 from rlctl.rollout.workers import Workers
 from tests import fork_server
 
@@ -39,9 +39,9 @@ def start():
 @pytest.fixture
 def fresh_interpreters():
     """Start workers as a user's process does, and not as forks of a warm one."""
-    set_start(subprocess.Popen)
+    child_process.start_process = subprocess.Popen
     yield
-    set_start(fork_server.start)
+    child_process.start_process = fork_server.start
 
 
 @pytest.fixture
