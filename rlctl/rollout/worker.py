@@ -22,9 +22,9 @@ from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import describe_exception
 from rlctl.policy.file import PolicyFile
+from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.policy.players.named import SERVER, make_player
 from rlctl.policy.players.player import Player
-from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.processes.pool import answer_messages
 from rlctl.processes.printed_lines import write_stderr
 from rlctl.rollout import messages

@@ -14,8 +14,8 @@ from rlctl.environments.dict_spaces import SINGLE, join, split, split_space
 from rlctl.errors import RecipeError, describe_exception, short_repr
 from rlctl.exporting.layers import OPSET
 from rlctl.policy.file import ACTOR_CRITIC, GRAPH, PolicyFile, Tensors
+from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.policy.onnx_policy import OWN_INPUT, OWN_OUTPUT
-from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy, is_own
 
 _COMPARED = 10  # number of random observations

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rlctl.errors import EpisodeFailed
+from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.policy.players.player import Exploration
-from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.rollout.messages import Play
 from rlctl.rollout.seeds import Stream, episode_seed
 from tests.rollout.policies import linear

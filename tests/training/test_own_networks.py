@@ -18,9 +18,8 @@ from rlctl.exporting.export import export_policy
 from rlctl.exporting.request import ExportRequest
 from rlctl.policy import own_modules
 from rlctl.policy.file import GRAPH, PolicyFile
-from rlctl.policy.numpy_policy import load_policy
+from rlctl.policy.numpy_policy import PolicyPlayer, load_policy
 from rlctl.policy.onnx_policy import OnnxPolicy, encode
-from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.policy.torch_policy import ALGORITHMS, TorchPolicy, policy_name
 from rlctl.recipe.recipe import NormalizeSettings, validate
 from rlctl.replaying.replay import ReplayRequest, run_replay

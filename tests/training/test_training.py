@@ -9,7 +9,7 @@ import pytest
 from rlctl import load_policy
 from rlctl.errors import ArtifactError, DivergedError, TaskError, UsageError
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.players.policy_player import PolicyPlayer
+from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
 from rlctl.run.directory import RunDirectory

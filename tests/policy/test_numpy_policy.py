@@ -13,9 +13,8 @@ from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.policy.numpy_policy import check_playable
+from rlctl.policy.numpy_policy import PolicyPlayer, check_playable
 from rlctl.policy.players.player import Exploration
-from rlctl.policy.players.policy_player import PolicyPlayer
 from rlctl.policy.torch_policy import ALGORITHMS, TorchPolicy, describe_network, policy_name
 
 FLAT, BOX = spaces.Box(-np.inf, np.inf, (6,)), spaces.Box(-2, 3, (2,))
