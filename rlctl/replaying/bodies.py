@@ -47,11 +47,9 @@ def _draw_marker(name: str, positions: NDArray[np.float64], color: tuple[int, in
     point = rr.Points3D.from_fields(radii=0.03, colors=color, labels=name, show_labels=True)
     stream.log(entity, point, static=True)
     timelines.send(entity, steps, rr.Points3D.columns(positions=positions))
+    wireframe = rr.components.FillMode.MajorWireframe
     halo = rr.Ellipsoids3D.from_fields(
-        half_sizes=[[_HALO_RADIUS] * 3],
-        colors=color,
-        line_radii=0.003,
-        fill_mode=rr.components.FillMode.MajorWireframe,
+        half_sizes=[[_HALO_RADIUS] * 3], colors=color, line_radii=0.003, fill_mode=wireframe
     )
     stream.log(f"{entity}/halo", halo, static=True)
     timelines.send(f"{entity}/halo", steps, rr.Ellipsoids3D.columns(centers=positions))
@@ -65,16 +63,13 @@ def _draw_ground(body: BodyMotion, scene: Scene, timelines: Timelines) -> None:
     low, high = bounds(scene)
     center, half = (low + high)[:2] / 2, max(2.0, float((high - low)[:2].max()))
     thickness = 0.01
-    timelines.stream.log(
-        _entity("world", body.name),
-        rr.Boxes3D(
-            centers=[[*center, (body.ground_height or 0.0) - thickness]],
-            half_sizes=[[half, half, thickness / 2]],
-            colors=[_GROUND_COLOR],
-            fill_mode=rr.components.FillMode.Solid,
-        ),
-        static=True,
+    box = rr.Boxes3D(
+        centers=[[*center, (body.ground_height or 0.0) - thickness]],
+        half_sizes=[[half, half, thickness / 2]],
+        colors=[_GROUND_COLOR],
+        fill_mode=rr.components.FillMode.Solid,
     )
+    timelines.stream.log(_entity("world", body.name), box, static=True)
 
 
 def _draw_terrain(name: str, points: NDArray[np.float64], timelines: Timelines) -> None:
@@ -141,26 +136,23 @@ def draw_shapes(body: BodyMotion, timelines: Timelines, warn: Warn) -> list[str]
         columns = rr.Transform3D.columns(translation=positions[:rows], quaternion=orientations[:rows])
         timelines.send(entity, range(rows), columns)
         for number, shape in enumerate(shapes):
-            archetype = _archetype(shape)
-            if archetype is None:
-                continue
-            part = f"{entity}/shape_{number}"
-            timelines.stream.log(part, archetype, static=True)
-            timelines.stream.log(part, _pose(shape), static=True)
-            drawn.append(part)
-    if len(drawn) < len(body.shapes) or (
-        not drawn and body.file.suffix == ".xml"
-    ):  # a file that only PyBullet can read
+            if (archetype := _make_archetype(shape)) is not None:
+                part = f"{entity}/shape_{number}"
+                timelines.stream.log(part, archetype, static=True)
+                timelines.stream.log(part, _make_pose(shape), static=True)
+                drawn.append(part)
+    only_bullet_reads_it = not drawn and body.file.suffix == ".xml"
+    if len(drawn) < len(body.shapes) or only_bullet_reads_it:
         warn(f"{body.file.name}: {len(drawn)} of {len(body.shapes)} shapes of {body.name!r} could be drawn")
     return drawn
 
 
-def _pose(shape: Shape) -> rr.Transform3D:
+def _make_pose(shape: Shape) -> rr.Transform3D:
     scale = shape.size if shape.kind == ShapeKind.MESH else None
     return rr.Transform3D(translation=shape.position, quaternion=rr.Quaternion(xyzw=shape.orientation), scale=scale)
 
 
-def _archetype(shape: Shape) -> rr.AsComponents | None:
+def _make_archetype(shape: Shape) -> rr.AsComponents | None:
     color = [round(255 * channel) for channel in shape.color]
     solid = rr.components.FillMode.Solid
     if shape.kind == ShapeKind.BOX:
@@ -188,8 +180,5 @@ def _draw_mesh(mesh: Mesh, color: list[int]) -> rr.Mesh3D:
     for corner in range(3):  # the viewer draws a flat silhouette of a mesh without normals
         np.add.at(normals, mesh.triangles[:, corner], np.cross(second - first, third - first))
     return rr.Mesh3D(
-        vertex_positions=mesh.vertices,
-        triangle_indices=mesh.triangles,
-        vertex_normals=normals,
-        albedo_factor=color,
+        vertex_positions=mesh.vertices, triangle_indices=mesh.triangles, vertex_normals=normals, albedo_factor=color
     )

@@ -81,15 +81,8 @@ class Plot:
 
 def send_curves(rollout: Rollout, timelines: Timelines) -> list[Plot]:
     """Send rewards, actions, joints and observations; return the plots, in order."""
-    plots = _rewards(rollout, timelines)
-    plots += _actions(rollout, timelines)
-    plots += _joints(rollout.scene, timelines)
-    return plots + _observations(rollout, timelines)
-
-
-def palette(count: int) -> list[Color]:
-    """Return `count` colours, distinct up to 10."""
-    return [_PALETTE[index % len(_PALETTE)] for index in range(count)]
+    rewards, actions = _send_rewards(rollout, timelines), _send_actions(rollout, timelines)
+    return [rewards, actions, *_send_joints(rollout.scene, timelines), *_send_observations(rollout, timelines)]
 
 
 def _send(
@@ -99,84 +92,75 @@ def _send(
     values: NDArray[Any],
     names: Sequence[str],
     *,
-    colors: Sequence[Color] | None = None,
+    color: Color | None = None,
     width: float = 1.5,
 ) -> None:
     """Send curves: `values` of shape (rows, curves), its first row at the step `first`."""
     rows, count = values.shape
     if count == 0:
         return
-    style = rr.SeriesLines(names=list(names), colors=colors or palette(count), widths=[width] * count)
+    colors = [color or _PALETTE[index % len(_PALETTE)] for index in range(count)]
+    style = rr.SeriesLines(names=list(names), colors=colors, widths=[width] * count)
     timelines.stream.log(entity, style, static=True)
     scalars = np.ascontiguousarray(values, np.float64)
     timelines.send(entity, range(first, first + rows), rr.Scalars.columns(scalars=scalars))
 
 
-def _rewards(rollout: Rollout, timelines: Timelines) -> list[Plot]:
-    names = rollout.episode.info.term_names
+def _send_rewards(rollout: Rollout, timelines: Timelines) -> Plot:
+    names, terms = rollout.episode.info.term_names, rollout.weighted_terms
     rewards = rollout.episode.rewards[:, None]
-    _send(timelines, "reward/total", 1, rewards, ["total"], colors=[_TOTAL_COLOR], width=2.5)
-    for index, (name, color) in enumerate(zip(names, palette(len(names)), strict=True)):
-        entity = rr.new_entity_path(["reward", "terms", name])
-        _send(timelines, entity, 1, rollout.weighted_terms[:, index : index + 1], [name], colors=[color])
+    _send(timelines, "reward/total", 1, rewards, ["total"], color=_TOTAL_COLOR, width=2.5)
+    for index, name in enumerate(names):
+        entity, color = rr.new_entity_path(["reward", "terms", name]), _PALETTE[index % len(_PALETTE)]
+        _send(timelines, entity, 1, terms[:, index : index + 1], [name], color=color)
     if rollout.successes is not None:
-        _send(timelines, "success", 1, rollout.successes[:, None], ["success"], colors=[_PALETTE[2]])
-    shown = np.concatenate([rewards, rollout.weighted_terms], axis=1)
-    return [Plot("reward, by weighted term" if names else "reward", "reward", "reward", shown)]
+        _send(timelines, "success", 1, rollout.successes[:, None], ["success"], color=_PALETTE[2])
+    shown = np.concatenate([rewards, terms], axis=1)
+    return Plot("reward, by weighted term" if names else "reward", "reward", "reward", shown)
 
 
-def _actions(rollout: Rollout, timelines: Timelines) -> list[Plot]:
+def _send_actions(rollout: Rollout, timelines: Timelines) -> Plot:
     actions = rollout.episode.actions.reshape(rollout.length, math.prod(rollout.episode.actions.shape[1:]))
     joints, count = rollout.env.joints, actions.shape[1]
-    names = list(joints.names) if joints is not None and len(joints.names) == count else _numbered("action", count)
+    names = list(joints.names) if joints is not None and len(joints.names) == count else _number("action", count)
     _send(timelines, "action", 1, actions, names)
     meaning = rollout.env.action_meaning
-    return [Plot(f"action: {meaning}" if meaning else "action", "action", "action", actions)]
+    return Plot(f"action: {meaning}" if meaning else "action", "action", "action", actions)
 
 
-def _joints(scene: Scene, timelines: Timelines) -> list[Plot]:
-    robots = scene.robots()
-    for body in robots:
-        names = [name if len(robots) == 1 else f"{body.name}/{name}" for name in body.joint_names]
-        positions, velocities = (rr.new_entity_path(["joints", kind, body.name]) for kind in ("position", "velocity"))
-        _send(timelines, positions, 0, body.joint_positions, names)
-        _send(timelines, velocities, 0, body.joint_velocities, names)
-    if not robots:
-        return []
-    all_positions = np.concatenate([body.joint_positions for body in robots], axis=1)
-    all_velocities = np.concatenate([body.joint_velocities for body in robots], axis=1)
-    return [
-        Plot("joint positions", "joints/position", "joints", all_positions),
-        Plot("joint velocities", "joints/velocity", "joints", all_velocities),
-    ]
+def _send_joints(scene: Scene, timelines: Timelines) -> list[Plot]:
+    plots, robots = [], scene.robots()
+    for kind, plural in (("position", "positions"), ("velocity", "velocities")) if robots else ():
+        curves = [getattr(body, f"joint_{plural}") for body in robots]
+        for body, values in zip(robots, curves, strict=True):
+            names = [name if len(robots) == 1 else f"{body.name}/{name}" for name in body.joint_names]
+            _send(timelines, rr.new_entity_path(["joints", kind, body.name]), 0, values, names)
+        plots.append(Plot(f"joint {plural}", f"joints/{kind}", "joints", np.concatenate(curves, axis=1)))
+    return plots
 
 
-def _numbered(name: str, count: int) -> list[str]:
+def _number(name: str, count: int) -> list[str]:
     return [name] if count == 1 else [f"{name}[{index}]" for index in range(count)]
 
 
-def _observations(rollout: Rollout, timelines: Timelines) -> list[Plot]:
+def _send_observations(rollout: Rollout, timelines: Timelines) -> list[Plot]:
     plots = []
     for name, values in split_names(rollout.episode.observations, rollout.env.observation_sizes).items():
         unit = rollout.env.observation_units.get(name)
         entity = "observation" if not name else rr.new_entity_path(["observation", name])
         title = f"observed {name}" if name else "observation"
-        if _is_image(values):
-            _send_images(timelines, entity, values)
+        if values.dtype == np.uint8 and values.ndim == 4 and values.shape[-1] in (1, 3):
+            send_pictures(timelines, entity, [(step, encode_jpeg(image)) for step, image in enumerate(values)])
             plots.append(Plot(title, entity, "image"))
             continue
         flat = values.reshape(len(values), -1)
         shown = flat[:, :_MOST_SERIES]
-        _send(timelines, entity, 0, shown, _numbered(name or "observation", flat.shape[1])[: shown.shape[1]])
+        _send(timelines, entity, 0, shown, _number(name or "observation", flat.shape[1])[: shown.shape[1]])
         plots.append(Plot(f"{title} [{unit}]" if unit else title, entity, "observation", shown))
     return plots
 
 
-def _is_image(values: NDArray[Any]) -> bool:
-    return values.dtype == np.uint8 and values.ndim == 4 and values.shape[-1] in (1, 3)
-
-
-def _send_images(timelines: Timelines, entity: str, values: NDArray[Any]) -> None:
-    blobs = [encode_jpeg(image) for image in values]
-    columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
-    timelines.send(entity, range(len(blobs)), columns)
+def send_pictures(timelines: Timelines, entity: str, pictures: Sequence[tuple[int, bytes]]) -> None:
+    """Send pictures: pairs of a step and a JPEG file."""
+    columns = rr.EncodedImage.columns(blob=[blob for _, blob in pictures], media_type=["image/jpeg"] * len(pictures))
+    timelines.send(entity, [step for step, _ in pictures], columns)

@@ -1,22 +1,21 @@
-"""Writes films of episodes, `.mp4` or `.gif`, without a display: with PyBullet's software renderer, or `render()`."""
+"""Shows episodes: films (`.mp4` or `.gif`) without a display, or the window of PyBullet or of an environment."""
 
 import fractions
+import os
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import RlctlError, UsageError, explain_missing_package
-from rlctl.replaying.recorder import Choose, Rollout, frame_time, play_episode
+from rlctl.errors import RlctlError, TaskError, UsageError, explain_missing_package
+from rlctl.replaying.recorder import Choose, Rollout, Watch, find_dt, play_episode
 from rlctl.replaying.report import FilmReport
 from rlctl.replaying.scene import Env
 from rlctl.replaying.view import Picture, look_at
 from rlctl.storage import files
-
-SUFFIXES = (".mp4", ".gif")
 
 _SIZE = {".mp4": (640, 480), ".gif": (400, 300)}  # [pixels]
 _RATE = {".mp4": 30.0, ".gif": 20.0}  # [1/s], at most
@@ -26,15 +25,14 @@ _PAUSE_S = 0.5  # [s] at the end of each episode
 
 def check_file(path: Path) -> None:
     """Raise `UsageError` for a file that is not a film, or if the package that encodes it is not installed."""
-    if path.suffix not in SUFFIXES:
+    if path.suffix not in _SIZE:
         raise UsageError(f"--video {path}: give a file that ends in .mp4 or .gif")
     if path.suffix == ".mp4":
         try:
             import av  # noqa: F401
         except ImportError:
-            raise UsageError(
-                f"{explain_missing_package(f'--video {path}', 'PyAV', 'video')}; .gif needs nothing more"
-            ) from None
+            missing = explain_missing_package(f"--video {path}", "PyAV", "video")
+            raise UsageError(f"{missing}; or write a .gif, which needs no package") from None
 
 
 def make_filmable(spec: EnvSpec) -> Env:
@@ -69,16 +67,14 @@ class _Film:
 
     def __init__(self, env: Env, suffix: str) -> None:
         self._view = look_at(env, *_SIZE[suffix])
-        dt = frame_time(env) or _DT
+        dt = find_dt(env) or _DT
         self._every = max(1, round(1 / (_RATE[suffix] * dt)))
         self._rate = 1 / (dt * self._every)
         self._count = 0
         self._seconds = 0.0
-        self._last: Picture = np.zeros((0, 0, 3), np.uint8)
         self._is_taken = False
 
     def begin(self, path: Path) -> None:
-        """Begin to write a file."""
         self.writer = (_Mp4 if path.suffix == ".mp4" else _Gif)(path, self._rate)
 
     def watch(self, step: int) -> None:
@@ -147,3 +143,36 @@ class _Gif:
     def close(self) -> None:
         first, *rest = self._pictures
         first.save(self._path, "GIF", save_all=True, append_images=rest, duration=self._duration, loop=0)
+
+
+def open_window(spec: EnvSpec) -> Env:
+    """Build an environment with a window; raises `UsageError` without a display."""
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if sys.platform == "linux" and not display and not registry.is_task(spec.constructor()):
+        raise UsageError("--gui: there is no display, DISPLAY is not set; leave out --gui to write a recording instead")
+    return spec.make("human")
+
+
+def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose]) -> list[Rollout]:
+    """Play an episode per seed in real time; closing PyBullet's window ends it early, without an error."""
+    shown: list[Rollout] = []
+    for seed in seeds:
+        try:
+            shown.append(play_episode(env, spec, seed, begin(seed), watch=_wait(find_dt(env) or _DT)))
+        except TaskError as error:
+            if "Not connected to physics server" not in str(error.__cause__):
+                raise
+            break
+    return shown
+
+
+def _wait(dt: float) -> Watch:
+    """Return a function that waits after each step of `dt` [s], so that the episode plays in real time."""
+    start: list[float] = []
+
+    def wait(step: int) -> None:
+        if step == 0:
+            start.append(time.monotonic())
+        time.sleep(max(0.0, start[0] + step * dt - time.monotonic()))
+
+    return wait

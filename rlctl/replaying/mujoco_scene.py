@@ -61,9 +61,8 @@ class MujocoReader:
         model = self._model
         positions, turns, centers, sites, qpos, qvel = (np.stack(part) for part in zip(*self._rows, strict=True))
         grounds = _find_ground(model)
-        shown = [
-            geom for geom in range(model.ngeom) if model.geom_group[geom] < _VISIBLE_GROUPS and geom not in grounds
-        ]
+        visible = np.flatnonzero(model.geom_group < _VISIBLE_GROUPS).tolist()
+        shown = [geom for geom in visible if geom not in grounds]
         links = [model.body(body).name or f"body {body}" for body in range(model.nbody)]
         joints = [joint for joint in range(model.njnt) if model.jnt_type[joint] >= _enum("mjtJoint", "mjJNT_SLIDE")]
         trunk = _find_trunk(model, positions)
@@ -122,7 +121,7 @@ def _find_trunk(model: mujoco.MjModel, positions: Array) -> int | None:
 
 
 def _describe_shape(model: mujoco.MjModel, geom: int, links: list[str]) -> Shape | None:
-    """Describe a geom; None where it is transparent."""
+    """Return a geom as a shape, or None if it is transparent."""
     size, color, material = model.geom_size[geom].tolist(), model.geom_rgba[geom].tolist(), model.geom_matid[geom]
     if material >= 0 and color == _NO_COLOR:
         color = model.mat_rgba[material].tolist()

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.replaying.mujoco_scene import MujocoReader
 from rlctl.replaying.scene import Camera, Env, Scene, SceneReader, Warn
+from rlctl.rollout.failures import format_hint
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode
 from rlctl.task.env import TaskEnv
 from rlctl.version import collect_versions
@@ -24,9 +25,6 @@ from rlctl.version import collect_versions
 Choose = Callable[[Any, int], Any]
 """Returns the action for an observation and the number of steps so far; None ends the episode."""
 Watch = Callable[[int], None]  # called with the number of a step after it; 0 is the reset
-
-ONLY_OF_POLICIES = ("torch", "stable-baselines3", "sb3-contrib")
-"""Packages that policies need, but recorded episodes, which contain the actions, do not."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +77,8 @@ def _make_reader(env: Env, warn: Warn) -> SceneReader | MujocoReader | Camera:
 
 
 class _Step(NamedTuple):
-    # The values that an environment returned for an action; arrays are copied, as it may change them later.
+    """What an environment returned for an action, as copies: an environment may reuse its arrays."""
+
     action: Any
     observation: Any
     reward: float
@@ -106,32 +105,30 @@ def play_episode(
     """
     about, space = describe(env), env.observation_space
     reader = _make_reader(env, draw) if draw is not None else None
-    looks = [watch] if reader is None else [reader.read, watch]
+    watches = [watch] if reader is None else [reader.read, watch]
     steps: list[_Step] = []
     terminated = truncated = False
     with _locate_errors(spec.task, seed, 0):
         observation, info = env.reset(seed=seed)
         first, drawn = _copy_observation(observation, space), _find_events(info, about)
-    for look in looks:
-        look(0)
+    for call in watches:
+        call(0)
     while not (terminated or truncated) and (action := choose(observation, len(steps))) is not None:
         with _locate_errors(spec.task, seed, len(steps) + 1):
             observation, reward, terminated, truncated, info = env.step(_cast_action(action, env.action_space))
             steps.append(_read_step(action, _copy_observation(observation, space), float(reward), info, about))
-        for look in looks:
-            look(len(steps))
-    ended = bool(terminated or truncated)
-    log = [LogEntry(0, f"reset with seed {seed}"), *_log_events(0, drawn), *_log_steps(steps)]
-    log += _log_end(steps, terminated) if ended else [LogEntry(len(steps), "the recorded actions end here", "WARN")]
+        for call in watches:
+            call(len(steps))
+    end = "terminated" if terminated else "truncated: time limit" if truncated else ""
     successes = [step.success for step in steps if step.success is not None]
     return Rollout(
         env=about,
         episode=_make_episode(spec, seed, policy, about, first, steps, env.action_space),
         weighted_terms=_stack_terms([step.weighted for step in steps], about),
         successes=np.array(successes, np.bool_) if steps and len(successes) == len(steps) else None,
-        ended=ended,
-        log=log,
-        dt=frame_time(env),
+        ended=bool(end),
+        log=[LogEntry(0, f"reset with seed {seed}"), *_log_events(0, drawn), *_log_steps(steps, end)],
+        dt=find_dt(env),
         scene=Scene() if reader is None else reader.scene(),
     )
 
@@ -172,19 +169,16 @@ def _stack_terms(rows: list[list[float]], about: EnvInfo) -> NDArray[np.float64]
     return np.array(rows, np.float64).reshape(len(rows), len(about.reward_weights))
 
 
-def _log_steps(steps: Iterable[_Step]) -> Iterator[LogEntry]:
-    """Yield the events of each step, and the steps in which the goal was reached or lost."""
+def _log_steps(steps: Sequence[_Step], end: str) -> Iterator[LogEntry]:
+    """Yield the events of each step, the steps in which the goal was reached or lost, and how the episode ended."""
     held = False
     for number, step in enumerate(steps, start=1):
         yield from _log_events(number, step.events)
         if bool(step.success) != held:
             held = not held
             yield LogEntry(number, "goal reached") if held else LogEntry(number, "goal lost", "WARN")
-
-
-def _log_end(steps: Sequence[_Step], terminated: bool) -> Iterator[LogEntry]:
-    yield LogEntry(len(steps), "terminated" if terminated else "truncated: time limit")
-    if (success := steps[-1].success) is not None:
+    yield LogEntry(len(steps), end) if end else LogEntry(len(steps), "the recorded actions end here", "WARN")
+    if end and (success := steps[-1].success) is not None:
         yield LogEntry(len(steps), "success") if success else LogEntry(len(steps), "no success", "WARN")
 
 
@@ -194,7 +188,7 @@ def _log_events(step: int, events: Mapping[str, Mapping[str, float]]) -> Iterato
         yield LogEntry(step, f"event {name}: {values}", "DEBUG")
 
 
-def frame_time(env: Env) -> float | None:
+def find_dt(env: Env) -> float | None:
     """Return the time between two steps [s]; None if the environment does not give it."""
     fps = env.metadata.get("render_fps")
     return describe(env).control_dt or (1.0 / fps if fps else None)
@@ -202,20 +196,13 @@ def frame_time(env: Env) -> float | None:
 
 def recorded_actions(episode: RecordedEpisode, env: Env, path: Path | None = None) -> Choose:
     """Return a function that chooses the recorded actions; raises `ArtifactError` if they cannot be replayed."""
-    acting = [name for name, acts in describe(env).events.items() if acts]
-    if episode.info.format < 2 and acting:
-        raise ArtifactError(
-            f"{path or episode.info.spec.task}: recorded before events had random numbers of their own, and "
-            f"{', '.join(acting)} acted in it: it cannot be reproduced; record it again with rlctl replay RUN"
-        )
     check_actions(episode, env.action_space.shape or (), path)
     return lambda _, step: episode.actions[step] if step < len(episode.actions) else None
 
 
 def check_actions(episode: RecordedEpisode, shape: tuple[int, ...], path: Path | None = None) -> None:
     """Raise `ArtifactError` if the shape of an episode's actions is not that of its task's actions."""
-    recorded = episode.actions.shape[1:]
-    if recorded != shape:
+    if (recorded := episode.actions.shape[1:]) != shape:
         task = episode.info.spec.task
         name = path or f"episode of {task}"
         raise ArtifactError(f"{name}: its actions have shape {recorded}, but those of {task} have {shape}")
@@ -236,15 +223,12 @@ def _locate_errors(task: str, seed: int, step: int) -> Iterator[None]:
     """Add the task, the episode and the step to any exception of an environment, `SystemExit` included."""
     try:
         yield
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:
+    except (Exception, SystemExit) as error:
         ours = isinstance(error, RlctlError)
         what = str(error) if ours else describe_exception(error)
-        where = f"in the episode with seed {seed}, step {step}"
+        where = f"in the episode with seed {seed}, step {step}; {format_hint(task)}"
         details = None if ours else format_plugin_traceback(error) or None
-        message = f"task {task!r}: {what}\n{where}; to see it alone: rlctl check-env {task}"
-        raise TaskError(message, details=details) from error
+        raise TaskError(f"task {task!r}: {what}\n{where}", details=details) from error
 
 
 def _copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
@@ -255,10 +239,8 @@ def _copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
     if isinstance(space, spaces.Dict):
         copied: dict[str, Any] = {}
         for key, part in space.spaces.items():
-            value = _copy_observation(observation[key], part)
-            copied |= (
-                {f"{key}/{name}": inner for name, inner in value.items()} if isinstance(value, dict) else {key: value}
-            )
+            parts = dict_spaces.split(_copy_observation(observation[key], part))
+            copied |= {f"{key}/{name}" if name else key: value for name, value in parts.items()}
         return copied
     value = np.array(observation, dtype=space.dtype)
     if value.shape != space.shape:

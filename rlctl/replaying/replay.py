@@ -13,13 +13,12 @@ from rlctl.errors import UsageError
 from rlctl.evaluation.players import LoadedPolicy, load_player
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.recipe.sources import parse_changes
-from rlctl.replaying.film import check_file, film_episodes, make_filmable
+from rlctl.replaying.film import check_file, film_episodes, make_filmable, open_window, show_episodes
 from rlctl.replaying.recorder import Choose, Rollout, make_drawable, play_episode, recorded_actions
 from rlctl.replaying.report import ReplayedEpisode, ReplayResult
 from rlctl.replaying.reproduce import print_warning, record_episode, verify_episode
 from rlctl.replaying.request import Choice, ReplayRequest
 from rlctl.replaying.scene import Env
-from rlctl.replaying.window import open_window, show_episodes
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
@@ -29,6 +28,11 @@ from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
 from rlctl.run.lookup import find_owner, find_policy, locate_task
 
 _EPISODES_TO_CHOOSE_FROM = 100
+_DEFAULTS = ReplayRequest()
+_OF_POLICIES = {"checkpoint": "--checkpoint and --pretrained", "settings": "--set"} | {
+    name: f"--{name}" for name in ("task", "episodes", "sim", "worst", "best", "failures")
+}
+"""The fields of a request that a recorded episode cannot have, and their options."""
 
 
 def choose_episodes(
@@ -75,11 +79,8 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
     output.results()  # from here on what an environment, or PyBullet's window, prints goes to stderr
     if request.verify is not None:
         return _verify(request.verify)
-    source = (
-        _RecordedSource(Path(str(request.source)), request.output)
-        if _is_episode(request.source)
-        else _PolicySource(request)
-    )
+    is_episode = _is_episode(request.source)
+    source = _RecordedSource(Path(str(request.source)), request.output) if is_episode else _PolicySource(request)
     spec, seeds, film = source.spec, source.seeds, None
     rollouts: list[Rollout] = []
     if request.video is not None and seeds:
@@ -99,32 +100,25 @@ def _is_episode(source: str | None) -> bool:
 
 
 def _check_request(request: ReplayRequest) -> None:
-    source, target, choice = request.source, request.output, request.choice
+    source, target = request.source, request.output
     if source is not None and Path(source).suffix == ".rrd":
         raise UsageError(f"{source} is a recording already; open it with: rerun {source}")
-    if request.verify is not None and (source is not None or request.gui or target is not None):
-        raise UsageError("--verify replays one recorded episode and writes nothing: give only --verify EPISODE")
-    if request.gui and target is not None:
-        raise UsageError("--gui shows a window and writes nothing: leave out --output")
+    for names in (("verify", "gui", "video", "output"), ("worst", "best", "failures")):
+        if len(given := [f"--{name}" for name in names if getattr(request, name)]) > 1:
+            raise UsageError(f"{given[0]} and {given[1]} exclude each other: leave out {given[1]}")
+    if request.verify is not None and source is not None:
+        raise UsageError(f"--verify replays only {request.verify}: leave out {source}")
     recorded = request.verify or (source if _is_episode(source) else None)
-    if recorded and request.checkpoint != "best":
-        raise UsageError("a recorded episode is replayed unchanged: leave out --checkpoint and --pretrained")
-    if recorded and request.sim is not None:
-        raise UsageError(f"--sim plays new episodes of a policy; {recorded} is a recorded episode")
-    if recorded and (request.task is not None or request.settings or request.episodes not in (None, 1)):
-        raise UsageError("a recorded episode is replayed unchanged: leave out --task, --set and --episodes")
-    if recorded and choice is not None:
-        raise UsageError(f"--{choice.kind} chooses among episodes of a policy; {recorded} is a recorded episode")
+    if recorded and (given := [name for name in _OF_POLICIES if getattr(request, name) != getattr(_DEFAULTS, name)]):
+        raise UsageError(
+            f"{recorded} is a recorded episode and is replayed unchanged: leave out {_OF_POLICIES[given[0]]}"
+        )
     if request.video is not None:
-        if request.gui or target is not None or request.verify is not None:
-            raise UsageError("--video writes a film and nothing else: leave out --gui, --output and --verify")
         check_file(request.video)
     if target is None:
         return
     if target.suffix == ".rrd" and request.shown > 1:
         raise UsageError(f"--output {target}: a recording has one episode; give a folder for {request.shown}")
-    if target.suffix == ".rrd" and target.is_dir():
-        raise UsageError(f"--output {target}: a folder whose name ends in .rrd; give a name inside it")
     if target.suffix != ".rrd" and target.is_file():
         raise UsageError(f"--output {target}: give a folder, or the name of a recording, which ends in .rrd")
 
@@ -183,16 +177,15 @@ class _PolicySource:
             self.spec = dataclasses.replace(self.spec, sim=request.sim)
         self.name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
         self._described = f"{self._file} ({info.algo}, step {info.training_steps:,})"
+        self.seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes or 1)
         self._chosen: dict[int, float] = {}  # returns of the chosen episodes, by seed
         self._choice = ""
-        if request.choice is None:
-            self.seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes or 1)
-        else:
+        if request.choice is not None:
             episodes = request.episodes or _EPISODES_TO_CHOOSE_FROM
             player = load_player(self._file, deterministic=True)
             results, self._choice = choose_episodes(player, self.spec, episodes, request.seed, request.choice)
-            self.seeds = [result.seed for result in results]
             self._chosen = {result.seed: result.total_reward for result in results}
+            self.seeds = list(self._chosen)
 
     def record(self) -> list[ReplayedEpisode]:
         """Write each episode and its recording."""

@@ -9,7 +9,7 @@ from typing import Any
 from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.errors import AnswerIsNo
-from rlctl.replaying.difference import Difference
+from rlctl.replaying.reproduce import Verification
 from rlctl.version import collect_versions
 
 
@@ -24,15 +24,6 @@ class ReplayedEpisode:
     events: Mapping[str, bool]  # the events that the task offers, and whether each acted
     recording: Path | None = None  # the `.rrd` file
     episode: Path | None = None  # the `.npz` file
-
-
-@dataclasses.dataclass(frozen=True)
-class Verification:
-    """How a recorded episode compares with a new rollout of its actions."""
-
-    episode: Path
-    difference: Difference | None
-    other_versions: dict[str, tuple[str, str | None]]  # recorded and current version, by name, of those that differ
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,34 +65,30 @@ def show(result: ReplayResult, json: str | None) -> None:
         return
     out = output.out()
     randomization = describe_randomization(result.episodes[0].events) if result.episodes else ""
-    parts = [part for part in (result.policy_file or result.policy, randomization) if part]
-    out.print(f"{result.task}: {', '.join(parts)}" if parts else result.task)
+    parts = ", ".join(part for part in (result.policy_file or result.policy, randomization) if part)
+    out.print(f"{result.task}: {parts}" if parts else result.task)
     if result.choice:
         out.print(result.choice)
     for episode in result.episodes:
-        out.print(_line(episode))
+        out.print(_format_episode(episode))
     if film := result.film:
-        out.print(
-            f"{film.file}: {film.pictures} pictures of {film.width}x{film.height}, {film.rate:.3g} per second; "
-            f"drawn at {film.drawn_per_s:.3g} per second",
-        )
+        pictures = f"{film.pictures} pictures of {film.width}x{film.height}, {film.rate:.3g} per second"
+        out.print(f"{film.file}: {pictures}; drawn at {film.drawn_per_s:.3g} per second")
     if command := open_command(result):
         out.print(f"open with: {command}")
         out.print(f"without a display, in a browser: {command.replace('rerun', 'rerun --serve-web', 1)}")
 
 
-def _line(episode: ReplayedEpisode) -> str:
-    parts = [f"seed {episode.seed}", f"{episode.length} steps", f"return {episode.total_reward:.4g}"]
-    if episode.success is not None:
-        parts.append("success" if episode.success else "no success")
-    where = f"{episode.recording}: " if episode.recording else ""
-    return where + ", ".join(parts)
+def _format_episode(episode: ReplayedEpisode) -> str:
+    file = f"{episode.recording}: " if episode.recording else ""
+    success = "" if episode.success is None else ", success" if episode.success else ", no success"
+    return f"{file}seed {episode.seed}, {episode.length} steps, return {episode.total_reward:.4g}{success}"
 
 
 def _show_verification(result: ReplayResult, verification: Verification) -> None:
     out, (episode,) = output.out(), result.episodes
     verdict = "identical, bit for bit" if verification.difference is None else "not identical"
-    out.print(f"{verification.episode}: {result.task}, {_line(episode)}: {verdict}")
+    out.print(f"{verification.episode}: {result.task}, {_format_episode(episode)}: {verdict}")
     for name, (recorded, now) in verification.other_versions.items():
         out.print(f"recorded with {name} {recorded}, now {now or 'not installed'}")
 
@@ -117,14 +104,11 @@ def as_json(result: ReplayResult) -> dict[str, Any]:
     content: dict[str, Any] = {
         "task": result.task,
         "policy": result.policy,
-        "episodes": [_episode_json(episode) for episode in result.episodes],
+        "episodes": [_describe_episode(episode) for episode in result.episodes],
         "open": open_command(result),
         "versions": collect_versions(),
     }
-    if result.choice:
-        content["choice"] = result.choice
-    if result.film is not None:
-        content["film"] = result.film
+    content |= {name: value for name in ("choice", "film") if (value := getattr(result, name))}
     if (verification := result.verification) is not None:
         versions = verification.other_versions.items()
         content["verification"] = {
@@ -136,7 +120,7 @@ def as_json(result: ReplayResult) -> dict[str, Any]:
     return content
 
 
-def _episode_json(episode: ReplayedEpisode) -> dict[str, Any]:
+def _describe_episode(episode: ReplayedEpisode) -> dict[str, Any]:
     return {
         "file": episode.recording,
         "episode": episode.episode,

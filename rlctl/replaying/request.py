@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
-from rlctl.errors import UsageError
 from rlctl.options import Argument, Checkpoint, EpisodeSeed, Option, Settings
 
 
@@ -57,14 +56,10 @@ class ReplayRequest:
 
     @property
     def choice(self) -> Choice | None:
-        """Which episodes to choose by their outcome; raises `UsageError` for two kinds at once."""
+        """Which episodes to choose by their outcome."""
         counts: dict[Literal["worst", "best", "failures"], int | None]
         counts = {"worst": self.worst, "best": self.best, "failures": self.failures}
-        choices = [Choice(kind, count) for kind, count in counts.items() if count is not None]
-        if len(choices) > 1:
-            kinds = f"--{choices[0].kind} and --{choices[1].kind}"
-            raise UsageError(f"{kinds} exclude each other: give one of --worst, --best and --failures")
-        return choices[0] if choices else None
+        return next((Choice(kind, count) for kind, count in counts.items() if count is not None), None)
 
     @property
     def shown(self) -> int:

@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from rlctl.environments import registry
 from rlctl.errors import ArtifactError
 from rlctl.replaying.bodies import bounds, draw_scene
-from rlctl.replaying.curves import Plot, Timelines, send_curves
+from rlctl.replaying.curves import Plot, Timelines, send_curves, send_pictures
 from rlctl.replaying.recorder import Rollout
 from rlctl.replaying.scene import BodyMotion, Scene, Warn
 from rlctl.run.episode import RecordedEpisode
@@ -36,13 +36,9 @@ def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn, several: 
     If `several` recordings are opened together, the viewer shows a list of them.
     """
     info = rollout.episode.info
-    stream = rr.RecordingStream(
-        f"rlctl_{registry.make_slug(info.spec.task)}",
-        recording_id=_recording_id(rollout.episode),
-        send_properties=False,
-    )
+    application = f"rlctl_{registry.make_slug(info.spec.task)}"
+    stream = rr.RecordingStream(application, recording_id=_make_id(rollout.episode), send_properties=False)
     stream.set_log_time_enabled(False)
-
     with stream:
         layout = _send(stream, rollout, title, warn, several)
         # Into memory: Rerun's own file writer can hang if the disk is full.
@@ -55,7 +51,7 @@ def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn, several: 
         raise ArtifactError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def _recording_id(episode: RecordedEpisode) -> str:
+def _make_id(episode: RecordedEpisode) -> str:
     content = hashlib.sha256(episode.info.model_dump_json().encode())
     content.update(episode.actions.tobytes())
     content.update(episode.rewards.tobytes())
@@ -70,9 +66,7 @@ def _send(stream: rr.RecordingStream, rollout: Rollout, title: str, warn: Warn, 
     plots = send_curves(rollout, timelines)
     _send_log(rollout, timelines)
     if scene.pictures:
-        steps, blobs = [step for step, _ in scene.pictures], [blob for _, blob in scene.pictures]
-        columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
-        timelines.send("camera", steps, columns)
+        send_pictures(timelines, "camera", scene.pictures)
     return _layout(rollout, plots, timelines.default, followed, several)
 
 
@@ -121,22 +115,15 @@ def _layout(rollout: Rollout, plots: Sequence[Plot], timeline: str, followed: Fo
     if scene.pictures:
         left.append(rrb.Spatial2DView(name="camera", origin="/camera"))
     left += [rrb.Spatial2DView(name=plot.title, origin=f"/{plot.entity}") for plot in plots if plot.kind == "image"]
-    columns = rrb.TextLogColumns(
-        timeline_columns=["step"] if timeline == "step" else ["step", timeline], text_log_columns=["body"]
-    )
-    log = rrb.TextLogView(name="events", origin="/events", columns=columns)
-    below = (
-        rrb.Horizontal(log, rrb.StateTimelineView(name="goal", origin="/goal"))
-        if rollout.successes is not None
-        else log
-    )
-    right = _curves(plots)
+    names = ["step"] if timeline == "step" else ["step", timeline]
+    columns = rrb.TextLogColumns(timeline_columns=names, text_log_columns=["body"])
+    below: rrb.Container | rrb.View = rrb.TextLogView(name="events", origin="/events", columns=columns)
+    if rollout.successes is not None:
+        below = rrb.Horizontal(below, rrb.StateTimelineView(name="goal", origin="/goal"))
+    curves = _arrange_curves(plots)
+    content: rrb.Container = rrb.Vertical(rrb.Vertical(*left) if left else curves, below, row_shares=[4, 1])
     if left:
-        content: rrb.Container = rrb.Horizontal(
-            rrb.Vertical(rrb.Vertical(*left), below, row_shares=[4, 1]), right, column_shares=[3, 2]
-        )
-    else:
-        content = rrb.Vertical(right, below, row_shares=[4, 1])
+        content = rrb.Horizontal(content, curves, column_shares=[3, 2])
     return rrb.Blueprint(
         content,
         rrb.TimePanel(state="collapsed", timeline=timeline),
@@ -147,12 +134,12 @@ def _layout(rollout: Rollout, plots: Sequence[Plot], timeline: str, followed: Fo
     )
 
 
-def _curves(plots: Sequence[Plot]) -> rrb.Container:
-    rows = [[_plot(plot) for plot in plots if plot.kind in kinds] for kinds in _PLOT_ROWS]
+def _arrange_curves(plots: Sequence[Plot]) -> rrb.Container:
+    rows = [[_arrange_plot(plot) for plot in plots if plot.kind in kinds] for kinds in _PLOT_ROWS]
     return rrb.Vertical(*(rrb.Tabs(*views) if len(views) > 1 else views[0] for views in rows if views))
 
 
-def _plot(plot: Plot) -> rrb.TimeSeriesView:
+def _arrange_plot(plot: Plot) -> rrb.TimeSeriesView:
     corner, span = plot.legend
     return rrb.TimeSeriesView(
         name=plot.title,
@@ -166,21 +153,20 @@ def _world(scene: Scene, followed: Followed) -> rrb.Spatial3DView:
     entity, body = followed or (None, None)
     low, high = bounds(scene) if body is None else body.box
     center, size = (low + high) / 2, float(np.linalg.norm(high - low))
-    distances = [1.0, 1.15 * size]
+    distance = max(1.0, 1.15 * size)
     if body is not None:
         # The followed body is in the middle of the picture: leave room for its feet below, and a goal to one side.
         goals = [float(np.linalg.norm(positions[0] - center)) for positions in scene.markers.values()]
-        distances = [1.0, 1.5 * size, *(_GOAL_MARGIN * goal for goal in goals)]
-    eye = center + max(distances) * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
+        distance = max(1.0, 1.5 * size, *(_GOAL_MARGIN * goal for goal in goals))
+    eye = center + distance * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
     start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     so_far = [rrb.VisibleTimeRange(name, start=start, end=end) for name in ("step", "sim_time")]
+    paths = [rr.new_entity_path(["world", "paths", body.name]) for body in scene.robots()]
     return rrb.Spatial3DView(
         name="world",
         origin="/",
         contents=["/world/**"],
-        overrides={
-            rr.new_entity_path(["world", "paths", body.name]): rrb.VisibleTimeRanges(so_far) for body in scene.robots()
-        },
+        overrides={path: rrb.VisibleTimeRanges(so_far) for path in paths},
         eye_controls=rrb.EyeControls3D(position=eye, look_target=center, eye_up=(0, 0, 1), tracking_entity=entity),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, plane=rr.components.Plane3D.XY),
     )

@@ -74,10 +74,8 @@ def find_bounds(bodies: Sequence[Body], markers: Sequence[Array] = ()) -> tuple[
     """Return the lowest and highest corner [m] of the present world: its markers and bodies, without the ground."""
     corners = list(markers)
     for body in bodies:
-        boxes = [
-            np.array(pybullet.getAABB(body.id, link, physicsClientId=body.client))
-            for link in range(-1, len(body.link_names))
-        ]
+        links = range(-1, len(body.link_names))
+        boxes = [np.array(pybullet.getAABB(body.id, link, physicsClientId=body.client)) for link in links]
         wide = any((box[1] - box[0])[:2].min() > _GROUND_SIZE for box in boxes)
         corners += [] if wide else list(itertools.chain(*boxes))
     return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
@@ -138,10 +136,8 @@ class _BodyReader:
         self._joint_velocities.append(body.joint_velocities.copy())
         inertial = pybullet.getBasePositionAndOrientation(body.id, physicsClientId=self.client)
         poses = [pybullet.multiplyTransforms(*inertial, *self._base_in_inertial)]
-        if len(self.links) > 1:
-            states = pybullet.getLinkStates(
-                body.id, list(range(len(self.links) - 1)), computeForwardKinematics=1, physicsClientId=self.client
-            )
+        if links := list(range(len(self.links) - 1)):
+            states = pybullet.getLinkStates(body.id, links, computeForwardKinematics=1, physicsClientId=self.client)
             poses += [state[_LINK_POSE] for state in states]
         self._poses.append(poses)
 
@@ -150,20 +146,20 @@ class _BodyReader:
         return BodyMotion(
             name=body.name,
             file=body.file,
-            ground_height=self._ground_height(),
-            terrain=self.body.terrain,
+            ground_height=self._find_ground_height(),
+            terrain=body.terrain,
             joint_names=body.joint_names,
             joint_positions=np.stack(self._joint_positions),
             joint_velocities=np.stack(self._joint_velocities),
             links=self.links,
             positions=np.array([[pose[0] for pose in poses] for poses in self._poses], np.float64),
             orientations=np.array([[pose[1] for pose in poses] for poses in self._poses], np.float64),
-            shapes=self._shapes(),
-            trunk=self._trunk(),
+            shapes=self._read_shapes(),
+            trunk=self._find_trunk(),
             box=self._box,
         )
 
-    def _ground_height(self) -> float | None:
+    def _find_ground_height(self) -> float | None:
         if len(self.links) > 1 or self.body.terrain is not None:
             return None
         low, high = pybullet.getAABB(self.body.id, -1, physicsClientId=self.client)
@@ -172,13 +168,13 @@ class _BodyReader:
         endless = high[2] - low[2] > 1e6  # an infinite plane has an infinite box
         return float(self._poses[0][0][0][2] if endless else high[2])
 
-    def _trunk(self) -> int | None:
+    def _find_trunk(self) -> int | None:
         trunk = self.body.find_trunk() if self.body.joint_names else None
         if trunk is None:
             return None
         return 0 if not self.body.fixed else self.links.index(trunk, 1)
 
-    def _shapes(self) -> list[Shape]:
+    def _read_shapes(self) -> list[Shape]:
         if self.body.file.suffix == ".xml":
             try:
                 return read_shapes(self.body.file)
@@ -212,9 +208,7 @@ class Camera:
             self._pictures.append((step, encode_jpeg(np.asarray(self._env.render()))))
         except Exception as error:  # pygame or OpenGL is missing, or it returned no picture
             self._works = False
-            no_render = isinstance(error, NotImplementedError)
-            why = "the environment does not implement render" if no_render else describe_exception(error)
-            self._warn(f"no camera pictures: {why}")
+            self._warn(f"no camera pictures: render() raised {describe_exception(error)}")
         if len(self._pictures) > _MOST_PICTURES:  # the length of an episode is not known before its end
             self._pictures, self._every = self._pictures[::2], 2 * self._every
 

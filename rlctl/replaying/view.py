@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError, UsageError, describe_exception
-from rlctl.replaying.difference import find_difference
 from rlctl.replaying.recorder import play_episode, recorded_actions
+from rlctl.replaying.reproduce import find_difference
 from rlctl.replaying.scene import Env, encode_jpeg, find_bounds
 from rlctl.run.episode import RecordedEpisode
 from rlctl.task import Sim
@@ -66,27 +66,22 @@ class _World:
         trunks = [(body, trunk) for body in robots if (trunk := body.find_trunk()) is not None]
         self._followed = trunks[0] if trunks else None
         markers = [np.asarray(position) for position in self._env.task.markers().values()]
-        if self._followed is None:
-            low, high = find_bounds(bodies, markers)
-            self._target, distance = (low + high) / 2, 1.5 * float(np.linalg.norm(high - low))
-        else:
-            low, high = find_bounds([self._followed[0]], [])
-            self._target, distance = (low + high) / 2, 1.6 * float(np.linalg.norm(high - low))
-            for marker in markers:
-                distance = max(distance, 2.5 * float(np.linalg.norm(marker - self._target)))
-        self._offset = min(max(distance, _CLOSEST), _FARTHEST) * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
+        low, high = find_bounds([trunks[0][0]]) if trunks else find_bounds(bodies, markers)
+        self._target, size = (low + high) / 2, float(np.linalg.norm(high - low))
+        distances = [1.6 * size if trunks else 1.5 * size]
+        if trunks:
+            distances += [2.5 * float(np.linalg.norm(marker - self._target)) for marker in markers]
+        self._offset = np.clip(max(distances), _CLOSEST, _FARTHEST) * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
 
     def draw(self) -> Picture:
         if self._followed is not None:
             body, trunk = self._followed
-            self._target[:2] = body.mass_state(trunk).position[
-                :2
-            ]  # the height is constant: a gait would shake the film
+            # The height is constant: a gait would shake the film.
+            self._target[:2] = body.mass_state(trunk).position[:2]
         self._env.move_markers()
         eye = self._target + self._offset
-        return self._env.sim.render(
-            *self._size, eye=eye.tolist(), target=self._target.tolist(), field_of_view=_FIELD_OF_VIEW
-        )
+        target = self._target.tolist()
+        return self._env.sim.render(*self._size, eye=eye.tolist(), target=target, field_of_view=_FIELD_OF_VIEW)
 
 
 @dataclasses.dataclass(frozen=True)

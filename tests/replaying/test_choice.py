@@ -83,18 +83,18 @@ def test_a_number_below_1_or_not_whole_is_refused(rlctl, value, problem):
     [
         (
             ["--worst", "1", "--best", "1"],
-            "--worst and --best exclude each other: give one of --worst, --best and --failures",
+            "--worst and --best exclude each other: leave out --best",
         ),
-        (["x.npz", "--worst", "1"], "--worst chooses among episodes of a policy; x.npz is a recorded episode"),
+        (["x.npz", "--worst", "1"], "x.npz is a recorded episode and is replayed unchanged: leave out --worst"),
         (
             ["--verify", "x.npz", "--worst", "1"],
-            "--worst chooses among episodes of a policy; x.npz is a recorded episode",
+            "x.npz is a recorded episode and is replayed unchanged: leave out --worst",
         ),
         (["--worst", "2", "-o", "y.rrd"], "--output y.rrd: a recording has one episode; give a folder for 2"),
         (["--video", "y.avi"], "--video y.avi: give a file that ends in .mp4 or .gif"),
         (
             ["--video", "y.gif", "-o", "y.rrd"],
-            "--video writes a film and nothing else: leave out --gui, --output and --verify",
+            "--video and --output exclude each other: leave out --output",
         ),
     ],
 )

@@ -68,9 +68,9 @@ def test_time_follows_from_the_frame_rate(tmp_path):
 @pytest.mark.parametrize(
     ("name", "parameters", "reason"),
     [
-        ("Pixels", {"fault": "render"}, "no camera pictures: OSError: no OpenGL"),
+        ("Pixels", {"fault": "render"}, "no camera pictures: render() raised OSError: no OpenGL"),
         ("Blind", {}, "envs.py:Blind takes no render_mode"),
-        ("Undrawn", {}, "no camera pictures: the environment does not implement render"),
+        ("Undrawn", {}, "no camera pictures: render() raised NotImplementedError"),
     ],
 )
 def test_missing_pictures_cost_a_warning_and_nothing_else_is_missing(name, parameters, reason, tmp_path):

@@ -141,7 +141,7 @@ def test_episode_of_a_plain_environment_from_the_command_line(replay, tmp_path):
     save_episode(tmp_path / "one.npz", rollout.episode)
     done = replay("one.npz", "-o", "recordings")
     assert done.returncode == 0
-    assert done.stderr == "no camera pictures: OSError: no OpenGL\n"
+    assert done.stderr == "no camera pictures: render() raised OSError: no OpenGL\n"
     assert (tmp_path / "recordings" / "one.rrd").is_file()
 
 
@@ -160,16 +160,16 @@ def test_what_an_environment_prints_stays_out_of_the_result(replay, tmp_path):
         (["x.npz"], 5, "error: x.npz: no such file\n"),
         (["--verify", "x.npz"], 5, "error: x.npz: no such file\n"),
         (["x.safetensors"], 5, "error: x.safetensors: no such file\n"),
-        (["x.npz", "--gui", "-o", "y.rrd"], 2, "error: --gui shows a window and writes nothing: leave out --output\n"),
+        (["x.npz", "--gui", "-o", "y.rrd"], 2, "error: --gui and --output exclude each other: leave out --output\n"),
         (
             ["x.npz", "--set", "task.tolerance=1"],
             2,
-            "error: a recorded episode is replayed unchanged: leave out --task, --set and --episodes\n",
+            "error: x.npz is a recorded episode and is replayed unchanged: leave out --set\n",
         ),
         (
             ["--verify", "x.npz", "-o", "y.rrd"],
             2,
-            "error: --verify replays one recorded episode and writes nothing: give only --verify EPISODE\n",
+            "error: --verify and --output exclude each other: leave out --output\n",
         ),
         (
             ["--episodes", "2", "-o", "y.rrd"],

@@ -1,8 +1,8 @@
 import time
 
 from rlctl.environments.spec import EnvSpec
+from rlctl.replaying.film import show_episodes
 from rlctl.replaying.report import ReplayResult, show
-from rlctl.replaying.window import show_episodes
 from rlctl.task.bullet import pybullet
 
 
