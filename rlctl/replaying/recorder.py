@@ -17,7 +17,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.replaying.mujoco_scene import MujocoReader
 from rlctl.replaying.scene import Camera, Env, Scene, SceneReader, Warn
-from rlctl.rollout.failures import format_hint
+from rlctl.rollout.messages import format_hint
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode
 from rlctl.task.env import TaskEnv
 from rlctl.version import collect_versions
