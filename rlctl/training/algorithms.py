@@ -79,10 +79,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
 
 
 def keep_compiler_out() -> None:
-    """Remove torch's compiler decorators from the optimisers: they import the compiler, which rlctl does not use.
-
-    The import takes 1.6 s, more than torch itself.
-    """
+    """Remove torch's compiler decorators from the optimisers: they import the compiler (1.6 s), which is not used."""
     for name in ("add_param_group", "load_state_dict", "state_dict", "zero_grad"):
         setattr(torch.optim.Optimizer, name, inspect.unwrap(getattr(torch.optim.Optimizer, name)))
     for optimizer in (torch.optim.Adam, torch.optim.RMSprop):

@@ -30,11 +30,9 @@ class Training:
         self.folder = folder  # the run's folder
         self.recipe = learner.recipe
         self.model = learner.model  # the Stable-Baselines3 model
-        self.metrics: Mapping[str, Any] = {}
-        """In `on_segment`: the row of `metrics.csv` that is written next; empty if none is due."""
+        self.metrics: Mapping[str, Any] = {}  # in `on_segment`: the row of `metrics.csv` that is due, if any
         self.evaluation: Mapping[str, Any] = {}  # in `on_evaluation`: the row of `evals.csv`
-        self.episodes: Sequence[EpisodeResult] = ()
-        """In `on_segment`: the training episodes that ended since the last call."""
+        self.episodes: Sequence[EpisodeResult] = ()  # in `on_segment`: training episodes that ended since the last call
         self._learner = learner
 
     @property
@@ -64,10 +62,7 @@ class Training:
         self._learner.progress.stop_reason = reason
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Set `learning_rate` or `clip_range`, for PPO and A2C also `ent_coef` or `vf_coef`, from now on.
-
-        Raises `ValueError` for another name, and for a value that is not a number of at least 0.
-        """
+        """Set `learning_rate` or `clip_range`, for PPO and A2C also `ent_coef` or `vf_coef`, to a number >= 0."""
         numbers = _NUMBERS if hasattr(self.model, "rollout_buffer") else ()
         known = [name for name in (*_SCHEDULES, *numbers) if hasattr(self.model, name)]
         if name not in known or not (math.isfinite(value) and value >= 0):

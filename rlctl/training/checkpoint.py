@@ -129,10 +129,7 @@ class CheckpointFolders:
             replay_segments.remove_unnamed(self._run.replay_segments, _named_segments(self._run))
 
     def restore(self, checkpoint: Checkpoint) -> str | None:
-        """Restore model, replay buffer and environments from a checkpoint.
-
-        Return a message if an environment did not reach its saved state; then all start new episodes.
-        """
+        """Restore a checkpoint; if an environment cannot be restored, start new episodes and return a message."""
         model, tensors = self._model, checkpoint.tensors
         try:
             snapshot.restore(model, tensors, checkpoint.state.model)
@@ -152,10 +149,7 @@ class CheckpointFolders:
 
 
 def read_newest(run: RunDirectory) -> tuple[Checkpoint | None, list[str]]:
-    """Return the newest undamaged checkpoint (None without any), and the problems of newer ones.
-
-    Raises `ArtifactError` if all are damaged.
-    """
+    """Return the newest undamaged checkpoint, if any, and the problems of newer ones; raises if all are damaged."""
     damage: list[str] = []
     for folder in reversed(run.checkpoints()):
         try:
@@ -227,7 +221,7 @@ def find_differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
 
 def _environment_tensors(env: WorkerVecEnv) -> Tensors:
     """Return the numbers, actions and last observations of the running episodes."""
-    histories = [env.history.of(index) for index in range(env.num_envs)]
+    histories = [env.join_actions(index) for index in range(env.num_envs)]
     last = env.workers.arrays.observation
     return {
         "environments/episodes_started": np.array(env.episodes_started, np.int64),

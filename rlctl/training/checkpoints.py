@@ -42,10 +42,7 @@ class Checkpoints:
         self._unsaved_best: PolicyFile | None = None  # the best policy, if it could not be written yet
 
     def attempt(self, what: str, write: Callable[[], object]) -> bool:
-        """Call `write`; on an `OSError` show a warning about `what` and return False.
-
-        Raises `ArtifactError` if the run was removed, `RunTaken` if another process has taken it over.
-        """
+        """Call `write`; on an `OSError` warn about `what` and return False. Raises if the run was removed or taken."""
         if not self.run.status_file.exists():
             raise ArtifactError(
                 f"{self.run.path}: was removed during training, so nothing can be saved; start a new training"
@@ -85,10 +82,7 @@ class Checkpoints:
         return time.monotonic() >= self._next_s
 
     def save(self) -> bool:
-        """Write the last policy and a checkpoint; False, with a warning, if they cannot be written.
-
-        Raises `DivergedError` if a learned number is not finite.
-        """
+        """Write the last policy and a checkpoint; False, with a warning, if that failed. Raises `DivergedError`."""
         check_finite(self._learner.model, self.run.path)
         self._learner.progress.seconds = self._learner.seconds
         began = time.monotonic()
@@ -118,10 +112,7 @@ class Checkpoints:
         self.saved_step = policy.info.training_steps
 
     def restore(self, checkpoint: Checkpoint, changed: Sequence[str]) -> str:
-        """Restore model and environments; return a message about how exactly the training is resumed.
-
-        `changed` holds the reasons known so far why it cannot be exact.
-        """
+        """Restore a checkpoint; return a message with the reasons, `changed` and others, why it is not exact."""
         file = checkpoint.folder / "policy.safetensors"
         info = PolicyFile.read_info(file)
         info.check_fits(self._learner.curriculum.goal, file)
@@ -136,10 +127,7 @@ class Checkpoints:
         return f"resuming at step {checkpoint.state.step:,}, {exactness}"
 
     def cut_back(self, step: int) -> list[str]:
-        """Return the run folder to its state at the checkpoint of a step; return warnings.
-
-        Later table rows and episodes of later evaluations are removed, later checkpoints are set aside.
-        """
+        """Return the run folder to its state at a step; return warnings. Later checkpoints are set aside."""
         for folder in self.run.checkpoints():
             if int(folder.name) > step:
                 files.set_aside(folder)

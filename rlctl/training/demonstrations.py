@@ -48,11 +48,7 @@ class Demonstration:
 
 
 def read_demonstrations(path: Path, task: str, env: EnvInfo) -> list[Demonstration]:
-    """Read an episode (.npz), a folder of them, or the folder of a LeRobot or Minari dataset; leave out failures.
-
-    Raises `ArtifactError` for what is missing or damaged, does not fit the task's spaces, or is not finite, and if no
-    episode succeeded; `UsageError` for a missing extra.
-    """
+    """Read an episode (.npz), a folder of them, or the folder of a LeRobot or Minari dataset; leave out failures."""
     episodes = _read(path, task)
     useful = [episode for episode in episodes if episode.success is not False and len(episode.actions)]
     if not useful:

@@ -41,11 +41,7 @@ class EvaluationEpisodes:
         self._latest: list[RecordedEpisode] = []
 
     def play(self, policy: PolicyFile, check: Callable[[], None], *, unseen: int | None = None) -> list[Episode]:
-        """Play the episodes of every evaluation, or `unseen` new ones; return them.
-
-        `check` is called several times a second and may raise to stop. Raises `TaskError` if an environment fails;
-        the next call uses new environments.
-        """
+        """Play and return the episodes of every evaluation, or `unseen` new ones; `check` may raise to stop."""
         settings = self._recipe.eval
         workers = self._workers = self._workers or self._make_workers()
         usual = settings.episodes
@@ -87,10 +83,7 @@ class EvaluationEpisodes:
         return recordings
 
     def keep_failed(self, error: RlctlError, spec: EnvSpec, evaluated_at: int | None = None) -> RlctlError:
-        """Save the actions of a failed episode, if known; return the error with a hint that names the file.
-
-        The episode was played in `spec`, in training or, at step `evaluated_at`, in an evaluation.
-        """
+        """Save the actions of a failed episode of `spec`, if known; return the error with a hint at the file."""
         if not isinstance(error, EpisodeFailed) or error.actions is None:
             return error
         info = EpisodeInfo(
@@ -117,10 +110,7 @@ class EvaluationEpisodes:
 
 
 class Evaluator:
-    """Evaluates the policy of a learner and keeps the best one, without any effect on the training.
-
-    Its methods call `check` several times a second while episodes are played; it may raise to stop them.
-    """
+    """Evaluates the policy of a learner and keeps the best one; `check` may raise at any time to stop the episodes."""
 
     def __init__(
         self, learner: Learner, episodes: EvaluationEpisodes, checkpoints: Checkpoints, display: Display
@@ -135,10 +125,7 @@ class Evaluator:
         self._reported_findings: set[str] = set()
 
     def restore(self) -> None:
-        """Read the best score from the best policy's file, which may be newer than the checkpoint.
-
-        Shows a warning if the file is missing although there were evaluations.
-        """
+        """Read the best score from the best policy's file, which may be newer than the checkpoint."""
         rows = read_table(self._checkpoints.run.evals_file)
         self._highest_success = max((row["success"] for row in rows if row["success"] is not None), default=0.0)
         try:
@@ -153,10 +140,7 @@ class Evaluator:
         return steps >= progress.next_eval or (self._learner.is_at_end and progress.last_eval < steps)
 
     def evaluate(self, check: Callable[[], None]) -> dict[str, Any]:
-        """Play the evaluation episodes, save the best policy, and write the row and the episodes; return the row.
-
-        If an environment fails, this evaluation is lost, the row is empty and the training continues.
-        """
+        """Play, save the best policy, write the row and the episodes; return the row, empty after a failure."""
         row: dict[str, Any] = {}
         steps, progress = self._learner.steps, self._learner.progress
         policy = self._learner.pack()

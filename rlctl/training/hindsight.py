@@ -20,10 +20,7 @@ _LEARNING_STARTS = 100  # SB3's own default, of every algorithm
 
 
 def replay_arguments(recipe: Recipe, her: Hindsight, env: EnvInfo) -> dict[str, Any]:
-    """Return SB3's arguments for the replay buffer, and a `learning_starts` after every first episode.
-
-    Raises `RecipeError` for an environment without goals, and for settings that hindsight excludes.
-    """
+    """Return SB3's arguments for the replay buffer; raises `RecipeError` for what hindsight excludes."""
     _check_goals(env)
     if recipe.reward_weights or any(stage.reward_weights for stage in recipe.stages):
         raise RecipeError("her: compute_reward does not use the recipe's reward_weights; remove her or reward_weights")

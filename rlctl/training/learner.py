@@ -28,10 +28,7 @@ from rlctl.training.status import Progress
 
 
 class Curriculum:
-    """The stages of a training; without any, no stage is ever due.
-
-    Its state is in `progress`, which checkpoints keep.
-    """
+    """The stages of a training, with their state in `progress`; without any, no stage is ever due."""
 
     def __init__(self, stages: Sequence[Stage], specs: Sequence[EnvSpec], goal: EnvInfo, progress: Progress) -> None:
         self.stages = stages
@@ -143,11 +140,7 @@ class Learner:
 
 
 def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
-    """Build an environment of every stage, one after the other; return the description of the last stage's.
-
-    `workers` have the first stage. Raises `RecipeError` or `TaskError` with the number of a stage that cannot be
-    built, and `RecipeError` if a stage's spaces or reward terms differ from the first's.
-    """
+    """Build an environment of every stage; raise an error if it differs from that of the first; return the last."""
     first = info = workers.info
     for number, spec in enumerate(specs[1:], start=2):
         where = f"stage {number} of {len(specs)}"

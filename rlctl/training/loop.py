@@ -33,10 +33,7 @@ class TrainingLoop:
         learner.start_clock()
 
     def run(self) -> None:
-        """Play and learn until the recipe's steps are done, or two evaluations in a row reach its `stop_success`.
-
-        Raises `Interrupted` after a signal, when the state is saved.
-        """
+        """Play and learn until the training is done. Raises `Interrupted` after a signal, when the state is saved."""
         learner = self.learner
         if learner.recipe.stages:
             self._display.stage(learner.curriculum.title)
@@ -54,10 +51,7 @@ class TrainingLoop:
             raise
 
     def boundary(self) -> bool:
-        """Do what is due between two updates; return whether the training is done.
-
-        Raises `ArtifactError` if the final state cannot be saved.
-        """
+        """Do what is due between two updates; return whether the training is done."""
         learner = self.learner
         finished = self._metrics.collect_finished_episodes()
         if learner.steps == 0:

@@ -136,10 +136,7 @@ def _measure_exploration(space: spaces.Space[Any], entropy_loss: Any) -> float |
 
 
 def _read_value(last: LastSteps | None, log: Mapping[str, Any]) -> float | None:
-    """Return the critic's mean value over a rollout, or over the minibatches of an off-policy update.
-
-    The off-policy actor's loss is minus this value; SAC's includes the entropy bonus.
-    """
+    """Return the critic's mean value. The off-policy actor's loss is minus it; SAC's includes the entropy bonus."""
     if last is not None and last.values is not None:
         return float(last.values.mean())
     loss = log.get("train/actor_loss")
@@ -205,10 +202,7 @@ def estimate_values(model: BaseAlgorithm, last: LastSteps) -> NDArray[Any]:
 def training_row(
     recent: Sequence[EpisodeResult], weights: Mapping[str, float], log: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the means of recent episodes, and the values that SB3 logged in the last update.
-
-    `weights` are the weights of the reward terms; missing values are None.
-    """
+    """Return the means of recent episodes, and what SB3 logged in the last update; `weights` name the reward terms."""
     means, metrics = mean_terms(recent), mean_metrics(recent)
     return {
         "acting": _mean(episode.acting for episode in recent),

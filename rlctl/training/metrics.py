@@ -98,10 +98,7 @@ _COMPARED = ("eval/success_rate", "eval/mean_reward", "eval/mean_ep_length")
 
 
 class _EventFile(TensorBoardOutputFormat):
-    """Writes each event immediately; errors of TensorBoard's own writer, which uses a thread, cannot be caught.
-
-    After a write that failed it starts a new file.
-    """
+    """Writes each event at once: errors of TensorBoard's own thread cannot be caught. Then it starts a new file."""
 
     def __init__(self, folder: Path, warn: Callable[[str], None]) -> None:
         self._folder = folder

@@ -18,8 +18,7 @@ class OffPolicyRollouts(Rollouts):
     """Plays `train_freq` steps, a chunk, into the replay buffer.
 
     With `overlap` workers play a chunk while the updates for the previous chunk are computed, so the acting policy is
-    one chunk older than without. The order depends on steps only and repeats exactly. The updates for the last chunk
-    stay due at the end; a run that is made longer does them while its next chunk is played.
+    one chunk older than without. At the end the updates for the last chunk stay due: a longer run does them first.
     """
 
     def __init__(self, model: Any, env: WorkerVecEnv, recipe: Recipe, progress: Progress) -> None:

@@ -32,10 +32,7 @@ def has_own_parts(policy: Any) -> bool:
 
 
 def check_policy_class(model: Any, algo: str, policy: PolicyFile) -> None:
-    """Raise `RecipeError` if a user's policy class acts otherwise than its exported graph and SB3's heads.
-
-    `policy` is the packed policy of `model`.
-    """
+    """Raise `RecipeError` if a user's policy class acts differently from its exported graph, packed as `policy`."""
     network, name = model.policy, type(model.policy).__name__
     space = policy.info.env.spaces()[0]
     space.seed(0)
@@ -58,11 +55,7 @@ def check_policy_class(model: Any, algo: str, policy: PolicyFile) -> None:
 
 
 def write_graph(model: Any, algo: str, raw_space: spaces.Space[Any]) -> Tensors:
-    """Return the graph of a model's own network as a tensor of a policy file; empty for SB3's networks.
-
-    `raw_space` is the observation space of the environment. Raises `RecipeError` if the network fails, or returns
-    another shape than it says.
-    """
+    """Return the graph of a user's own network, as a tensor of a policy file; empty for SB3's networks."""
     policy = model.policy
     if not has_own_parts(policy):
         return {}
@@ -161,11 +154,10 @@ def _take_weights_out(graph: Any, actor: _Actor) -> None:
         begin = next((begin for begin in actor.prefixes if tensor.name.startswith(begin)), None)
         if begin is not None:
             renamed[tensor.name] = f"policy/{actor.prefixes[begin]}{tensor.name.removeprefix(begin)}"
-    constants = [tensor for tensor in graph.initializer if tensor.name not in renamed]
-    names_of_constants = {tensor.name for tensor in constants}
-    inputs = [port for port in graph.input if port.name not in names_of_constants]
+    constants = {tensor.name: tensor for tensor in graph.initializer if tensor.name not in renamed}
+    inputs = [port for port in graph.input if port.name not in constants]
     del graph.initializer[:], graph.input[:]
-    graph.initializer.extend(constants)
+    graph.initializer.extend(constants.values())
     graph.input.extend(inputs)
     for port in graph.input:
         port.name = renamed.get(port.name, port.name)

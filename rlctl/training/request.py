@@ -45,10 +45,7 @@ class TrainResult:
 
 
 def run_training(request: TrainRequest) -> TrainResult:
-    """Train or resume; returns when the training is done.
-
-    Raises `Interrupted` after a signal, and `TaskError` if evaluations failed.
-    """
+    """Train or resume to the end. Raises `Interrupted` after a signal, and `TaskError` if evaluations failed."""
     with StopSignals() as signals, find_start(request) as start:
         if start.run is not None and start.checkpoint is not None and start.checkpoint.state.progress.done:
             return _report_finished(start, start.run, start.checkpoint.state.progress)

@@ -29,8 +29,7 @@ class Rollouts(abc.ABC):
     """Replaces the loop in SB3's `learn`, which would query the policy at every step."""
 
     overlap = False  # whether a segment is played while the model learns from earlier ones
-    is_trained = False
-    """Whether the policy begins trained; then it plays the steps before the first update, else actions are random."""
+    is_trained = False  # whether the policy begins trained; then it plays the steps before the first update, too
 
     def __init__(self, model: Any, env: WorkerVecEnv, recipe: Recipe, progress: Progress) -> None:
         self.model = model
@@ -39,8 +38,7 @@ class Rollouts(abc.ABC):
         self._progress = progress
         self._learner = choose_learner(model)
         self._policy_info: PolicyInfo | None = None
-        self.rehearse: Callable[[int], None] = lambda updates: None
-        """Called after so many off-policy updates; see `rlctl.training.demonstrations`."""
+        self.rehearse: Callable[[int], None] = lambda updates: None  # called after so many off-policy updates
 
     def begin(self, total_timesteps: int) -> None:
         """Prepare the model to learn up to a step; start the first episodes of a new training."""
@@ -70,14 +68,11 @@ class Rollouts(abc.ABC):
 
     def acting_statistics(self) -> Statistics:
         """Return a copy of the statistics; before the first segment has ended, mean 0 and variance 1."""
-        statistics = {}
-        for key, rms in observation_statistics(self.model.get_vec_normalize_env()).items():
-            mean, var = rms.mean.copy(), rms.var.copy()
-            # A few resets vary too little: dividing by their deviation would give huge values.
-            statistics[key] = (
-                (mean, var) if self.model.num_timesteps or self.is_trained else (np.zeros_like(mean), np.ones_like(var))
-            )
-        return statistics
+        statistics = observation_statistics(self.model.get_vec_normalize_env())
+        if self.model.num_timesteps or self.is_trained:
+            return {key: (rms.mean.copy(), rms.var.copy()) for key, rms in statistics.items()}
+        # A few resets vary too little: dividing by their deviation would give huge values.
+        return {key: (np.zeros_like(rms.mean), np.ones_like(rms.var)) for key, rms in statistics.items()}
 
     def send_policy(self, statistics: Statistics) -> None:
         """Send the current weights and statistics to the workers."""

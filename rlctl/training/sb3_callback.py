@@ -5,8 +5,6 @@ import inspect
 from collections.abc import Iterator
 from typing import Any
 
-from stable_baselines3.common.callbacks import BaseCallback
-
 from rlctl.environments.dict_spaces import join
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.training.callbacks import Callback, Training
@@ -17,12 +15,9 @@ _WATCHED = ("learning_rate", "lr_schedule", "clip_range", "ent_coef", "vf_coef",
 
 
 class Sb3Callback(Callback):
-    """Calls a callback of Stable-Baselines3 after each segment and its updates, once per step of all environments.
+    """Calls a callback of Stable-Baselines3 after each segment and its updates, once per step of all environments."""
 
-    What it logs goes to TensorBoard. If `on_step` returns False the training ends at this boundary.
-    """
-
-    def __init__(self, callback: BaseCallback) -> None:
+    def __init__(self, callback: Any) -> None:
         self._callback = callback
         self._model: Any = None
         self._episodes: collections.deque[dict[str, float]] = collections.deque(maxlen=100)
@@ -58,16 +53,12 @@ class Sb3Callback(Callback):
         """Return the variables of SB3's loop that callbacks read; observations and rewards are not normalised."""
         timeouts = segment.truncated[:, step] & ~segment.terminated[:, step]
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(timeout)} for timeout in timeouts]
-        for episode in segment.ended:
-            if episode.row == step:
-                info = infos[episode.env]
-                info["episode"] = {"r": episode.total_reward, "l": episode.length, "t": 0.0}
-                info["terminal_observation"] = join(
-                    {key: rows[episode.env, step] for key, rows in segment.final.items()}
-                )
-                if episode.success is not None:
-                    info["is_success"] = episode.success
-                self._episodes.append(info["episode"])
+        for episode in (episode for episode in segment.ended if episode.row == step):
+            final = join({key: rows[episode.env, step] for key, rows in segment.final.items()})
+            result = {"r": episode.total_reward, "l": episode.length, "t": 0.0}
+            success = {} if episode.success is None else {"is_success": episode.success}
+            infos[episode.env] |= {"episode": result, "terminal_observation": final, **success}
+            self._episodes.append(result)
         buffer = "rollout_buffer" if hasattr(self._model, "rollout_buffer") else "replay_buffer"
         return {
             "self": self._model,
@@ -110,12 +101,16 @@ class Sb3Callback(Callback):
                 setattr(owners[owner], name, value)
 
 
-def _list_nested(value: Any) -> list[BaseCallback]:
-    items = value if isinstance(value, list) else [value]
-    return [item for item in items if isinstance(item, BaseCallback)]
+def is_of_sb3(cls: type) -> bool:
+    """Return whether a class is a callback of Stable-Baselines3, which is not imported for this."""
+    return any(base.__module__ == "stable_baselines3.common.callbacks" for base in cls.__mro__)
 
 
-def _walk(callback: BaseCallback, path: str) -> Iterator[tuple[str, BaseCallback]]:
+def _list_nested(value: Any) -> list[Any]:
+    return [item for item in (value if isinstance(value, list) else [value]) if is_of_sb3(type(item))]
+
+
+def _walk(callback: Any, path: str) -> Iterator[tuple[str, Any]]:
     yield path, callback
     for name, value in vars(callback).items():
         if name not in _REFERENCES:

@@ -8,19 +8,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from rlctl import output
-from rlctl.environments import registry
 from rlctl.errors import RlctlError, UsageError
 from rlctl.evaluation.group import GroupScore, as_json, evaluate_group
 from rlctl.evaluation.request import EvalRequest
-from rlctl.recipe.sources import resolve
 from rlctl.run.directory import RunLock
 from rlctl.run.group import Group, create_group, parse_seeds, read_group
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
-from rlctl.training.start import check_arguments, preserve_process_state
-from rlctl.training.tracking import check_installed
+from rlctl.training.start import check_arguments, find_start
 from rlctl.training.trainings import MakeTrainings, Trainings, make_local_trainings
-from rlctl.training.warm_start import find_source
 
 
 class SeedsFailed(RlctlError):
@@ -61,8 +57,7 @@ def train_seeds(
     """Train a request with several seeds, or resume its group; then evaluate the best policy of each seed.
 
     At most `jobs` train at a time; `make_trainings` decides where. Finished seeds are not trained again, and a seed
-    that fails does not stop the others. Raises `UsageError` for invalid seeds, `RecipeError` for an invalid recipe, and
-    `Interrupted` after a signal, when all have saved their checkpoints.
+    that fails does not stop the others. Raises `Interrupted` after a signal, when all have saved their checkpoints.
     """
     if seeds is not None:
         group, resume = _begin(request, seeds), TrainRequest()
@@ -76,7 +71,6 @@ def train_seeds(
 def _train(
     group: Group, resume: TrainRequest, jobs: int | None, episodes: int, make_trainings: MakeTrainings
 ) -> SeedsResult:
-    """Train the unfinished seeds of a group; `resume` has the arguments that change."""
     requests = {seed: _make_request(group, seed, resume) for seed in group.seeds if _is_waiting(group, seed, resume)}
     trainings = make_trainings(group.path, str(group.request.task), len(requests), jobs)
     _print_start(group, len(requests), trainings)
@@ -97,25 +91,17 @@ def _begin(request: TrainRequest, seeds: str) -> Group:
         raise UsageError("--seeds starts a new group: give TASK and leave out --resume")
     if "seed" in request.settings:
         raise UsageError("--seeds and --seed exclude each other")
-    check_arguments(request)
     numbers = parse_seeds(seeds)
-    with preserve_process_state():
-        registry.load(request.task)
-    recipe = resolve(request.task, request.config, request.settings)
-    check_installed(recipe)
-    if request.initial_policy is not None:
-        find_source(request.initial_policy, recipe)
+    find_start(request)
     return create_group(request, numbers)
 
 
 def _print_start(group: Group, waiting: int, trainings: Trainings) -> None:
     done = len(group.seeds) - waiting
-    note = f"{group.path}: {output.format_count(len(group.seeds), 'seed')}"
-    if waiting:
-        note += f"{f', {done} done' if done else ''}, {trainings.describe()}"
-    else:
-        note += ", all done: nothing to train; to train longer, give -n"
-    output.print_notes([note])
+    state = f"{f'{done} done, ' if done else ''}{trainings.describe()}"
+    if not waiting:
+        state = "all done: nothing to train; to train longer, give -n"
+    output.print_notes([f"{group.path}: {output.format_count(len(group.seeds), 'seed')}, {state}"])
 
 
 def _make_request(group: Group, seed: int, resume: TrainRequest) -> TrainRequest:

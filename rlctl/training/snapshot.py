@@ -110,10 +110,7 @@ def _array(tensor: torch.Tensor) -> NDArray[Any]:
 
 
 def flatten(value: Any, path: str) -> tuple[Tensors, Any]:
-    """Split nested dicts and lists into tensors by path, and JSON that refers to them.
-
-    Raises `TypeError` for anything that is not plain data.
-    """
+    """Split nested dicts and lists into tensors by path, and JSON that refers to them; `TypeError` for others."""
     if isinstance(value, torch.Tensor):
         return {path: _array(value)}, {"tensor": path}
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":

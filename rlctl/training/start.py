@@ -27,14 +27,13 @@ from rlctl.run import lookup
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
-from rlctl.training.callbacks import Callback, call_callback
+from rlctl.training.callbacks import Callback, Sb3Callback, call_callback, is_of_sb3
 from rlctl.training.tracking import check_installed
 from rlctl.training.warm_start import find_source
 
 if TYPE_CHECKING:
     from rlctl.training.checkpoint import Checkpoint
 
-_OF_SB3 = "stable_baselines3.common.callbacks"
 _NO_CALLBACK = "neither a rlctl.Callback nor a BaseCallback of Stable-Baselines3"
 _DEMONSTRATIONS = (".npz", ".parquet", ".hdf5", ".arrow", ".json")  # suffixes of files
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
@@ -192,9 +191,7 @@ def _load_callback(name: str, arguments: Mapping[str, Any]) -> Callback:
     if not _may_be_called(constructor):
         raise RecipeError(f"callbacks: {name}: {_NO_CALLBACK}, or a function of your own file that returns one")
     callback: Any = call_callback(name, lambda: constructor(**arguments))
-    if _OF_SB3 in (base.__module__ for base in type(callback).__mro__):
-        from rlctl.training.sb3_callback import Sb3Callback
-
+    if is_of_sb3(type(callback)):
         return Sb3Callback(callback)
     if isinstance(callback, Callback):
         return callback
@@ -204,7 +201,7 @@ def _load_callback(name: str, arguments: Mapping[str, Any]) -> Callback:
 def _may_be_called(constructor: Any) -> bool:
     # A recipe may come from somebody else: it must not call `os:system`.
     if inspect.isclass(constructor):
-        return any(base is Callback or base.__module__ == _OF_SB3 for base in constructor.__mro__)
+        return issubclass(constructor, Callback) or is_of_sb3(constructor)
     return inspect.isfunction(constructor) and named_task.is_own_file(Path(inspect.getfile(constructor)))
 
 

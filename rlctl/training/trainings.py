@@ -85,10 +85,7 @@ class Trainings:
         receive: Callable[[str], None],
         is_hopeless: Callable[[], bool] | None = None,
     ) -> int:
-        """Train in a child process that ends with this one; return its exit code. `receive` gets its output lines.
-
-        `is_hopeless` is called twice a second; True stops the training with a checkpoint.
-        """
+        """Train in a child process; return its exit code. `is_hopeless` is called twice a second; True stops it."""
         if self.stopped_by is not None:
             return 0
         return self._execute(request, receive, self._make_next_signal(is_hopeless))
@@ -133,10 +130,7 @@ def train_in_child(
     command: Sequence[str] | None = None,
     env: Mapping[str, str] | None = None,
 ) -> int:
-    """Train in a child process that ends with this one; return its exit code, 128 + N after signal N.
-
-    `receive` gets its output lines. Any exception from `next_signal` kills the process and is raised.
-    """
+    """Train in a child process that ends with this one; return its exit code, 128 + N after signal N."""
     reader = LineReader(receive)
     child = ChildProcess(
         "rlctl.training.trainings:main",

@@ -18,25 +18,6 @@ from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
 
 
-class ActionHistory:
-    """Stores the actions of each environment's running episode; `episodes` are the actions so far, (steps, ...)."""
-
-    def __init__(self, episodes: Iterable[NDArray[Any]]) -> None:
-        self._parts = [[actions] for actions in episodes]
-
-    def add_segment(self, actions: NDArray[Any], ended: Iterable[tuple[int, int]]) -> None:
-        """Store a segment, shape (n_envs, steps, ...); `ended` are pairs (environment, row), ordered by row."""
-        last = dict(ended)
-        for env, rows in enumerate(actions):
-            if env in last:
-                self._parts[env] = []
-            self._parts[env].append(rows[last.get(env, -1) + 1 :].copy())
-
-    def of(self, env: int) -> NDArray[Any]:
-        """Return the actions of an environment's episode so far, shape (steps, ...)."""
-        return np.concatenate(self._parts[env])
-
-
 def _count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[Any]]) -> tuple[int, str]:
     """Count observations, shape (n_envs, steps, ...), outside their space; return also a message about one."""
     outside: Any = False  # later an array, one element per observation
@@ -62,12 +43,10 @@ class WorkerVecEnv(VecEnv):
         self.workers = workers
         self.run_seed = run_seed
         self.episodes_started = [0] * workers.n_envs  # per environment the number of episodes that have begun
-        self.history = ActionHistory(workers.arrays.segment.action[:, :0])  # the actions of the running episodes
-        self.outside, self.outside_message = 0, ""
-        """Number of observations outside their space since it was set to 0, and a message about one."""
+        self._actions: list[list[NDArray[Any]]] = []  # of the running episodes: by environment, in parts
+        self.outside, self.outside_message = 0, ""  # observations outside their space since it was set to 0
         self.ended: list[EpisodeResult] = []  # episodes that ended since the list was emptied
-        self.last_segment: SegmentArrays | None = None
-        """The last result of `finish`; the next segment overwrites its arrays."""
+        self.last_segment: SegmentArrays | None = None  # of `finish`; the next segment overwrites its arrays
         self.waited_s = 0.0  # time spent waiting for the environments to play [s], since it was set to 0
         self._steps = 0
         super().__init__(workers.n_envs, *workers.info.spaces())
@@ -83,19 +62,20 @@ class WorkerVecEnv(VecEnv):
             error.actions = []
             raise
         self.episodes_started = [number + 1 for number in self.episodes_started]
-        self.history = ActionHistory(self.workers.arrays.segment.action[:, :0])
+        self._actions = [[actions] for actions in self.workers.arrays.segment.action[:, :0]]
         return self.workers.observations()
 
-    def replay_actions(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
-        """Restore each environment's running episode by replaying its actions, shape (steps, ...) per environment.
+    def join_actions(self, env: int) -> NDArray[Any]:
+        """Return the actions of an environment's running episode so far, shape (steps, ...)."""
+        return np.concatenate(self._actions[env])
 
-        Return the environments whose episode ended too early, which happens only if they are not deterministic.
-        """
+    def replay_actions(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
+        """Restore running episodes by replaying their actions; return the environments whose episode ended early."""
         self.episodes_started = list(episodes_started)
         seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
         episodes = dict(enumerate(zip(seeds, actions, strict=True)))
         ended = self.workers.replay_actions(episodes, doing="replaying episodes", may_fail=True)
-        self.history = ActionHistory(actions)
+        self._actions = [[actions_of_episode] for actions_of_episode in actions]
         return ended
 
     def start(self, steps: int, exploration: Exploration) -> None:
@@ -114,9 +94,12 @@ class WorkerVecEnv(VecEnv):
             raise
         self.waited_s += time.monotonic() - began
         segment, steps = self.workers.arrays.segment, self._steps
-        for result in ended:
-            self.episodes_started[result.env] += 1
-        self.history.add_segment(segment.action[:, :steps], [(episode.env, episode.row) for episode in ended])
+        last_rows = {episode.env: episode.row for episode in ended}  # where the last episode of the segment ended
+        for episode in ended:
+            self.episodes_started[episode.env] += 1
+            self._actions[episode.env] = []
+        for env, actions in enumerate(segment.action[:, :steps]):
+            self._actions[env].append(actions[last_rows.get(env, -1) + 1 :].copy())
         self.ended += ended
         seen = {key: rows[:, 1 : steps + 1] for key, rows in segment.observation.items()}
         count, message = _count_outside(self.observation_space, seen)
@@ -130,7 +113,7 @@ class WorkerVecEnv(VecEnv):
         rows = int(arrays.inside[error.env, 2]) + 1
         if error.step <= rows:
             return arrays.segment.action[error.env, rows - error.step : rows].copy()
-        return np.concatenate([self.history.of(error.env), arrays.segment.action[error.env, :rows]])
+        return np.concatenate([self.join_actions(error.env), arrays.segment.action[error.env, :rows]])
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Raise `NotImplementedError`: workers play whole segments."""
@@ -147,7 +130,7 @@ class WorkerVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return `render_mode`, None per environment; raise `AttributeError` for other names."""
         if attr_name == "render_mode":
-            return [None for _ in self._get_indices(indices)]
+            return [None] * self.num_envs
         raise AttributeError(f"worker environments do not hand out attributes: {attr_name}")
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:

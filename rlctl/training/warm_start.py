@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pydantic_core import to_jsonable_python
+
 from rlctl.environments import installed
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import UsageError
@@ -18,11 +20,7 @@ _TARGETS = {"td3": ("actor.", "actor_target."), "ddpg": ("actor.", "actor_target
 
 
 def find_source(text: str, recipe: Recipe) -> dict[str, Any]:
-    """Find the policy to start with; return the entry `from` of `run.json`.
-
-    `text` is a run, a policy file, or the name of a task that ships a policy. Raises `UsageError` for an ONNX file, and
-    if the algorithm is not the recipe's.
-    """
+    """Find the policy of a run, a file, or a task that ships one; return the entry `from` of `run.json`."""
     if Path(text).suffix == ".onnx":
         raise UsageError(f"--from {text}: ONNX files cannot be trained further; give the run or its .safetensors file")
     ships = installed.find(text) is not None and not (Path(text) / "run.json").is_file()
@@ -33,12 +31,8 @@ def find_source(text: str, recipe: Recipe) -> dict[str, Any]:
             f"--from {file}: the policy was trained with {info.algo}, the recipe uses {recipe.algo}; "
             f"add --algo {info.algo}, or give another policy"
         )
-    return {
-        "policy": str(file.resolve()),
-        "task": info.spec.task,
-        "algo": info.algo,
-        "training_steps": info.training_steps,
-    }
+    source = {"policy": str(file.resolve()), "task": info.spec.task, "algo": info.algo}
+    return source | {"training_steps": info.training_steps}
 
 
 def load_source(source: Mapping[str, Any], model: Any, env: EnvInfo) -> str:
@@ -48,14 +42,13 @@ def load_source(source: Mapping[str, Any], model: Any, env: EnvInfo) -> str:
     """
     file = Path(source["policy"])
     policy = PolicyFile.read(file)
-    info, weights = policy.info, policy.weights
+    info = policy.info
     info.check_fits(env, file)
-    _check_network(file, info, model, weights)
-    whole = len(policy.actor_only().tensors) < len(policy.tensors)
-    _load_weights(info, model, weights)
+    _check_network(file, info, model, policy.weights)
+    _load_weights(info, model, policy.weights)
     _load_normalization(file, info, model, policy.tensors)
     text = f"starts from {file} ({info.algo}, {info.training_steps:,} steps on {info.spec.task})"
-    if whole:
+    if len(policy.actor_only().tensors) < len(policy.tensors):
         return f"{text}: its actor, critic and normalisation"
     return (
         f"{text}: its actor and normalisation; it has no critic, so training starts with a new one, and the first "
@@ -67,23 +60,19 @@ def _check_network(file: Path, info: PolicyInfo, model: Any, weights: Mapping[st
     from rlctl.policy.torch_policy import describe_network
 
     ours = describe_network(model.policy)
-    network = {name: tuple(tensor.shape) for name, tensor in model.policy.state_dict().items()}
-    wrong = [name for name, tensor in weights.items() if network.get(name) != tensor.shape]
-    needed = list_actor_tensors(info.algo, [f"policy/{name}" for name in network])
-    wrong += [name for name in (key.removeprefix("policy/") for key in needed) if name not in weights]
+    network = {f"policy/{name}": tuple(tensor.shape) for name, tensor in model.policy.state_dict().items()}
+    given = {f"policy/{name}": tensor.shape for name, tensor in weights.items()}
+    wrong = [name for name, shape in given.items() if network.get(name) != shape]
+    wrong += [name for name in list_actor_tensors(info.algo, list(network)) if name not in given]
     keys = dict.fromkeys([*info.policy_kwargs, *ours]) if wrong else _SAME_FUNCTION
-    different = [key for key in keys if _as_plain(info.policy_kwargs.get(key)) != _as_plain(ours.get(key))]
-    if not wrong and not different:
-        return
+    values = {key: (info.policy_kwargs.get(key), ours.get(key)) for key in keys}
     parts = [
-        f"policy_kwargs.{key} is {info.policy_kwargs.get(key)} in the policy and {ours.get(key)} in the recipe"
-        for key in different
+        f"policy_kwargs.{key} is {theirs} in the policy and {own} in the recipe"
+        for key, (theirs, own) in values.items()
+        if to_jsonable_python(theirs) != to_jsonable_python(own)  # tuples are lists
     ]
-    raise UsageError(f"--from {file}: its network differs: {'; '.join(parts) or f'tensor {wrong[0]} differs'}")
-
-
-def _as_plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+    if wrong or parts:
+        raise UsageError(f"--from {file}: its network differs: {'; '.join(parts) or f'tensor {wrong[0]} differs'}")
 
 
 def _load_weights(info: PolicyInfo, model: Any, weights: Mapping[str, Any]) -> None:

@@ -48,8 +48,8 @@ class StepSearch:
         self._lock = threading.Lock()
         own = [trial for trial in tuning.trials if trial.step == number]
         self._begun = [trial for trial in own if trial.state == "begun"]
-        # The best trial so far also has values of these dimensions.
-        for trial in (best, *(trial for trial in own if trial.state != "begun")):
+        self._finished = [trial for trial in own if trial.state != "begun"]
+        for trial in (best, *self._finished):  # the best trial so far also has values of these dimensions
             self._add(trial)
 
     def _open_study(self) -> optuna.Study:
@@ -84,13 +84,12 @@ class StepSearch:
         return f"{registry.make_slug(tuning.task)} {', '.join(self._distributions)} {digest[:8]}"
 
     def count_waiting(self) -> int:
-        """Return the number of trials to train, including unfinished ones."""
+        """Return the number of trials to train, including unfinished ones; ask before the first begins."""
         sizes = [len(dimension.choices) or math.inf for dimension in self._dimensions]
         # The unchanged recipe, already trained, is the first trial of the first step.
         trials = self._tuning.trials_per_step - (self._number == 1)
         most = min(trials, math.prod(sizes) - 1)  # the best trial already has one combination
-        finished = [trial for trial in self._tuning.trials if trial.step == self._number and trial.state != "begun"]
-        return max(0, int(most) - len(finished))
+        return max(0, int(most) - len(self._finished))
 
     def run_next(self) -> None:
         """Train the next trial, and store its result."""
@@ -122,62 +121,52 @@ class StepSearch:
                 trial = Trial(len(self._tuning.trials), self._number, values)
                 self._tuning.trials.append(trial)
                 self._tuning.save()
-                asked.set_user_attr(_LABEL, self._label(trial))
+                asked.set_user_attr(_LABEL, f"{self._tuning.path.name}/{trial.number}")
                 return trial, asked
             # Do not train equal values twice: report the first result to Optuna.
             state = _STATES.get(known.state, TrialState.FAIL)
             self._study.tell(asked, known.score if state == TrialState.COMPLETE else None, state)
         return None
 
-    def _label(self, trial: Trial) -> str:
-        return f"{self._tuning.path.name}/{trial.number}"
-
     def _add(self, trial: Trial) -> None:
         """Add a finished trial to Optuna's study if its values are within the distributions."""
-        content, label, state = merge(self._recipe, nest(trial.values)), self._label(trial), _STATES[trial.state]
-        drawn = {
-            dimension.key: dimension.from_value(get_value(content, dimension.key)) for dimension in self._dimensions
-        }
+        content, state = merge(self._recipe, nest(trial.values)), _STATES[trial.state]
+        label = f"{self._tuning.path.name}/{trial.number}"
+        values = ((dimension, get_value(content, dimension.key)) for dimension in self._dimensions)
+        drawn = {dimension.key: dimension.from_value(value) for dimension, value in values}
         known = (asked.user_attrs.get(_LABEL) for asked in self._study.get_trials(deepcopy=False, states=(state,)))
         if None in drawn.values() or label in known:
             return
-        self._study.add_trial(
-            optuna.trial.create_trial(
-                state=state,
-                value=trial.score if state == TrialState.COMPLETE else None,
-                params=drawn,
-                distributions=self._distributions,
-                user_attrs={_LABEL: label},
-                intermediate_values=dict(enumerate(self._tuning.list_scores(trial))),
-            )
+        finished = optuna.trial.create_trial(
+            state=state,
+            value=trial.score if state == TrialState.COMPLETE else None,
+            params=drawn,
+            distributions=self._distributions,
+            user_attrs={_LABEL: label},
+            intermediate_values=dict(enumerate(self._tuning.list_scores(trial))),
         )
+        self._study.add_trial(finished)
 
 
 class _Pruning:
-    """Decides while a trial trains whether to stop it."""
+    """Decides while a trial trains whether to stop it; a resumed one, without `asked`, is never stopped."""
 
     def __init__(self, tuning: Tuning, trial: Trial, asked: optuna.Trial | None) -> None:
         self._tuning, self._trial, self._asked = tuning, trial, asked
-        self._reported = 0
-        self.decided = False
+        self._reported, self.decided = 0, False
 
     def is_hopeless(self) -> bool:
         """Report the evaluations since the last call; return whether to stop the trial."""
-        if self._asked is None:
-            return False
-        scores = self._tuning.list_scores(self._trial)
-        for number in range(self._reported, len(scores)):
-            self._asked.report(scores[number], number)
-            self.decided = self.decided or self._asked.should_prune()
-        self._reported = len(scores)
+        if self._asked is not None:
+            for score in self._tuning.list_scores(self._trial)[self._reported :]:
+                self._asked.report(score, self._reported)
+                self._reported += 1
+                self.decided = self.decided or self._asked.should_prune()
         return self.decided
 
 
 def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning | None = None) -> None:
-    """Train or resume a trial, and store how it ended; after a signal its state stays `begun`.
-
-    Without `pruning` raises `UsageError` as soon as an evaluation lacks the metric.
-    """
+    """Train or resume a trial, and store how it ended; without `pruning` an evaluation must have the metric."""
     lines: list[str] = []
 
     def lacks_metric() -> bool:
@@ -204,13 +193,11 @@ def train(tuning: Tuning, trial: Trial, trainings: Trainings, pruning: _Pruning 
         trial.problem = str(error)
         return
     with lock:
-        if code in (_KILLED, RunTaken.exit_code):
-            # The result is unknown: `tune --resume` trains it again.
+        if code in (_KILLED, RunTaken.exit_code):  # the result is unknown: `tune --resume` trains it again
             trial.problem = "killed by SIGKILL" if code == _KILLED else "another process trained it"
             return
         _note_end(tuning, trial, run, code, lines, pruned=pruning is not None and pruning.decided)
-        if run is not None:
-            # Nobody resumes these trainings, and their replay buffers are large; the policies stay.
+        if run is not None:  # nobody resumes these trainings, and their replay buffers are large; the policies stay
             files.remove_tree(run.checkpoint(0).parent)
 
 
@@ -224,9 +211,9 @@ def _note_end(
     """Store in a trial how its training ended; `lines` is its output."""
     trial.problem = ""
     if code == 0 and _has_finished(run):
-        trial.score = tuning.measure(trial)
-        trial.state = "done" if trial.score is not None else "failed"
-        trial.problem = "" if trial.score is not None else f"no evaluation reported {tuning.metric}"
+        trial.state, trial.score = "done", tuning.measure(trial)
+        if trial.score is None:
+            trial.state, trial.problem = "failed", f"no evaluation reported {tuning.metric}"
     elif pruned:
         trial.state, trial.score = "pruned", tuning.measure(trial)
     else:

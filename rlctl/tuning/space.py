@@ -115,10 +115,7 @@ def _parse_range(key: str, match: re.Match[str], text: str) -> Dimension:
 
 
 def list_usual_steps(recipe: Recipe) -> list[list[Dimension]]:
-    """Return the usual steps: learning rate; then rollout or n-step return, and minibatch; then discount.
-
-    Each is searched around the value that the recipe has.
-    """
+    """Return the usual steps, around the recipe's values: learning rate; n_steps and batch_size; gamma."""
     parameters = fill_parameters(recipe)
     return [
         [_vary_learning_rate(parameters["learning_rate"])],

@@ -17,8 +17,8 @@ from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.recipe.recipe import Recipe
 from rlctl.recipe.sources import find_config, resolve_with_stages
 from rlctl.run.directory import RunLock, create_group_folder
-from rlctl.training.start import preserve_process_state
-from rlctl.training.tracking import check_installed
+from rlctl.run.train_request import TrainRequest
+from rlctl.training.start import find_start, preserve_process_state
 from rlctl.training.trainings import MakeTrainings, make_local_trainings
 from rlctl.tuning.space import Dimension, fill_parameters, list_usual_steps, list_values, nest, parse_search
 from rlctl.tuning.tune_request import TuneRequest
@@ -50,9 +50,7 @@ def tune(
 
 
 def _begin(request: TuneRequest, task: str) -> Tuning:
-    with preserve_process_state():
-        recipe = resolve_with_stages(task, request.config, request.settings)
-    check_installed(recipe)
+    recipe = find_start(TrainRequest(task, config=request.config, settings=request.settings)).recipe
     if request.storage is not None:
         _check_storage(request.storage)
     steps = [parse_search(request.search)] if request.search else list_usual_steps(recipe)
@@ -84,7 +82,6 @@ def _check_storage(url: str) -> None:
 
 
 def _check(dimension: Dimension, task: str, request: TuneRequest) -> None:
-    """Raise `UsageError` for a key that cannot be searched, and `RecipeError` for a value that it cannot have."""
     first = dimension.key.partition(".")[0]
     if dimension.key in ("seed", "total_timesteps", "stop_success") or first in ("eval", "checkpoint"):
         raise UsageError(f"--search {dimension.key}: not a hyperparameter: it changes the measurement, not the policy")
@@ -134,18 +131,16 @@ def _warn_of_long_rollouts(recipe: Recipe) -> list[str]:
     if recipe.algo not in ON_POLICY or rollout * _FEWEST_EVALUATIONS <= recipe.total_timesteps:
         return []
     evaluations = output.format_count(math.ceil(recipe.total_timesteps / rollout), "evaluation")
-    return [
-        f"warning: a trial has only {evaluations}: they happen between rollouts of {rollout:,} steps "
-        "(n_steps x n_envs); make trials longer with -n"
-    ]
+    rollouts = f"rollouts of {rollout:,} steps (n_steps x n_envs)"
+    return [f"warning: a trial has only {evaluations}: they happen between {rollouts}; make trials longer with -n"]
 
 
 def _describe(tuning: Tuning, recipe: Recipe, where: str) -> str:
     names = "; then ".join(" and ".join(dimension.name for dimension in step) for step in tuning.steps)
-    trials, several = tuning.trials_per_step, len(tuning.steps) > 1
+    trials = output.format_count(tuning.trials_per_step, "trial")
+    if len(tuning.steps) > 1:
+        trials += f" each, {tuning.trials_per_step * len(tuning.steps):,} trainings in all,"
     return (
-        f"{tuning.path}: {names}; at most {output.format_count(trials, 'trial')} "
-        f"{f'each, {trials * len(tuning.steps):,} trainings in all, ' if several else ''}"
-        f"of {recipe.total_timesteps:,} steps, {where}; "
+        f"{tuning.path}: {names}; at most {trials} of {recipe.total_timesteps:,} steps, {where}; "
         "-n changes their length, --trials their number"
     )

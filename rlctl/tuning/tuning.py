@@ -186,10 +186,8 @@ def _list_cells(
 
 def as_json(tuning: Tuning, runs: dict[int, RunSummary]) -> dict[str, Any]:
     """Return every trial, with its run, as plain data."""
-    trials = [
-        {**dataclasses.asdict(trial), "run": runs[trial.number].path if trial.number in runs else None}
-        for trial in tuning.trials
-    ]
+    paths = {number: run.path for number, run in runs.items()}
+    trials = [{**dataclasses.asdict(trial), "run": paths.get(trial.number)} for trial in tuning.trials]
     best = tuning.best
     return {
         "task": tuning.task,

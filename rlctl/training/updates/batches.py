@@ -24,10 +24,7 @@ class Batch:
 
 
 def sample_batches(model: Any, network: Any, count: int, size: int) -> list[Batch]:
-    """Return `count` minibatches of `size` transitions, the same that SB3 would draw.
-
-    Features are what `network`, an actor or a Q-network of SB3, extracts from observations.
-    """
+    """Return `count` minibatches of `size` transitions, as SB3 would draw them; `network` extracts the features."""
     parts = _gather(model, count, size)
     features, next_features = (_extract(network, parts[name]) for name in ("observations", "next_observations"))
     batches = []

@@ -37,7 +37,8 @@ class _Layer:
 class MlpStack:
     """Perceptrons of equal shape: linear layers with an activation after each except the last.
 
-    Arrays have the shape (networks, batch, size). The weights stay those of the modules; they are on the CPU.
+    Arrays have the shape (networks, batch, size); inputs of shape (1, batch, size) are used by all networks. The weights
+    stay those of the modules.
     """
 
     def __init__(self, networks: Sequence[Iterable[nn.Module]]) -> None:
@@ -63,11 +64,7 @@ class MlpStack:
         return [*(layer.weight_gradient for layer in self._layers), *(layer.bias_gradient for layer in self._layers)]
 
     def run(self, inputs: Floats, use: str) -> list[Floats]:
-        """Return the inputs and the output of each layer.
-
-        Inputs of shape (1, batch, features) are used by all networks. The next run with the same `use` overwrites the
-        returned arrays.
-        """
+        """Return the inputs and the output of each layer. The next run with the same `use` overwrites these arrays."""
         values = [inputs, *self._get_buffers(use, inputs.shape[1])]
         for index, layer in enumerate(self._layers):
             output = values[index + 1]
@@ -91,10 +88,7 @@ class MlpStack:
             torch.from_numpy(values).relu_()  # a tenth of NumPy's time
 
     def backpropagate(self, values: list[Floats], gradient: Floats, *, latent: Floats | None = None) -> None:
-        """Set the gradients of the weights from the gradient of the outputs; `values` is the result of `run`.
-
-        `latent` is a gradient of the last hidden layer's values that is added to the one that comes from the outputs.
-        """
+        """Set the weights' gradients from the outputs' gradient, and from `latent`, of the last hidden layer."""
         ones = np.ones((1, gradient.shape[1]), np.float32)
         hidden = self._get_buffers("gradients", gradient.shape[1])
         for index in reversed(range(len(self._layers))):
@@ -199,10 +193,7 @@ _WORTHWHILE = 8_000_000  # multiplications per forward pass from which a second 
 
 
 class SideBySide:
-    """Runs the first of several calls on this thread and the others on a second one.
-
-    For small networks or on one core all run on this thread. The results are bit-exact either way.
-    """
+    """Runs calls on two threads, for small networks or on one core on one; the results are bit-exact either way."""
 
     def __init__(self, networks: Sequence[Iterable[nn.Module]], batch_size: int) -> None:
         smallest = min(count_weights(network) for network in networks)

@@ -63,10 +63,7 @@ class SquashedGaussianActor:
         return plain and len(actor.latent_pi) > 0 and is_mlp(_list_modules(actor))
 
     def sample(self, features: Floats, use: str) -> Sample:
-        """Draw actions for features, shape (batch, features); with gSDE by the matrix that was drawn last.
-
-        The next sample for the same `use` overwrites the `values` of this one.
-        """
+        """Draw actions for features, shape (batch, features); the next with the same `use` overwrites its `values`."""
         values = self._network.run(features[None], use)
         latent, mean = values[-2][0], values[-1][0, :, : self._count]
         if self._actor.use_sde:
