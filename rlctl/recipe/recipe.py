@@ -72,7 +72,7 @@ class EvalSettings(Section):
 
 
 class Hindsight(Section):
-    """Hindsight experience replay, by the names of SB3's `HerReplayBuffer`; see `rlctl.training.hindsight`."""
+    """Hindsight experience replay, by the names of SB3's `HerReplayBuffer`; see `rlctl.training.off_policy`."""
 
     n_sampled_goal: Whole = Field(4, ge=1, le=1000)
     """Relabelled transitions per real transition."""

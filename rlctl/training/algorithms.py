@@ -18,7 +18,7 @@ from rlctl.policy.own_modules import import_named
 from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
 from rlctl.recipe.recipe import ON_POLICY, NormalizeSettings, Recipe
 from rlctl.storage.untrusted import measure_free_memory
-from rlctl.training.hindsight import replay_arguments
+from rlctl.training.off_policy import replay_arguments
 from rlctl.training.own_networks import check_policy_class, write_graph
 from rlctl.training.snapshot import pack
 from rlctl.training.vec_env import WorkerVecEnv

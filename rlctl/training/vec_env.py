@@ -1,7 +1,7 @@
 """The worker environments as a VecEnv of Stable-Baselines3."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np

@@ -16,9 +16,8 @@ from rlctl.rollout.workers import Workers
 from rlctl.run.train_request import TrainRequest
 from rlctl.training import checkpoint
 from rlctl.training.algorithms import build_model
-from rlctl.training.hindsight import replay_arguments
 from rlctl.training.learner import begin_next_episodes
-from rlctl.training.off_policy import OffPolicyRollouts
+from rlctl.training.off_policy import OffPolicyRollouts, replay_arguments
 from rlctl.training.request import run_training
 from rlctl.training.status import Progress
 from rlctl.training.vec_env import WorkerVecEnv

@@ -37,7 +37,7 @@ class _Layer:
 class MlpStack:
     """Perceptrons of equal shape: linear layers with an activation after each except the last.
 
-    Arrays have the shape (networks, batch, size); inputs of shape (1, batch, size) are used by all networks. The weights
+    Arrays have the shape (networks, batch, size); inputs of shape (1, batch, size) are used by all. The weights
     stay those of the modules.
     """
 
