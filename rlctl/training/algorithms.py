@@ -20,8 +20,8 @@ from rlctl.recipe.recipe import ON_POLICY, NormalizeSettings, Recipe
 from rlctl.storage.untrusted import measure_free_memory
 from rlctl.training.off_policy import replay_arguments
 from rlctl.training.own_networks import check_policy_class, write_graph
+from rlctl.training.rollouts import WorkerVecEnv
 from rlctl.training.snapshot import pack
-from rlctl.training.vec_env import WorkerVecEnv
 
 # The system provides a replay buffer's memory only when it is written, so one that is too large fails hours later.
 _FLOAT32 = 4  # [bytes]

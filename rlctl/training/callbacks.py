@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from rlctl.training.snapshot import Tensors
 
 _SCHEDULES = {"learning_rate": "lr_schedule", "clip_range": "clip_range"}  # attribute of SB3's model by parameter
-_NUMBERS = ("ent_coef", "vf_coef")
-"""Parameters that PPO and A2C read at each update; SAC reads its `ent_coef` only at the start."""
+_NUMBERS = ("ent_coef", "vf_coef")  # PPO and A2C read them at each update; SAC reads its `ent_coef` only at the start
+_REFERENCES = ("model", "locals", "globals", "parent", "pbar")  # attributes of SB3's callbacks that are no state
+_WATCHED = ("learning_rate", "lr_schedule", "clip_range", "ent_coef", "vf_coef", "target_kl", "gamma", "tau")
+"""Attributes of the model that a callback of SB3 may replace; checkpoints store only those that are plain data."""
 
 
 class Training:
@@ -190,11 +192,6 @@ class Callbacks:
             call_callback(name, functools.partial(callback.load_state_dict, state), "load_state_dict: ")
         self._training.apply_parameters()
         return [entry["inexact"] for entry in entries if entry.get("inexact")]
-
-
-_REFERENCES = ("model", "locals", "globals", "parent", "pbar")  # attributes that are no state
-_WATCHED = ("learning_rate", "lr_schedule", "clip_range", "ent_coef", "vf_coef", "target_kl", "gamma", "tau")
-"""Attributes of the model that a callback may replace; checkpoints store only those that are plain data."""
 
 
 class Sb3Callback(Callback):

@@ -29,9 +29,9 @@ from rlctl.training import replay_segments, snapshot
 from rlctl.training.callbacks import Callbacks
 from rlctl.training.learner import begin_next_episodes
 from rlctl.training.replay_segments import ReplaySegments, Segment
+from rlctl.training.rollouts import WorkerVecEnv
 from rlctl.training.snapshot import Tensors
 from rlctl.training.status import Progress
-from rlctl.training.vec_env import WorkerVecEnv
 from rlctl.version import collect_versions
 
 FORMAT = 1

@@ -19,9 +19,8 @@ from rlctl.errors import RecipeError
 from rlctl.policy.file import DETERMINISTIC
 from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import Hindsight, Recipe
-from rlctl.training.rollouts import Check, Rollouts, to_network_layout
+from rlctl.training.rollouts import Check, Rollouts, WorkerVecEnv, to_network_layout
 from rlctl.training.status import Progress
-from rlctl.training.vec_env import WorkerVecEnv
 
 
 class OffPolicyRollouts(Rollouts):

@@ -1,24 +1,163 @@
-"""Base class of rollouts: workers play with the model's policy, and the model learns from the segments.
+"""Worker environments as a VecEnv of Stable-Baselines3, and the base class of rollouts, which play and learn with them.
 
 The normalisation statistics are constant while a segment is played, and are updated after it.
 """
 
 import abc
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
 
+from rlctl.environments.dict_spaces import split_space
+from rlctl.errors import EpisodeFailed
 from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import Recipe
+from rlctl.rollout.messages import EpisodeResult, Play
+from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SegmentArrays
+from rlctl.rollout.workers import Workers
 from rlctl.training.own_networks import write_graph
 from rlctl.training.snapshot import observation_statistics, pack
 from rlctl.training.status import Progress
 from rlctl.training.updates import choose_learner
-from rlctl.training.vec_env import WorkerVecEnv
+
+
+def _count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[Any]]) -> tuple[int, str]:
+    """Count observations, shape (n_envs, steps, ...), outside their space; return also a message about one."""
+    outside: Any = False  # later an array, one element per observation
+    message = ""
+    for key, box in split_space(space).items():
+        if not isinstance(box, spaces.Box) or box.dtype == np.uint8:
+            continue
+        values = observations[key]
+        wrong = ((values < box.low) | (values > box.high)).reshape(*values.shape[:2], -1)
+        if wrong.any():
+            outside |= wrong.any(axis=2)
+            env, step, element = np.argwhere(wrong)[0].tolist()
+            value, low, high = (array.ravel()[element] for array in (values[env, step], box.low, box.high))
+            name = f"observation {key!r}" if key else "observation"
+            message = f"{name} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
+    return int(np.count_nonzero(outside)), message
+
+
+class WorkerVecEnv(VecEnv):
+    """Plays with `Workers` for SB3. Seeds follow from run seed, environment and episode number, not from SB3."""
+
+    def __init__(self, workers: Workers, run_seed: int) -> None:
+        self.workers = workers
+        self.run_seed = run_seed
+        self.episodes_started = [0] * workers.n_envs  # per environment the number of episodes that have begun
+        self._actions: list[list[NDArray[Any]]] = []  # of the running episodes: by environment, in parts
+        self.outside, self.outside_message = 0, ""  # observations outside their space since it was set to 0
+        self.ended: list[EpisodeResult] = []  # episodes that ended since the list was emptied
+        self.last_segment: SegmentArrays | None = None  # of `finish`; the next segment overwrites its arrays
+        self.waited_s = 0.0  # time spent waiting for the environments to play [s], since it was set to 0
+        self._steps = 0
+        super().__init__(workers.n_envs, *workers.info.spaces())
+
+    def _seed(self, env: int, episode: int) -> int:
+        return episode_seed(self.run_seed, Stream.TRAIN, env, episode)
+
+    def reset(self) -> Any:
+        """Start the next episode of every environment; return the first observations, shape (n_envs, ...)."""
+        try:
+            self.workers.reset({env: self._seed(env, number) for env, number in enumerate(self.episodes_started)})
+        except EpisodeFailed as error:
+            error.actions = []
+            raise
+        self.episodes_started = [number + 1 for number in self.episodes_started]
+        self._actions = [[actions] for actions in self.workers.arrays.segment.action[:, :0]]
+        return self.workers.observations()
+
+    def join_actions(self, env: int) -> NDArray[Any]:
+        """Return the actions of an environment's running episode so far, shape (steps, ...)."""
+        return np.concatenate(self._actions[env])
+
+    def replay_actions(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
+        """Restore running episodes by replaying their actions; return the environments whose episode ended early."""
+        self.episodes_started = list(episodes_started)
+        seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
+        episodes = dict(enumerate(zip(seeds, actions, strict=True)))
+        ended = self.workers.replay_actions(episodes, doing="replaying episodes", may_fail=True)
+        self._actions = [[actions_of_episode] for actions_of_episode in actions]
+        return ended
+
+    def start(self, steps: int, exploration: Exploration) -> None:
+        """Begin to play `steps` steps of each environment."""
+        self._steps = steps
+        running, next_episodes = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
+        self.workers.start_playing(Play(steps, running, next_episodes, self.run_seed, exploration=exploration))
+
+    def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
+        """Wait for the steps that `start` began; `check` is called several times a second."""
+        began = time.monotonic()
+        try:
+            ended = self.workers.finish_playing(check=check)
+        except EpisodeFailed as error:
+            error.actions = self._failed_actions(error)
+            raise
+        self.waited_s += time.monotonic() - began
+        segment, steps = self.workers.arrays.segment, self._steps
+        last_rows = {episode.env: episode.row for episode in ended}  # where the last episode of the segment ended
+        for episode in ended:
+            self.episodes_started[episode.env] += 1
+            self._actions[episode.env] = []
+        for env, actions in enumerate(segment.action[:, :steps]):
+            self._actions[env].append(actions[last_rows.get(env, -1) + 1 :].copy())
+        self.ended += ended
+        seen = {key: rows[:, 1 : steps + 1] for key, rows in segment.observation.items()}
+        count, message = _count_outside(self.observation_space, seen)
+        self.outside, self.outside_message = self.outside + count, self.outside_message or message
+        self.last_segment = segment.first(steps, ended)
+        return self.last_segment
+
+    def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any]:
+        """Return the actions of a failed episode; the last is that of the failed step."""
+        arrays = self.workers.arrays
+        rows = int(arrays.inside[error.env, 2]) + 1
+        if error.step <= rows:
+            return arrays.segment.action[error.env, rows - error.step : rows].copy()
+        return np.concatenate([self.join_actions(error.env), arrays.segment.action[error.env, :rows]])
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Raise `NotImplementedError`: workers play whole segments."""
+        raise NotImplementedError("workers play segments; nothing steps them one by one")
+
+    def step_wait(self) -> Any:
+        """Raise `NotImplementedError`: workers play whole segments."""
+        raise NotImplementedError("workers play segments; nothing steps them one by one")
+
+    def close(self) -> None:
+        """End the workers."""
+        self.workers.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return `render_mode`, None per environment; raise `AttributeError` for other names."""
+        if attr_name == "render_mode":
+            return [None] * self.num_envs
+        raise AttributeError(f"worker environments do not hand out attributes: {attr_name}")
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Raise `AttributeError`: attributes of environments in workers cannot be set."""
+        raise AttributeError(f"worker environments take no attributes: {attr_name}")
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Call `compute_reward`, which SB3's hindsight replay needs; raise `AttributeError` for any other method."""
+        if method_name == "compute_reward":  # of SB3's hindsight replay; its infos are empty
+            rewards = self.workers.compute_rewards(*method_args[:2])
+            return [rewards for _ in self._get_indices(indices)]
+        raise AttributeError(f"worker environments hand out no methods: {method_name}")
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """Return False per environment: no wrapper is visible from outside the workers."""
+        return [False for _ in self._get_indices(indices)]
+
 
 Check = Callable[[], None]  # called several times a second while workers play; may raise to stop
 Statistics = dict[str, tuple[NDArray[Any], NDArray[Any]]]

@@ -105,7 +105,7 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
     from rlctl.training.learner import Curriculum, Learner, check_stages
     from rlctl.training.off_policy import OffPolicyRollouts
     from rlctl.training.on_policy import OnPolicyRollouts
-    from rlctl.training.vec_env import WorkerVecEnv
+    from rlctl.training.rollouts import WorkerVecEnv
 
     pin_threads()
     recipe, goal = start.recipe, workers.info

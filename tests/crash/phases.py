@@ -10,15 +10,15 @@ import rlctl.rollout.workers
 import rlctl.storage.files
 import rlctl.training.evaluator
 import rlctl.training.loop
+import rlctl.training.rollouts
 import rlctl.training.status
-import rlctl.training.vec_env
 from rlctl.processes import child_process
 
 PHASES = {
     "workers start": (child_process, "start_process", 1),
     "workers build": (rlctl.rollout.workers.Workers, "info", 1),
     "run folder": (rlctl.training.status, "write_start", 1),
-    "first rollout": (rlctl.training.vec_env.WorkerVecEnv, "finish", 1),
+    "first rollout": (rlctl.training.rollouts.WorkerVecEnv, "finish", 1),
     "boundary": (rlctl.training.loop.TrainingLoop, "boundary", 2),
     "evaluation": (rlctl.training.evaluator.EvaluationEpisodes, "play", 1),
     "first checkpoint": (rlctl.storage.files, "os.rename", 1),

@@ -5,7 +5,7 @@ import pytest
 from rlctl.recipe import recipe as recipes
 from rlctl.rollout.workers import available_cores
 from rlctl.training import checkpoints
-from rlctl.training.vec_env import WorkerVecEnv
+from rlctl.training.rollouts import WorkerVecEnv
 from tests.training.comparing import Killed, assert_same_run, rows
 from tests.training.conftest import FAULTY, SMALL
 

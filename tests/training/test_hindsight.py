@@ -19,8 +19,8 @@ from rlctl.training.algorithms import build_model
 from rlctl.training.learner import begin_next_episodes
 from rlctl.training.off_policy import OffPolicyRollouts, replay_arguments
 from rlctl.training.request import run_training
+from rlctl.training.rollouts import WorkerVecEnv
 from rlctl.training.status import Progress
-from rlctl.training.vec_env import WorkerVecEnv
 from tests.task import tasks
 from tests.training.conftest import ENVS, SMALL
 from tests.training.envs import Plane

@@ -17,10 +17,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from rlctl.environments.dict_spaces import split
 from rlctl.errors import RecipeError
 from rlctl.training.updates import choose_learner
-from rlctl.training.updates.dqn import DqnUpdate
 from rlctl.training.updates.ppo import PpoUpdate
+from rlctl.training.updates.q_learning import DqnUpdate, Td3Update
 from rlctl.training.updates.sac import SacUpdate, TqcUpdate
-from rlctl.training.updates.td3 import Td3Update
 
 pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 
@@ -202,8 +201,9 @@ def test_what_sb3_updates_itself():
     sac = [make_off_policy(network=elu), make_off_policy(network={"net_arch": []}), make_off_policy(TQC)]
     sac += [make_off_policy(observations=image, policy="CnnPolicy")]
     sac += [make_off_policy(use_sde=True, network={"use_expln": True})]
-    assert [PpoUpdate.supports(model) for model in ppo] == [False] * 3
-    assert [SacUpdate.supports(model) for model in sac] == [False] * 5
+    assert [choose_learner(model) for model in ppo] == ppo
+    assert not SacUpdate.supports(sac.pop(2))
+    assert [choose_learner(model) for model in sac] == sac
 
 
 def test_a_delayed_actor_learns_at_every_other_update():

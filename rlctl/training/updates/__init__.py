@@ -7,17 +7,17 @@ from stable_baselines3 import SAC
 
 from rlctl.errors import RecipeError
 from rlctl.training.own_networks import has_own_parts
-from rlctl.training.updates.dqn import DqnUpdate
 from rlctl.training.updates.ppo import PpoUpdate
+from rlctl.training.updates.q_learning import DqnUpdate, Td3Update
 from rlctl.training.updates.sac import SacUpdate, TqcUpdate
-from rlctl.training.updates.td3 import Td3Update
 
 
 def choose_learner(model: Any) -> Any:
     """Return the object whose `train` updates a model: a class of this package, or the SB3 model itself."""
     updates: tuple[Any, ...] = (PpoUpdate, SacUpdate, TqcUpdate, Td3Update, DqnUpdate)
+    extracts = any("features_extractor" in name for name, _ in model.policy.named_parameters())  # not all are linear
     for update in updates:
-        if not has_own_parts(model.policy) and update.supports(model):
+        if not extracts and not has_own_parts(model.policy) and update.supports(model):
             return update(model)
     if type(model) in (SAC, TQC) and getattr(model, "policy_delay", 1) > 1:
         raise RecipeError(

@@ -48,8 +48,7 @@ class PpoUpdate:
             )
         else:
             plain = type(distribution) is DiagGaussianDistribution
-        networks = is_mlp(_actor_modules(policy)) and is_mlp(_critic_modules(policy))
-        return bool(plain) and networks and not list(policy.features_extractor.parameters())
+        return bool(plain) and is_mlp(_actor_modules(policy)) and is_mlp(_critic_modules(policy))
 
     @torch.no_grad()
     def train(self) -> None:

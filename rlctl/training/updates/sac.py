@@ -1,6 +1,8 @@
-"""SAC's updates without autograd; equal to SB3's `SAC.train` except for rounding.
+"""Updates of SAC and TQC without autograd; equal to SB3's and sb3-contrib's `train` except for rounding.
 
 T. Haarnoja et al., Soft Actor-Critic Algorithms and Applications, 2018, https://arxiv.org/abs/1812.05905.
+A. Kuznetsov et al., Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional Quantile
+Critics, 2020, https://arxiv.org/abs/2005.04269.
 """
 
 import collections
@@ -39,13 +41,8 @@ class SacUpdate:
         """Return whether this class can update a model; SB3 updates all others."""
         if type(model) is not cls.algorithm:
             return False
-        actor, critic = model.actor, model.critic
-        extractors = (actor.features_extractor, critic.features_extractor)
-        return (
-            SquashedGaussianActor.supports(actor)
-            and all(is_mlp(network) for network in critic.q_networks)
-            and not any(list(extractor.parameters()) for extractor in extractors)
-        )
+        networks = model.critic.q_networks
+        return SquashedGaussianActor.supports(model.actor) and all(is_mlp(network) for network in networks)
 
     @torch.no_grad()
     def train(self, gradient_steps: int, batch_size: int) -> None:

@@ -1,5 +1,6 @@
-"""TD3's and DDPG's updates without autograd; equal to SB3's `TD3.train` except for rounding.
+"""Updates of DQN, TD3 and DDPG without autograd; equal to SB3's `train` except for rounding.
 
+V. Mnih et al., Human-level control through deep reinforcement learning, Nature, 2015.
 S. Fujimoto et al., Addressing Function Approximation Error in Actor-Critic Methods, 2018,
 https://arxiv.org/abs/1802.09477.
 """
@@ -10,10 +11,48 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3 import DDPG, TD3
+from stable_baselines3 import DDPG, DQN, TD3
 
 from rlctl.training.updates.batches import Batch, sample_batches
-from rlctl.training.updates.mlp import Floats, MlpStack, SideBySide, is_mlp
+from rlctl.training.updates.mlp import Floats, MlpStack, SideBySide, clip_norm, is_mlp
+
+
+class DqnUpdate:
+    """Updates a DQN model whose network is a multi-layer perceptron on the CPU."""
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+        self._network, self._target = (MlpStack([net.q_net]) for net in (model.q_net, model.q_net_target))
+
+    @classmethod
+    def supports(cls, model: Any) -> bool:
+        """Return whether this class can update a model; SB3 updates all others."""
+        return type(model) is DQN and is_mlp(model.q_net.q_net)
+
+    @torch.no_grad()
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """Do `gradient_steps` updates with minibatches of the replay buffer; log what SB3 logs."""
+        model = self._model
+        model._update_learning_rate(model.policy.optimizer)
+        losses = [self._update(batch) for batch in sample_batches(model, model.q_net, gradient_steps, batch_size)]
+        model._n_updates += gradient_steps
+        model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
+        model.logger.record("train/loss", np.mean(losses))
+
+    def _update(self, batch: Batch) -> float:
+        """Return the loss before the update."""
+        best = self._target.run(batch.next_features[None], "target")[-1][0].max(1, keepdims=True)
+        values = self._network.run(batch.features[None], "learning")
+        actions = batch.actions.astype(np.int64)
+        errors = np.take_along_axis(values[-1][0], actions, 1) - (batch.rewards + batch.discounts * best)
+        to_values = np.zeros_like(values[-1])
+        # The derivative of the Huber loss is the error, clipped to [-1, 1].
+        np.put_along_axis(to_values[0], actions, errors.clip(-1, 1) / np.float32(len(errors)), 1)
+        self._network.backpropagate(values, to_values)
+        clip_norm(self._network.gradients, self._model.max_grad_norm)
+        self._model.policy.optimizer.step()
+        sizes = np.abs(errors)
+        return float(np.where(sizes <= 1, 0.5 * np.square(sizes), sizes - 0.5).mean())
 
 
 class Td3Update:
@@ -34,13 +73,8 @@ class Td3Update:
         """Return whether this class can update a model; SB3 updates all others."""
         if type(model) not in (TD3, DDPG):
             return False
-        actor, critic = model.actor, model.critic
-        extractors = (actor.features_extractor, critic.features_extractor)
-        return (
-            isinstance(actor.mu[-1], torch.nn.Tanh)
-            and all(is_mlp(network) for network in (actor.mu[:-1], *critic.q_networks))
-            and not any(list(extractor.parameters()) for extractor in extractors)
-        )
+        networks = (model.actor.mu[:-1], *model.critic.q_networks)
+        return isinstance(model.actor.mu[-1], torch.nn.Tanh) and all(is_mlp(network) for network in networks)
 
     @torch.no_grad()
     def train(self, gradient_steps: int, batch_size: int) -> None:
