@@ -47,6 +47,26 @@ class Counter(ConstantCounter):
         return self.steps
 
 
+class ConstantSpeed(Clean):
+    """A measurement that is an array of its own, and never updated."""
+
+    def __init__(self):
+        super().__init__()
+        speed = spaces.Box(-100, 100, (2,), np.float32)
+        self.observation_space = spaces.Dict({"position": self.observation_space, "speed": speed})
+
+    def observe(self):
+        return {"position": self.position.copy(), "speed": self.speed()}
+
+    def speed(self):
+        return np.zeros(2, np.float32)
+
+
+class Speed(ConstantSpeed):
+    def speed(self):
+        return self.position * np.float32(0.5)
+
+
 class SomeFlags(Clean):
     """Flags of which one is hardly ever set: nothing is wrong with it."""
 
@@ -78,6 +98,17 @@ class HiddenGoalNoisyStart(HiddenGoal):
     def start(self):
         super().start()
         self.position += self.np_random.uniform(-0.02, 0.02, 2).astype(np.float32)
+
+
+class Bandit(HiddenGoal):
+    """What the arms pay is hidden, and there is nothing to observe: nothing is wrong with it."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = spaces.Box(0, 1, (1,), np.float32)
+
+    def observe(self):
+        return np.zeros(1, np.float32)
 
 
 class SeenGoal(HiddenGoal):

@@ -7,7 +7,8 @@ from tests.checking.judging import case, check_case, findings, found, rules_of
 BROKEN = "broken_observations.py"
 CASES = [
     case(f"{BROKEN}:ConstantElement", ("RL110", "info"), twin=f"{BROKEN}:Wide"),
-    case(f"{BROKEN}:ConstantCounter", ("RL110", "warning"), twin=f"{BROKEN}:Counter"),
+    case(f"{BROKEN}:ConstantCounter", ("RL110", "info"), twin=f"{BROKEN}:Counter"),
+    case(f"{BROKEN}:ConstantSpeed", ("RL110", "warning"), twin=f"{BROKEN}:Speed"),
     case(f"{BROKEN}:HiddenGoal", ("RL114", "warning"), twin=f"{BROKEN}:SeenGoal"),
     case(f"{BROKEN}:HiddenGoalNoisyStart", ("RL114", "warning"), twin=f"{BROKEN}:NoisyReward"),
 ]
@@ -24,6 +25,10 @@ CLEAN = [f"{BROKEN}:{name}" for name in ("Wide", "Counter", "SomeFlags", "SeenGo
 @pytest.mark.parametrize("task", CLEAN)
 def test_clean_is_clean(task):
     assert found(task, *rules_of("RL1")) == set()
+
+
+def test_a_bandit_shows_nothing():
+    assert found(f"{BROKEN}:Bandit", "RL110", "RL114") == {("RL110", "info")}
 
 
 def finding_of(name):

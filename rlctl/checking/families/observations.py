@@ -258,12 +258,13 @@ def _find_constant_elements(records: Records) -> Iterator[RuleFinding]:
         rows = _rows(records, index)
         constant = _constant(rows, leaf)
         total += rows.shape[1]
-        has_constant_leaf |= len(constant) == rows.shape[1]
+        has_constant_leaf |= np.dtype(leaf.dtype).kind == "f" and len(constant) == rows.shape[1]
         names += [f"{built.element(index, int(column))} ({float(rows[0, column]):.4g})" for column in constant]
     if names:
         message = f"{len(names)} of {total} elements of the observation never changed: {list_names(names)}"
         evidence = {"value": len(names), "expected": 0, "elements": [name.partition(" (")[0] for name in names[:8]]}
-        yield RuleFinding("RL110", message, evidence, Severity.WARNING if has_constant_leaf else Severity.INFO)
+        is_likely = has_constant_leaf and total > 1  # masks, maps and the single number of a bandit seldom change
+        yield RuleFinding("RL110", message, evidence, Severity.WARNING if is_likely else Severity.INFO)
 
 
 def _constant(rows: NDArray[np.float64], leaf: Leaf) -> NDArray[np.intp]:
