@@ -91,7 +91,8 @@ def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
     for cause in iterate_causes(error):
         name, folders = None, [str(Path.cwd())]
         if isinstance(cause, FileNotFoundError):
-            name = str(cause.filename or cause)
+            path = re.search(r"[^\s'\"]*[/\\][^\s'\":]*", str(cause))
+            name = str(cause.filename or (path[0] if path else cause))
         elif type(cause).__module__ == "pybullet" and "load" in str(cause).lower():
             name, data = _find_model(cause.__traceback__), sys.modules.get("pybullet_data")
             folders += [data.getDataPath()] if data else []

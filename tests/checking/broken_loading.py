@@ -22,6 +22,12 @@ class NoFile(Clean):
             self.gains = file.read()
 
 
+class NoTable(Clean):
+    def __init__(self):
+        super().__init__()
+        raise FileNotFoundError("data/table.csv not found.")
+
+
 class NoModel(Clean):
     """PyBullet says only that it cannot load, and searches in more than one folder."""
 

@@ -59,6 +59,24 @@ class OldActionsAsRegistered(OldActions):
     spec = EnvSpec("OldActions-v0", nondeterministic=True)
 
 
+class FirstEpisodeDiffers(Clean):
+    """Its first episode pays more; the action that it keeps over a reset has no effect."""
+
+    was_played, kept = False, 0.0
+
+    def start(self):
+        super().start()
+        self.bonus = 0.0 if self.was_played else 1.0
+        self.was_played = True
+
+    def move(self, action):
+        self.kept = float(action[0])
+        super().move(action)
+
+    def reward(self):
+        return super().reward() + self.bonus
+
+
 class KeptChance(Clean):
     """Starts where chance in the steps of the episode before left it."""
 

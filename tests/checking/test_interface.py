@@ -57,7 +57,9 @@ def test_a_library_that_is_not_installed_is_not_the_environments_fault():
 
 def test_no_limit_is_told_with_what_is_known():
     (message,) = messages("Falls", "RL506")
-    assert message.startswith("no time limit: step always returns truncated=False; all 16 episodes ended with ")
+    assert message.startswith(
+        "no time limit was seen: step always returns truncated=False; all 16 episodes ended with "
+    )
 
 
 @pytest.mark.parametrize(

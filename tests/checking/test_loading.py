@@ -47,6 +47,11 @@ def test_a_missing_model_is_named_with_the_search_path():
     assert finding.message.startswith("the constructor does not find 'kuka_iiwa/modell.urdf', looked for in ")
 
 
+def test_a_missing_file_is_named_without_the_words_around_it():
+    (finding,) = findings("broken_loading.py:NoTable", "RL007")
+    assert finding.evidence["file"] == "data/table.csv"
+
+
 def test_a_missing_model_of_a_reset_is_named():
     (finding,) = findings("broken_loading.py:NoModelAtReset", "RL007")
     assert finding.message.startswith("reset does not find 'robot.urdf', looked for in ")

@@ -168,6 +168,12 @@ def test_state_that_reset_keeps_is_named():
     assert finding.message.endswith("; a new process repeats it, so reset keeps state (self.actions, self.position)")
 
 
+def test_state_without_effect_is_not_named():
+    (finding,) = findings("broken_repeats.py:FirstEpisodeDiffers", "RL302")
+    assert finding.message.endswith("; the first episode of an instance differs from all later ones")
+    assert "self.kept" not in finding.fix
+
+
 def test_chance_that_reset_keeps_is_no_missing_seed():
     verdict = verdict_of("broken_repeats.py:KeptChance", "RL308")
     assert verdict.not_judged["RL308"] == "an episode depends already on the one before it (RL301 to RL303)"

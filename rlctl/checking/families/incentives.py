@@ -51,7 +51,7 @@ def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
     severity = _severity_of_end(episodes, early, inner)
     if gain <= 0 or severity is None:
         return
-    example = early[int(np.argmax(gains))]
+    example = early[int(np.argsort(gains)[len(gains) // 2])]
     last = float(example.rewards[-1])
     saved = -rewards.DISCOUNT * rewards.discounted_steps(mean, longest - example.steps)
     yield RuleFinding(
