@@ -17,7 +17,7 @@ from typing import Any
 
 from rlctl.cluster.ray_connection import Pulse, connect, describe_slots, is_copied
 from rlctl.cluster.work import PREEMPTED, TAKEN, ClusterSettings, Work, execute, make_work, mark_shared_folder
-from rlctl.run.job import Job, read_job, write_job
+from rlctl.run.group import Job, read_job, write_job
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.trainings import NextSignal, Trainings
 

@@ -18,8 +18,7 @@ from pydantic import Field
 from rlctl.environments.registry import identify_task
 from rlctl.errors import ArtifactError, RlctlError
 from rlctl.run.directory import RunDirectory
-from rlctl.run.group import find_run_of_seed
-from rlctl.run.job import JOBS, list_jobs
+from rlctl.run.group import JOBS, find_run_of_seed, list_jobs
 from rlctl.run.lookup import locate_task
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files, yaml_text

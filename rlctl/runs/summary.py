@@ -12,8 +12,7 @@ from typing import Any
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import Score
 from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
-from rlctl.run.group import find_run_of_seed
-from rlctl.run.job import list_jobs, read_job
+from rlctl.run.group import find_run_of_seed, list_jobs, read_job
 
 Rows = list[dict[str, float | None]]  # of a table, oldest first; an empty field is None
 _LARGEST = 1e100  # larger numbers are ignored: plots and sums would overflow

@@ -19,7 +19,7 @@ from rlctl.cluster.ray_connection import connect
 from rlctl.errors import TaskError
 from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.vary import measure_robustness
-from rlctl.run.job import read_job
+from rlctl.run.group import read_job
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.request import run_training
 from rlctl.training.seeds import train_seeds

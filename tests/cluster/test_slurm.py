@@ -9,8 +9,7 @@ import pytest
 
 from rlctl.cluster.executors import choose_executor
 from rlctl.errors import TaskError, UsageError
-from rlctl.run.group import read_group
-from rlctl.run.job import list_jobs, read_job
+from rlctl.run.group import list_jobs, read_group, read_job
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.request import run_training as train_run
 from rlctl.training.seeds import train_seeds

@@ -11,7 +11,7 @@ import pytest
 
 from rlctl.errors import ArtifactError
 from rlctl.run.directory import RunDirectory
-from rlctl.run.job import JOBS, Job, write_job
+from rlctl.run.group import JOBS, Job, write_job
 from rlctl.runs.listing import format_changes, list_runs
 from rlctl.runs.summary import summarize
 
