@@ -43,9 +43,9 @@ def check_env(
 
     if explain is not None and explain.upper().startswith("Q"):
         from rlctl import output as streams
-        from rlctl.runs import diagnosis
+        from rlctl.runs.diagnosis import findings
 
-        streams.out().print("\n".join(diagnosis.explain(explain)))
+        streams.out().print("\n".join(findings.explain(explain)))
         return
     if list_rules or explain is not None:
         formats.show_list() if explain is None else formats.explain(explain)

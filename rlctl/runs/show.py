@@ -14,7 +14,7 @@ from rlctl.run import robustness
 from rlctl.run.directory import RunDirectory
 from rlctl.run.lookup import describe_source_change
 from rlctl.run.robustness import Robustness
-from rlctl.runs.diagnosis import diagnose, format_finding
+from rlctl.runs.diagnosis.findings import diagnose, format_finding
 from rlctl.runs.diagnosis.history import History
 from rlctl.runs.listing import as_json
 from rlctl.runs.summary import Rows, list_points, summarize

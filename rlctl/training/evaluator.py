@@ -16,7 +16,7 @@ from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
-from rlctl.runs.diagnosis import Grade, diagnose
+from rlctl.runs.diagnosis.findings import Grade, diagnose
 from rlctl.runs.summary import is_better, read_table
 from rlctl.training import measurements
 from rlctl.training.checkpoints import STEP_LABEL, Checkpoints

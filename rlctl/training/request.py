@@ -13,7 +13,7 @@ from rlctl.processes.printed_lines import write_stderr
 from rlctl.recipe.recipe import Recipe
 from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
-from rlctl.runs.diagnosis import Finding, diagnose, format_end
+from rlctl.runs.diagnosis.findings import Finding, diagnose, format_end
 from rlctl.training import status
 from rlctl.training.display import duration, make_display, percent
 from rlctl.training.setup import set_up

@@ -13,8 +13,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
-from rlctl.runs.diagnosis import Grade, diagnose, format_end
-from rlctl.runs.diagnosis.findings import list_signs
+from rlctl.runs.diagnosis.findings import Grade, diagnose, format_end, list_signs
 
 UPDATES = 30
 STEPS = 1000 * np.arange(1, UPDATES + 1)

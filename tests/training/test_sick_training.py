@@ -3,7 +3,7 @@
 import pytest
 
 from rlctl.environments.spec import merge
-from rlctl.runs.diagnosis import Grade, diagnose
+from rlctl.runs.diagnosis.findings import Grade, diagnose
 
 SHORT = {"total_timesteps": 60_000, "eval": {"every_steps": 12_000, "episodes": 10}}
 # The end comes from a clock that is not observed, and is said to be a termination.

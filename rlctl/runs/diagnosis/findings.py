@@ -1,4 +1,8 @@
-"""Findings of a training; `findings.yaml` has the combinations of signs that make a finding, and its texts."""
+"""Findings of a training, from its run folder: Q1 to Q13, each with its evidence and what to try.
+
+A single sign proves little: in a perfect training of `reach`, three of four updates have `approx_kl > 0.03`. So a
+finding is a combination of signs; `findings.yaml` has the combinations and all texts.
+"""
 
 import dataclasses
 import enum
@@ -13,7 +17,7 @@ import yaml
 from rlctl.errors import UsageError, did_you_mean
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.run.directory import RunDirectory
-from rlctl.runs.diagnosis import episode_signs, record_signs, signs, update_signs
+from rlctl.runs.diagnosis import episode_signs, record_signs, signs
 from rlctl.runs.diagnosis.history import History
 
 _NOT = "not "
@@ -65,7 +69,7 @@ def list_signs() -> dict[str, signs.Sign]:
     """Return the function of every sign that `findings.yaml` may name."""
     return {
         name: function
-        for module in (signs, update_signs, episode_signs, record_signs)
+        for module in (signs, episode_signs, record_signs)
         for name, function in inspect.getmembers(module, inspect.isfunction)
         if function.__module__ == module.__name__ and not name.startswith("_")
     }

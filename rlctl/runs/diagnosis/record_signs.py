@@ -1,11 +1,136 @@
-"""Signs in the use of time and in the end of a run. Functions as in `signs`."""
+"""Signs in the values logged after updates, in the use of time and in the end of a run. Functions as in `signs`."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
 from rlctl.output import format_count
 from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
+
+_MOST_NORMALIZED_REWARD = 10.0  # where SB3's `VecNormalize` clips
+
+
+def critic_explains_nothing(run: History) -> str | None:
+    """The value function explains nothing of the returns."""
+    explained = run.curve("explained_variance")
+    if len(explained) < LEAST_ROWS:
+        return None
+    median = float(np.median(explained.values[len(explained) // 2 :]))
+    return f"explained variance {median:.2f} (median of the second half)" if median < 0.1 else None
+
+
+def values_explode(run: History) -> str | None:
+    """The critic predicts more than rewards can add up to."""
+    value, most = run.curve("value"), _largest_value(run)
+    if len(value) < LEAST_ROWS or most is None:
+        return None
+    peak, last = float(np.abs(value.values).max()), value.thirds()[1]
+    # An entropy bonus comes on top of rewards, most at the beginning.
+    if peak < 30 * most and abs(last) < 3 * most:
+        return None
+    return f"the critic expects up to {peak:.3g}, {last:.3g} in the last third; rewards add up to {most:.3g} at most"
+
+
+def gradients_explode(run: History) -> str | None:
+    """Gradients are far larger than errors of the value function can explain."""
+    norm, most = run.curve("gradient_norm"), _largest_value(run)
+    if len(norm) < LEAST_ROWS or most is None or (peak := float(norm.values.max())) < 1000 * max(most, 1.0):
+        return None
+    return f"the gradient's norm is up to {peak:.2g}, where rewards add up to {most:.3g} at most"
+
+
+def _largest_value(run: History) -> float | None:
+    """Return the most that discounted rewards can add up to, as the critic sees them; None where it is not known."""
+    gamma, settings = run.parameters.get("gamma"), run.recipe.get("normalize")
+    if not isinstance(gamma, float) or not 0 <= gamma < 1 or not run.episodes:
+        return None
+    normalized = isinstance(settings, dict) and settings.get("reward", True)
+    largest = (
+        _MOST_NORMALIZED_REWARD if normalized else max(float(np.abs(episode.rewards).max()) for episode in run.episodes)
+    )
+    return max(largest / (1 - gamma), float(np.abs(run.curve("return").values).max(initial=0.0)))
+
+
+def policy_hardly_changes(run: History) -> str | None:
+    """Updates change nothing, before a schedule has lowered the learning rate."""
+    change = _read_change(run)
+    return change.describe(".1e") if change and change.kl <= 1e-4 and change.clipped <= 1e-3 else None
+
+
+def policy_jumps(run: History) -> str | None:
+    """Updates change the policy several times more than PPO intends."""
+    change = _read_change(run)
+    return change.describe() if change and (change.kl >= 0.2 or change.clipped >= 0.55) else None
+
+
+def policy_is_replaced(run: History) -> str | None:
+    """Each update replaces the policy by a very different one, and none of them is good."""
+    change = _read_change(run)
+    return change.describe() if change and not run.is_good and change.kl >= 1 and change.clipped >= 0.7 else None
+
+
+class _Change(NamedTuple):
+    """How much updates change the policy: medians of the first two thirds, in which schedules still have an effect."""
+
+    kl: float
+    clipped: float
+
+    def describe(self, form: str = ".2g") -> str:
+        """Return the medians as text."""
+        return f"approx_kl {self.kl:{form}}, clip fraction {self.clipped:.1%} (medians)"
+
+
+def _read_change(run: History) -> _Change | None:
+    curves = [run.curve(name).values for name in ("approx_kl", "clip_fraction")]
+    early = [values[: (2 * len(values) + 2) // 3] for values in curves]
+    return _Change(*(float(np.median(values)) for values in early)) if min(map(len, early)) >= LEAST_ROWS else None
+
+
+def exploration_vanishes(run: History) -> str | None:
+    """The policy is almost deterministic halfway through the training, or from the beginning."""
+    curve = _exploration(run)
+    if len(curve) < LEAST_ROWS:
+        return None
+    half = curve.values[max(0, len(curve) // 2 - 2) : len(curve) // 2 + 1].mean()
+    if half > 0.1 * curve.values[0] and not (curve.values[0] < 0.02 and half < 0.02):
+        return None
+    return f"exploration {curve.values[0]:.2g} at first, {half:.2g} halfway (1 is half the range of an action)"
+
+
+def _exploration(run: History) -> Curve:
+    measured = run.curve("exploration")
+    return measured if len(measured) else run.curve("std")
+
+
+def exploration_does_not_fall(run: History) -> str | None:
+    """The policy is as random at the end as at the beginning, or more so."""
+    curve = _exploration(run)
+    if len(curve) < LEAST_ROWS or run.progress < 0.5:
+        return None
+    first, last = curve.thirds()
+    return f"exploration {first:.2g} in the first third, {last:.2g} in the last" if last >= 0.97 * first else None
+
+
+def exploration_explodes(run: History) -> str | None:
+    """The policy becomes far more random than the actions' range."""
+    curve = _exploration(run)
+    if len(curve) < LEAST_ROWS:
+        return None
+    first, last = curve.thirds()
+    return (
+        f"exploration grows from {first:.2g} to {last:.2g} of half the action range"
+        if last > max(2 * first, 2.0)
+        else None
+    )
+
+
+def saturated(run: History) -> str | None:
+    """Nearly all actions are at a limit of their range."""
+    curve = run.curve("action_saturation")
+    if len(curve) < LEAST_ROWS or (last := curve.thirds()[1]) < 0.8:
+        return None
+    return f"{last:.0%} of the actions are at a limit in the last third"
 
 
 def learner_slow(run: History) -> str | None:

@@ -16,7 +16,7 @@ from rlctl.recipe.recipe import NOT_SET, Recipe
 from rlctl.recipe.stages import format_value
 from rlctl.run.episode import RecordedEpisode
 from rlctl.runs.comparison import RunComparison, compare_runs, find_recipe_changes
-from rlctl.runs.diagnosis import Finding
+from rlctl.runs.diagnosis.findings import Finding
 from rlctl.runs.listing import find_runs_of
 from rlctl.runs.show import RunDescription
 from rlctl.runs.summary import Rows, list_points
