@@ -98,7 +98,7 @@ def evaluate(
     environment: `reward_weights`, `randomize`, `events`. `pandas.DataFrame(result.episodes)` is a table of them.
     """
     from rlctl.errors import UsageError
-    from rlctl.evaluation.evaluate import Gates, run_evaluation
+    from rlctl.evaluation.evaluate import run_evaluation
     from rlctl.evaluation.request import EvalRequest
     from rlctl.recipe.sources import check_changes
 
@@ -117,7 +117,7 @@ def evaluate(
         changes=check_changes({**recipe, **({"task": parameters} if parameters else {})}, "evaluate"),
         deterministic=deterministic,
     )
-    return run_evaluation(request, Gates())
+    return run_evaluation(request)
 
 
 def load_policy(path: str | os.PathLike[str], /) -> Policy:

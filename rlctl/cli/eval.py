@@ -6,7 +6,7 @@ from typing import Annotated
 
 from rlctl.cli.arguments import choose_checkpoint, command, parse_changes
 from rlctl.errors import UsageError
-from rlctl.evaluation.request import EvalOptions, EvalRequest
+from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates
 from rlctl.options import Cluster, Json, On, Option, Pretrained, Settings, Yes
 
 
@@ -38,7 +38,7 @@ def evaluate(
     json: Json = None,
 ) -> None:
     """Evaluate a policy: success rate with its interval, returns, reward terms."""
-    from rlctl.evaluation.evaluate import Gates, run_evaluation
+    from rlctl.evaluation.evaluate import evaluate_group, run_evaluation
     from rlctl.evaluation.report import show, show_group, show_robustness
     from rlctl.run.directory import is_group
     from rlctl.run.group import read_group
@@ -60,8 +60,6 @@ def evaluate(
         show_robustness(robustness, json)
         return check_gates(robustness, gates)
     if request.run is not None and request.baseline is None and is_group(folder := Path(request.run)):
-        from rlctl.evaluation.group import evaluate_group
-
         scores = evaluate_group(read_group(folder), request)
         show_group(scores, json)
         return scores.check(gates)

@@ -1,17 +1,18 @@
-"""`rlctl eval`: play many episodes, each with its own seed, and return their statistics."""
+"""`rlctl eval`: play many episodes, each with its own seed, and return their statistics; also of a group of seeds."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from pydantic_core import to_jsonable_python
+
 from rlctl import output
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import AnswerIsNo, UsageError
+from rlctl.errors import AnswerIsNo, ArtifactError, RlctlError, UsageError
 from rlctl.evaluation.episode_statistics import (
     Spread,
     mean_action_change,
@@ -22,7 +23,7 @@ from rlctl.evaluation.episode_statistics import (
     success_rate,
 )
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, find_player, load_baseline
-from rlctl.evaluation.request import EvalRequest
+from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.players.player import Exploration
 from rlctl.policy.shipped import MeasuredScore
@@ -30,6 +31,7 @@ from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run.episode import save_episode
+from rlctl.run.group import Group
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,48 +87,6 @@ class Evaluation:
 def _flatten(row: dict[str, Any]) -> dict[str, Any]:
     nested = {f"{key}.{name}": value for key in ("terms", "metrics") for name, value in row.pop(key).items()}
     return row | nested
-
-
-@dataclasses.dataclass(frozen=True)
-class Gates:
-    """The minimum scores that an evaluation must reach."""
-
-    min_success: float | None = None
-    min_success_lower: float | None = None
-    min_return: float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("min_success", "min_success_lower"):
-            rate = getattr(self, name)
-            if rate is not None and not 0 <= rate <= 1:
-                hint = f"; {rate:g} % is {rate / 100:g}" if 1 < rate <= 100 else ""
-                raise UsageError(f"--{name.replace('_', '-')} {rate:g}: a rate is between 0 and 1{hint}")
-        if self.min_return is not None and math.isnan(self.min_return):
-            raise UsageError("--min-return nan: every return would pass; give a number")
-
-    def check_possible(self, has_success: bool) -> None:
-        """Raise `UsageError` for a gate on success where the environment does not report it."""
-        if not has_success and (self.min_success is not None or self.min_success_lower is not None):
-            raise UsageError("--min-success: this task reports no success (no is_success); use --min-return")
-
-    def check(self, result: Evaluation) -> None:
-        """Raise `AnswerIsNo`, naming every gate that was missed."""
-        if missed := self.list_missed(result.success_rate, result.success_interval, result.returns.mean):
-            raise AnswerIsNo("gate missed: " + "; ".join(missed))
-
-    def list_missed(self, rate: float | None, interval: tuple[float, float] | None, mean_return: float) -> list[str]:
-        """Return a phrase for each gate that these scores miss."""
-        missed = []
-        if self.min_success is not None and rate is not None and rate < self.min_success:
-            missed.append(f"success rate {rate:.3f} is below {self.min_success:g}")
-        if self.min_success_lower is not None and interval is not None and interval[0] < self.min_success_lower:
-            missed.append(f"lower bound {interval[0]:.3f} of the success rate is below {self.min_success_lower:g}")
-        if self.min_return is not None and mean_return < self.min_return:
-            missed.append(f"mean return {mean_return:.3f} is below {self.min_return:g}")
-        return missed
-
-
-NO_GATES = Gates()
 
 
 def run_evaluation(
@@ -236,3 +196,87 @@ def measure_score(
         ended_early=None if limit is None else sum(result.length < limit for result in results) / len(results),
         action_change=evaluation.action_change or 0.0,
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class SeedScore:
+    """The score of one seed, or why it has none."""
+
+    seed: int
+    run: str = ""
+    algo: str = ""
+    steps: int | None = None
+    seconds: float | None = None  # spent training [s]
+    score: MeasuredScore | None = None
+    problem: str = ""  # why there is no score
+
+
+@dataclasses.dataclass(frozen=True)
+class GroupScore:
+    """The scores of a group."""
+
+    group: Group
+    seeds: list[SeedScore]
+
+    def spread(self, quantity: str) -> Spread | None:
+        """Return how `success` or `mean_return` is distributed over seeds; None where no seed has it."""
+        values = [getattr(seed.score, quantity) for seed in self.seeds if seed.score is not None]
+        known = [value for value in values if value is not None]
+        return Spread.of(known) if known else None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the scores as plain data."""
+        spreads = {"success": self.spread("success"), "return": self.spread("mean_return")}
+        plain: dict[str, Any] = to_jsonable_python(
+            {"group": self.group.path, "task": self.group.task, "seeds": self.seeds, **spreads}
+        )
+        return plain
+
+    def check(self, gates: Gates) -> None:
+        """Raise `ArtifactError` if a seed has no score, and `AnswerIsNo` if one misses a gate.
+
+        Raises `UsageError` for a gate on success where the task does not report it.
+        """
+        if failed := [seed for seed in self.seeds if seed.score is None]:
+            raise ArtifactError(
+                f"{self.group.path}: {len(failed)} of {len(self.seeds)} seeds have no score; seed {failed[0].seed}: "
+                f"{failed[0].problem}"
+            )
+        missed = []
+        for seed in self.seeds:
+            score = seed.score
+            assert score is not None
+            gates.check_possible(score.success is not None)
+            gates_missed = gates.list_missed(score.success, score.success_interval, score.mean_return)
+            missed += [f"seed {seed.seed}: {gate}" for gate in gates_missed]
+        if missed:
+            raise AnswerIsNo("gate missed: " + "; ".join(missed))
+
+
+def evaluate_group(group: Group, request: EvalRequest) -> GroupScore:
+    """Evaluate a policy of every seed's run, by default the best; a seed without one has a problem instead.
+
+    A warning about several seeds, such as a changed task, is printed once.
+    """
+    printed: set[str] = set()
+
+    def print_new(notes: Sequence[str]) -> None:
+        output.print_notes(note for note in notes if note not in printed)
+        printed.update(notes)
+
+    return GroupScore(group, [_evaluate_seed(group, seed, request, print_new) for seed in group.seeds])
+
+
+def _evaluate_seed(
+    group: Group, seed: int, request: EvalRequest, print_notes: Callable[[Sequence[str]], None]
+) -> SeedScore:
+    run = group.find_run(seed)
+    if run is None:
+        return SeedScore(seed, problem="not started yet")
+    try:
+        status = run.status()
+        score = measure_score(dataclasses.replace(request, run=str(run.path)), print_notes)
+    except RlctlError as error:
+        return SeedScore(seed, run.path.name, problem=str(error).partition("\n")[0])
+    steps, seconds = status.get("steps"), status.get("seconds")
+    return SeedScore(seed, run.path.name, str(status.get("algo", "")), steps, seconds, score)

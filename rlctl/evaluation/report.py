@@ -10,9 +10,7 @@ from pydantic_core import to_jsonable_python
 from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.evaluation.episode_statistics import Spread
-from rlctl.evaluation.evaluate import Evaluation
-from rlctl.evaluation.group import GroupScore, SeedScore
-from rlctl.evaluation.group import as_json as group_as_json
+from rlctl.evaluation.evaluate import Evaluation, GroupScore, SeedScore
 from rlctl.evaluation.vary import format_command
 from rlctl.policy.shipped import Interval, MeasuredScore
 from rlctl.run.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
@@ -153,7 +151,7 @@ def _format_interval(interval: Interval | None, *, percent: bool = False) -> str
 
 def show_group(result: GroupScore, json: str | None) -> None:
     """Print a row per seed, then mean, IQM and standard deviation; or JSON alone for `-`."""
-    if output.present(group_as_json(result), json):
+    if output.present(result.as_json(), json):
         return
     out = output.out()
     scores = [seed.score for seed in result.seeds if seed.score is not None]

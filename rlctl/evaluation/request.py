@@ -1,15 +1,18 @@
-"""The arguments of `rlctl eval` as data. Imports nothing heavy."""
+"""The arguments of `rlctl eval` as data: what to evaluate, and the gates. Imports nothing heavy."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.options import Checkpoint, EnvTimeout, EpisodeSeed, Option, RunName
 
 if TYPE_CHECKING:
     from rlctl.environments.spec import EnvChanges, EnvSpec
+    from rlctl.evaluation.evaluate import Evaluation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,3 +63,45 @@ class EvalRequest(EvalOptions):
     """Default: the environment of the policy's training, or for a baseline of the task's recipe."""
     measure_actions: bool = False
     """Whether to measure how much actions change; all episodes are then kept in memory."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Gates:
+    """The minimum scores that an evaluation must reach."""
+
+    min_success: float | None = None
+    min_success_lower: float | None = None
+    min_return: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("min_success", "min_success_lower"):
+            rate = getattr(self, name)
+            if rate is not None and not 0 <= rate <= 1:
+                hint = f"; {rate:g} % is {rate / 100:g}" if 1 < rate <= 100 else ""
+                raise UsageError(f"--{name.replace('_', '-')} {rate:g}: a rate is between 0 and 1{hint}")
+        if self.min_return is not None and math.isnan(self.min_return):
+            raise UsageError("--min-return nan: every return would pass; give a number")
+
+    def check_possible(self, has_success: bool) -> None:
+        """Raise `UsageError` for a gate on success where the environment does not report it."""
+        if not has_success and (self.min_success is not None or self.min_success_lower is not None):
+            raise UsageError("--min-success: this task reports no success (no is_success); use --min-return")
+
+    def check(self, result: Evaluation) -> None:
+        """Raise `AnswerIsNo`, naming every gate that was missed."""
+        if missed := self.list_missed(result.success_rate, result.success_interval, result.returns.mean):
+            raise AnswerIsNo("gate missed: " + "; ".join(missed))
+
+    def list_missed(self, rate: float | None, interval: tuple[float, float] | None, mean_return: float) -> list[str]:
+        """Return a phrase for each gate that these scores miss."""
+        missed = []
+        if self.min_success is not None and rate is not None and rate < self.min_success:
+            missed.append(f"success rate {rate:.3f} is below {self.min_success:g}")
+        if self.min_success_lower is not None and interval is not None and interval[0] < self.min_success_lower:
+            missed.append(f"lower bound {interval[0]:.3f} of the success rate is below {self.min_success_lower:g}")
+        if self.min_return is not None and mean_return < self.min_return:
+            missed.append(f"mean return {mean_return:.3f} is below {self.min_return:g}")
+        return missed
+
+
+NO_GATES = Gates()

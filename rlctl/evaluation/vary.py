@@ -17,10 +17,10 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation import axes as axes_of
 from rlctl.evaluation.episode_statistics import summarize
-from rlctl.evaluation.evaluate import NO_GATES, Gates, start_workers
+from rlctl.evaluation.evaluate import start_workers
 from rlctl.evaluation.players import LoadedPolicy, find_player
 from rlctl.evaluation.push import measure_push
-from rlctl.evaluation.request import EvalRequest
+from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.policy.players.player import Exploration
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import EpisodeResult

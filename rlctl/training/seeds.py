@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rlctl import output
 from rlctl.errors import RlctlError, UsageError
-from rlctl.evaluation.group import GroupScore, as_json, evaluate_group
+from rlctl.evaluation.evaluate import GroupScore, evaluate_group
 from rlctl.evaluation.request import EvalRequest
 from rlctl.run.directory import RunLock
 from rlctl.run.group import Group, create_group, parse_seeds, read_group
@@ -81,7 +81,7 @@ def _train(
     codes = trainings.run(calls, f"rlctl train --resume {shlex.quote(str(group.path))}")
     failed = {seed: code for seed, code in zip(requests, codes, strict=True) if code}
     score = evaluate_group(group, EvalRequest(None, episodes=episodes))
-    files.write_json(group.scores_file, as_json(score))
+    files.write_json(group.scores_file, score.as_json())
     return SeedsResult(score, failed)
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.environments import installed, registry
-from rlctl.evaluation.group import as_json, evaluate_group
+from rlctl.evaluation.evaluate import evaluate_group
 from rlctl.evaluation.request import EvalRequest
 from rlctl.run.directory import GROUP_FILE
 from rlctl.run.group import Group, parse_seeds, read_group
@@ -75,7 +75,7 @@ def read_scores(group: Group) -> dict[str, Any]:
     if file.is_file() and file.stat().st_mtime >= newest:
         content = json.loads(file.read_text())
     if not content or [each["seed"] for each in content["seeds"]] != group.seeds:
-        content = as_json(evaluate_group(group, EvalRequest(None)))
+        content = evaluate_group(group, EvalRequest(None)).as_json()
         files.write_json(file, content)
     return content
 

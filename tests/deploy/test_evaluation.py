@@ -14,7 +14,7 @@ from gymnasium import spaces
 from rlctl.deploy.server import messages
 from rlctl.deploy.server.client import PolicyClient, RemotePlayer
 from rlctl.errors import PolicyError, RecipeError, UsageError
-from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.report import as_json, count_interventions
 from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.self_test import run_self_test
@@ -38,7 +38,7 @@ def evaluate(tmp_path, text, **options):
     request = EvalRequest(
         "reach", checkpoint=PRETRAINED, episodes=2, n_envs=1, limits=tmp_path / "limits.yaml", **options
     )
-    return run_evaluation(request, Gates())
+    return run_evaluation(request)
 
 
 def test_what_limits_cost(tmp_path):
@@ -66,10 +66,8 @@ def test_limits_that_the_task_cannot_have(tmp_path):
 
 
 def test_through_a_server_it_is_the_same(reach_server):
-    direct = run_evaluation(EvalRequest("reach", checkpoint=PRETRAINED, episodes=2, n_envs=1), Gates())
-    served = run_evaluation(
-        EvalRequest("reach", baseline=f"ws://{reach_server.address}", episodes=2, n_envs=1), Gates()
-    )
+    direct = run_evaluation(EvalRequest("reach", checkpoint=PRETRAINED, episodes=2, n_envs=1))
+    served = run_evaluation(EvalRequest("reach", baseline=f"ws://{reach_server.address}", episodes=2, n_envs=1))
     assert [episode.result.total_reward for episode in served.played] == [
         episode.result.total_reward for episode in direct.played
     ]
@@ -87,9 +85,9 @@ def test_a_server_that_does_not_run_its_policy_is_said_to(reach_server, rlctl):
 
 def test_a_server_that_is_not_there_or_of_another_task(reach_server, capfd):
     with pytest.raises(UsageError, match="no policy server answers"):
-        run_evaluation(EvalRequest("reach", baseline="ws://127.0.0.1:1"), Gates())
+        run_evaluation(EvalRequest("reach", baseline="ws://127.0.0.1:1"))
     with pytest.raises(UsageError, match="has other observation or action spaces than this task"):
-        run_evaluation(EvalRequest("Pendulum-v1", baseline=f"ws://{reach_server.address}", episodes=1), Gates())
+        run_evaluation(EvalRequest("Pendulum-v1", baseline=f"ws://{reach_server.address}", episodes=1))
     assert "Unclosed" not in capfd.readouterr().err
 
 

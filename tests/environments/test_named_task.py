@@ -10,7 +10,7 @@ from safetensors.numpy import load_file, save
 from rlctl.environments import named_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.file import PolicyFile, compute_digest
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
@@ -106,10 +106,10 @@ def test_a_policy_that_names_a_function_runs_nothing(run, tmp_path):
     text, tensors = json.dumps(evil), load_file(run.best_policy)
     path.write_bytes(save(tensors, metadata={"rlctl": text, "sha256": compute_digest(text, tensors)}))
     with pytest.raises(ArtifactError, match=r"^a policy file names 'os:system' as its task"):
-        run_evaluation(EvalRequest(str(path), episodes=1), Gates())
+        run_evaluation(EvalRequest(str(path), episodes=1))
     assert not mark.exists()
     task = f"{ENVS}:Line"
-    assert run_evaluation(EvalRequest(str(path), task=task, episodes=1), Gates()).episodes
+    assert run_evaluation(EvalRequest(str(path), task=task, episodes=1)).episodes
 
 
 def test_an_episode_that_names_a_function_runs_nothing(tmp_path):

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError
-from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.request import ExportRequest
@@ -102,7 +102,7 @@ def zoo_agent(tmp_path_factory):
 def test_the_zoos_agents_play_as_they_did(zoo_agent):
     model, env, imported = zoo_agent
     assert imported.info.spec.time_feature
-    evaluated = run_evaluation(EvalRequest(str(imported.path), episodes=2), Gates()).played
+    evaluated = run_evaluation(EvalRequest(str(imported.path), episodes=2)).played
     for seed, episode in zip(episode_seeds(0, Stream.EVAL, 2), evaluated, strict=True):
         env.seed(seed)
         observation, total, done = env.reset(), 0.0, [False]

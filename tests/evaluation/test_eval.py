@@ -8,10 +8,9 @@ import pytest
 from rlctl.environments.spec import EnvChanges
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.episode_statistics import Spread, mean_terms, success_interval, success_rate
-from rlctl.evaluation.evaluate import Gates, measure_score, run_evaluation
-from rlctl.evaluation.group import GroupScore, SeedScore
+from rlctl.evaluation.evaluate import GroupScore, SeedScore, measure_score, run_evaluation
 from rlctl.evaluation.report import as_json
-from rlctl.evaluation.request import EvalRequest
+from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.train_request import TrainRequest
 from rlctl.runs.summary import read_table
@@ -30,7 +29,7 @@ def reach_run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def evaluation(reach_run):
-    return run_evaluation(EvalRequest(str(reach_run.path), episodes=6), Gates())
+    return run_evaluation(EvalRequest(str(reach_run.path), episodes=6))
 
 
 def result(success, total=1.0, terms=None):
@@ -80,7 +79,7 @@ def test_mean_terms_add_up():
 
 
 def test_an_episode_does_not_depend_on_what_runs_beside_it(reach_run, evaluation):
-    alone = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, n_envs=1), Gates())
+    alone = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, n_envs=1))
     assert [episode.result.total_reward for episode in alone.played] == [
         episode.result.total_reward for episode in evaluation.played
     ]
@@ -109,11 +108,11 @@ def test_json_has_what_ci_needs(evaluation):
 
 def test_tolerance_is_a_parameter(reach_run):
     wide = EvalRequest(str(reach_run.path), episodes=4, changes=EnvChanges({"tolerance": 10.0}))
-    assert run_evaluation(wide, Gates()).success_rate == 1.0
+    assert run_evaluation(wide).success_rate == 1.0
 
 
 def test_it_says_whether_it_was_randomised(reach_run, evaluation, rlctl):
-    shaken = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, changes=EnvChanges(randomize=True)), Gates())
+    shaken = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, changes=EnvChanges(randomize=True)))
     offered = as_json(evaluation)["events"]
     assert offered
     assert not any(offered.values())
@@ -131,9 +130,9 @@ def test_it_says_whether_it_was_randomised(reach_run, evaluation, rlctl):
 
 def test_stochastic_repeats_with_its_seed(reach_run):
     request = EvalRequest(str(reach_run.path), episodes=2, deterministic=False)
-    first, second = (run_evaluation(request, Gates()).returns.mean for _ in range(2))
+    first, second = (run_evaluation(request).returns.mean for _ in range(2))
     assert first == second
-    assert first != run_evaluation(EvalRequest(str(reach_run.path), episodes=2), Gates()).returns.mean
+    assert first != run_evaluation(EvalRequest(str(reach_run.path), episodes=2)).returns.mean
 
 
 @pytest.mark.parametrize(

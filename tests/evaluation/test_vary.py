@@ -10,8 +10,8 @@ from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.axes import change, read_axes
 from rlctl.evaluation.episode_statistics import mean_interval
-from rlctl.evaluation.evaluate import Gates, run_evaluation
-from rlctl.evaluation.request import EvalRequest
+from rlctl.evaluation.evaluate import run_evaluation
+from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.evaluation.vary import check_gates, format_command, measure_robustness
 from rlctl.output import format_duration
 from rlctl.run.robustness import read
@@ -36,7 +36,7 @@ def test_a_cell_is_the_evaluation_with_its_values(block_run, measured):
     ]
     assert [cell.values for cell in found.cells] == [[0, 1], [0, 3], [1.5, 1], [1.5, 3], [3, 1], [3, 3]]
     changes = EnvChanges(randomize=False, events={"push": {"force": 1.5}, "mass": {"factor": 3.0}})
-    alone = run_evaluation(EvalRequest(str(block_run.path), episodes=5, changes=changes), Gates())
+    alone = run_evaluation(EvalRequest(str(block_run.path), episodes=5, changes=changes))
     cell = found.cells[3]
     assert (cell.success_rate, cell.success_interval) == (alone.success_rate, alone.success_interval)
     assert cell.mean_return == alone.returns.mean

@@ -5,7 +5,7 @@ import typer
 
 from rlctl.cli import build_app
 from rlctl.errors import UsageError
-from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
 from rlctl.replaying.replay import run_replay, select
 from rlctl.replaying.request import Choice, ReplayRequest
@@ -35,7 +35,7 @@ def test_without_success_the_return_counts():
 def test_they_are_episodes_of_the_evaluation_bit_for_bit(run, tmp_path, capsys):
     request = ReplayRequest(str(run.run.path), episodes=5, output=tmp_path, worst=2)
     result = run_replay(request)
-    evaluated = run_evaluation(EvalRequest(str(run.run.path), episodes=5), Gates()).episodes
+    evaluated = run_evaluation(EvalRequest(str(run.run.path), episodes=5)).episodes
     expected = sorted((bool(row["success"]), row["return"], row["seed"]) for row in evaluated)[:2]
     assert [(each.success, each.total_reward, each.seed) for each in result.episodes] == expected
     assert all(each.recording.is_file() for each in result.episodes)

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from rlctl import load_policy
 from rlctl.errors import RecipeError, UsageError
-from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.file import PolicyFile
 from rlctl.replaying.reproduce import verify_episode
@@ -94,7 +94,7 @@ def test_policy_file_has_all_stages(staged):
 
 @pytest.mark.parametrize(("stage", "rate"), [(None, 0.0), (1, 1.0), (2, 0.0)])
 def test_eval_of_a_stage(staged, stage, rate):
-    result = run_evaluation(EvalRequest(str(staged.run.path), episodes=3, stage=stage), Gates())
+    result = run_evaluation(EvalRequest(str(staged.run.path), episodes=3, stage=stage))
     assert (result.success_rate, result.spec.stage) == (rate, stage or 2)
 
 
@@ -102,7 +102,7 @@ def test_eval_of_a_stage(staged, stage, rate):
 def test_eval_of_a_stage_that_is_not_there(staged, stage):
     message = f"--stage {stage}: this policy was trained in 2 stages; give a number from 1 to 2"
     with pytest.raises(UsageError, match=message):
-        run_evaluation(EvalRequest(str(staged.run.path), stage=stage), Gates())
+        run_evaluation(EvalRequest(str(staged.run.path), stage=stage))
 
 
 def test_without_stages_there_is_no_stage_anywhere(train, small_ppo):
@@ -110,7 +110,7 @@ def test_without_stages_there_is_no_stage_anywhere(train, small_ppo):
     assert "stage" not in rows(result.run.metrics_file)[0]
     assert "stage" not in rows(result.run.evals_file)[0]
     with pytest.raises(UsageError, match="--stage 1: this policy was trained without stages"):
-        run_evaluation(EvalRequest(str(result.run.path), stage=1), Gates())
+        run_evaluation(EvalRequest(str(result.run.path), stage=1))
 
 
 def test_promotion_by_return_in_plain_lines(train, small_ppo, capsys):
@@ -244,9 +244,7 @@ def test_reach_in_stages_of_its_class(write_module, tmp_path):
         assert verify_episode(episode, file)[1].difference is None
     info = load_policy(result.run.last_policy).info
     assert [info.stages[number - 1].level for number in (1, 2)] == [0.1, info.spec.level] == [0.1, 1.0]
-    near, exact = (
-        run_evaluation(EvalRequest(str(result.run.path), episodes=2, stage=stage), Gates()) for stage in (1, 2)
-    )
+    near, exact = (run_evaluation(EvalRequest(str(result.run.path), episodes=2, stage=stage)) for stage in (1, 2))
     # The same policy and goals, and the mass makes no great difference; `reached` is measured by the tolerance.
     assert near.terms["reached"] > exact.terms["reached"]
 

@@ -3,7 +3,7 @@
 import pytest
 
 from rlctl.environments.spec import EnvChanges
-from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.request import run_training
@@ -15,8 +15,8 @@ from tests.training.conftest import ENVS
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_reach_is_learnt(tmp_path, seed):
     run = run_training(TrainRequest("reach", settings={"seed": seed}, root=tmp_path, check=False)).run
-    wide = run_evaluation(EvalRequest(str(run.path)), Gates())
-    strict = run_evaluation(EvalRequest(str(run.path), changes=EnvChanges({"tolerance": 0.02})), Gates())
+    wide = run_evaluation(EvalRequest(str(run.path)))
+    strict = run_evaluation(EvalRequest(str(run.path), changes=EnvChanges({"tolerance": 0.02})))
     assert wide.success_rate >= 0.98
     assert strict.success_rate >= 0.90
 
@@ -40,6 +40,6 @@ def test_a_sparse_reward_is_learnt_in_hindsight_only(tmp_path, seed):
             "eval": {"episodes": 20, "every_steps": 4000},
         }
         run = run_training(TrainRequest(f"{ENVS}:Plane", settings=settings, root=tmp_path, check=False)).run
-        rates[her] = run_evaluation(EvalRequest(str(run.path), episodes=100), Gates()).success_rate
+        rates[her] = run_evaluation(EvalRequest(str(run.path), episodes=100)).success_rate
     assert rates[True] >= 0.95
     assert rates[False] <= 0.2

@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from rlctl.errors import ArtifactError, Interrupted, RecipeError, UsageError
-from rlctl.evaluation.evaluate import Gates
-from rlctl.evaluation.group import as_json, evaluate_group
-from rlctl.evaluation.request import EvalRequest
+from rlctl.evaluation.evaluate import evaluate_group
+from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.run.directory import RunLock, is_being_written
 from rlctl.run.group import create_group, find_group, parse_seeds, read_group
 from rlctl.run.lookup import find_policy, find_run
@@ -150,7 +149,7 @@ def test_what_is_done_stays_and_a_damaged_run_stops_no_other(group, tmp_path):
         assert caught.value.exit_code == 5
         scores = evaluate_group(read_group(group.path), EvalRequest(None, episodes=2))
         assert [seed.score is None for seed in scores.seeds] == [False, True]
-        assert "run.json: damaged" in as_json(scores)["seeds"][1]["problem"]
+        assert "run.json: damaged" in scores.as_json()["seeds"][1]["problem"]
         with pytest.raises(ArtifactError, match="1 of 2 seeds have no score; seed 5: "):
             scores.check(Gates())
     finally:

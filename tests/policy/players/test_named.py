@@ -5,7 +5,7 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.errors import PolicyError, UsageError
-from rlctl.evaluation.evaluate import Gates, run_evaluation
+from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.report import as_json
 from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.players.named import load_function, make_player
@@ -91,18 +91,18 @@ def test_a_function_that_is_not_there(functions):
 
 
 def test_a_baseline_is_evaluated_as_a_policy_is(functions):
-    zero = run_evaluation(EvalRequest("reach", baseline="zero", episodes=2), Gates())
+    zero = run_evaluation(EvalRequest("reach", baseline="zero", episodes=2))
     assert zero.lengths.mean == 120
     assert as_json(zero)["policy"] == {"baseline": "zero"}
-    ones = run_evaluation(EvalRequest("reach", baseline=f"{functions}:seven", episodes=2), Gates())
+    ones = run_evaluation(EvalRequest("reach", baseline=f"{functions}:seven", episodes=2))
     assert [episode["seed"] for episode in ones.episodes] == [episode["seed"] for episode in zero.episodes]
     assert ones.returns.mean != zero.returns.mean
     with pytest.raises(PolicyError, match=r"\(7,\), float32\)\nin environment 0, episode seed \d+, step 0$"):
-        run_evaluation(EvalRequest("reach", baseline=f"{functions}:to_goal", episodes=1), Gates())
+        run_evaluation(EvalRequest("reach", baseline=f"{functions}:to_goal", episodes=1))
 
 
 def test_what_a_baseline_does_not_take():
     with pytest.raises(UsageError, match="not a run: leave out --checkpoint, --pretrained"):
-        run_evaluation(EvalRequest("reach", baseline="zero", checkpoint="pretrained"), Gates())
+        run_evaluation(EvalRequest("reach", baseline="zero", checkpoint="pretrained"))
     with pytest.raises(UsageError, match="give the task to play: rlctl eval reach --policy zero"):
-        run_evaluation(EvalRequest(None, baseline="zero"), Gates())
+        run_evaluation(EvalRequest(None, baseline="zero"))
