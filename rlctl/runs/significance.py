@@ -13,7 +13,7 @@ import itertools
 import math
 import statistics
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ class MeanDifference:
     mean: float
     low: float  # lower end of the 95 % interval; equal to `mean` where there is nothing to resample
     high: float
-    p: float  # two-sided p-value, adjusted for all tests; 1 if all pairs are equal
+    p: float  # two-sided p-value, adjusted for all tests; 1 where nothing differs
     needed: int | None
     """About how many episodes, or seeds per recipe, would decide if this is the true difference; None if it is 0."""
 
@@ -64,51 +64,56 @@ class SeedDifference(MeanDifference):
     smallest_p: float  # the smallest p-value that this number of seeds can reach
 
 
-_Kind = TypeVar("_Kind", bound=MeanDifference)
-
-
 def compare_episodes(
     baseline: Mapping[Quantity, Array], candidate: Mapping[Quantity, Array], comparisons: int = 1
 ) -> dict[Quantity, MeanDifference]:
     """Compare two policies by success and return on the same episodes, each of shape (episodes,), NaN where unknown.
 
-    `comparisons` is how many candidates are compared with this baseline.
+    `comparisons` is how many candidates are compared with this baseline; p-values are adjusted by Bonferroni.
     """
-    differences, changes = {}, []
-    for quantity in baseline:
-        one, two = baseline[quantity], candidate[quantity]
-        known = np.isfinite(one) & np.isfinite(two)
-        measure = success_difference if quantity == "success" else return_difference
-        differences[quantity] = measure(one[known], two[known])
-        changes.append(np.where(known, two - one, 0.0))
-    return _adjust(differences, flip_signs(np.array(changes)), comparisons)
+    changes = {quantity: candidate[quantity] - baseline[quantity] for quantity in baseline}
+    p_values = flip_signs(np.array([np.where(np.isfinite(change), change, 0.0) for change in changes.values()]))
+    differences = {}
+    for (quantity, change), p in zip(changes.items(), p_values, strict=True):
+        known = change[np.isfinite(change)]
+        mean, std = float(known.mean()), float(known.std(ddof=1)) if known.size > 1 else math.nan
+        low, high = _success_interval(known) if quantity == "success" else _interval((known,), np.mean)
+        needed = _sample_size(mean, std, _LEAST_PAIRS)
+        differences[quantity] = MeanDifference(mean, low, high, min(1.0, comparisons * float(p)), needed)
+    return differences
 
 
 def compare_seeds(
     baseline: Mapping[Quantity, Array], candidate: Mapping[Quantity, Array], comparisons: int = 1
 ) -> dict[Quantity, SeedDifference]:
-    """Compare two recipes by the scores of their training seeds, each of shape (seeds,); see `compare_episodes`."""
-    differences = {quantity: seed_difference(baseline[quantity], candidate[quantity]) for quantity in baseline}
+    """Compare two recipes by the final scores of their training seeds, each of shape (seeds,); see `compare_episodes`.
+
+    Two seeds or more each. The interval of the difference of means is a bootstrap over seeds.
+    """
     p_values = exchange_seeds(np.array(list(baseline.values())), np.array(list(candidate.values())))
-    return {
-        quantity: dataclasses.replace(difference, smallest_p=min(1.0, comparisons * difference.smallest_p))
-        for quantity, difference in _adjust(differences, p_values, comparisons).items()
-    }
-
-
-def _adjust(differences: Mapping[Quantity, _Kind], p_values: Array, comparisons: int) -> dict[Quantity, _Kind]:
-    """Return the differences with p-values for all quantities together, and by Bonferroni for several candidates."""
-    return {
-        quantity: dataclasses.replace(difference, p=min(1.0, comparisons * max(difference.p, float(p))))
-        for (quantity, difference), p in zip(differences.items(), p_values, strict=True)
-    }
+    differences = {}
+    for quantity, p in zip(baseline, p_values, strict=True):
+        one, two = baseline[quantity], candidate[quantity]
+        mean, std = float(two.mean() - one.mean()), math.sqrt(float(two.var(ddof=1) + one.var(ddof=1)))
+        low, high = _interval((two, one), _difference_of_means)
+        differences[quantity] = SeedDifference(
+            mean,
+            low,
+            high,
+            min(1.0, comparisons * float(p)),
+            _sample_size(mean, std, _LEAST_SEEDS),
+            probability_of_improvement=float((np.sign(two[:, None] - one[None, :]) + 1).mean() / 2),
+            smallest_p=min(1.0, comparisons * 2 / math.comb(one.size + two.size, one.size)),
+        )
+    return differences
 
 
 def flip_signs(differences: Array) -> Array:
     """Return the p-values, shape (quantities,), of paired differences, shape (quantities, episodes), tested together.
 
     Under the null hypothesis all differences of an episode can change their sign together. Step-down maximum of
-    Westfall and Young (1993), which allows for the correlation of success and return.
+    Westfall and Young (1993), which allows for the correlation of success and return. Of success alone it is McNemar's
+    exact test, for few episodes; for more, signs are drawn at random.
     """
     moving = differences[:, differences.any(axis=0)]
     episodes = moving.shape[1]
@@ -157,60 +162,15 @@ def find_least_seeds(comparisons: int) -> tuple[int, float]:
     raise AssertionError
 
 
-def success_difference(baseline: Array, candidate: Array) -> MeanDifference:
-    """Compare two policies' successes, 0 or 1, on the same episodes: McNemar's exact test (McNemar, 1947).
+def _success_interval(change: Array) -> tuple[float, float]:
+    """Return the interval of Agresti and Min (2005) of the mean change of success, which is -1, 0 or 1 per episode.
 
-    Both of shape (episodes,). The interval is that of Agresti and Min (2005), which is not empty if no episode
-    differs: half an episode is added to each of the four outcomes of a pair.
+    It is not empty if no episode differs: half an episode is added to each of the four outcomes of a pair.
     """
-    from scipy.stats import binomtest
-
-    episodes, difference = baseline.size, candidate - baseline
-    gained, lost = int((difference > 0).sum()), int((difference < 0).sum())
-    p = float(binomtest(gained, gained + lost, 0.5).pvalue) if gained + lost else 1.0
-    centre = (gained - lost) / (episodes + 2)
-    half = _quantiles()[0] * math.sqrt((gained + lost + 1) / (episodes + 2) - centre**2) / math.sqrt(episodes + 2)
-    needed = _episodes_for_success(gained, lost, episodes)
-    return MeanDifference(float(difference.mean()), max(-1.0, centre - half), min(1.0, centre + half), p, needed)
-
-
-def return_difference(baseline: Array, candidate: Array) -> MeanDifference:
-    """Compare two policies' returns on the same episodes: a paired permutation test and a bootstrap interval.
-
-    Both of shape (episodes,). Raises `ValueError` if the shapes differ.
-    """
-    from scipy.stats import permutation_test
-
-    difference = candidate - baseline
-    mean = float(difference.mean())
-    if not difference.any():
-        return MeanDifference(0.0, 0.0, 0.0, 1.0, None)
-    test = permutation_test(
-        (difference,), np.mean, permutation_type="samples", n_resamples=_RESAMPLES, vectorized=True, rng=_rng()
-    )
-    low, high = _interval((difference,), np.mean)
-    std = float(difference.std(ddof=1)) if difference.size > 1 else math.nan
-    return MeanDifference(mean, low, high, float(test.pvalue), _sample_size(mean, std, _LEAST_PAIRS))
-
-
-def seed_difference(baseline: Array, candidate: Array) -> SeedDifference:
-    """Compare two recipes by the final scores of their training seeds: a permutation test, exact for few seeds.
-
-    Shapes (seeds,), two seeds or more each. The interval of the difference of means is a bootstrap over seeds.
-    """
-    from scipy.stats import permutation_test
-
-    mean = float(candidate.mean() - baseline.mean())
-    wins = np.sign(candidate[:, None] - baseline[None, :])
-    improvement = float((wins + 1).mean() / 2)
-    smallest = min(1.0, 2 / math.comb(baseline.size + candidate.size, baseline.size))
-    p = 1.0
-    if wins.any():
-        result = permutation_test((candidate, baseline), _difference_of_means, n_resamples=_RESAMPLES, rng=_rng())
-        p = float(result.pvalue)
-    low, high = _interval((candidate, baseline), _difference_of_means)
-    std = math.sqrt(float(candidate.var(ddof=1) + baseline.var(ddof=1)))
-    return SeedDifference(mean, low, high, p, _sample_size(mean, std, _LEAST_SEEDS), improvement, smallest)
+    episodes, changed = change.size + 2, float(np.abs(change).sum())
+    centre = float(change.sum()) / episodes
+    half = _quantiles()[0] * math.sqrt((changed + 1) / episodes - centre**2) / math.sqrt(episodes)
+    return max(-1.0, centre - half), min(1.0, centre + half)
 
 
 def interquartile_mean_interval(scores: Array) -> tuple[float, float]:
@@ -249,16 +209,6 @@ def _sample_size(difference: float, std: float, least: int) -> int | None:
     if difference == 0 or not math.isfinite(std):
         return None
     return max(least, math.ceil((sum(_quantiles()) * std / difference) ** 2))
-
-
-def _episodes_for_success(gained: int, lost: int, episodes: int) -> int | None:
-    """Return for how many pairs McNemar's test would find the difference (Connor, 1987)."""
-    if gained == lost:
-        return None
-    disagreeing, difference = (gained + lost) / episodes, (gained - lost) / episodes
-    alpha, beta = _quantiles()
-    root = alpha * math.sqrt(disagreeing) + beta * math.sqrt(max(disagreeing - difference**2, 0.0))
-    return math.ceil(max((root / difference) ** 2, _LEAST_PAIRS / disagreeing))
 
 
 def _quantiles() -> tuple[float, float]:

@@ -14,10 +14,19 @@ from rlctl.runs.significance import (
     find_least_seeds,
     flip_signs,
     interquartile_mean_interval,
-    return_difference,
-    seed_difference,
-    success_difference,
 )
+
+
+def success_difference(baseline, candidate):
+    return compare_episodes({"success": baseline}, {"success": candidate})["success"]
+
+
+def return_difference(baseline, candidate):
+    return compare_episodes({"return": baseline}, {"return": candidate})["return"]
+
+
+def seed_difference(baseline, candidate):
+    return compare_seeds({"return": baseline}, {"return": candidate})["return"]
 
 
 def successes(*groups):
@@ -51,13 +60,14 @@ def test_interval_of_a_difference_in_success_by_hand():
     assert (difference.low, difference.high) == pytest.approx((0.010842, 0.146020), abs=2e-6)
 
 
-def test_episodes_needed_by_connors_formula():
-    # 3 gained, 1 lost of 100: (1.959964 * sqrt(0.04) + 0.841621 * sqrt(0.04 - 0.0004))^2 / 0.02^2 = 783.9
+def test_episodes_needed_by_hand():
+    # 3 gained, 1 lost of 100: mean 0.02, variance (0.04 - 0.0004) * 100 / 99 = 0.04;
+    # (1.959964 + 0.841621)^2 * 0.04 / 0.02^2 = 784.9
     baseline = successes((False, 3), (True, 1), (True, 96))
     candidate = successes((True, 3), (False, 1), (True, 96))
     difference = success_difference(baseline, candidate)
     assert difference.p == pytest.approx(2 * 5 / 16)  # 2 * P(at most 1 of 4)
-    assert difference.needed == pytest.approx(784, abs=1)
+    assert difference.needed == 785
 
 
 def test_fewer_pairs_than_can_decide_are_not_called_enough():
@@ -131,7 +141,7 @@ def test_success_and_return_are_tested_together_by_hand():
     assert [difference.p for difference in both.values()] == [2 / 64, 2 / 64]
     # Of three candidates each p-value counts three times.
     assert compare_episodes({"return": 0 * ones}, {"return": ones}, comparisons=3)["return"].p == 6 / 64
-    # One episode of success says nothing of returns: its p-value stays 1, that of the return does not fall.
+    # One episode of success tells nothing: its p-value stays 1, and that of the return does not become smaller.
     success = np.array([1.0, 0, 0, 0, 0, 0])
     mixed = compare_episodes({"success": 0 * ones, "return": 0 * ones}, {"success": success, "return": ones})
     assert mixed["success"].p == 1.0
