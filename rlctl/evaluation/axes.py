@@ -1,9 +1,10 @@
 """The axes of `--vary`: an event or a parameter of a task, and its values."""
 
+import dataclasses
 import inspect
 import math
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,10 @@ from rlctl.task.events.event import read_range
 from rlctl.task.task import Task
 
 ALL = "all"
-MOST_CELLS = 1_000_000
+_MOST_VALUES = 1000  # of an axis
 _VALUES = 5  # per axis of `--vary all`
 _WIDER = 2.0  # width of an axis of `--vary all`, relative to the event's range
-_FORM = "write NAME=LOWEST:HIGHEST:VALUES, for example --vary mass=0.6:1.4:9"
-
-
+_FORM = f"write NAME=LOWEST:HIGHEST:VALUES with 2 to {_MOST_VALUES:,} values, for example --vary mass=0.6:1.4:9"
 SIM = "sim"  # the setting of the axis whose values are MuJoCo's contacts
 _SOLREFS = [0.02, 0.01, 0.005]  # [s], from MuJoCo's default to contacts about as stiff as PyBullet's
 
@@ -49,21 +48,15 @@ def read_axes(texts: Sequence[str], spec: EnvSpec) -> list[list[Axis]]:
     return [axes]
 
 
-def count_cells(maps: Iterable[Sequence[Axis]]) -> int:
-    """Return how many cells maps of these axes have; raises `UsageError` for more than `MOST_CELLS`."""
-    cells = sum(math.prod(len(axis.values) for axis in axes) for axes in maps)
-    if cells > MOST_CELLS:
-        raise UsageError(f"--vary: {cells:,} cells; at most {MOST_CELLS:,} are possible")
-    return cells
-
-
-def change(axis: Axis, value: float) -> EnvChanges:
-    """Return the change of the environment that sets an axis to a value."""
+def apply(axis: Axis, value: float, spec: EnvSpec) -> EnvSpec:
+    """Return an environment in which an axis has a value."""
+    if axis.setting == SIM:
+        return dataclasses.replace(spec, sim=f"mujoco:{value:g}")
     kind, _, rest = axis.setting.partition(".")
     if kind == "events":
         event, _, parameter = rest.partition(".")
-        return EnvChanges(events={event: {parameter: value}})
-    return EnvChanges(parameters={rest: int(value) if value.is_integer() and axis.whole else value})
+        return EnvChanges(events={event: {parameter: value}}).apply(spec)
+    return EnvChanges(parameters={rest: int(value) if value.is_integer() and axis.whole else value}).apply(spec)
 
 
 def _read_axis(text: str, task: Any, spec: EnvSpec) -> Axis:
@@ -73,14 +66,10 @@ def _read_axis(text: str, task: Any, spec: EnvSpec) -> Axis:
         if not equals or len(parts) != 3:
             raise ValueError
         low, high, count = float(parts[0]), float(parts[1]), int(parts[2])
+        if not (-math.inf < low < high < math.inf and 2 <= count <= _MOST_VALUES):
+            raise ValueError
     except ValueError:
-        raise UsageError(f"--vary {short_repr(text)!r}: {_FORM}") from None
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise UsageError(f"--vary {text}: {low:g} to {high:g} is not a range; {_FORM}")
-    if count < 2:
-        raise UsageError(f"--vary {text}: an axis needs two or more values; for a single value use --set; {_FORM}")
-    if count > MOST_CELLS:
-        raise UsageError(f"--vary {text}: at most {MOST_CELLS:,} values are possible")
+        raise UsageError(f"--vary {short_repr(text)!r}: {_FORM}; for a single value use --set") from None
     name = name.strip()
     events: Mapping[str, Event] = task.events if is_task(task) else {}
     event, _, parameter = name.removeprefix("events.").partition(".")
@@ -142,7 +131,6 @@ def _vary_parameter(name: str, task: Any, span: tuple[float, float, int], spec: 
 
 
 def _is_whole(declared: inspect.Parameter, values: Sequence[float]) -> bool:
-    """Return whether a parameter takes only whole numbers: by its type, else by its default and `values`."""
     if declared.annotation is not declared.empty:
         return declared.annotation in (int, "int")
     return type(declared.default) is int and all(value.is_integer() for value in values)
@@ -154,7 +142,6 @@ def _find_numbers(task: type[Task]) -> dict[str, Any]:
 
 
 def _vary_all(task: Any, spec: EnvSpec) -> list[Axis]:
-    """Return an axis per event: its range, twice as wide."""
     if not is_task(task) or not task.events:
         raise UsageError(f"--vary all: {spec.task} has no events; name one of its parameters")
     # Colours matter only to policies that use a camera; name the event to vary it.

@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import itertools
 import json
+import math
 import shlex
 import sys
 import time
@@ -59,7 +60,7 @@ def measure_robustness(
     if sim is not None:
         dataclasses.replace(spec, sim=sim).make().close()  # raises for what MuJoCo cannot build
         maps.append([axes_of.make_contact_axis(sim)])
-    cells = axes_of.count_cells(maps)  # raises for too many
+    cells = sum(math.prod(len(axis.values) for axis in axes) for axes in maps)
     with start_workers(spec, request) as workers:
         policy.give_to(workers)
         player = CellPlayer(workers, policy, request)
@@ -143,10 +144,7 @@ def _play_maps(
 
 def _apply(axes: Sequence[Axis], values: Sequence[float], spec: EnvSpec) -> EnvSpec:
     for axis, value in zip(axes, values, strict=True):
-        is_engine = axis.setting == axes_of.SIM
-        spec = (
-            dataclasses.replace(spec, sim=f"mujoco:{value:g}") if is_engine else axes_of.change(axis, value).apply(spec)
-        )
+        spec = axes_of.apply(axis, value, spec)
     return spec
 
 
@@ -156,7 +154,6 @@ def _is_nominal(axes: Sequence[Axis], values: Sequence[float]) -> bool:
 
 
 def _ask(cells: int, seconds: float, yes: bool) -> None:
-    """Ask before a long measurement; raises `UsageError` without a terminal."""
     total = cells * seconds
     if yes or total <= ASK_ABOVE_S:
         return
