@@ -84,26 +84,19 @@ def load_episode(path: Path) -> RecordedEpisode:
 
 def _find_mismatch(episode: RecordedEpisode) -> str | None:
     """Return which array has a wrong shape or type for the number of rewards; None if all fit."""
-    observations, rewards = episode.observations, episode.rewards
-    if rewards.ndim != 1 or rewards.dtype != np.float64:
-        return f"rewards are {_describe_array(rewards)}, not a row of float64"
-    steps, names = len(rewards), len(episode.info.term_names)
-    if episode.terms.shape != (steps, names) or episode.terms.dtype != np.float64:
-        return f"reward terms are {_describe_array(episode.terms)}, not float64 of shape {(steps, names)}"
-    parts = split(observations)
-    # A failed episode has only its actions, of any number.
-    acted, observed = (None, 0) if episode.info.failure and not steps else (steps, steps + 1)
-    observations_and_counts = ((name, values, observed) for name, values in parts.items())
-    for name, values, count in (("actions", episode.actions, acted), *observations_and_counts):
-        label = name if name == "actions" else f"observations {name}".strip()
-        if values.ndim == 0 or (count is not None and len(values) != count):
-            return f"{label} are {_describe_array(values)}, not {count} of them"
-        if values.dtype.kind not in "biuf":
-            return f"{label} are {_describe_array(values)}, not numbers"
-    if not np.isfinite(episode.actions).all():
-        return "actions are not all finite"
-    return None
-
-
-def _describe_array(values: NDArray[Any]) -> str:
-    return f"{values.dtype} of shape {values.shape}"
+    steps, actions = episode.rewards.size, episode.actions
+    only_actions = bool(episode.info.failure) and not steps  # the environment failed; they are of any number
+    acted = actions.shape[:1] if only_actions and actions.ndim else (steps,)
+    observed = 0 if only_actions else steps + 1
+    for name, values, shape in (
+        ("rewards", episode.rewards, (steps,)),
+        ("terms", episode.terms, (steps, len(episode.info.term_names))),
+        ("actions", actions, (*acted, *actions.shape[1:])),
+        *(
+            (f"observations {key}".strip(), part, (observed, *part.shape[1:]))
+            for key, part in split(episode.observations).items()
+        ),
+    ):
+        if values.shape != shape or values.dtype.kind not in "biuf":
+            return f"{name}: {values.dtype} of shape {values.shape}, not numbers of shape {shape}"
+    return None if np.isfinite(actions).all() else "actions are not all finite"
