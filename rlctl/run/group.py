@@ -13,9 +13,9 @@ from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
 
 VERSION = 2  # of the format of `group.json`
-_NOT_STORED = {"root", "resume"}  # arguments that are not stored: the runs of a group are always in its folder
+_NOT_STORED = {"root", "resume"}  # arguments: the runs of a group are always in its folder
 _MOST_SEEDS = 1000
-_RANGE = re.compile(r"(\d{1,9})-(\d{1,9})")
+_RANGE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 JOBS = ".jobs"  # in the folder of a group or a tuning: a small file per seed that a cluster trains
 
 
@@ -61,18 +61,11 @@ def parse_seeds(text: str) -> list[int]:
     """Return the seeds of `0-4` or `0,3,7-9`; raises `UsageError` for text that is not one, and for a seed twice."""
     seeds: list[int] = []
     for part in text.split(","):
-        part = part.strip()
-        if match := _RANGE.fullmatch(part):
-            first, last = int(match[1]), int(match[2])
-            if last < first:
-                raise UsageError(f"--seeds {text}: {part} goes down; write {last}-{first}")
-            if last - first >= _MOST_SEEDS:
-                raise UsageError(f"--seeds {text}: at most {_MOST_SEEDS} seeds")
-            seeds += range(first, last + 1)
-        elif part.isdecimal() and len(part) < 10:
-            seeds.append(int(part))
-        else:
-            raise UsageError(f"--seeds {text}: write a range or a list, such as 0-4 or 0,3,7")
+        match = _RANGE.fullmatch(part.strip())
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
+        if not 0 <= last - first < _MOST_SEEDS:
+            raise UsageError(f"--seeds {text}: write a range or a list, such as 0-4 or 0,3,7; at most {_MOST_SEEDS:,}")
+        seeds += range(first, last + 1)
     if twice := [seed for seed in seeds if seeds.count(seed) > 1]:
         raise UsageError(f"--seeds {text}: seed {twice[0]} is given twice")
     return seeds
@@ -101,22 +94,17 @@ def read_group(path: Path) -> Group:
         raise ArtifactError(f"{path}: not a group of runs: it has no {GROUP_FILE}")
     file = path / GROUP_FILE
     content: Any = files.read_json(file)
-    if isinstance(content, dict) and content.get("version") != VERSION:
-        raise ArtifactError(
-            f"{file}: written by another version of rlctl: the group cannot be resumed; resume its runs one by one"
-        )
     try:
-        if content["request"].keys() & _NOT_STORED:
-            raise ValueError
         seeds = content["seeds"]
-        request = TrainRequest.from_json({**content["request"], "root": str(path)})
-        if request.task is None or not all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds):
-            raise ValueError
-        if len(set(seeds)) != len(seeds):
+        request = TrainRequest.from_json({**content["request"], "root": str(path), "resume": None})
+        are_seeds = all(type(seed) is int and 0 <= seed < 2**32 for seed in seeds) and len(set(seeds)) == len(seeds)
+        if content["version"] != VERSION or request.task is None or not are_seeds:
             raise ValueError
         return Group(path, list(seeds), request)
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise ArtifactError(f"{file}: damaged: it must hold seeds and a training request") from None
+    except (KeyError, TypeError, ValueError):
+        raise ArtifactError(
+            f"{file}: damaged, or written by another version of rlctl; resume the runs of the group one by one"
+        ) from None
 
 
 @dataclasses.dataclass(frozen=True)
