@@ -57,11 +57,10 @@ def choose_spec(info: PolicyInfo, request: EvalRequest) -> EnvSpec:
         return info.derive_spec(request.task, request.changes)
     if request.task is not None and request.task != info.spec.task:
         raise UsageError(f"--stage: the policy has only stages of {info.spec.task}; leave out --task")
-    if not info.stages:
-        raise UsageError(f"--stage {stage}: this policy was trained without stages; leave out --stage")
     if not 1 <= stage <= len(info.stages):
-        count = len(info.stages)
-        raise UsageError(f"--stage {stage}: this policy was trained in {count} stages; give a number from 1 to {count}")
+        raise UsageError(
+            f"--stage {stage}: this policy was trained in {output.format_count(len(info.stages), 'stage')}"
+        )
     return request.changes.apply(info.stages[stage - 1])
 
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 _MOST_COLUMNS = 25  # of a map that is drawn
-_MOST_ROWS = 60
 _NOMINAL, _WORST = "*", "<"
 
 
@@ -50,7 +49,6 @@ def show(result: Evaluation, json: str | None) -> None:
 
 
 def _show_limits(result: Evaluation, unlimited: Evaluation) -> None:
-    """Print the scores with and without limits, and how often each limit acted."""
     out = output.out()
     without, limited = unlimited.success_rate, result.success_rate
     success = ""
@@ -125,28 +123,18 @@ def as_json(result: Evaluation) -> dict[str, Any]:
 
 def describe_score(score: MeasuredScore) -> str:
     """Return `success 100.0% (96.3% to 100.0%), return 96.7 (95.1 to 98.2), action change 0.031`."""
-    outcome = Outcome(
-        success_rate=score.success,
-        success_interval=score.success_interval,
-        mean_return=score.mean_return,
-        return_interval=score.return_interval,
-    )
     early = "" if score.ended_early is None else f", {score.ended_early:.0%} ended early"
-    return f"{_format_outcome(outcome)}{early}, action change {score.action_change:.3f}"
+    return f"{_format_outcome(score)}{early}, action change {score.action_change:.3f}"
 
 
-def _format_outcome(outcome: Outcome) -> str:
-    """Return `success 97.0% (91.5% to 99.0%), return 123 (119 to 127)`."""
-    rate, interval = outcome.success_rate, _format_interval(outcome.success_interval, percent=True)
-    success = "" if rate is None else f"success {rate:.1%} ({interval}), "
-    return f"{success}return {outcome.mean_return:.4g} ({_format_interval(outcome.return_interval)})"
+def _format_outcome(outcome: Outcome | MeasuredScore) -> str:
+    rate = outcome.success if isinstance(outcome, MeasuredScore) else outcome.success_rate
+    success = "" if rate is None else f"success {rate:.1%} ({_format_interval(outcome.success_interval, '.1%')}), "
+    return f"{success}return {outcome.mean_return:.4g} ({_format_interval(outcome.return_interval, '.4g')})"
 
 
-def _format_interval(interval: Interval | None, *, percent: bool = False) -> str:
-    if interval is None:
-        return "-"
-    low, high = interval
-    return f"{low:.1%} to {high:.1%}" if percent else f"{low:.4g} to {high:.4g}"
+def _format_interval(interval: Interval | None, form: str) -> str:
+    return "-" if interval is None else f"{interval[0]:{form}} to {interval[1]:{form}}"
 
 
 def show_group(result: GroupScore, json: str | None) -> None:
@@ -167,15 +155,9 @@ def show_group(result: GroupScore, json: str | None) -> None:
 
 
 def _list_cells(seed: SeedScore) -> tuple[str, ...]:
-    score = seed.score
-    return (
-        str(seed.seed),
-        "-" if score is None or score.success is None else f"{score.success:.1%}",
-        "-" if score is None else f"{score.mean_return:.4g}",
-        "-" if seed.steps is None else f"{seed.steps:,}",
-        "-" if seed.seconds is None else f"{seed.seconds:.0f}",
-        seed.problem,
-    )
+    success, mean_return = (None, None) if seed.score is None else (seed.score.success, seed.score.mean_return)
+    numbers = ((success, ".1%"), (mean_return, ".4g"), (seed.steps, ","), (seed.seconds, ".0f"))
+    return (str(seed.seed), *("-" if value is None else format(value, form) for value, form in numbers), seed.problem)
 
 
 def show_robustness(result: Robustness, json: str | None) -> None:
@@ -203,29 +185,28 @@ def show_robustness(result: Robustness, json: str | None) -> None:
 
 
 def _show_map(varied: RobustnessMap, worst: Cell | None) -> None:
-    out = output.out()
-    columns, rows = len(varied.axes[-1].values), len(varied.cells) // len(varied.axes[-1].values)
-    if len(varied.axes) == 1 and columns <= _MOST_ROWS:
+    if len(varied.axes) == 1:
         _show_list(varied, worst)
-    elif columns <= _MOST_COLUMNS and rows <= _MOST_ROWS:
+    elif len(varied.axes[1].values) <= _MOST_COLUMNS:
         _show_grid(varied, worst)
     else:
         names = " x ".join(axis.name for axis in varied.axes)
-        out.print(f"{names}: {len(varied.cells):,} cells, too many to draw; --json FILE writes all of them")
+        output.out().print(
+            f"{names}: more than {_MOST_COLUMNS} columns, too many to draw; --json FILE writes all cells"
+        )
 
 
 def _show_list(varied: RobustnessMap, worst: Cell | None) -> None:
     has_success = varied.cells[0].success_rate is not None
     successes = ("success", "95 % interval") if has_success else ()
     rows = []
-    for cell, color in zip(varied.cells, _color_cells(varied), strict=True):
-        cells: list[str | Text] = [f"{cell.values[0]:g}"]
+    for cell in varied.cells:
+        cells = [f"{cell.values[0]:g}"]
         if cell.success_rate is not None:
-            cells += [_paint(f"{cell.success_rate:.1%}", color), _format_interval(cell.success_interval, percent=True)]
-        value = f"{cell.mean_return:.4g}"
-        cells += [value if has_success else _paint(value, color), _format_interval(cell.return_interval)]
-        marks = [*(["nominal"] if cell.nominal else []), *(["worst"] if cell is worst else [])]
-        rows.append([*cells, ", ".join(marks)])
+            cells += [f"{cell.success_rate:.1%}", _format_interval(cell.success_interval, ".1%")]
+        cells += [f"{cell.mean_return:.4g}", _format_interval(cell.return_interval, ".4g")]
+        marks = ["nominal" if cell.nominal else "", "worst" if cell is worst else ""]
+        rows.append([*cells, ", ".join(filter(None, marks))])
     output.print_table((varied.axes[0].name, *successes, "return", "95 % interval", ""), rows, left=("",))
 
 
@@ -233,11 +214,9 @@ def _show_grid(varied: RobustnessMap, worst: Cell | None) -> None:
     """Print a heat map: the first axis downwards, the second across."""
     down, across = varied.axes
     has_success = varied.cells[0].success_rate is not None
-    cells = list(zip(varied.cells, _color_cells(varied), strict=True))
-    width = len(across.values)
+    cells = iter(zip(varied.cells, _color_cells(varied), strict=True))
     rows: list[list[str | Text]] = [
-        [f"{value:.3g} ", *(_draw_cell(cell, color, cell is worst) for cell, color in cells[start : start + width])]
-        for value, start in zip(down.values, range(0, len(cells), width), strict=True)
+        [f"{value:.3g} ", *(_draw_cell(*next(cells), worst) for _ in across.values)] for value in down.values
     ]
     columns = [f"{down.name} \\ {across.name} ", *(f" {value:.3g} " for value in across.values)]
     output.print_table(columns, rows, gap="")
@@ -246,25 +225,20 @@ def _show_grid(varied: RobustnessMap, worst: Cell | None) -> None:
     out.print(f"{'success [%]' if has_success else 'mean return'}; {', '.join(marks)}")
 
 
-def _draw_cell(cell: Cell, color: str, is_worst: bool) -> Text:
-    text = f"{cell.mean_return:.3g}" if cell.success_rate is None else f"{100 * cell.success_rate:.0f}"
-    mark = f"{_NOMINAL if cell.nominal else ''}{_WORST if is_worst else ''}"
-    return _paint(f" {text}{mark or ' '}", color)
-
-
-def _paint(text: str, color: str) -> Text:
+def _draw_cell(cell: Cell, color: str, worst: Cell | None) -> Text:
     from rich.text import Text
 
-    return Text(text, style=f"black on {color}")
+    text = f"{cell.mean_return:.3g}" if cell.success_rate is None else f"{100 * cell.success_rate:.0f}"
+    mark = f"{_NOMINAL if cell.nominal else ''}{_WORST if cell is worst else ''}"
+    return Text(f" {text}{mark or ' '}", style=f"black on {color}")
 
 
 def _color_cells(varied: RobustnessMap) -> list[str]:
     """Return a colour per cell, from red over yellow to green: of success rates from 0 to 1, else of the returns."""
-    rates = [cell.success_rate for cell in varied.cells]
     returns = [cell.mean_return for cell in varied.cells]
-    low, high = min(returns), max(returns)
+    low, size = min(returns), max(returns) - min(returns) or 1.0
     parts = [
-        (mean - low) / (high - low or 1.0) if rate is None else rate for rate, mean in zip(rates, returns, strict=True)
+        (cell.mean_return - low) / size if cell.success_rate is None else cell.success_rate for cell in varied.cells
     ]
     return [f"rgb({min(255, round(510 * (1 - part)))},{min(255, round(510 * part))},80)" for part in parts]
 
@@ -274,10 +248,9 @@ def _show_push(push: PushTest) -> None:
     target = push.body if push.link is None else f"{push.link} of {push.body}"
     out.print(f"push on {target} in the middle of the episode, {push.duration_s:g} s, from a random direction")
     held = "success" if push.measure == "success" else "reached the time limit"
-    speeds = [level.impulse / push.mass if push.mass else 0.0 for level in push.levels]
     rows = [
-        (f"{level.impulse:.3g}", f"{speed:.2g}", f"{level.held:.1%}", f"{level.mean_return:.4g}")
-        for level, speed in zip(push.levels, speeds, strict=True)
+        (f"{level.impulse:.3g}", f"{level.impulse / push.mass:.2g}", f"{level.held:.1%}", f"{level.mean_return:.4g}")
+        for level in push.levels
     ]
     output.print_table(("push [N s]", "speed change [m/s]", held, "return"), rows)
     out.print(push.verdict)

@@ -90,8 +90,6 @@ def find_group(text: str, root: Path = ROOT) -> Path | None:
 def read_group(path: Path) -> Group:
     """Read a group; raises `ArtifactError` for a folder that is not one, or damaged."""
     refuse_tuning(path)
-    if not is_group(path):
-        raise ArtifactError(f"{path}: not a group of runs: it has no {GROUP_FILE}")
     file = path / GROUP_FILE
     content: Any = files.read_json(file)
     try:

@@ -202,14 +202,14 @@ def _describe_choice(
         notes.append(f"it belongs to the group {run.path.parent}")
     if skipped:
         notes.append(f"skipped {', '.join(str(run.path) for run in skipped)}: no such policy yet")
-    if (better := _find_better(info, older)) is not None:
+    if better := _find_better(info, older):
         notes.append(better)
     return tuple(notes)
 
 
 def _find_better(info: PolicyInfo, older: Sequence[RunDirectory]) -> str | None:
-    """Describe the best older run of the same task, parameters and rewards, if it was better in its evaluations."""
-    better: list[tuple[float, RunDirectory, str]] = []
+    """Describe the best older run of the same parameters and rewards, if it was better in its evaluations."""
+    better: list[tuple[float, str]] = []
     for run in older[:_MOST_COMPARED]:
         with contextlib.suppress(ArtifactError):
             other = PolicyFile.read_info(run.policy_file("best"))
@@ -221,11 +221,8 @@ def _find_better(info: PolicyInfo, older: Sequence[RunDirectory]) -> str | None:
                 ours, theirs = info.evaluation.mean_return, other.evaluation.mean_return
                 form = "return {:.4g} against {:.4g}"
             if theirs > ours:
-                better.append((theirs, run, form.format(theirs, ours)))
-    if not better:
-        return None
-    _, run, scores = max(better, key=lambda scored: scored[0])
-    return f"an older run had a better evaluation: {run.path} ({scores})"
+                better.append((theirs, f"{run.path} ({form.format(theirs, ours)})"))
+    return f"an older run had a better evaluation: {max(better)[1]}" if better else None
 
 
 def _read_latest(root: Path) -> RunDirectory | None:

@@ -57,10 +57,10 @@ class TrainRequest:
 
     def to_json(self) -> dict[str, Any]:
         """Return the request as JSON data."""
-        return {
-            field.name: str(value) if isinstance(value := getattr(self, field.name), Path) else value
-            for field in dataclasses.fields(self)
-        }
+        from pydantic_core import to_jsonable_python
+
+        content: dict[str, Any] = to_jsonable_python(self)
+        return content
 
     @classmethod
     def from_json(cls, content: Any) -> TrainRequest:

@@ -244,8 +244,8 @@ def _default_threshold(threshold: float | None, has_success: bool) -> float | No
 
 def _differences(baseline: Side, side: Side, of_recipes: bool, comparisons: int) -> Mapping[Quantity, MeanDifference]:
     quantities: list[Quantity] = ["success", "return"] if baseline.has_success and side.has_success else ["return"]
-    if of_recipes:
-        one, two = ({quantity: own.scores(quantity) for quantity in quantities} for own in (baseline, side))
-        return compare_seeds(one, two, comparisons)
-    one, two = ({quantity: own.runs[0].values(quantity) for quantity in quantities} for own in (baseline, side))
-    return compare_episodes(one, two, comparisons)
+    one, two = (
+        {quantity: own.scores(quantity) if of_recipes else own.runs[0].values(quantity) for quantity in quantities}
+        for own in (baseline, side)
+    )
+    return compare_seeds(one, two, comparisons) if of_recipes else compare_episodes(one, two, comparisons)

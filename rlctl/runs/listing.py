@@ -90,14 +90,8 @@ def show(runs: list[RunSummary], json: str | None) -> None:
 def _find_source_changes(runs: list[RunSummary]) -> dict[str, list[str]]:
     """Return the names of the runs whose task has changed since they began, by what has changed."""
     changes: dict[str, list[str]] = {}
-    known: dict[tuple[str, str, str], str | None] = {}
     for run in runs:
-        if run.state == "damaged" or not run.source_sha256:
-            continue
-        key = (run.task, run.folder, run.source_sha256)
-        if key not in known:
-            known[key] = describe_source_change(RunDirectory(run.path))
-        if (change := known[key]) is not None:
+        if run.source_sha256 and (change := describe_source_change(RunDirectory(run.path))):
             changes.setdefault(change, []).append(run.name)
     return changes
 

@@ -18,7 +18,6 @@ Rows = list[dict[str, float | None]]  # of a table, oldest first; an empty field
 _LARGEST = 1e100  # larger numbers are ignored: plots and sums would overflow
 _STANDARD_ERRORS = 1.645
 """A success rate is lower beyond this many standard errors: 5 % of equal policies count as lower (one-sided)."""
-_TAIL_BYTES = 4096  # the last row of a table is read from this many bytes; a row has a few hundred
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,10 +130,9 @@ def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
 def _first_number(*values: object) -> float | None:
     """Return the first value that is a number, or the text of one, and below `_LARGEST`."""
     for value in values:
-        if isinstance(value, str | int | float) and not isinstance(value, bool):
-            with contextlib.suppress(ValueError, OverflowError):
-                if abs(number := float(value)) < _LARGEST:
-                    return number
+        with contextlib.suppress(ValueError, OverflowError, TypeError):
+            if abs(number := float(value)) < _LARGEST:  # type: ignore[arg-type]
+                return number
     return None
 
 
@@ -246,17 +244,13 @@ def find_best_row(rows: Rows) -> dict[str, float | None] | None:
 
 
 def last_row(path: Path) -> dict[str, str] | None:
-    """Return the last whole row of a table without reading the rest of it."""
+    """Return the last whole row of a table without parsing the others."""
     try:
-        with path.open("rb") as file:
-            header = file.readline()
-            size = file.seek(0, os.SEEK_END)
-            file.seek(max(len(header), size - _TAIL_BYTES))
-            lines = file.read().decode(errors="replace").splitlines(keepends=True)
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
     except OSError:
         return None
     whole = [line for line in lines if line.endswith("\n")]
-    if not whole:
+    if len(whole) < 2:
         return None
-    names, values = next(csv.reader([header.decode(errors="replace")])), next(csv.reader([whole[-1]]))
+    names, values = csv.reader((whole[0], whole[-1]))
     return dict(zip(names, values, strict=True)) if len(names) == len(values) else None
