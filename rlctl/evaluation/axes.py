@@ -33,10 +33,7 @@ def make_contact_axis(sim: str) -> Axis:
 
 
 def read_axes(texts: Sequence[str], spec: EnvSpec) -> list[list[Axis]]:
-    """Return the axes of each map of `--vary`: a single map, or with `all` one per event of the task.
-
-    Raises `UsageError` for a name that the task does not have, or values that it cannot take.
-    """
+    """Return the axes of each map of `--vary`: a single map, or with `all` one per event of the task."""
     task = spec.constructor()
     if list(texts) == [ALL]:
         return [[axis] for axis in _vary_all(task, spec)]

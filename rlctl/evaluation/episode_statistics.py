@@ -97,10 +97,7 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 def mean_action_change(episodes: Sequence[Episode]) -> float:
-    """Return the mean of |action - previous action| over elements and steps of recorded episodes.
-
-    It is 0 for discrete actions, and for episodes of one step.
-    """
+    """Return the mean of |action - previous action| over elements and steps; 0 for discrete actions."""
     changes = [
         np.abs(np.diff(episode.trajectory.actions, axis=0)).ravel()
         for episode in episodes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -233,19 +234,15 @@ class GroupScore:
         return plain
 
     def check(self, gates: Gates) -> None:
-        """Raise `ArtifactError` if a seed has no score, and `AnswerIsNo` if one misses a gate.
-
-        Raises `UsageError` for a gate on success where the task does not report it.
-        """
+        """Raise `ArtifactError` if a seed has no score, and `AnswerIsNo` if one misses a gate."""
+        scores = [(seed, seed.score) for seed in self.seeds if seed.score is not None]
         if failed := [seed for seed in self.seeds if seed.score is None]:
             raise ArtifactError(
                 f"{self.group.path}: {len(failed)} of {len(self.seeds)} seeds have no score; seed {failed[0].seed}: "
                 f"{failed[0].problem}"
             )
         missed = []
-        for seed in self.seeds:
-            score = seed.score
-            assert score is not None
+        for seed, score in scores:
             gates.check_possible(score.success is not None)
             gates_missed = gates.list_missed(score.success, score.success_interval, score.mean_return)
             missed += [f"seed {seed.seed}: {gate}" for gate in gates_missed]
@@ -254,17 +251,9 @@ class GroupScore:
 
 
 def evaluate_group(group: Group, request: EvalRequest) -> GroupScore:
-    """Evaluate a policy of every seed's run, by default the best; a seed without one has a problem instead.
-
-    A warning about several seeds, such as a changed task, is printed once.
-    """
-    printed: set[str] = set()
-
-    def print_new(notes: Sequence[str]) -> None:
-        output.print_notes(note for note in notes if note not in printed)
-        printed.update(notes)
-
-    return GroupScore(group, [_evaluate_seed(group, seed, request, print_new) for seed in group.seeds])
+    """Evaluate a policy of every seed's run, by default the best; a seed without one has a problem instead."""
+    print_notes = functools.cache(output.print_notes)  # a warning about all seeds, such as a changed task, only once
+    return GroupScore(group, [_evaluate_seed(group, seed, request, print_notes) for seed in group.seeds])
 
 
 def _evaluate_seed(

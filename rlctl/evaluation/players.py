@@ -67,10 +67,7 @@ def choose_spec(info: PolicyInfo, request: EvalRequest) -> EnvSpec:
 def find_player(
     request: EvalRequest, print_notes: Callable[[Sequence[str]], None] = output.print_notes
 ) -> tuple[lookup.FoundPolicy, LoadedPolicy, EnvSpec]:
-    """Find and read the policy of a request, and return it with the environment to evaluate it in.
-
-    `print_notes` prints which policy was chosen, and warnings about it.
-    """
+    """Find and read the policy of a request; return it with its environment. `print_notes` prints which was chosen."""
     source = lookup.find_policy(request.run, request.checkpoint)
     print_notes(source.notes)
     policy = load_player(source.file, request.deterministic)

@@ -41,10 +41,7 @@ class PushedBody:
 
 
 def find_pushed(spec: EnvSpec) -> PushedBody:
-    """Build the world and find the base, or the trunk on rails, of its robot.
-
-    Raises `UsageError` for a robot that is fixed to the world, and for a plain environment.
-    """
+    """Build the world and find the base, or the trunk on rails, of its robot; raises `UsageError` without one."""
     from rlctl.task.env import TaskEnv
 
     with contextlib.closing(spec.make()) as env:

@@ -112,11 +112,7 @@ def compare(
 
     `texts` are runs, groups, globs, or folders of runs; the first is the baseline. `threshold` is a success rate, or a
     return if the task reports no success; the result has the steps until an evaluation reached it. `force` compares
-    even if the task has changed since a training.
-
-    Raises `UsageError` for less than two sides, a run compared with itself, runs of different tasks without `task`,
-    a task that has changed, and a mix of groups and single runs; `ArtifactError` for runs that are missing, damaged or
-    without a policy.
+    even if the task has changed since a training. Raises `UsageError` for sides that cannot be compared.
     """
     if len(texts) < 2:
         raise UsageError("give two or more to compare, the baseline first: rlctl runs compare A B")
@@ -204,11 +200,9 @@ def _refuse_unequal(names: Sequence[str], groups: Sequence[Sequence[RunDirectory
 
 def _common_task(runs: list[RunDirectory], task: str | None) -> str:
     tasks = list(dict.fromkeys(str(run.status()["task"]) for run in runs))
-    if task is not None:
-        return task
-    if len(tasks) > 1:
+    if task is None and len(tasks) > 1:
         raise UsageError(f"runs of different tasks ({', '.join(tasks)}); --task TASK evaluates all on one task")
-    return tasks[0]
+    return task or tasks[0]
 
 
 def _refuse_changed(runs: list[RunDirectory]) -> None:

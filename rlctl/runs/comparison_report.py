@@ -43,18 +43,17 @@ def _show_seeds(result: RunComparison) -> None:
     columns = ["recipe", "seed", "success", "return"]
     if result.threshold is not None:
         columns += [f"steps to {result.threshold:g}", f"seconds to {result.threshold:g}"]
-    rows = [
-        (side.name, _or_dash(run.seed, ""), *_format_scores(run), *_format_reached(run))[: len(columns)]
-        for side in result.sides
-        for run in side.runs
-    ]
+    rows = []
+    for side in result.sides:
+        for run in side.runs:
+            reached = _or_dash(run.steps_to_threshold, ","), _or_dash(run.seconds_to_threshold, ".0f")
+            rows.append((side.name, _or_dash(run.seed, ""), *_format_scores(run), *reached)[: len(columns)])
     output.print_table(columns, rows, left=("recipe",))
     for side in result.sides:
         scores = "; ".join(_format_aggregate(side, quantity) for quantity in result.candidates[0].differences)
         output.out().print(f"{side.name}: {len(side.runs)} seeds, {scores}")
         if side.mixed:
-            mixed = ", ".join(side.mixed)
-            output.out().print(f"warning: {side.name} is not one recipe: its runs differ in {mixed}")
+            output.out().print(f"warning: {side.name} is not one recipe: its runs differ in {', '.join(side.mixed)}")
 
 
 def _or_dash(value: float | None, form: str) -> str:
@@ -63,10 +62,6 @@ def _or_dash(value: float | None, form: str) -> str:
 
 def _format_scores(run: EvaluatedRun) -> tuple[str, str]:
     return _or_dash(run.evaluation.success_rate, ".1%"), f"{run.evaluation.returns.mean:.4g}"
-
-
-def _format_reached(run: EvaluatedRun) -> tuple[str, str]:
-    return _or_dash(run.steps_to_threshold, ","), _or_dash(run.seconds_to_threshold, ".0f")
 
 
 def _format_aggregate(side: Side, quantity: Quantity) -> str:

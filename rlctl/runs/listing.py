@@ -37,7 +37,7 @@ def list_runs(
     commands: Iterable[str] = (),
     waiting: bool = False,
 ) -> list[RunSummary]:
-    """Return the runs of a task, or all, best or newest first; with `waiting` also those a cluster has not begun.
+    """Return the runs of a task, or all; with `waiting` also those that a cluster has not begun.
 
     Raises `ArtifactError` for a task without runs; the error suggests similar tasks and `commands`.
     """

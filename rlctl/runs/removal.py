@@ -25,10 +25,7 @@ class Removal:
 def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Path = ROOT) -> Removal:
     """Find the runs to remove: those named, or of each task all finished or failed runs except the `keep_best` best.
 
-    `keep_best` never removes the runs of a group.
-
-    Raises `UsageError` unless exactly one of both is given, or if a run is being trained; `ArtifactError` for a folder
-    that is not a run.
+    `keep_best` never removes the runs of a group. Raises `UsageError` if a run is being trained.
     """
     if bool(runs) == (keep_best is not None) or "" in runs:  # an unset variable of the shell
         raise UsageError("give RUN..., or --keep-best N to remove all but the N best of each task")
@@ -65,10 +62,9 @@ def _all_but_best(runs: list[RunSummary], count: int) -> list[RunSummary]:
 
 
 def plan_prune(runs: Sequence[str] = (), root: Path = ROOT) -> Removal:
-    """Find the checkpoints, replay buffers included, of finished runs; they are needed only to train longer.
+    """Find the checkpoints of finished runs, by default of all; they are needed only to train longer.
 
-    `runs` are runs, groups, globs or folders of runs; by default all. Raises `UsageError` for one of these that has not
-    finished.
+    Raises `UsageError` for a named run that has not finished.
     """
     named = [summarize(run.path) for text in runs for run in find_runs_of(text)]
     for run in named:
@@ -85,10 +81,7 @@ def _measure(paths: list[Path]) -> Removal:
 
 
 def remove_with_report(removal: Removal, *, yes: bool, dry_run: bool = False) -> None:
-    """List the folders and their size, ask, and remove them; `dry_run` only lists.
-
-    Raises `UsageError` without a terminal, if `yes` is not set.
-    """
+    """List the folders and their size, ask unless `yes`, and remove them; `dry_run` only lists."""
     out = output.out()
     for path in removal.paths:
         out.print(str(path))
@@ -107,14 +100,11 @@ def remove_with_report(removal: Removal, *, yes: bool, dry_run: bool = False) ->
 
 
 def remove(removal: Removal) -> None:
-    """Remove the folders. Each is renamed first, so that a partly removed one is not listed as a run.
-
-    Raises `UsageError` for a run whose training has started since it was listed.
-    """
+    """Remove the folders; raises `UsageError` for a run whose training has started since it was listed."""
     for path in removal.paths:
         if is_being_written(path if (path / ".lock").exists() else path.parent):
             raise UsageError(f"{path}: this run is being trained; it was not removed")
-        renamed = path.with_name(f".{path.name}.removed")
+        renamed = path.with_name(f".{path.name}.removed")  # a partly removed one is not listed as a run
         try:
             path.rename(renamed)
             shutil.rmtree(renamed)

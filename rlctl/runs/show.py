@@ -69,7 +69,6 @@ def describe_robustness(result: Robustness) -> Iterator[str]:
 
 
 def _measure_sizes(run: RunDirectory) -> dict[str, int]:
-    """Return the bytes of each file or folder of a run."""
     entries = [entry for entry in sorted(run.path.iterdir()) if not entry.name.startswith(".")]
     return {
         entry.name: sum(file.stat().st_size for file in (entry, *entry.rglob("*")) if file.is_file())
@@ -81,12 +80,10 @@ def show(run: RunDescription, json: str | None) -> None:
     """Print the description, or JSON alone for `-`."""
     out, summary, sizes = output.out(), run.summary, _measure_sizes(run.run)
     source = run.status.get("from")
-    if json is not None:
-        content = {**as_json(summary), "evaluations": run.evaluations, "metrics": run.metrics}
-        notes = {"warnings": run.warnings, "findings": run.findings}
-        measured = None if run.robustness is None else run.robustness.model_dump(mode="json")
-        if output.present({**content, **notes, "robustness": measured, "bytes": sizes}, json):
-            return
+    records = {"evaluations": run.evaluations, "metrics": run.metrics, "warnings": run.warnings}
+    measured = {"findings": run.findings, "robustness": run.robustness, "bytes": sizes}
+    if output.present({**as_json(summary), **records, **measured}, json):
+        return
     title = f": {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}"
     out.print(Text.assemble((summary.name, "bold"), title))
     duration = output.format_duration(summary.seconds or 0.0)
@@ -149,11 +146,10 @@ def _show_evaluations(rows: Rows) -> None:
 def tabulate(rows: Rows) -> tuple[list[str], list[list[str]]]:
     """Return the columns that have values in a table of evaluations, and the cells of its rows."""
     columns = [name for name in (rows[0] if rows else {}) if any(row.get(name) is not None for row in rows)]
-    return columns, [[format_cell(name, row.get(name)) for name in columns] for row in rows]
+    return columns, [[_format_cell(name, row.get(name)) for name in columns] for row in rows]
 
 
-def format_cell(name: str, value: float | None) -> str:
-    """Return a value of a table of evaluations, by its column; empty for None."""
+def _format_cell(name: str, value: float | None) -> str:
     if value is None:
         return ""
     if name in ("steps", "episodes"):

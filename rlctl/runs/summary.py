@@ -72,12 +72,10 @@ def find_runs(root: Path = ROOT) -> Iterator[Path]:
 def _folders(path: Path) -> list[Path]:
     try:
         with os.scandir(path) as entries:
-            folders = [
-                entry for entry in entries if entry.is_dir(follow_symlinks=False) and not entry.name.startswith(".")
-            ]
+            own = [entry for entry in entries if not entry.name.startswith(".")]
+            return [Path(entry.path) for entry in own if entry.is_dir(follow_symlinks=False)]
     except OSError:
         return []
-    return [Path(folder.path) for folder in folders]
 
 
 def summarize(path: Path) -> RunSummary:
@@ -144,12 +142,9 @@ def _state(run: RunDirectory, status: dict[str, Any]) -> tuple[str, str]:
     state, error = status.get("status"), _first_line(str(status.get("error") or ""))
     if state == "finished":
         return "done", ""
-    if state == "running":
-        # A killed training could not write that it stopped, but its lock is free.
-        if is_being_written(run.path):
-            return "running", ""
-        return _remote_state(run, status) or ("stopped", "")
-    if state == "interrupted":
+    if state == "running" and is_being_written(run.path):  # the lock of a killed training is free
+        return "running", ""
+    if state in ("running", "interrupted"):
         return _remote_state(run, status) or ("stopped", "")
     return "failed", error
 

@@ -86,7 +86,7 @@ def test_command_for_another_algorithm_trains_the_same_recipe(write_run):
 def test_group_is_drawn_with_a_band(group):
     page = write(group[0].parent)
     assert "reach, ppo, seeds 0, 1, 2" in page
-    assert "the best policies of 3 trainings succeed in 90.0% of the episodes (80.0% to 100.0%)" in page
+    assert "the best policies of 3 trainings succeed in 90.0% (80.0% to 100.0%) of the episodes" in page
     assert "Mean of 3 trainings, from the lowest to the highest." in page
     assert "rlctl train reach --seeds 0,1,2 --set algo_kwargs.learning_rate=0.001" in page
 

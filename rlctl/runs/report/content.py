@@ -56,10 +56,7 @@ class RunReport:
 
 
 def collect(texts: Sequence[str]) -> RunReport:
-    """Read the runs that arguments name.
-
-    Raises `ArtifactError` for a damaged run and one without records, `UsageError` for runs of several tasks.
-    """
+    """Read the runs that arguments name; raises `RlctlError` for runs that cannot be in one report."""
     folders = {run.path.resolve(): run for text in texts for run in find_runs_of(text)}
     runs = [RunDescription(run) for run in folders.values()]
     for run in runs:
@@ -114,10 +111,7 @@ def _name_recipe(settings: Mapping[str, Any]) -> str:
 
 
 def compare_recipes(report: RunReport, episodes: int) -> RunComparison | None:
-    """Evaluate and compare the recipes of a report, the first as the baseline; None for a single recipe.
-
-    Raises `RlctlError` where they cannot be compared.
-    """
+    """Evaluate and compare the recipes of a report, the first as the baseline; None for a single recipe."""
     if len(report.recipes) == 1:
         return None
     groups = [[run.run for run in recipe.runs] for recipe in report.recipes]
@@ -157,23 +151,25 @@ def summarize_result(runs: Sequence[RunDescription]) -> str:
     scored = [run for run in runs if run.summary.best_return is not None]
     if not scored:
         return "No evaluation yet."
-    if len(scored) == 1:
-        summary = scored[0].summary
-        best = next((row for row in scored[0].evaluations if row.get("steps") == summary.best_step), {})
-        count = f"{best['episodes']:,.0f}" if best.get("episodes") else "its"
-        verb = "has"
-        if summary.best_success is not None:
-            verb = f"succeeds in {summary.best_success:.1%} of {count} episodes, with"
-        of_return = f"a mean return of {summary.best_return:.4g}, at step {summary.best_step or 0:,}"
-        return f"In the evaluation that selected it, the best policy {verb} {of_return}."
     successes = [run.summary.best_success for run in scored if run.summary.best_success is not None]
     returns = [run.summary.best_return for run in scored if run.summary.best_return is not None]
-    of_returns = f"a mean return of {np.mean(returns):.4g} ({min(returns):.4g} to {max(returns):.4g})"
-    start = f"In the evaluations that selected them, the best policies of {len(scored)} trainings"
+    start, verbs = "In the evaluation that selected it, the best policy", ("succeeds", "has")
+    episodes, end = "the episodes", f", at step {scored[0].summary.best_step or 0:,}"
+    if len(scored) > 1:
+        start = f"In the evaluations that selected them, the best policies of {len(scored)} trainings"
+        verbs, end = ("succeed", "have"), ""
+    elif count := scored[0].evaluations[-1].get("episodes"):
+        episodes = f"{count:,.0f} episodes"
+    of_return = f"a mean return of {_format_range(returns, '.4g')}{end}"
     if len(successes) < len(scored):
-        return f"{start} have {of_returns}."
-    rates = f"{np.mean(successes):.1%} of the episodes ({min(successes):.1%} to {max(successes):.1%})"
-    return f"{start} succeed in {rates}, with {of_returns}."
+        return f"{start} {verbs[1]} {of_return}."
+    return f"{start} {verbs[0]} in {_format_range(successes, '.1%')} of {episodes}, with {of_return}."
+
+
+def _format_range(values: Sequence[float], form: str) -> str:
+    """Return `80.0%`, or of several values `90.0% (80.0% to 100.0%)`."""
+    mean = f"{np.mean(values):{form}}"
+    return mean if len(values) == 1 else f"{mean} ({min(values):{form}} to {max(values):{form}})"
 
 
 def describe_absence(report: RunReport) -> str:

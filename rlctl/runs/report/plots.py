@@ -32,10 +32,7 @@ _UNITS = {"return": "return of an episode", "success": "success rate"}
 
 
 def plot_learning(report: RunReport, column: str) -> str | None:
-    """Return the curve of a quantity over training steps, with evaluations; None where there is none.
-
-    Several runs of a recipe are drawn as their mean, with a band from the lowest to the highest.
-    """
+    """Return the curve of a quantity over training steps, with evaluations; None where there is none."""
     figure, axes = _make_figure()
     for number, recipe in enumerate(report.recipes):
         training = mean_curve([run.metrics for run in recipe.runs], column)

@@ -30,8 +30,6 @@ def write_report(
     """Write a report and return its file, by default report.html; None for Markdown that was printed.
 
     Runs of several recipes are compared first, each plays `episodes` for it; 0 leaves it out.
-
-    Raises `UsageError` for runs of several tasks, `ArtifactError` for a damaged run or one without records.
     """
     report = content.collect(runs)
     is_html = form == "html"
