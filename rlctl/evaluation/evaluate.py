@@ -14,15 +14,8 @@ from rlctl import output
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, RlctlError, UsageError
-from rlctl.evaluation.episode_statistics import (
-    Spread,
-    mean_action_change,
-    mean_interval,
-    mean_metrics,
-    mean_terms,
-    success_interval,
-    success_rate,
-)
+from rlctl.evaluation import episode_statistics
+from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, find_player, load_baseline
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.policy.file import PolicyInfo
@@ -167,15 +160,15 @@ def _summarize(
         seed=request.seed,
         deterministic=request.deterministic,
         played=[dataclasses.replace(episode, trajectory=None) for episode in episodes],
-        success_rate=success_rate(results),
-        success_interval=success_interval(results),
+        success_rate=episode_statistics.success_rate(results),
+        success_interval=episode_statistics.success_interval(results),
         returns=Spread.of([result.total_reward for result in results]),
         lengths=Spread.of([result.length for result in results]),
-        terms=mean_terms(results),
-        metrics=mean_metrics(results),
+        terms=episode_statistics.mean_terms(results),
+        metrics=episode_statistics.mean_metrics(results),
         final_distance=Spread.of(distances) if distances else None,
         max_steps=info.max_steps,
-        action_change=mean_action_change(episodes) if request.measure_actions else None,
+        action_change=episode_statistics.mean_action_change(episodes) if request.measure_actions else None,
     )
 
 
@@ -190,7 +183,7 @@ def measure_score(
         episodes=len(results),
         seed=evaluation.seed,
         mean_return=evaluation.returns.mean,
-        return_interval=mean_interval([result.total_reward for result in results]),
+        return_interval=episode_statistics.mean_interval([result.total_reward for result in results]),
         success=evaluation.success_rate,
         success_interval=evaluation.success_interval,
         mean_length=evaluation.lengths.mean,

@@ -1,11 +1,10 @@
 """What `rlctl eval` prints: one evaluation, a group of seeds, or how robust a policy is."""
 
-from __future__ import annotations
-
 import collections
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic_core import to_jsonable_python
+from rich.text import Text
 
 from rlctl import output
 from rlctl.environments.info import describe_randomization
@@ -15,9 +14,6 @@ from rlctl.evaluation.vary import format_command
 from rlctl.policy.shipped import Interval, MeasuredScore
 from rlctl.run.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
 from rlctl.version import collect_versions
-
-if TYPE_CHECKING:
-    from rich.text import Text
 
 _MOST_COLUMNS = 25  # of a map that is drawn
 _NOMINAL, _WORST = "*", "<"
@@ -226,8 +222,6 @@ def _show_grid(varied: RobustnessMap, worst: Cell | None) -> None:
 
 
 def _draw_cell(cell: Cell, color: str, worst: Cell | None) -> Text:
-    from rich.text import Text
-
     text = f"{cell.mean_return:.3g}" if cell.success_rate is None else f"{100 * cell.success_rate:.0f}"
     mark = f"{_NOMINAL if cell.nominal else ''}{_WORST if cell is worst else ''}"
     return Text(f" {text}{mark or ' '}", style=f"black on {color}")

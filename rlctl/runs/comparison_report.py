@@ -8,16 +8,8 @@ from rich.text import Text
 from rlctl import output
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.recipe.stages import format_value
+from rlctl.runs import significance
 from rlctl.runs.comparison import Candidate, EvaluatedRun, RunComparison, Side
-from rlctl.runs.significance import (
-    ALPHA,
-    MeanDifference,
-    Quantity,
-    SeedDifference,
-    Verdict,
-    find_least_seeds,
-    interquartile_mean_interval,
-)
 
 
 def show(result: RunComparison, json: str | None) -> None:
@@ -43,11 +35,7 @@ def _show_seeds(result: RunComparison) -> None:
     columns = ["recipe", "seed", "success", "return"]
     if result.threshold is not None:
         columns += [f"steps to {result.threshold:g}", f"seconds to {result.threshold:g}"]
-    rows = []
-    for side in result.sides:
-        for run in side.runs:
-            reached = _or_dash(run.steps_to_threshold, ","), _or_dash(run.seconds_to_threshold, ".0f")
-            rows.append((side.name, _or_dash(run.seed, ""), *_format_scores(run), *reached)[: len(columns)])
+    rows = [(side.name, *_format_seed(run))[: len(columns)] for side in result.sides for run in side.runs]
     output.print_table(columns, rows, left=("recipe",))
     for side in result.sides:
         scores = "; ".join(_format_aggregate(side, quantity) for quantity in result.candidates[0].differences)
@@ -64,10 +52,15 @@ def _format_scores(run: EvaluatedRun) -> tuple[str, str]:
     return _or_dash(run.evaluation.success_rate, ".1%"), f"{run.evaluation.returns.mean:.4g}"
 
 
-def _format_aggregate(side: Side, quantity: Quantity) -> str:
+def _format_seed(run: EvaluatedRun) -> tuple[str, ...]:
+    reached = (_or_dash(run.steps_to_threshold, ","), _or_dash(run.seconds_to_threshold, ".0f"))
+    return (_or_dash(run.seed, ""), *_format_scores(run), *reached)
+
+
+def _format_aggregate(side: Side, quantity: significance.Quantity) -> str:
     """Return `success mean 97.0%, IQM 97.5% (95 % interval 95.0% to 99.0%)`."""
     scores = side.scores(quantity)
-    spread, interval = Spread.of(scores.tolist()), interquartile_mean_interval(scores)
+    spread, interval = Spread.of(scores.tolist()), significance.interquartile_mean_interval(scores)
     form = ".1%" if quantity == "success" else ".4g"
     mean, middle, low, high = (format(value, form) for value in (spread.mean, spread.iqm, *interval))
     return f"{quantity} mean {mean}, IQM {middle} (95 % interval {low} to {high})"
@@ -87,27 +80,18 @@ def _show_candidate(result: RunComparison, candidate: Candidate) -> None:
 
 def describe_candidate(result: RunComparison, candidate: Candidate) -> list[str]:
     """Return a line per difference, and if the verdict is `cannot tell`, how much data would decide."""
-    lines = [
-        f"{quantity}: {format_difference(difference, as_percent=quantity == 'success')}"
-        for quantity, difference in candidate.differences.items()
-    ]
-    if candidate.verdict is Verdict.CANNOT_TELL:
+    lines = [_format_difference(quantity, difference) for quantity, difference in candidate.differences.items()]
+    if candidate.verdict is significance.Verdict.CANNOT_TELL:
         lines.append(format_needed(candidate, len(result.candidates)))
     return lines
 
 
-def format_difference(difference: MeanDifference, *, as_percent: bool) -> str:
-    """Return `+3.0 points (95 % interval +1.0 to +5.0), p = 0.012`; points are percentage points, of success."""
-
-    def number(value: float) -> str:
-        return f"{value * 100:+.1f}" if as_percent else f"{value:+.4g}"
-
-    unit = " points" if as_percent else ""
-    text = (
-        f"{number(difference.mean)}{unit} (95 % interval {number(difference.low)} to {number(difference.high)}), "
-        f"p = {difference.p:.2g}"
-    )
-    if isinstance(difference, SeedDifference):
+def _format_difference(quantity: significance.Quantity, difference: significance.MeanDifference) -> str:
+    """Return `success: +3.0 points (95 % interval +1.0 to +5.0), p = 0.012`; points are percentage points."""
+    scale, form, unit = (100, "+.1f", " points") if quantity == "success" else (1, "+.4g", "")
+    mean, low, high = (format(scale * value, form) for value in (difference.mean, difference.low, difference.high))
+    text = f"{quantity}: {mean}{unit} (95 % interval {low} to {high}), p = {difference.p:.2g}"
+    if isinstance(difference, significance.SeedDifference):
         text += f", probability of improvement {difference.probability_of_improvement:.0%}"
     return text
 
@@ -116,18 +100,16 @@ def format_needed(candidate: Candidate, comparisons: int) -> str:
     """Return how much data would decide; `comparisons` is the number of candidates."""
     first, *_ = candidate.differences.values()
     unit, parts = "episodes", []
-    if isinstance(first, SeedDifference):
+    if isinstance(first, significance.SeedDifference):
         unit = "seeds for each recipe"
-        if first.smallest_p >= ALPHA:
-            seeds, smallest = find_least_seeds(comparisons)
+        if first.smallest_p >= significance.ALPHA:
+            seeds, smallest = significance.find_least_seeds(comparisons)
             parts.append(
                 f"too few seeds to decide: their smallest possible p-value is {first.smallest_p:.2g}; "
                 f"{seeds} seeds for each recipe reach {smallest:.2g}"
             )
     needed = [
-        (difference.needed, quantity)
-        for quantity, difference in candidate.differences.items()
-        if difference.needed is not None
+        (difference.needed, quantity) for quantity, difference in candidate.differences.items() if difference.needed
     ]
     if needed:
         count, quantity = min(needed)
@@ -141,7 +123,8 @@ def describe_tests(result: RunComparison) -> str:
     count = len(result.candidates)
     of = "" if count == 1 else f" of {count} candidates"
     together = "" if count == 1 and " and " not in quantities else ", p-values adjusted for all tests together"
-    return f"tested: {quantities}{of}{together}; if all are equal, {ALPHA:.0%} of comparisons report a difference"
+    rate = f"{significance.ALPHA:.0%} of comparisons report a difference"
+    return f"tested: {quantities}{of}{together}; if all are equal, {rate}"
 
 
 def as_json(result: RunComparison) -> dict[str, Any]:
@@ -190,7 +173,7 @@ def _side_as_json(side: Side, result: RunComparison) -> dict[str, Any]:
     over_seeds = {
         quantity: {
             **dataclasses.asdict(Spread.of(values.tolist())),
-            "iqm_interval": interquartile_mean_interval(values),
+            "iqm_interval": significance.interquartile_mean_interval(values),
         }
         for quantity, values in scores.items()
     }

@@ -79,33 +79,29 @@ def diagnose(run: RunDirectory | History) -> list[Finding]:
     """Return what the records of a run show, warnings first; never raises for what is in the folder."""
     history = run if isinstance(run, History) else History(run)
     functions = list_signs()
-
-    @functools.cache
-    def read_sign(name: str) -> str | None:
-        return functions[name](history)
-
+    read_sign = functools.cache(lambda name: functions[name](history))
     findings = [finding for text in _texts()["findings"] if (finding := _check(text, read_sign, history)) is not None]
     return sorted(findings, key=lambda finding: list(Grade).index(finding.grade))
 
 
 def _check(text: dict[str, Any], read_sign: Callable[[str], str | None], history: History) -> Finding | None:
-    matches = [signs for signs in text["when"] if all(_holds(name, read_sign) for name in signs)]
+    matches = [
+        names
+        for names in text["when"]
+        if all((read_sign(name.removeprefix(_NOT)) is None) == name.startswith(_NOT) for name in names)
+    ]
     if not matches:
         return None
-    names = dict.fromkeys(name for signs in matches for name in signs if not name.startswith(_NOT))
+    evidence = (read_sign(name) for names in matches for name in names if not name.startswith(_NOT))
     return Finding(
         id=text["id"],
         name=text["name"],
         grade=Grade(text["grade"]),
-        evidence=list(dict.fromkeys(evidence for name in names if (evidence := read_sign(name)) is not None)),
+        evidence=list(dict.fromkeys(sign for sign in evidence if sign is not None)),
         meaning=text["meaning"],
         advice=[history.name_run(advice) for advice in text["try"]],
         settings=list(_settings(text["settings"], history)),
     )
-
-
-def _holds(name: str, read_sign: Callable[[str], str | None]) -> bool:
-    return read_sign(name.removeprefix(_NOT)) is None if name.startswith(_NOT) else read_sign(name) is not None
 
 
 def _settings(names: Iterable[str], history: History) -> Iterable[Setting]:

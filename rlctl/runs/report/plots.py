@@ -1,19 +1,17 @@
 """The plots of a report, as SVG texts for an HTML page."""
 
-from __future__ import annotations
-
 import io
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from rlctl.run.robustness import PushTest, RobustnessMap
 from rlctl.runs.report.content import RecipeRuns, RunReport, mean_curve
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _SIZE = (4.4, 2.7)  # [inches]: the width of a phone, so that text is readable there
 _STYLE: dict[Any, Any] = {
@@ -68,8 +66,6 @@ def plot_terms(recipe: RecipeRuns) -> str | None:
 
 
 def _scale_rates(axes: Axes) -> None:
-    from matplotlib.ticker import PercentFormatter
-
     axes.set_ylim(-0.03, 1.03)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
 
@@ -132,9 +128,6 @@ def _value(cell: Any, quantity: str) -> float:
 
 
 def _make_figure() -> tuple[Figure, Axes]:
-    import matplotlib
-    from matplotlib.figure import Figure
-
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=_SIZE, layout="constrained")
         axes = figure.add_subplot()
@@ -142,9 +135,6 @@ def _make_figure() -> tuple[Figure, Axes]:
 
 
 def _finish(figure: Figure, axes: Axes, x: str, y: str, title: str) -> str:
-    import matplotlib
-    from matplotlib.ticker import EngFormatter
-
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.set_title(title, loc="left", fontsize=9, fontweight="bold")

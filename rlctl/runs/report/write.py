@@ -5,6 +5,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import jinja2
+
 from rlctl import output
 from rlctl.errors import RlctlError
 from rlctl.runs.comparison_report import describe_candidate, describe_tests
@@ -43,8 +45,6 @@ def write_report(
 
 
 def _render(template: str, escape: bool, values: dict[str, Any]) -> str:
-    import jinja2
-
     finalize = None if escape else _escape_html
     environment = jinja2.Environment(
         autoescape=escape, trim_blocks=True, undefined=jinja2.StrictUndefined, finalize=finalize
@@ -113,14 +113,12 @@ def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, lis
 
 def _split_terms(rows: Rows) -> list[tuple[list[str], list[list[str]]]]:
     """Return the table of evaluations, and that of the reward terms if there are any, as columns and cells."""
-    columns, cells = tabulate(rows)
-    main = [index for index, name in enumerate(columns) if not name.startswith("term/")]
-    terms = [index for index, name in enumerate(columns) if name.startswith("term/") or name == "steps"]
-    names = [name.removeprefix("term/") for name in columns]
+    main = [{name: value for name, value in row.items() if not name.startswith("term/")} for row in rows]
+    terms = [{name: value for name, value in row.items() if name.startswith(("term/", "steps"))} for row in rows]
     return [
-        ([names[index] for index in chosen], [[row[index] for index in chosen] for row in cells])
-        for chosen in (main, terms)
-        if len(chosen) > 1
+        ([name.removeprefix("term/") for name in columns], cells)
+        for columns, cells in map(tabulate, (main, terms))
+        if len(columns) > 1
     ]
 
 
@@ -134,24 +132,9 @@ def _draw(report: RunReport, pictures: bool) -> dict[str, Any]:
     maps += [plots.plot_push(result.push) for result in measured if result.push is not None]
     return {
         "learning": [plot for plot in learning if plot is not None],
-        "band": _describe_bands(report),
         "maps": maps,
         "pictures": list(_take_pictures(report)) if pictures else [],
     }
-
-
-def _describe_bands(report: RunReport) -> str:
-    counts = [len(recipe.runs) for recipe in report.recipes]
-    of_recipes = ""
-    if len(counts) > 1:
-        of_recipes = (
-            "In the charts of return and success a colour is a recipe; lines are training episodes, points are "
-            "evaluations. "
-        )
-    if max(counts) == 1:
-        return of_recipes
-    count = str(counts[0]) if len(set(counts)) == 1 else f"{min(counts)} to {max(counts)}"
-    return f"{of_recipes}Mean of {count} trainings{' each' if of_recipes else ''}, from the lowest to the highest."
 
 
 def _take_pictures(report: RunReport) -> Iterator[tuple[str, list[tuple[int, str]]]]:
