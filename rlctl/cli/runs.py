@@ -141,7 +141,7 @@ def remove_runs(
     dry_run: DryRun = False,
 ) -> None:
     """Remove runs, never one that is being trained."""
-    from rlctl.runs.removal import plan_removal, remove_with_report
+    from rlctl.runs.listing import plan_removal, remove_with_report
 
     remove_with_report(plan_removal(runs, keep_best=keep_best), yes=yes, dry_run=dry_run)
 
@@ -156,6 +156,6 @@ def prune_runs(
     dry_run: DryRun = False,
 ) -> None:
     """Remove the checkpoints of finished runs, which are needed only to train longer."""
-    from rlctl.runs.removal import plan_prune, remove_with_report
+    from rlctl.runs.listing import plan_prune, remove_with_report
 
     remove_with_report(plan_prune(runs), yes=yes, dry_run=dry_run)

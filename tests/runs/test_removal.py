@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.runs.removal import plan_prune, plan_removal, remove
+from rlctl.runs.listing import plan_prune, plan_removal, remove
 from rlctl.runs.summary import summarize
 
 

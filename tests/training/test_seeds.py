@@ -19,8 +19,7 @@ from rlctl.run.group import create_group, find_group, parse_seeds, read_group
 from rlctl.run.lookup import find_policy, find_run
 from rlctl.run.train_request import TrainRequest
 from rlctl.runs.comparison import find_runs_of
-from rlctl.runs.listing import list_runs
-from rlctl.runs.removal import plan_removal
+from rlctl.runs.listing import list_runs, plan_removal
 from rlctl.training.seeds import train_seeds
 from tests.training.conftest import ENVS, TINY
 

@@ -20,8 +20,7 @@ from rlctl.run import directory
 from rlctl.run.directory import RunDirectory, is_being_written
 from rlctl.run.group import read_group
 from rlctl.run.lookup import find_run
-from rlctl.runs.listing import list_runs
-from rlctl.runs.removal import plan_removal
+from rlctl.runs.listing import list_runs, plan_removal
 from rlctl.training.trainings import Trainings
 from rlctl.tuning.tune import tune
 from rlctl.tuning.tune_request import TuneRequest

@@ -45,10 +45,9 @@ def _largest_value(run: History) -> float | None:
     gamma, settings = run.parameters.get("gamma"), run.recipe.get("normalize")
     if not isinstance(gamma, float) or not 0 <= gamma < 1 or not run.episodes:
         return None
-    normalized = isinstance(settings, dict) and settings.get("reward", True)
-    largest = (
-        _MOST_NORMALIZED_REWARD if normalized else max(float(np.abs(episode.rewards).max()) for episode in run.episodes)
-    )
+    largest = max(float(np.abs(episode.rewards).max()) for episode in run.episodes)
+    if isinstance(settings, dict) and settings.get("reward", True):
+        largest = _MOST_NORMALIZED_REWARD
     return max(largest / (1 - gamma), float(np.abs(run.curve("return").values).max(initial=0.0)))
 
 
@@ -118,11 +117,8 @@ def exploration_explodes(run: History) -> str | None:
     if len(curve) < LEAST_ROWS:
         return None
     first, last = curve.thirds()
-    return (
-        f"exploration grows from {first:.2g} to {last:.2g} of half the action range"
-        if last > max(2 * first, 2.0)
-        else None
-    )
+    grows = last > max(2 * first, 2.0)
+    return f"exploration grows from {first:.2g} to {last:.2g} of half the action range" if grows else None
 
 
 def saturated(run: History) -> str | None:

@@ -189,9 +189,8 @@ def episodes_shrink(run: History) -> str | None:
     if len(terminated) and terminated.thirds()[1] < 0.5:
         return None
     first, last = lengths.thirds()
-    return (
-        f"episodes shrink from {first:.0f} to {last:.0f} steps while the return rises" if last < 0.75 * first else None
-    )
+    shrinks = last < 0.75 * first
+    return f"episodes shrink from {first:.0f} to {last:.0f} steps while the return rises" if shrinks else None
 
 
 def return_rises(run: History) -> str | None:
