@@ -15,7 +15,6 @@ from rlctl.errors import UsageError, did_you_mean, short_repr
 from rlctl.run.robustness import Axis
 from rlctl.task.events import Event, RangeLimits, set_color
 from rlctl.task.events.event import read_range
-from rlctl.task.task import Task
 
 ALL = "all"
 _MOST_VALUES = 1000  # of an axis
@@ -45,15 +44,19 @@ def read_axes(texts: Sequence[str], spec: EnvSpec) -> list[list[Axis]]:
     return [axes]
 
 
-def apply(axis: Axis, value: float, spec: EnvSpec) -> EnvSpec:
-    """Return an environment in which an axis has a value."""
-    if axis.setting == SIM:
-        return dataclasses.replace(spec, sim=f"mujoco:{value:g}")
-    kind, _, rest = axis.setting.partition(".")
-    if kind == "events":
-        event, _, parameter = rest.partition(".")
-        return EnvChanges(events={event: {parameter: value}}).apply(spec)
-    return EnvChanges(parameters={rest: int(value) if value.is_integer() and axis.whole else value}).apply(spec)
+def apply(axes: Sequence[Axis], values: Sequence[float], spec: EnvSpec) -> EnvSpec:
+    """Return an environment in which axes have these values."""
+    for axis, value in zip(axes, values, strict=True):
+        kind, _, rest = axis.setting.partition(".")
+        if axis.setting == SIM:
+            spec = dataclasses.replace(spec, sim=f"mujoco:{value:g}")
+        elif kind == "events":
+            event, _, parameter = rest.partition(".")
+            spec = EnvChanges(events={event: {parameter: value}}).apply(spec)
+        else:
+            number = int(value) if value.is_integer() and axis.whole else value
+            spec = EnvChanges(parameters={rest: number}).apply(spec)
+    return spec
 
 
 def _read_axis(text: str, task: Any, spec: EnvSpec) -> Axis:
@@ -103,7 +106,8 @@ def _spread(span: tuple[float, float, int], whole: bool) -> list[float]:
 def _vary_parameter(name: str, task: Any, span: tuple[float, float, int], spec: EnvSpec) -> Axis:
     parameter = name.removeprefix("task.")
     if is_task(task):
-        numbers = _find_numbers(task)
+        hints = typing.get_type_hints(task)
+        numbers = {name: hints[name] for name in task.parameters() if hints[name] in (int, float)}
         if parameter not in numbers:
             known = [*task.events, *numbers]
             offered = ", ".join(known) or "nothing that can be varied"
@@ -131,11 +135,6 @@ def _is_whole(declared: inspect.Parameter, values: Sequence[float]) -> bool:
     if declared.annotation is not declared.empty:
         return declared.annotation in (int, "int")
     return type(declared.default) is int and all(value.is_integer() for value in values)
-
-
-def _find_numbers(task: type[Task]) -> dict[str, Any]:
-    hints = typing.get_type_hints(task)
-    return {name: hints[name] for name in task.parameters() if hints[name] in (int, float)}
 
 
 def _vary_all(task: Any, spec: EnvSpec) -> list[Axis]:

@@ -49,8 +49,7 @@ class Evaluation:
     max_steps: int | None
     limited_by: Path | None = None
     unlimited: Evaluation | None = None  # the same episodes without limits
-    action_change: float | None = None
-    """Mean of |action - previous action|, over elements and steps; None if it was not measured."""
+    action_change: float | None = None  # mean of |action - previous action|; None if it was not measured
 
     @property
     def episodes(self) -> list[dict[str, Any]]:
@@ -103,8 +102,8 @@ def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:
 
 
 def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
-    if request.record is not None:
-        _check_new(request.record)
+    if (folder := request.record) is not None and (folder.is_file() or any(folder.glob("*"))):
+        raise UsageError(f"--record {folder}: exists already; give a new folder, or remove this one")
     with start_workers(spec, request) as workers:
         limits = None if request.limits is None else _read_limits(request.limits, workers.info)
         actor.give_to(workers)
@@ -121,11 +120,6 @@ def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalReques
             evaluation = dataclasses.replace(limited, limited_by=request.limits, unlimited=evaluation)
     gates.check_possible(evaluation.success_rate is not None)
     return evaluation
-
-
-def _check_new(folder: Path) -> None:
-    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        raise UsageError(f"--record {folder}: exists already; give a new folder, or remove this one")
 
 
 def _read_limits(file: Path, info: EnvInfo) -> dict[str, Any]:

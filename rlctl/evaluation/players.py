@@ -97,20 +97,15 @@ def load_baseline(request: EvalRequest) -> Baseline:
     if name in BASELINES:
         return Baseline(name)
     if name.startswith(SERVER):
-        _ask_server(name)
+        try:
+            from rlctl.deploy.server.client import PolicyClient
+        except ModuleNotFoundError as error:
+            raise UsageError(explain_missing_package(f"--policy {name}", error.name, "serve")) from None
+        PolicyClient(name).close()  # raises if no policy server answers, before environments are built
         return Baseline(name)
     load_function(name)  # raises before environments are built
     place, _, function = name.rpartition(":")
     return Baseline(f"{Path(place).expanduser().resolve()}:{function}" if place.endswith(".py") else name)
-
-
-def _ask_server(address: str) -> None:
-    """Raise `UsageError` if no policy server answers, before environments are built."""
-    try:
-        from rlctl.deploy.server.client import PolicyClient
-    except ModuleNotFoundError as error:
-        raise UsageError(explain_missing_package(f"--policy {address}", error.name, "serve")) from None
-    PolicyClient(address).close()
 
 
 def choose_task(request: EvalRequest) -> EnvSpec:

@@ -132,7 +132,7 @@ def _play_maps(
     points = [(axes, values) for axes in maps for values in itertools.product(*(axis.values for axis in axes))]
     cells: dict[int, Cell] = {}
     with output.show_progress("varying", len(points)) as show:
-        for index, outcome in play([_apply(axes, values, spec) for axes, values in points]):
+        for index, outcome in play([axes_of.apply(axes, values, spec) for axes, values in points]):
             axes, values = points[index]
             cells[index] = Cell(**outcome.model_dump(), values=list(values), nominal=_is_nominal(axes, values))
             show(len(cells))
@@ -140,12 +140,6 @@ def _play_maps(
         RobustnessMap(axes=axes, cells=[cells[index] for index in range(len(points)) if points[index][0] is axes])
         for axes in maps
     ]
-
-
-def _apply(axes: Sequence[Axis], values: Sequence[float], spec: EnvSpec) -> EnvSpec:
-    for axis, value in zip(axes, values, strict=True):
-        spec = axes_of.apply(axis, value, spec)
-    return spec
 
 
 def _is_nominal(axes: Sequence[Axis], values: Sequence[float]) -> bool:

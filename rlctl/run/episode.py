@@ -37,8 +37,7 @@ class Trajectory:
     """The data of T steps of an episode."""
 
     actions: NDArray[Any]  # shape (T, ...)
-    observations: Observations
-    """The observation before each action, and the last one: shape (T + 1, ...), or a dict of such arrays."""
+    observations: Observations  # before each action, and the last one: shape (T + 1, ...), or a dict of such arrays
     rewards: NDArray[np.float64]  # shape (T,)
     terms: NDArray[np.float64]  # raw reward terms in the order of the task's weights, shape (T, terms)
 

@@ -30,8 +30,7 @@ class FoundPolicy:
 
     file: Path
     run: RunDirectory | None
-    notes: tuple[str, ...] = ()
-    """Lines for a user who did not name the run: which run it is, which were skipped, which older one was better."""
+    notes: tuple[str, ...] = ()  # for a user who did not name the run: which it is, and which were skipped or better
 
     def locate(self, spec: EnvSpec) -> EnvSpec:
         """Return `spec` with the absolute path of its task's file; see `locate_task`."""

@@ -21,8 +21,7 @@ class Outcome(_Content):
     success_rate: float | None  # in [0, 1]; None where the task reports no success
     success_interval: Interval | None  # 95 % interval of the success rate (Clopper-Pearson)
     mean_return: float
-    return_interval: Interval
-    """95 % interval of the mean, by Student's t; for a single episode both ends are its return."""
+    return_interval: Interval  # 95 % interval of the mean, by Student's t; of one episode both ends are its return
 
 
 class Cell(Outcome):
@@ -40,8 +39,7 @@ class Cell(Outcome):
 class Axis(_Content):
     """What is varied."""
 
-    name: str
-    """As the user names it: an event (`mass`), an event's parameter (`push.force`) or the task's (`tolerance`)."""
+    name: str  # as the user names it: an event (`mass`), its parameter (`push.force`) or the task's (`tolerance`)
     setting: str  # as `--set` names it: `events.mass.factor`, `task.tolerance`
     values: list[float]
     nominal: float | None  # the value in the unchanged world; None if it is not a single number
@@ -58,10 +56,6 @@ class RobustnessMap(_Content):
         """Return where a cell is: `mass 0.6, friction 0.2`."""
         return ", ".join(f"{axis.name} {value:g}" for axis, value in zip(self.axes, cell.values, strict=True))
 
-    def find_worst(self) -> Cell:
-        """Return the cell with the lowest success rate, or mean return where there is none."""
-        return min(self.cells, key=lambda cell: cell.score)
-
 
 class PushLevel(Outcome):
     """The scores with pushes of one impulse."""
@@ -77,8 +71,7 @@ class PushTest(_Content):
     link: str | None  # none: the base of the body
     duration_s: float  # how long a push lasts [s]
     mass: float  # of the whole body [kg]
-    measure: Literal["success", "upright"]
-    """What counts as going well: `success`, or `upright`, an episode that lasts until its time limit."""
+    measure: Literal["success", "upright"]  # `upright`: an episode goes well if it lasts until its time limit
     levels: list[PushLevel]  # by impulse; the first is without a push
     threshold: float | None  # impulse [N s] at which half of the episodes fail; None: cannot tell
     threshold_interval: Interval | None  # 95 % interval, by resampling episodes
@@ -107,8 +100,8 @@ class Robustness(_Content):
 
     def find_worst(self) -> tuple[RobustnessMap, Cell] | None:
         """Return the worst cell of all maps with its map; None where nothing was varied."""
-        worst = [(varied, varied.find_worst()) for varied in self.maps]
-        return min(worst, key=lambda pair: pair[1].score) if worst else None
+        cells = ((varied, cell) for varied in self.maps for cell in varied.cells)
+        return min(cells, key=lambda pair: pair[1].score, default=None)
 
 
 def write(path: Path, result: Robustness) -> None:

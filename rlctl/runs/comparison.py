@@ -133,9 +133,16 @@ def compare_runs(
 ) -> RunComparison:
     """Compare sides that have these names and runs; see `compare`."""
     _refuse_unequal(names, groups)
-    task = _common_task([run for group in groups for run in group], request.task)
-    if request.task is None and not force:
-        _refuse_changed([run for group in groups for run in group])
+    runs = [run for group in groups for run in group]
+    tasks = list(dict.fromkeys(str(run.status()["task"]) for run in runs))
+    if request.task is None and len(tasks) > 1:
+        raise UsageError(f"runs of different tasks ({', '.join(tasks)}); --task TASK evaluates all on one task")
+    for run in runs if request.task is None and not force else ():
+        if change := describe_source_change(run):
+            raise UsageError(
+                f"{run.path}: {change}\nit was trained on another version of the task, so the comparison is not fair; "
+                "--force compares anyway"
+            )
     recipes = [[run.recipe() for run in group] for group in groups]
     first = _evaluate(groups[0][0], request, threshold)
     # All play in the same environment: an easier tolerance does not make a policy better.
@@ -152,7 +159,7 @@ def compare_runs(
     of_recipes = len(groups[0]) > 1
     return RunComparison(
         of_recipes=of_recipes,
-        task=task,
+        task=request.task or tasks[0],
         baseline=baseline,
         candidates=[
             Candidate(
@@ -196,22 +203,6 @@ def _refuse_unequal(names: Sequence[str], groups: Sequence[Sequence[RunDirectory
     twice = next((path for path in paths if paths.count(path) > 1), None)
     if twice is not None:
         raise UsageError(f"{twice}: given twice; a run cannot be compared with itself")
-
-
-def _common_task(runs: list[RunDirectory], task: str | None) -> str:
-    tasks = list(dict.fromkeys(str(run.status()["task"]) for run in runs))
-    if task is None and len(tasks) > 1:
-        raise UsageError(f"runs of different tasks ({', '.join(tasks)}); --task TASK evaluates all on one task")
-    return task or tasks[0]
-
-
-def _refuse_changed(runs: list[RunDirectory]) -> None:
-    for run in runs:
-        if change := describe_source_change(run):
-            raise UsageError(
-                f"{run.path}: {change}\nit was trained on another version of the task, so the comparison is not fair; "
-                "--force compares anyway"
-            )
 
 
 def _evaluate(run: RunDirectory, request: EvalRequest, threshold: float | None) -> EvaluatedRun:

@@ -24,8 +24,7 @@ Array = NDArray[np.float64]
 ALPHA = 0.05  # a difference is significant below this p-value; intervals have the level 1 - ALPHA
 POWER = 0.8
 _RESAMPLES = 9999
-_LEAST_PAIRS, _LEAST_SEEDS = 6, 4
-"""The fewest pairs that differ, and seeds per recipe, with which an exact test can reach `ALPHA`."""
+_LEAST_PAIRS, _LEAST_SEEDS = 6, 4  # the fewest differing pairs, and seeds per recipe, that can reach `ALPHA`
 
 
 class Verdict(enum.StrEnum):
@@ -44,8 +43,7 @@ class MeanDifference:
     low: float  # lower end of the 95 % interval; equal to `mean` where there is nothing to resample
     high: float
     p: float  # two-sided p-value, adjusted for all tests; 1 where nothing differs
-    needed: int | None
-    """About how many episodes, or seeds per recipe, would decide if this is the true difference; None if it is 0."""
+    needed: int | None  # about how many episodes, or seeds per recipe, would decide; None for a difference of 0
 
     @property
     def verdict(self) -> Verdict:
@@ -95,7 +93,7 @@ def compare_seeds(
     for quantity, p in zip(baseline, p_values, strict=True):
         one, two = baseline[quantity], candidate[quantity]
         mean, std = float(two.mean() - one.mean()), math.sqrt(float(two.var(ddof=1) + one.var(ddof=1)))
-        low, high = _interval((two, one), _difference_of_means)
+        low, high = _interval((two, one), lambda new, old, axis=-1: np.mean(new, axis=axis) - np.mean(old, axis=axis))
         differences[quantity] = SeedDifference(
             mean,
             low,
@@ -177,14 +175,7 @@ def interquartile_mean_interval(scores: Array) -> tuple[float, float]:
     """Return the 95 % bootstrap interval of the interquartile mean over seeds, shape (seeds,)."""
     from scipy.stats import trim_mean
 
-    def middle(values: Array, axis: int = -1) -> Any:
-        return trim_mean(values, 0.25, axis=axis)
-
-    return _interval((scores,), middle)
-
-
-def _difference_of_means(one: Array, two: Array, axis: int = -1) -> Any:
-    return np.mean(one, axis=axis) - np.mean(two, axis=axis)
+    return _interval((scores,), lambda values, axis=-1: trim_mean(values, 0.25, axis=axis))
 
 
 def _interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float]:

@@ -36,8 +36,7 @@ class RunSummary:
     best_step: int | None = None
     best_success: float | None = None
     best_return: float | None = None
-    changes: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Recipe keys, dotted, that differ from the task's own recipe, and their values."""
+    changes: dict[str, Any] = dataclasses.field(default_factory=dict)  # recipe keys that differ from the task's
     versions: dict[str, str] = dataclasses.field(default_factory=dict)
     folder: str = ""  # the working folder of the training; a relative path of a task starts there
     source_sha256: str = ""  # of the task's file when the training began

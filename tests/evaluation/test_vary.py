@@ -208,7 +208,7 @@ def test_whole_numbers_of_plain_environments(vary, values, kind):
     spec = EnvSpec(f"{ENVS}:Chain")
     (axis,) = read_axes([vary], spec)[0]
     assert axis.values == values
-    (value,) = apply(axis, axis.values[0], spec).parameters.values()
+    (value,) = apply([axis], axis.values[:1], spec).parameters.values()
     assert type(value) is kind
 
 

@@ -10,12 +10,11 @@ import numpy as np
 
 from rlctl.environments import installed
 from rlctl.errors import ArtifactError, RlctlError, UsageError, short_repr
-from rlctl.evaluation.request import EvalRequest
 from rlctl.output import format_duration
 from rlctl.recipe.recipe import NOT_SET, Recipe
 from rlctl.recipe.stages import format_value
 from rlctl.run.episode import RecordedEpisode
-from rlctl.runs.comparison import RunComparison, compare_runs, find_recipe_changes
+from rlctl.runs.comparison import find_recipe_changes
 from rlctl.runs.diagnosis.findings import Finding
 from rlctl.runs.listing import find_runs_of
 from rlctl.runs.show import RunDescription
@@ -108,14 +107,6 @@ def _name_recipe(settings: Mapping[str, Any]) -> str:
         for key, value in settings.items()
     ]
     return ", ".join(names[:_SETTINGS_NAMED]) + (", ..." if len(names) > _SETTINGS_NAMED else "")
-
-
-def compare_recipes(report: RunReport, episodes: int) -> RunComparison | None:
-    """Evaluate and compare the recipes of a report, the first as the baseline; None for a single recipe."""
-    if len(report.recipes) == 1:
-        return None
-    groups = [[run.run for run in recipe.runs] for recipe in report.recipes]
-    return compare_runs([recipe.name for recipe in report.recipes], groups, EvalRequest(None, episodes=episodes))
 
 
 def list_facts(report: RunReport) -> list[tuple[str, str]]:

@@ -9,6 +9,8 @@ import jinja2
 
 from rlctl import output
 from rlctl.errors import RlctlError
+from rlctl.evaluation.request import EvalRequest
+from rlctl.runs.comparison import compare_runs
 from rlctl.runs.comparison_report import describe_candidate, describe_tests
 from rlctl.runs.report import content
 from rlctl.runs.report.content import RunReport
@@ -35,21 +37,18 @@ def write_report(
     """
     report = content.collect(runs)
     is_html = form == "html"
-    text = _render(f"report.{form}.jinja", is_html, _values(report, is_html, pictures, episodes))
+    finalize = None if is_html else _escape_html
+    environment = jinja2.Environment(
+        autoescape=is_html, trim_blocks=True, undefined=jinja2.StrictUndefined, finalize=finalize
+    )
+    template = environment.from_string(Path(__file__).with_name(f"report.{form}.jinja").read_text(encoding="utf-8"))
+    text = template.render(_values(report, is_html, pictures, episodes))
     if target is None and not is_html:
         output.results().write(output.escape_controls(text))
         return None
     path = target or DEFAULT_FILE
     files.write_bytes(path, text.encode())
     return path
-
-
-def _render(template: str, escape: bool, values: dict[str, Any]) -> str:
-    finalize = None if escape else _escape_html
-    environment = jinja2.Environment(
-        autoescape=escape, trim_blocks=True, undefined=jinja2.StrictUndefined, finalize=finalize
-    )
-    return environment.from_string(Path(__file__).with_name(template).read_text(encoding="utf-8")).render(values)
 
 
 def _escape_html(value: Any) -> Any:
@@ -91,14 +90,16 @@ def _values(report: RunReport, is_html: bool, pictures: bool, episodes: int) -> 
 
 def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, list[str]]], list[str]]:
     """Return question, verdict and evidence per candidate, and notes, such as why nothing was compared."""
-    if not episodes:
+    if not episodes or len(report.recipes) == 1:
         return [], []
+    names, groups = (
+        [recipe.name for recipe in report.recipes],
+        [[run.run for run in recipe.runs] for recipe in report.recipes],
+    )
     try:
-        result = content.compare_recipes(report, episodes)
+        result = compare_runs(names, groups, EvalRequest(None, episodes=episodes))
     except RlctlError as error:
         return [], [f"not compared: {str(error).splitlines()[0]}"]
-    if result is None:
-        return [], []
     verdicts = [
         (
             f"{candidate.side.name} against {result.baseline.name}",
