@@ -84,7 +84,9 @@ def _vary_event(
     ranges = event.ranges
     if not ranges or (parameter and parameter not in ranges):
         close = did_you_mean(parameter, ranges)
-        raise UsageError(f"--vary {name}: event {key!r} draws {', '.join(ranges) or 'no parameter'}.{close}")
+        raise UsageError(
+            f"--vary {name}: the random parameters of event {key!r} are: {', '.join(ranges) or 'none'}.{close}"
+        )
     parameter = parameter or next(iter(ranges))
     limits = ranges[parameter]
     read_range(f"--vary {name}", list(span[:2]), RangeLimits(limits.low, limits.high, limits.above), UsageError)

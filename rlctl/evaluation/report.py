@@ -39,7 +39,9 @@ def show(result: Evaluation, json: str | None) -> None:
     reports = [episode.result.report for episode in result.played]
     if stopped := sum(report.get("not_running", 0) for report in reports):
         answers = sum(len(report["round_trips_s"]) for report in reports)
-        out.print(f"{stopped:,} of {answers:,} answers: the server held or stopped instead of running the policy")
+        out.print(
+            f"for {stopped:,} of {answers:,} answers the server did not run the policy, because it held or stopped"
+        )
     if result.unlimited is not None:
         _show_limits(result, result.unlimited)
 

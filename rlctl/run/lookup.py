@@ -49,7 +49,7 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
         newest = _read_latest(root) or next(iter(_list_newest_first(root, "*/*/run.json", "*/*/*_s*/run.json")), None)
         if newest is None:
             tunings = sorted(root.glob(f"*/*/{TUNE_FILE}"))
-            trials = f", but trials of rlctl tune; name one in {tunings[-1].parent}" if tunings else ""
+            trials = f", only trials of rlctl tune; name one of them, from {tunings[-1].parent}" if tunings else ""
             hint = trials or "; train one: rlctl train reach"
             raise ArtifactError(f"no run yet under {root.resolve()}{hint}")
         return newest
@@ -73,7 +73,9 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
             f"rlctl runs import {text} --task TASK"
         )
     if tunings := sorted((root / registry.make_slug(text)).glob(f"*/{TUNE_FILE}")):
-        raise ArtifactError(f"no run of {text!r} but the trials of rlctl tune; name one in {tunings[-1].parent}")
+        raise ArtifactError(
+            f"no run of {text!r}, only trials of rlctl tune; name one of them, from {tunings[-1].parent}"
+        )
     if entry := installed.find(text):
         option = f"rlctl train {text} --from {text}" if to_train else "--pretrained"
         shipped = f"; to use the policy that it ships: {option}" if entry.policy_file else ""

@@ -25,7 +25,7 @@ def show(result: RunComparison, json: str | None) -> None:
         rows = [(side.name, *_format_scores(side.runs[0])) for side in result.sides]
         output.print_table(("policy", "success", "return"), rows, left=("policy",))
     if result.world_differences:
-        out.print(f"all played with the baseline's {', '.join(result.world_differences)}")
+        out.print(f"all runs were evaluated with the baseline's {', '.join(result.world_differences)}")
     out.print(describe_tests(result))
     for candidate in result.candidates:
         _show_candidate(result, candidate)

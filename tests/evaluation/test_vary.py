@@ -170,7 +170,10 @@ def test_an_event_that_acts_has_no_nominal_value():
             ["masss=0.5:2:4"],
             r"no event or number of that name\. Did you mean 'mass'\? It has: mass, friction, push, limit",
         ),
-        (["push.forces=0:2:4"], r"event 'push' draws force, duration_s\. Did you mean 'force'\?"),
+        (
+            ["push.forces=0:2:4"],
+            r"the random parameters of event 'push' are: force, duration_s\. Did you mean 'force'\?",
+        ),
         (["mass=0.5:2:1"], "2 to 1,000 values, .*for a single value use --set"),
         (["mass=2:2:4"], "write NAME=LOWEST:HIGHEST:VALUES"),
         (["mass=nan:2:4"], "write NAME=LOWEST:HIGHEST:VALUES"),

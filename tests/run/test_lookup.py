@@ -205,7 +205,7 @@ def test_trials_of_a_tuning_are_not_the_latest(root, make_run):
     make_run("reach/2026-01-02_10-00-00_tune", "2026-01-02_10-00-01_s0", policy=None)
     folder = root / "reach/2026-01-02_10-00-00_tune"
     (folder / directory.TUNE_FILE).write_text("{}")
-    assert f"but trials of rlctl tune; name one in {folder}" in error(
+    assert f"only trials of rlctl tune; name one of them, from {folder}" in error(
         ArtifactError, find_policy, "latest", "best", root
     )
     run = make_run("reach", "2026-01-01_10-00-00_s0")

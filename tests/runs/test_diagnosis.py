@@ -209,7 +209,7 @@ def test_training_that_ends_before_the_last_stage_is_found(write_training):
     run = write_training({"stage": 1}, recipe={"stages": stages})
     (finding,) = diagnose(run)
     assert (finding.id, finding.grade) == ("Q1", Grade.WARNING)
-    assert finding.evidence == ["trained in stage 1 of 2 to the end"]
+    assert finding.evidence == ["the training ended in stage 1 of 2"]
     assert f"rlctl train --resume {run.path} -n STEPS" in finding.advice[0]
 
 

@@ -170,7 +170,7 @@ def test_run_in_progress_is_reported_as_such(group, hold_lock):
 
 def test_what_cannot_be_reported(group, write_run):
     other = write_run("ant/2026-11-21_10-00-00_s0")
-    with pytest.raises(UsageError, match="runs of several tasks, ant, reach"):
+    with pytest.raises(UsageError, match=r"runs of several tasks \(ant, reach\)"):
         write(group[0], other)
     empty = write_run("reach/2026-11-21_11-00-00_s0", metrics=(), evals=())
     with pytest.raises(ArtifactError, match="nothing to report yet"):

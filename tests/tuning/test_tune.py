@@ -276,7 +276,7 @@ def test_its_runs_are_runs(played, tmp_path):
     assert not (root / "latest").exists()
     with pytest.raises(UsageError, match="see its table: rlctl tune --resume"):
         find_run(str(tuning.path))
-    with pytest.raises(ArtifactError, match=f"but the trials of rlctl tune; name one in {tuning.path}"):
+    with pytest.raises(ArtifactError, match=f"only trials of rlctl tune; name one of them, from {tuning.path}"):
         find_run(LINE, root)
 
 

@@ -39,7 +39,9 @@ def shakes(run: History) -> str | None:
     reversals, size = np.median(changes, axis=0)
     if reversals < 0.6 or size < 0.4:
         return None
-    return f"actions reverse in {reversals:.0%} of the steps, on average by {size:.2g} of half their range"
+    return (
+        f"actions change direction in {reversals:.0%} of the steps, on average by {size:.2g} of half the action range"
+    )
 
 
 def stands_still(run: History) -> str | None:
@@ -47,7 +49,7 @@ def stands_still(run: History) -> str | None:
     sizes = [float(np.abs(actions).mean()) for actions in _actions(run)]
     if not sizes or run.progress < 0.5 or (largest := max(sizes)) > 0.05:
         return None
-    return f"actions are on average {largest:.1%} of half their range"
+    return f"the mean size of actions is {largest:.1%} of half the action range"
 
 
 def mostly_constant_reward(run: History) -> str | None:

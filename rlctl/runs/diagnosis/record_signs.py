@@ -29,7 +29,7 @@ def values_explode(run: History) -> str | None:
     # An entropy bonus comes on top of rewards, most at the beginning.
     if peak < 30 * most and abs(last) < 3 * most:
         return None
-    return f"the critic expects up to {peak:.3g}, {last:.3g} in the last third; rewards add up to {most:.3g} at most"
+    return f"the critic predicts up to {peak:.3g} (last third: {last:.3g}), but rewards add up to {most:.3g} at most"
 
 
 def gradients_explode(run: History) -> str | None:
@@ -37,7 +37,7 @@ def gradients_explode(run: History) -> str | None:
     norm, most = run.curve("gradient_norm"), _largest_value(run)
     if len(norm) < LEAST_ROWS or most is None or (peak := float(norm.values.max())) < 1000 * max(most, 1.0):
         return None
-    return f"the gradient's norm is up to {peak:.2g}, where rewards add up to {most:.3g} at most"
+    return f"the gradient norm reaches {peak:.2g}, but rewards add up to {most:.3g} at most"
 
 
 def _largest_value(run: History) -> float | None:
@@ -161,8 +161,8 @@ class _Shares:
     def describe(self) -> str:
         """Return the shares as text."""
         return (
-            f"waiting for environments takes {self.environments:.0%} of the time, for the policy that acts in them "
-            f"{self.policy:.0%}, updates the rest; {self.steps_per_s:,.0f} steps/s"
+            f"{self.environments:.0%} of the time is spent in environments, {self.policy:.0%} in choosing actions, the "
+            f"rest in updates; {self.steps_per_s:,.0f} steps/s"
         )
 
 
@@ -203,7 +203,7 @@ def last_stage_never_begun(run: History) -> str | None:
     reached = run.curve("stage").values
     if run.status.get("status") != "finished" or not len(reached) or reached[-1] >= run.stage_count:
         return None
-    return f"trained in stage {reached[-1]:.0f} of {run.stage_count} to the end"
+    return f"the training ended in stage {reached[-1]:.0f} of {run.stage_count}"
 
 
 def stage_never_succeeds(run: History) -> str | None:

@@ -133,7 +133,9 @@ def collapsed(run: History) -> str | None:
         if len(curve):
             if len(curve) < least or (fall := _find_fall(curve)) is None:
                 return None
-            parts.append(f"{what} from {fall[0]:.4g} up to {fall[1]:.4g} at step {fall[3]:,.0f}, then {fall[2]:.4g}")
+            parts.append(
+                f"{what}: {fall[0]:.4g} at first, {fall[1]:.4g} at step {fall[3]:,.0f}, {fall[2]:.4g} at the end"
+            )
     return "; ".join(parts) or None
 
 
@@ -178,7 +180,8 @@ def penalties_dominate(run: History) -> str | None:
     if negative <= 3 * positive:
         return None
     worst = min(means, key=lambda name: means[name])
-    return f"per episode {positive:.3g} of reward and -{negative:.3g} of penalties, {means[worst]:.3g} of it {worst}"
+    largest = f"{worst}, {means[worst]:.3g}"
+    return f"per episode rewards are {positive:.3g} and penalties -{negative:.3g}; the largest penalty is {largest}"
 
 
 def episodes_shrink(run: History) -> str | None:

@@ -62,7 +62,7 @@ def collect(texts: Sequence[str]) -> RunReport:
         if run.summary.state == "damaged":
             raise ArtifactError(f"{run.run.path}: damaged: {run.summary.reason}")
     if len(tasks := {run.summary.task for run in runs}) > 1:
-        raise UsageError(f"runs of several tasks, {', '.join(sorted(tasks))}: a report is about one")
+        raise UsageError(f"runs of several tasks ({', '.join(sorted(tasks))}); a report covers one task")
     if not any(run.metrics or run.evaluations for run in runs):
         raise ArtifactError(f"{runs[0].run.path}: nothing to report yet: no update is finished")
     notes = [note for run in runs for note in _find_notes(run)]

@@ -109,7 +109,7 @@ def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, lis
         for candidate in result.candidates
     ]
     worlds = result.world_differences
-    return verdicts, [f"all were compared with the baseline's {', '.join(worlds)}"] if worlds else []
+    return verdicts, [f"all runs were evaluated with the baseline's {', '.join(worlds)}"] if worlds else []
 
 
 def _split_terms(rows: Rows) -> list[tuple[list[str], list[list[str]]]]:
