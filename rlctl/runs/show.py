@@ -1,6 +1,5 @@
 """`rlctl runs show`: one run: what it was trained with, its curve, its evaluations, its files."""
 
-import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -116,19 +115,18 @@ def plot(run: RunDescription, name: str) -> str:
         return ""
     import plotext
 
-    is_utf8 = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
     plotext.clear_figure()
     plotext.plotsize(*_PLOT_SIZE)
     plotext.title(f"{name} over steps")
     if name == "success":
         plotext.ylim(0, 1)  # plotext would need too much memory for a point far outside
         lines = [[(step, min(max(value, 0.0), 1.0)) for step, value in points] for points in lines]
-    for points, label, marker in zip(
-        lines, ("training", "evaluations"), (("braille", "●") if is_utf8 else (".", "o")), strict=True
-    ):
-        if points:
-            draw = plotext.plot if label == "training" else plotext.scatter
-            draw(*zip(*points, strict=True), label=label, marker=marker)
+    line, point = ("braille", "●") if output.is_utf8() else (".", "o")
+    training, evaluations = lines
+    if training:
+        plotext.plot(*zip(*training, strict=True), label="training", marker=line)
+    if evaluations:
+        plotext.scatter(*zip(*evaluations, strict=True), label="evaluations", marker=point)
     return str(plotext.uncolorize(plotext.build()))
 
 

@@ -1,10 +1,10 @@
 """The records of a training, read from its run folder, as curves."""
 
-import contextlib
 import dataclasses
 import functools
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from rlctl.run.episode import RecordedEpisode, load_episode
 from rlctl.runs.summary import Rows, list_points, read_table
 
 Array = NDArray[np.float64]
+_Record = TypeVar("_Record")
 
 LEAST_ROWS = 10  # rows of `metrics.csv`; with fewer rows most signs are not checked
 _GOOD = 0.8  # a training with this success rate has succeeded, whatever its other records are
@@ -56,40 +57,17 @@ class Curve:
 
 
 class History:
-    """Reads the records of a run on demand; a missing or damaged record is empty."""
+    """Reads the records of a run; a missing or damaged record is empty."""
 
     def __init__(self, run: RunDirectory) -> None:
         self.run = run
-
-    @functools.cached_property
-    def status(self) -> Mapping[str, Any]:
-        """What `run.json` holds."""
-        try:
-            return self.run.status()
-        except (RlctlError, OSError):
-            return {}
+        self.status: Mapping[str, Any] = _read(run.status) or {}
+        self.recipe: Mapping[str, Any] = _read(sources.read, run.recipe_file) or {}
+        self.metrics, self.evaluations = read_table(run.metrics_file), read_table(run.evals_file)
 
     def name_run(self, text: str) -> str:
         """Replace RUN and TASK in a command by the run and its task."""
         return text.replace("RUN", str(self.run.path)).replace("TASK", str(self.status.get("task", "TASK")))
-
-    @functools.cached_property
-    def recipe(self) -> Mapping[str, Any]:
-        """The recipe as plain data."""
-        try:
-            return sources.read(self.run.recipe_file)
-        except (RlctlError, OSError):
-            return {}
-
-    @functools.cached_property
-    def metrics(self) -> Rows:
-        """The rows of `metrics.csv`."""
-        return read_table(self.run.metrics_file)
-
-    @functools.cached_property
-    def evaluations(self) -> Rows:
-        """The rows of `evals.csv`."""
-        return read_table(self.run.evals_file)
 
     def curve(self, name: str) -> Curve:
         """Return a column of `metrics.csv`."""
@@ -145,22 +123,22 @@ class History:
     @functools.cached_property
     def env(self) -> EnvInfo | None:
         """The environment that the policy was trained in."""
-        for file in (self.run.last_policy, self.run.best_policy):
-            try:
-                return PolicyFile.read(file).info.env
-            except (RlctlError, OSError):
-                continue
-        return None
+        info = _read(PolicyFile.read_info, self.run.last_policy) or _read(PolicyFile.read_info, self.run.best_policy)
+        return None if info is None else info.env
 
     @functools.cached_property
     def episodes(self) -> list[RecordedEpisode]:
         """The newest recorded episodes of evaluations, at most `EPISODES`."""
-        episodes: list[RecordedEpisode] = []
-        files = [file for file in self.run.episodes.glob("*.npz") if file.stem.isdecimal()]
-        for file in sorted(files, reverse=True)[:EPISODES]:
-            with contextlib.suppress(RlctlError, OSError):
-                episodes.append(load_episode(file))
-        return [episode for episode in episodes if len(episode.rewards)]
+        files = sorted((file for file in self.run.episodes.glob("*.npz") if file.stem.isdecimal()), reverse=True)
+        episodes = [_read(load_episode, file) for file in files[:EPISODES]]
+        return [episode for episode in episodes if episode is not None and len(episode.rewards)]
+
+
+def _read(function: Callable[..., _Record], *arguments: Path) -> _Record | None:
+    try:
+        return function(*arguments)
+    except (RlctlError, OSError):
+        return None
 
 
 def _curve(rows: Rows, name: str) -> Curve:

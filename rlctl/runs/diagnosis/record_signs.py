@@ -1,6 +1,5 @@
 """Signs in the values logged after updates, in the use of time and in the end of a run. Functions as in `signs`."""
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -149,8 +148,7 @@ def environments_slow(run: History) -> str | None:
     return shares.describe()
 
 
-@dataclasses.dataclass(frozen=True)
-class _Shares:
+class _Shares(NamedTuple):
     """Fractions of the learner's time; environments that step during updates do not count."""
 
     environments: float
