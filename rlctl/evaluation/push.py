@@ -83,18 +83,17 @@ def measure_push(
             [result.success if has_success else result.length >= pushed.max_steps for result in results], bool
         )
 
-    held = {0.0: find_held(unpushed)}
-    outcomes = {0.0: summarize(unpushed)}
+    played = {0.0: unpushed}
 
     def fails(impulse: float) -> bool:
-        results = play(pushed.parameters(impulse))
-        held[impulse], outcomes[impulse] = find_held(results), summarize(results)
-        return float(held[impulse].mean()) <= 0.5
+        played[impulse] = play(pushed.parameters(impulse))
+        return float(find_held(played[impulse]).mean()) <= 0.5
 
-    if held[0.0].mean() > 0.5:
+    if find_held(unpushed).mean() > 0.5:
         _search(fails, _FIRST_SPEED * pushed.mass)
-    impulses = sorted(held)
-    threshold, interval = find_threshold(impulses, np.array([held[impulse] for impulse in impulses]))
+    impulses = sorted(played)
+    held = np.array([find_held(played[impulse]) for impulse in impulses])
+    threshold, interval = find_threshold(impulses, held)
     measure: Literal["success", "upright"] = "success" if has_success else "upright"
     return PushTest(
         body=pushed.body,
@@ -103,23 +102,21 @@ def measure_push(
         mass=pushed.mass,
         measure=measure,
         levels=[
-            PushLevel(**outcomes[impulse].model_dump(), impulse=impulse, held=float(held[impulse].mean()))
-            for impulse in impulses
+            PushLevel(**summarize(played[impulse]).model_dump(), impulse=impulse, held=float(rate))
+            for impulse, rate in zip(impulses, held.mean(axis=1), strict=True)
         ],
         threshold=threshold,
         threshold_interval=interval,
-        verdict=_describe_result(pushed, measure, held, threshold, interval),
+        verdict=_describe_result(pushed.mass, measure, impulses[-1], held, threshold, interval),
     )
 
 
 def _search(fails: Callable[[float], bool], first: float) -> None:
     low, high = 0.0, first
-    for _ in range(_DOUBLINGS + 1):
-        if fails(high):
-            break
+    while not fails(high):
+        if high >= first * 2**_DOUBLINGS:
+            return
         low, high = high, 2 * high
-    else:
-        return
     for _ in range(_BISECTIONS):
         middle = (low + high) / 2
         low, high = (low, middle) if fails(middle) else (middle, high)
@@ -152,22 +149,21 @@ def _cross(impulses: Sequence[float], rates: NDArray[np.float64]) -> float | Non
 
 
 def _describe_result(
-    pushed: PushedBody,
+    mass: float,
     measure: str,
-    held: dict[float, NDArray[np.bool_]],
+    largest: float,
+    held: NDArray[np.bool_],
     threshold: float | None,
     interval: Interval | None,
 ) -> str:
     goes_well = "succeed" if measure == "success" else "last until the time limit"
-    if held[0.0].mean() <= 0.5:
-        return f"cannot tell: without a push only {held[0.0].mean():.0%} of the episodes {goes_well}"
-    largest = max(held)
+    if held[0].mean() <= 0.5:
+        return f"cannot tell: without a push only {held[0].mean():.0%} of the episodes {goes_well}"
     if threshold is None or interval is None:
-        if measure == "upright" and all(outcomes.all() for outcomes in held.values()):
+        if measure == "upright" and held.all():
             return "cannot tell: this task reports no success, and no episode ended early"
         return f"more than half of the episodes {goes_well} with every push tried, up to {largest:.3g} N s"
     return (
         f"half of the episodes fail at a push of {threshold:.3g} N s (95 % interval {interval[0]:.3g} to "
-        f"{interval[1]:.3g}), which changes the speed of the robot ({pushed.mass:.3g} kg) by "
-        f"{threshold / pushed.mass:.2g} m/s"
+        f"{interval[1]:.3g}), which changes the speed of the robot ({mass:.3g} kg) by {threshold / mass:.2g} m/s"
     )
