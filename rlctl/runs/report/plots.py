@@ -51,15 +51,12 @@ def plot_learning(report: RunReport, column: str) -> str | None:
 
 def plot_terms(recipe: RecipeRuns) -> str | None:
     """Return the weighted reward terms of a recipe over training steps; None where there are none."""
-    columns = dict.fromkeys(name for run in recipe.runs for name in (run.metrics[0] if run.metrics else {}))
-    names = [name for name in columns if name.startswith("term/")]
-    curves = {name: mean_curve([run.metrics for run in recipe.runs], name) for name in names}
-    drawn = {name.removeprefix("term/"): curve for name, curve in curves.items() if curve is not None}
-    if not drawn:
-        return None
     figure, axes = _make_figure()
-    for name, curve in drawn.items():
-        _draw_curve(axes, curve, name, {"linewidth": 1.2})
+    for name in dict.fromkeys(name for run in recipe.runs for name in run.terms()):
+        if (curve := mean_curve([run.metrics for run in recipe.runs], f"term/{name}")) is not None:
+            _draw_curve(axes, curve, name, {"linewidth": 1.2})
+    if not axes.lines:
+        return None
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), **_LEGEND)
     title = "Reward terms over training steps" + (f"\n{recipe.name}" if recipe.name else "")
     return _finish(figure, axes, "training steps", "weighted sum per episode", title)
