@@ -20,8 +20,8 @@ from rlctl.evaluation.episode_statistics import summarize
 from rlctl.evaluation.evaluate import start_workers
 from rlctl.evaluation.players import LoadedPolicy, load_player
 from rlctl.evaluation.request import EvalRequest
+from rlctl.evaluation.robustness import Outcome
 from rlctl.evaluation.vary import CellPlayer, order_cells
-from rlctl.run.robustness import Outcome
 
 _POLL_S = 5.0
 

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rlctl.evaluation.robustness import Outcome
 from rlctl.rollout.collect import Episode
 from rlctl.rollout.messages import EpisodeResult
-from rlctl.run.robustness import Outcome
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,9 +10,9 @@ from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.evaluate import Evaluation, GroupScore, SeedScore
+from rlctl.evaluation.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
 from rlctl.evaluation.vary import format_command
 from rlctl.policy.shipped import Interval, MeasuredScore
-from rlctl.run.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
 from rlctl.version import collect_versions
 
 _MOST_COLUMNS = 25  # of a map that is drawn

@@ -16,19 +16,18 @@ from rlctl import output
 from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.evaluation import axes as axes_of
+from rlctl.evaluation import robustness
 from rlctl.evaluation.episode_statistics import summarize
 from rlctl.evaluation.evaluate import start_workers
 from rlctl.evaluation.players import LoadedPolicy, find_player
 from rlctl.evaluation.push import measure_push
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
+from rlctl.evaluation.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.policy.players.player import Exploration
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
-from rlctl.run import robustness
-from rlctl.run.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.version import collect_versions
 
 ASK_ABOVE_S = 600.0  # rlctl asks before it starts a measurement that takes longer than this [s]
@@ -56,10 +55,10 @@ def measure_robustness(
     if request.changes.randomize is None:
         request = dataclasses.replace(request, changes=dataclasses.replace(request.changes, randomize=False))
     source, policy, spec = find_player(request)
-    maps = axes_of.read_axes(vary, spec) if vary else []
+    maps = robustness.read_axes(vary, spec) if vary else []
     if sim is not None:
         dataclasses.replace(spec, sim=sim).make().close()  # raises for what MuJoCo cannot build
-        maps.append([axes_of.make_contact_axis(sim)])
+        maps.append([robustness.make_contact_axis(sim)])
     cells = sum(math.prod(len(axis.values) for axis in axes) for axes in maps)
     with start_workers(spec, request) as workers:
         policy.give_to(workers)
@@ -132,7 +131,7 @@ def _play_maps(
     points = [(axes, values) for axes in maps for values in itertools.product(*(axis.values for axis in axes))]
     cells: dict[int, Cell] = {}
     with output.show_progress("varying", len(points)) as show:
-        for index, outcome in play([axes_of.apply(axes, values, spec) for axes, values in points]):
+        for index, outcome in play([robustness.apply_axes(axes, values, spec) for axes, values in points]):
             axes, values = points[index]
             cells[index] = Cell(**outcome.model_dump(), values=list(values), nominal=_is_nominal(axes, values))
             show(len(cells))
@@ -190,7 +189,7 @@ def format_command(result: Robustness, varied: RobustnessMap, cell: Cell) -> str
     settings["randomize"] = "false"
     engine = []
     for axis, value in zip(varied.axes, cell.values, strict=True):
-        if axis.setting == axes_of.SIM:
+        if axis.setting == robustness.SIM:
             engine = ["--sim", f"mujoco:{value:g}"]
             continue
         settings[axis.setting] = str(int(value) if value.is_integer() else value)

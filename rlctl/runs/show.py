@@ -8,11 +8,11 @@ from rich.text import Text
 
 from rlctl import output
 from rlctl.errors import ArtifactError
+from rlctl.evaluation import robustness
+from rlctl.evaluation.robustness import Robustness
 from rlctl.recipe.stages import format_value
-from rlctl.run import robustness
 from rlctl.run.directory import RunDirectory
 from rlctl.run.lookup import describe_source_change
-from rlctl.run.robustness import Robustness
 from rlctl.runs.diagnosis.findings import diagnose, format_finding
 from rlctl.runs.diagnosis.history import History
 from rlctl.runs.listing import as_json

@@ -9,8 +9,8 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.evaluation.push import find_pushed, find_threshold
 from rlctl.evaluation.request import EvalRequest
+from rlctl.evaluation.robustness import read
 from rlctl.evaluation.vary import measure_robustness
-from rlctl.run.robustness import read
 from tests.evaluation.conftest import ENVS, write_run
 
 

@@ -8,13 +8,12 @@ import pytest
 
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.evaluation.axes import apply, read_axes
 from rlctl.evaluation.episode_statistics import mean_interval
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest, Gates
+from rlctl.evaluation.robustness import apply_axes, read, read_axes
 from rlctl.evaluation.vary import check_gates, format_command, measure_robustness
 from rlctl.output import format_duration
-from rlctl.run.robustness import read
 from tests.evaluation.conftest import ENVS, write_run
 
 BLOCK = EnvSpec(f"{ENVS}:Block")
@@ -211,7 +210,7 @@ def test_whole_numbers_of_plain_environments(vary, values, kind):
     spec = EnvSpec(f"{ENVS}:Chain")
     (axis,) = read_axes([vary], spec)[0]
     assert axis.values == values
-    (value,) = apply([axis], axis.values[:1], spec).parameters.values()
+    (value,) = apply_axes([axis], axis.values[:1], spec).parameters.values()
     assert type(value) is kind
 
 

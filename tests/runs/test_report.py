@@ -10,10 +10,10 @@ import subprocess
 import pytest
 
 from rlctl.errors import ArtifactError, UsageError
+from rlctl.evaluation import robustness
+from rlctl.evaluation.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.recipe.sources import parse_settings, resolve
-from rlctl.run import robustness
 from rlctl.run.directory import RunDirectory
-from rlctl.run.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.runs.report import content
 from rlctl.runs.report.write import write_report
 from rlctl.training.status import find_recipe_changes

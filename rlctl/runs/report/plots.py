@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from rlctl.run.robustness import PushTest, RobustnessMap
+from rlctl.evaluation.robustness import PushTest, RobustnessMap
 from rlctl.runs.report.content import RecipeRuns, RunReport, mean_curve
 
 _SIZE = (4.4, 2.7)  # [inches]: the width of a phone, so that text is readable there
