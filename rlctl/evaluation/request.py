@@ -38,13 +38,9 @@ class EvalOptions:
     """From 1."""
     deterministic: Annotated[bool, Option("Sample actions instead of taking the mean.", ("/--stochastic",))] = True
     n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1)] = None
-    limits: Annotated[Path | None, Option("Compare with and without these safety limits (YAML).", metavar="FILE")] = (
-        None
-    )
+    limits: Annotated[Path | None, Option("Compare with and without safety limits (YAML).", metavar="FILE")] = None
     """Limits on the policy's actions; it is also evaluated without them."""
-    record: Annotated[
-        Path | None, Option("Write the episodes (.npz) into this new folder; --demos reads it.", metavar="FOLDER")
-    ] = None
+    record: Annotated[Path | None, Option("New folder for the episodes (.npz), for --demos.", metavar="FOLDER")] = None
     env_timeout_s: EnvTimeout = 60.0
 
 

@@ -20,9 +20,7 @@ class TrainRequest:
     task: OptionalTask = None
     resume: Annotated[
         str | None,
-        Option(
-            "Resume a run, or a group of seeds: its folder, a task's name, or latest.", metavar="RUN", completes="run"
-        ),
+        Option("Resume a run or a group: its folder, a task's name, or latest.", metavar="RUN", completes="run"),
     ] = None
     initial_policy: Annotated[
         str | None,

@@ -1,10 +1,8 @@
 """Tests whether one policy or recipe is better than another: p-values, intervals, and how much data would decide.
 
-Two policies are compared on the same episodes, so the unit is the episode and the test is paired. Two recipes are
-compared by training each several times, so the unit is the training seed.
-
-Success and return are tested together, and each candidate against the baseline. The p-values are adjusted for that:
-if all are equal, at most `ALPHA` of the comparisons report a difference.
+Two policies play the same episodes: the unit is the episode and the test is paired. Of two recipes the unit is the
+training seed. Success and return are tested together, and each candidate against the baseline, with p-values adjusted
+for that: if all are equal, at most `ALPHA` of the comparisons report a difference.
 """
 
 import dataclasses
