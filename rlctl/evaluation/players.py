@@ -58,9 +58,7 @@ def choose_spec(info: PolicyInfo, request: EvalRequest) -> EnvSpec:
     if request.task is not None and request.task != info.spec.task:
         raise UsageError(f"--stage: the policy has only stages of {info.spec.task}; leave out --task")
     if not 1 <= stage <= len(info.stages):
-        raise UsageError(
-            f"--stage {stage}: this policy was trained in {output.format_count(len(info.stages), 'stage')}"
-        )
+        raise UsageError(f"--stage {stage}: this policy has {output.format_count(len(info.stages), 'stage')}")
     return request.changes.apply(info.stages[stage - 1])
 
 
@@ -94,16 +92,14 @@ def load_baseline(request: EvalRequest) -> Baseline:
             f"--policy {name} plays a task, not a run: leave out --checkpoint, "
             "--pretrained, --stage, --stochastic and --task"
         )
-    if name in BASELINES:
-        return Baseline(name)
     if name.startswith(SERVER):
         try:
             from rlctl.deploy.server.client import PolicyClient
         except ModuleNotFoundError as error:
             raise UsageError(explain_missing_package(f"--policy {name}", error.name, "serve")) from None
         PolicyClient(name).close()  # raises if no policy server answers, before environments are built
-        return Baseline(name)
-    load_function(name)  # raises before environments are built
+    elif name not in BASELINES:
+        load_function(name)  # raises before environments are built
     place, _, function = name.rpartition(":")
     return Baseline(f"{Path(place).expanduser().resolve()}:{function}" if place.endswith(".py") else name)
 

@@ -100,7 +100,7 @@ def test_eval_of_a_stage(staged, stage, rate):
 
 @pytest.mark.parametrize("stage", [0, 3])
 def test_eval_of_a_stage_that_is_not_there(staged, stage):
-    message = f"--stage {stage}: this policy was trained in 2 stages"
+    message = f"--stage {stage}: this policy has 2 stages"
     with pytest.raises(UsageError, match=message):
         run_evaluation(EvalRequest(str(staged.run.path), stage=stage))
 
@@ -109,7 +109,7 @@ def test_without_stages_there_is_no_stage_anywhere(train, small_ppo):
     result = train("Line", small_ppo)
     assert "stage" not in rows(result.run.metrics_file)[0]
     assert "stage" not in rows(result.run.evals_file)[0]
-    with pytest.raises(UsageError, match="--stage 1: this policy was trained in 0 stages"):
+    with pytest.raises(UsageError, match="--stage 1: this policy has 0 stages"):
         run_evaluation(EvalRequest(str(result.run.path), stage=1))
 
 
