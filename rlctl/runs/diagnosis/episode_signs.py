@@ -116,21 +116,16 @@ def badly_scaled_observations(run: History) -> str | None:
     settings = run.recipe.get("normalize")
     if (isinstance(settings, dict) and settings.get("observation", True)) or not run.episodes:
         return None
-    deviations: dict[str, float] = {}
-    for episode in run.episodes[:1]:
-        for name, rows in _named_observations(episode, run).items():
-            for index, value in enumerate(rows.std(axis=0)):
-                if value > 1e-9:
-                    deviations[f"{name}[{index}]"] = float(value)
-    if len(deviations) < 2:
+    deviations = [
+        (float(value), f"{name}[{index}]")
+        for name, rows in _named_observations(run.episodes[0], run).items()
+        for index, value in enumerate(rows.std(axis=0))
+        if value > 1e-9
+    ]
+    (least, small), (most, large) = min(deviations, default=(1.0, "")), max(deviations, default=(1.0, ""))
+    if most < 1000 * least:
         return None
-    small, large = (choose(deviations, key=lambda name: deviations[name]) for choose in (min, max))
-    if deviations[large] < 1000 * deviations[small]:
-        return None
-    return (
-        f"not normalised: {large} varies by {deviations[large]:.2g} and {small} by {deviations[small]:.2g} "
-        "(standard deviations)"
-    )
+    return f"not normalised: the standard deviation of {large} is {most:.2g}, that of {small} is {least:.2g}"
 
 
 def _named_observations(episode: RecordedEpisode, run: History) -> dict[str, Array]:
