@@ -20,7 +20,6 @@ class EvalOptions:
     """The arguments of `rlctl eval` that choose the policy and its episodes."""
 
     run: RunName = None
-    """With `baseline`, the name of a task."""
     task: Annotated[str | None, Option("Evaluate on this task instead of the one it was trained on.")] = None
     checkpoint: Checkpoint = "best"
     baseline: Annotated[
@@ -31,15 +30,12 @@ class EvalOptions:
             metavar="zero|random|FUNCTION|ws://HOST:PORT",
         ),
     ] = None
-    """What to play instead of a trained policy."""
     episodes: Annotated[int, Option("Episodes, each with its own seed.", min=1, max=1_000_000)] = 100
     seed: EpisodeSeed = 0
     stage: Annotated[int | None, Option("Stage of the policy's curriculum.", min=1, default_text="the last")] = None
-    """From 1."""
     deterministic: Annotated[bool, Option("Sample actions instead of taking the mean.", ("/--stochastic",))] = True
     n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1)] = None
     limits: Annotated[Path | None, Option("Compare with and without safety limits (YAML).", metavar="FILE")] = None
-    """Limits on the policy's actions; it is also evaluated without them."""
     record: Annotated[Path | None, Option("New folder for the episodes (.npz), for --demos.", metavar="FOLDER")] = None
     env_timeout_s: EnvTimeout = 60.0
 

@@ -13,7 +13,7 @@ import pydantic
 
 from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvChanges, EnvSpec, read_parameters
-from rlctl.errors import UsageError, did_you_mean, short_repr
+from rlctl.errors import UsageError, check_name, did_you_mean, short_repr
 from rlctl.policy.shipped import Interval
 from rlctl.storage import files, untrusted
 from rlctl.task.events import Event, RangeLimits, set_color
@@ -189,12 +189,8 @@ def _vary_event(
     name: str, key: str, parameter: str, event: Event, span: tuple[float, float, int], spec: EnvSpec
 ) -> Axis:
     ranges = event.ranges
-    if not ranges or (parameter and parameter not in ranges):
-        close = did_you_mean(parameter, ranges)
-        raise UsageError(
-            f"--vary {name}: the random parameters of event {key!r} are: {', '.join(ranges) or 'none'}.{close}"
-        )
-    parameter = parameter or next(iter(ranges))
+    parameter = parameter or next(iter(ranges), name)
+    check_name(parameter, ranges, f"--vary {name}: event {key!r} has no random parameter", UsageError)
     limits = ranges[parameter]
     read_range(f"--vary {name}", list(span[:2]), RangeLimits(limits.low, limits.high, limits.above), UsageError)
     acts = spec.randomize or event.enabled or key in spec.events

@@ -41,10 +41,8 @@ class TrainRequest:
     device: Annotated[str, Option("cpu, cuda, or auto.")] = "cpu"
     record: Annotated[int, Option("Write the last N evaluation episodes as .rrd.", metavar="N", min=0)] = 0
     check: Annotated[bool, Option("Train without checking the environment first.", ("/--no-check",))] = True
-    """Whether to check the environment first, and to refuse one that has errors."""
     force: Annotated[bool, Option("Resume a run even if its task has changed.", ("--force",))] = False
     env_timeout_s: EnvTimeout = 60.0
-    """How long a step or reset may take [s]."""
     root: RunsFolder = Path("runs")
 
     def to_resume(self, run: Path, settings: Mapping[str, Any]) -> TrainRequest:

@@ -171,7 +171,7 @@ def test_an_event_that_acts_has_no_nominal_value():
         ),
         (
             ["push.forces=0:2:4"],
-            r"the random parameters of event 'push' are: force, duration_s\. Did you mean 'force'\?",
+            r"event 'push' has no random parameter 'forces'\. Did you mean 'force'\? It has: force, duration_s",
         ),
         (["mass=0.5:2:1"], "2 to 1,000 values, .*for a single value use --set"),
         (["mass=2:2:4"], "write NAME=LOWEST:HIGHEST:VALUES"),

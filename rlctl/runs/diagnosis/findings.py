@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from rlctl.errors import UsageError, did_you_mean
+from rlctl.errors import UsageError, check_name
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.run.directory import RunDirectory
 from rlctl.runs.diagnosis import episode_signs, record_signs, signs
@@ -115,12 +115,12 @@ def _settings(names: Iterable[str], history: History) -> Iterable[Setting]:
 
 def explain(code: str) -> list[str]:
     """Return what the findings of an id (`Q10`) mean, and what to try; raises `UsageError` for an unknown id."""
-    texts = [text for text in _texts()["findings"] if text["id"] == code.upper()]
-    if not texts:
-        known = list(dict.fromkeys(text["id"] for text in _texts()["findings"]))
-        raise UsageError(f"no finding {code!r}.{did_you_mean(code, known)} There are: {', '.join(known)}")
+    findings = _texts()["findings"]
+    check_name(
+        code.upper(), dict.fromkeys(text["id"] for text in findings), "no finding", UsageError, listed="There are"
+    )
     lines = []
-    for text in texts:
+    for text in (text for text in findings if text["id"] == code.upper()):
         lines += [f"{text['id']} {text['name']} ({text['grade']})", f"  {text['meaning']}"]
         lines += [f"  try: {advice}" for advice in text["try"]]
         if text["settings"]:
