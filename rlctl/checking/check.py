@@ -71,8 +71,9 @@ class CheckReport:
         method = finding.evidence.get("call") or METHODS.get(finding.rule[:3], "")
         if finding.rule in OF_SPACES:
             kind = "action" if str(finding.evidence.get("element")).startswith("action") else "observation"
-            method = f"{kind}_space" if f"{kind}_space" in built.lines else method
-        return Path(built.file), built.lines.get(method) or built.line or 1
+            method = f"{kind}_space" if f"{kind}_space" in built.places else method
+        file_name, line = built.places.get(method) or (built.file, built.line or 1)
+        return Path(file_name), line
 
     def fingerprint(self, finding: RuleFinding) -> str:
         """Return what identifies a finding in every run: no number of a message, which differ from run to run."""

@@ -35,7 +35,7 @@ NO_DISPLAY = re.compile(
 """What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
 _LIBRARY = re.compile(
     rf"^<|^{re.escape(sysconfig.get_path('stdlib'))}/(?!site-packages|dist-packages)|"
-    rf"(site|dist)-packages/({'|'.join(LIBRARIES)}|mujoco|dm_control/_render|dm_control/mujoco|glfw|OpenGL)(/|\\.)"
+    rf"(site|dist)-packages/({'|'.join(LIBRARIES)})(/|\\.)"
 )
 """Files of Python itself and of libraries: an exception there comes from a wrong call in the environment."""
 NO_OPENGL = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW", re.IGNORECASE)
@@ -72,13 +72,22 @@ def describe(error: BaseException) -> str:
 
 
 def find_line(error: BaseException) -> tuple[str, int] | None:
-    """Return the last file and line of the environment's own code in a traceback; None if it has only libraries."""
+    """Return the last file and line of the environment's own package in a traceback; None if it has only libraries."""
     if isinstance(error, SyntaxError) and error.filename:
         return error.filename, error.lineno or 1
-    trace = traceback.extract_tb(error.__traceback__)
-    frames = [frame for frame in trace if PACKAGE_FOLDER not in Path(frame.filename).parents]
-    own = [frame for frame in frames if not _LIBRARY.search(frame.filename)]
+    own = [frame for frame in traceback.extract_tb(error.__traceback__) if is_own_file(frame.filename)]
+    own = [frame for frame in own if _find_package(frame.filename) == _find_package(own[0].filename)]
     return (own[-1].filename, own[-1].lineno or 1) if own else None
+
+
+def _find_package(file: str) -> str:
+    installed = re.search(r"(?:site|dist)-packages/([^/]+)", file)
+    return installed[1] if installed else ""
+
+
+def is_own_file(file: str) -> bool:
+    """Say whether a file belongs to the environment, not to rlctl, Python or a library."""
+    return PACKAGE_FOLDER not in Path(file).parents and _LIBRARY.search(file) is None
 
 
 def lacks_display(failure: CallFailure) -> bool:

@@ -34,7 +34,7 @@ class Built:
     nondeterministic: bool = False  # its registration says that it is not repeatable
     truncation: str = "unknown"  # `truncated` in the code of step: `never`, `computed`, `unknown`
     counter: str = ""  # comparison in step that sets terminated by a counter
-    lines: Mapping[str, int] = dataclasses.field(default_factory=dict)  # method or space -> line in `file`
+    places: Mapping[str, tuple[str, int]] = dataclasses.field(default_factory=dict)  # of a method or a space
     accepts_seed: bool = True
     accepts_options: bool = True
     model: str = ""  # Mass, joints and limits of a model in MuJoCo

@@ -101,6 +101,20 @@ def test_flags_per_agent_are_of_a_wrong_type_and_end_nothing():
     assert [finding.rule for finding in verdict.findings] == ["RL204", "RL204"]
 
 
+def test_an_exception_in_a_library_is_placed_at_its_call(tmp_path, monkeypatch):
+    (tmp_path / "site-packages").mkdir()
+    (tmp_path / "site-packages" / "grippers.py").write_text("def close():\n    raise ValueError('no gripper')\n")
+    monkeypatch.syspath_prepend(tmp_path / "site-packages")
+    file = tmp_path / "gripping.py"
+    file.write_text(
+        "import grippers\n\nfrom tests.checking.broken_envs import Clean\n\n\n"
+        "class Gripping(Clean):\n    def start(self):\n        super().start()\n        grippers.close()\n"
+    )
+    (finding,) = findings(f"{file}:Gripping", "RL207")
+    assert finding.where == (str(file), 9)
+    assert finding.message == "reset raised ValueError: no gripper (gripping.py:9)"
+
+
 def test_missing_opengl_is_fixed_by_another_backend_and_other_exceptions_by_repair():
     (finding,) = findings(f"{FILE}:LacksOpenGL", "RL207")
     assert "set MUJOCO_GL=egl (or osmesa)" in finding.fix

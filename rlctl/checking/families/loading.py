@@ -28,6 +28,7 @@ from rlctl.checking.instance import (
     find_line,
     find_longest_episode,
     find_missing_file,
+    is_own_file,
     iterate_causes,
     lacks_display,
 )
@@ -176,7 +177,7 @@ def describe_built(instance: Instance) -> Built:
         max_steps=find_longest_episode(env),
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
         **_read_flags(inner),
-        lines=_find_lines(env, author, file),
+        places=_find_places(env, author, file),
         accepts_seed=instance.accepts_seed,
         accepts_options=instance.accepts_options,
         model=describe_mujoco_model(env),
@@ -201,17 +202,13 @@ def _place(author: type) -> tuple[str | None, int | None]:
         return None, None
 
 
-def _find_lines(env: Any, author: type, file: str | None) -> dict[str, int]:
-    lines = {}
-    for name in ("observation_space", "action_space"):
-        place = find_assignment(env, f"self.{name}")
-        if place is not None and place[0] == file:
-            lines[name] = place[1]
+def _find_places(env: Any, author: type, file: str | None) -> dict[str, tuple[str, int]]:
+    places = {name: find_assignment(env, f"self.{name}") for name in ("observation_space", "action_space")}
     for name in ("__init__", "reset", "step"):
         code = getattr(inspect.unwrap(getattr(author, name, None) or author), "__code__", None)
-        if code is not None and code.co_filename == file:
-            lines[name] = int(code.co_firstlineno)
-    return lines
+        places[name] = (code.co_filename, code.co_firstlineno) if code is not None else None
+    found = {name: place for name, place in places.items() if place is not None}
+    return {name: place for name, place in found.items() if place[0] == file or is_own_file(place[0])}
 
 
 def _read_flags(env: Any) -> dict[str, str]:
