@@ -36,13 +36,13 @@ class ActionNumber:
         return name_element(self.leaf, self.index, "action")
 
     @property
-    def bounds(self) -> tuple[float, float]:
-        """Lowest and highest value; infinite where there is none."""
-        low, high = self.leaf.flat_bounds
-        return float(low[self.index]), float(high[self.index])
+    def bounds(self) -> tuple[Any, Any]:
+        """Lowest and highest value, of the action's type; infinite where there is none."""
+        low, high = np.ravel(np.asarray(self.leaf.low)), np.ravel(np.asarray(self.leaf.high))
+        return low[self.index].item(), high[self.index].item()
 
     @property
-    def ends(self) -> tuple[float, float]:
+    def ends(self) -> tuple[Any, Any]:
         """Two values that are far apart and inside the bounds."""
         low, high = self.bounds
         return (low if np.isfinite(low) else min(-1.0, high)), (high if np.isfinite(high) else max(1.0, low))
