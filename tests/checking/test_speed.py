@@ -69,6 +69,12 @@ def test_slow_has_hours_and_the_slowest_calls():
     assert finding.evidence == {"value": 1 / 0.036, "expected": 100.0, "step_ms": 36.0, "steps": 200}
 
 
+def test_slow_without_a_slow_call_is_an_info():
+    calls = [TimedCall("Road.neighbours", "road.py:7", 0.06), TimedCall("numpy.dot", "", 0.04)]
+    (finding,) = findings(with_speed(step_s=0.036, slowest_in_step=calls))
+    assert (finding.rule, finding.severity) == ("RL901", "info")
+
+
 def test_just_fast_enough_is_no_finding():
     assert findings(with_speed(step_s=0.0099)) == []
 

@@ -26,6 +26,7 @@ MOST_CALLS = 5
 MILLION = 1_000_000
 SLOW_STEPS_PER_S = 100.0  # a million steps then take about three hours [steps/s]
 CLEARLY_SLOW = 1.25  # So many times slower than that is a warning; less may be a busy machine
+LARGE_CALL = 0.25  # share of a step; where no call takes so much, a slow step is an info: there is no place to begin
 SLOW_LOADING_S = 0.005  # [s]; resetSimulation of an empty world takes a tenth of this
 LITTLE_LOADING = 0.05  # Share of an episode below which loading in reset is not reported
 MOST_LOADING = 0.2  # share of a step from which loading there is a finding
@@ -118,11 +119,13 @@ def _find_slow_step(records: Records) -> Iterator[RuleFinding]:
         return
     per_s, hours = 1 / speed.step_s, MILLION * speed.step_s / 3600
     calls = _list(speed.slowest_in_step)
+    is_clear = left * SLOW_STEPS_PER_S > CLEARLY_SLOW
+    has_large_call = any(call.share >= LARGE_CALL for call in speed.slowest_in_step)
     yield RuleFinding(
         "RL901",
         f"{per_s:,.3g} steps/s: a million steps take {hours:,.3g} hours per process on this machine; slowest: {calls}",
         {"value": per_s, "expected": SLOW_STEPS_PER_S, "step_ms": 1e3 * speed.step_s, "steps": speed.steps},
-        Severity.WARNING if left * SLOW_STEPS_PER_S > CLEARLY_SLOW else Severity.INFO,
+        Severity.WARNING if is_clear and has_large_call else Severity.INFO,
     )
 
 
