@@ -1,6 +1,5 @@
 """Prints a comparison."""
 
-import dataclasses
 from typing import Any
 
 from rich.text import Text
@@ -142,7 +141,7 @@ def as_json(result: RunComparison) -> dict[str, Any]:
                 **_side_as_json(candidate.side, result),
                 "verdict": str(candidate.verdict),
                 "differences": {
-                    quantity: {**dataclasses.asdict(difference), "verdict": str(difference.verdict)}
+                    quantity: {**vars(difference), "verdict": str(difference.verdict)}
                     for quantity, difference in candidate.differences.items()
                 },
                 "recipe_changes": {
@@ -169,12 +168,9 @@ def _side_as_json(side: Side, result: RunComparison) -> dict[str, Any]:
     ]
     if not result.of_recipes:
         return {"name": side.name, "runs": runs}
-    scores = {quantity: side.scores(quantity) for quantity in result.candidates[0].differences}
-    over_seeds = {
-        quantity: {
-            **dataclasses.asdict(Spread.of(values.tolist())),
-            "iqm_interval": significance.interquartile_mean_interval(values),
-        }
-        for quantity, values in scores.items()
-    }
+    over_seeds = {}
+    for quantity in result.candidates[0].differences:
+        scores = side.scores(quantity)
+        interval = significance.interquartile_mean_interval(scores)
+        over_seeds[quantity] = {**vars(Spread.of(scores.tolist())), "iqm_interval": interval}
     return {"name": side.name, "runs": runs, "over_seeds": over_seeds, "mixed": side.mixed}

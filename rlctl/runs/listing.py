@@ -47,15 +47,12 @@ def list_runs(
     """
     runs = [*(summarize(path) for path in find_runs(root)), *(list_waiting(root) if waiting else ())]
     if task is not None:
+        known = [*sorted({run.task for run in runs}), *commands]
         slug = registry.make_slug(task)
-        named = [run for run in runs if run.task == task or run.name.partition("/")[0] == slug]
-        if not named:
-            names = sorted({run.task for run in runs})
-            close = did_you_mean(task, [*names, *commands])
-            raise ArtifactError(
-                f"no run of {task!r} under {root.resolve()}, and rlctl runs has no such command.{close}"
-            )
-        runs = named
+        runs = [run for run in runs if run.task == task or run.name.partition("/")[0] == slug]
+        if not runs:
+            close = did_you_mean(task, known)
+            raise ArtifactError(f"no run of {task!r} under {root.resolve()}; rlctl runs has no such command.{close}")
     return sorted(runs, key=_SORT_KEYS[sort], reverse=True)
 
 
@@ -103,15 +100,14 @@ def _find_source_changes(runs: list[RunSummary]) -> dict[str, list[str]]:
 def _cells(run: RunSummary) -> list[Any]:
     state = run.state_text if output.out().width >= _WIDE else run.state
     styles = {"done": "green", "queued": "cyan", "running": "cyan", "failed": "red", "damaged": "red"}
+    minutes = None if run.seconds is None else run.seconds / 60
+    numbers = ((run.steps, ","), (minutes, ".1f"), (run.best_success, ".1%"), (run.best_return, ".2f"))
     return [
         run.name,
         run.algo,
         "" if run.seed is None else str(run.seed),
         Text(short_repr(state, _STATE_SHOWN), style=styles.get(run.state, "")),
-        "" if run.steps is None else f"{run.steps:,}",
-        "" if run.seconds is None else f"{run.seconds / 60:.1f}",
-        "" if run.best_success is None else f"{run.best_success:.1%}",
-        "" if run.best_return is None else f"{run.best_return:.2f}",
+        *("" if number is None else format(number, form) for number, form in numbers),
         format_changes(run.changes),
     ]
 

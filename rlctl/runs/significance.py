@@ -152,10 +152,8 @@ def _step_down(observed: Array, resampled: Array, exact: bool) -> Array:
 
 def find_least_seeds(comparisons: int) -> tuple[int, float]:
     """Return the fewest seeds per recipe that can show a difference, and their smallest p-value."""
-    for seeds in itertools.count(2):
-        if (smallest := comparisons * 2 / math.comb(2 * seeds, seeds)) < ALPHA:
-            return seeds, smallest
-    raise AssertionError
+    smallest = ((seeds, comparisons * 2 / math.comb(2 * seeds, seeds)) for seeds in itertools.count(2))
+    return next(pair for pair in smallest if pair[1] < ALPHA)
 
 
 def _success_interval(change: Array) -> tuple[float, float]:
