@@ -81,15 +81,11 @@ def summarize(path: Path) -> RunSummary:
     """Read one run; never raises for what is in the folder."""
     run = RunDirectory(path)
     try:
-        status = run.status()
-    except (ArtifactError, OSError) as error:
+        return _summarize(run, run.status())
+    except (ArtifactError, OSError, ValueError, TypeError, KeyError) as error:
         problem = _first_line(str(error)).removeprefix(f"{path}/")
         reason = problem if run.status_file.is_file() else "no run.json"
         return RunSummary(path, task=path.parent.name, state="damaged", reason=reason)
-    try:
-        return _summarize(run, status)
-    except (ArtifactError, OSError, ValueError, TypeError, KeyError) as error:
-        return RunSummary(path, task=str(status["task"]), state="damaged", reason=_first_line(str(error)))
 
 
 def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
@@ -138,21 +134,16 @@ def _whole(number: float | None) -> int | None:
 
 
 def _state(run: RunDirectory, status: dict[str, Any]) -> tuple[str, str]:
-    state, error = status.get("status"), _first_line(str(status.get("error") or ""))
+    state = status.get("status")
     if state == "finished":
         return "done", ""
     if state == "running" and is_being_written(run.path):  # the lock of a killed training is free
         return "running", ""
-    if state in ("running", "interrupted"):
-        return _remote_state(run, status) or ("stopped", "")
-    return "failed", error
-
-
-def _remote_state(run: RunDirectory, status: dict[str, Any]) -> tuple[str, str] | None:
-    """Return the state of a run that a cluster executes or will resume; None for others."""
+    if state not in ("running", "interrupted"):
+        return "failed", _first_line(str(status.get("error") or ""))
     seed = _whole(_first_number(status.get("seed")))
-    job = None if seed is None else read_job(run.path.parent, seed)
-    return None if job is None or job.state == "ended" else (job.state, job.describe())
+    job = None if seed is None else read_job(run.path.parent, seed)  # of a run that a cluster executes or will resume
+    return ("stopped", "") if job is None or job.state == "ended" else (job.state, job.describe())
 
 
 def list_waiting(root: Path = ROOT) -> Iterator[RunSummary]:
