@@ -109,14 +109,14 @@ def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalReques
         actor.give_to(workers)
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
-        episodes, info = _play(workers, request), workers.info
+        episodes = _play(workers, request)
         if request.record is not None:
             for number, episode in enumerate(episodes):
-                save_episode(request.record / f"{number:06d}.npz", episode.describe(spec, info, actor.name))
-        evaluation = _summarize(actor, spec, info, request, episodes)
+                save_episode(request.record / f"{number:06d}.npz", episode.describe(spec, workers.info, actor.name))
+        evaluation = _summarize(actor, workers, request, episodes)
         if limits is not None:
             workers.limit_actions(limits)
-            limited = _summarize(actor, spec, info, request, _play(workers, request))
+            limited = _summarize(actor, workers, request, _play(workers, request))
             evaluation = dataclasses.replace(limited, limited_by=request.limits, unlimited=evaluation)
     gates.check_possible(evaluation.success_rate is not None)
     return evaluation
@@ -135,22 +135,21 @@ def _read_limits(file: Path, info: EnvInfo) -> dict[str, Any]:
 def _play(workers: Workers, request: EvalRequest) -> list[Episode]:
     seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
     exploration = Exploration(stochastic=not request.deterministic)
+    record = request.measure_actions or request.record is not None
     with output.show_progress("evaluating", len(seeds)) as show:
-        return play_episodes(
-            workers, seeds, exploration, record=request.measure_actions or request.record is not None, watch=show
-        )
+        return play_episodes(workers, seeds, exploration, record=record, watch=show)
 
 
 def _summarize(
-    actor: LoadedPolicy | Baseline, spec: EnvSpec, info: EnvInfo, request: EvalRequest, episodes: list[Episode]
+    actor: LoadedPolicy | Baseline, workers: Workers, request: EvalRequest, episodes: list[Episode]
 ) -> Evaluation:
     results = [episode.result for episode in episodes]
     distances = [result.final_distance for result in results if result.final_distance is not None]
     return Evaluation(
         name=actor.name,
         policy=actor.info,
-        spec=spec,
-        events=info.events,
+        spec=workers.spec,
+        events=workers.info.events,
         seed=request.seed,
         deterministic=request.deterministic,
         played=[dataclasses.replace(episode, trajectory=None) for episode in episodes],
@@ -161,7 +160,7 @@ def _summarize(
         terms=episode_statistics.mean_terms(results),
         metrics=episode_statistics.mean_metrics(results),
         final_distance=Spread.of(distances) if distances else None,
-        max_steps=info.max_steps,
+        max_steps=workers.info.max_steps,
         action_change=episode_statistics.mean_action_change(episodes) if request.measure_actions else None,
     )
 

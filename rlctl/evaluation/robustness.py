@@ -26,7 +26,7 @@ _VALUES = 5  # per axis of `--vary all`
 _WIDER = 2.0  # width of an axis of `--vary all`, relative to the event's range
 _FORM = f"write NAME=LOWEST:HIGHEST:VALUES with 2 to {_MOST_VALUES:,} values, for example --vary mass=0.6:1.4:9"
 SIM = "sim"  # the setting of the axis whose values are MuJoCo's contacts
-_SOLREFS = [0.02, 0.01, 0.005]  # [s], from MuJoCo's default to contacts about as stiff as PyBullet's
+SOLREFS = [0.02, 0.01, 0.005]  # [s], from MuJoCo's default to contacts about as stiff as PyBullet's
 
 
 class _Content(pydantic.BaseModel, extra="forbid", frozen=True):
@@ -130,12 +130,6 @@ def write(path: Path, result: Robustness) -> None:
 def read(path: Path) -> Robustness:
     """Read a result; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
     return untrusted.parse_model(untrusted.read_bytes(path, untrusted.JSON_LIMIT), Robustness, path, "robustness")
-
-
-def make_contact_axis(sim: str) -> Axis:
-    """Return the axis of `mujoco`, three stiffnesses of contacts, or of `mujoco:SOLREF`, that one."""
-    values = [float(sim.partition(":")[2])] if ":" in sim else _SOLREFS
-    return Axis(name="mujoco solref", setting=SIM, values=values, nominal=None)
 
 
 def read_axes(texts: Sequence[str], spec: EnvSpec) -> list[list[Axis]]:

@@ -58,7 +58,8 @@ def measure_robustness(
     maps = robustness.read_axes(vary, spec) if vary else []
     if sim is not None:
         dataclasses.replace(spec, sim=sim).make().close()  # raises for what MuJoCo cannot build
-        maps.append([robustness.make_contact_axis(sim)])
+        values = [float(sim.partition(":")[2])] if ":" in sim else robustness.SOLREFS
+        maps.append([Axis(name="mujoco solref", setting=robustness.SIM, values=values, nominal=None)])
     cells = sum(math.prod(len(axis.values) for axis in axes) for axes in maps)
     with start_workers(spec, request) as workers:
         policy.give_to(workers)
