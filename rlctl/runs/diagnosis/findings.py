@@ -92,6 +92,7 @@ def _check(text: dict[str, Any], read_sign: Callable[[str], str | None], history
     ]
     if not matches:
         return None
+    task = str(history.status.get("task", "TASK"))
     evidence = (read_sign(name) for names in matches for name in names if not name.startswith(_NOT))
     return Finding(
         id=text["id"],
@@ -99,7 +100,7 @@ def _check(text: dict[str, Any], read_sign: Callable[[str], str | None], history
         grade=Grade(text["grade"]),
         evidence=list(dict.fromkeys(sign for sign in evidence if sign is not None)),
         meaning=text["meaning"],
-        advice=[history.name_run(advice) for advice in text["try"]],
+        advice=[advice.replace("RUN", str(history.run.path)).replace("TASK", task) for advice in text["try"]],
         settings=list(_settings(text["settings"], history)),
     )
 

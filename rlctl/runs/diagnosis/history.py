@@ -65,10 +65,6 @@ class History:
         self.recipe: Mapping[str, Any] = _read(sources.read, run.recipe_file) or {}
         self.metrics, self.evaluations = read_table(run.metrics_file), read_table(run.evals_file)
 
-    def name_run(self, text: str) -> str:
-        """Replace RUN and TASK in a command by the run and its task."""
-        return text.replace("RUN", str(self.run.path)).replace("TASK", str(self.status.get("task", "TASK")))
-
     def curve(self, name: str) -> Curve:
         """Return a column of `metrics.csv`."""
         return _curve(self.metrics, name)
@@ -82,14 +78,6 @@ class History:
         """The stages of the curriculum, 0 without one."""
         stages = self.recipe.get("stages")
         return len(stages) if isinstance(stages, list) else 0
-
-    def last_stage_curve(self, name: str) -> Curve:
-        """Return a column of `metrics.csv` in the last stage of a curriculum, which is the one that is evaluated."""
-        curve, reached = self.curve(name), self.curve("stage")
-        if not self.stage_count or not len(reached):
-            return curve
-        in_last = np.isin(curve.steps, reached.steps[reached.values == self.stage_count])
-        return Curve(curve.steps[in_last], curve.values[in_last])
 
     @property
     def successes(self) -> tuple[Curve, Curve]:

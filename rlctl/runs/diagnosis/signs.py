@@ -76,10 +76,13 @@ def never_succeeds(run: History) -> str | None:
 
 def succeeds_by_exploring(run: History) -> str | None:
     """Training episodes succeed with exploration noise, but evaluations never do, up to the end."""
-    evaluated, trained = run.evaluation_curve("success"), run.last_stage_curve("success")
-    if run.progress < 1 or len(evaluated) < _LEAST_EVALUATIONS or not len(trained):
+    evaluated, trained, reached = run.evaluation_curve("success"), run.curve("success"), run.curve("stage")
+    successes = trained.values
+    if run.stage_count and len(reached):  # the last stage is the one that is evaluated
+        successes = successes[np.isin(trained.steps, reached.steps[reached.values == run.stage_count])]
+    if run.progress < 1 or len(evaluated) < _LEAST_EVALUATIONS or not len(successes):
         return None
-    best = float(trained.values.max())
+    best = float(successes.max())
     if evaluated.values.max() > _NEVER or best < _BY_CHANCE:
         return None
     return f"success at most {evaluated.values.max():.1%} in {len(evaluated)} evaluations, {best:.0%} while training"
