@@ -23,10 +23,15 @@ def show(result: Evaluation, json: str | None) -> None:
     """Print the numbers, or JSON alone for `-`."""
     if output.present(as_json(result), json):
         return
-    out = output.out()
-    _show_head(result)
-    if result.spec.stage and result.policy is not None:
-        out.print(f"stage {result.spec.stage} of {len(result.policy.stages)}")
+    out, info = output.out(), result.policy
+    mode = "" if result.deterministic else ", sampled actions"
+    trained = "" if info is None else f" ({info.algo}, step {info.training_steps:,})"
+    out.print(f"{result.spec.task}: {'policy ' if info is None else ''}{result.name}{trained}")
+    randomization = describe_randomization(result.events)
+    episodes = output.format_count(len(result.played), "episode")
+    out.print(f"{episodes}, seed {result.seed}{mode}{randomization and f', {randomization}'}")
+    if result.spec.stage and info is not None:
+        out.print(f"stage {result.spec.stage} of {len(info.stages)}")
     if result.success_rate is not None and result.success_interval is not None:
         low, high = result.success_interval
         out.print(f"success rate {result.success_rate:.1%}  (95 % interval {low:.1%} to {high:.1%})")
@@ -39,9 +44,7 @@ def show(result: Evaluation, json: str | None) -> None:
     reports = [episode.result.report for episode in result.played]
     if stopped := sum(report.get("not_running", 0) for report in reports):
         answers = sum(len(report["round_trips_s"]) for report in reports)
-        out.print(
-            f"for {stopped:,} of {answers:,} answers the server did not run the policy, because it held or stopped"
-        )
+        out.print(f"for {stopped:,} of {answers:,} answers the server held or stopped instead of running the policy")
     if result.unlimited is not None:
         _show_limits(result, result.unlimited)
 
@@ -68,16 +71,6 @@ def count_interventions(result: Evaluation) -> collections.Counter[str]:
     for episode in result.played:
         counts.update(episode.result.report.get("interventions", {}))
     return counts
-
-
-def _show_head(result: Evaluation) -> None:
-    out, info = output.out(), result.policy
-    mode = "" if result.deterministic else ", sampled actions"
-    trained = "" if info is None else f" ({info.algo}, step {info.training_steps:,})"
-    out.print(f"{result.spec.task}: {'policy ' if info is None else ''}{result.name}{trained}")
-    randomization = describe_randomization(result.events)
-    episodes = output.format_count(len(result.played), "episode")
-    out.print(f"{episodes}, seed {result.seed}{mode}{randomization and f', {randomization}'}")
 
 
 def _format_spread(spread: Spread) -> tuple[str, ...]:
@@ -165,9 +158,8 @@ def show_robustness(result: Robustness, json: str | None) -> None:
     out = output.out()
     out.print(f"{result.task}: {result.policy_file} ({result.algo}, step {result.training_steps:,})")
     mode = "" if result.deterministic else ", sampled actions"
-    out.print(
-        f"{output.format_count(result.episodes, 'episode')} in every cell, the same seeds (seed {result.seed}){mode}"
-    )
+    episodes = output.format_count(result.episodes, "episode")
+    out.print(f"{episodes} in every cell, the same seeds (seed {result.seed}){mode}")
     out.print(f"nominal: {_format_outcome(result.nominal)}")
     worst = result.find_worst()
     for varied in result.maps:

@@ -117,12 +117,10 @@ def show(result: SelfTest, json: str | None) -> None:
     if served.success_rate is not None:
         out.print(f"success rate {served.success_rate:.1%}, {direct.success_rate:.1%} without the server")
     out.print(f"return {served.returns.mean:.4g}, {direct.returns.mean:.4g} without the server")
-    deadline = (
-        "" if result.control_dt is None else f"; {result.misses} later than control_dt, {result.control_dt:.4g} s"
-    )
+    late = "" if result.control_dt is None else f"; {result.misses} later than control_dt, {result.control_dt:.4g} s"
     out.print(
         f"{result.requests:,} answers: p50 {result.round_trip_p50_s * 1e3:.3g} ms, "
-        f"p99 {result.round_trip_p99_s * 1e3:.3g} ms{deadline}"
+        f"p99 {result.round_trip_p99_s * 1e3:.3g} ms{late}"
     )
 
 

@@ -133,18 +133,14 @@ def _play_maps(
     cells: dict[int, Cell] = {}
     with output.show_progress("varying", len(points)) as show:
         for index, outcome in play([robustness.apply_axes(axes, values, spec) for axes, values in points]):
-            axes, values = points[index]
-            cells[index] = Cell(**outcome.model_dump(), values=list(values), nominal=_is_nominal(axes, values))
+            pairs = list(zip(*points[index], strict=True))
+            nominal = all(axis.nominal is not None and abs(axis.nominal - value) < 1e-9 for axis, value in pairs)
+            cells[index] = Cell(**outcome.model_dump(), values=[value for _, value in pairs], nominal=nominal)
             show(len(cells))
     return [
         RobustnessMap(axes=axes, cells=[cells[index] for index in range(len(points)) if points[index][0] is axes])
         for axes in maps
     ]
-
-
-def _is_nominal(axes: Sequence[Axis], values: Sequence[float]) -> bool:
-    pairs = zip(axes, values, strict=True)
-    return all(axis.nominal is not None and abs(axis.nominal - value) < 1e-9 for axis, value in pairs)
 
 
 def _ask(cells: int, seconds: float, yes: bool) -> None:

@@ -27,7 +27,13 @@ def show(result: RunComparison, json: str | None) -> None:
         out.print(f"all runs were evaluated with the baseline's {', '.join(result.world_differences)}")
     out.print(describe_tests(result))
     for candidate in result.candidates:
-        _show_candidate(result, candidate)
+        question = f"\n{candidate.side.name} against {result.baseline.name}: "
+        out.print(Text.assemble(question, (candidate.verdict, "bold")))
+        lines = describe_candidate(result, candidate)
+        for key, (value, before) in candidate.recipe_changes.items():
+            lines.append(f"recipe: {key}: {format_value(key, before)} -> {format_value(key, value)}")
+        for line in lines if candidate.recipe_changes else [*lines, "recipe: the same"]:
+            out.print(f"  {line}")
 
 
 def _show_seeds(result: RunComparison) -> None:
@@ -63,18 +69,6 @@ def _format_aggregate(side: Side, quantity: significance.Quantity) -> str:
     form = ".1%" if quantity == "success" else ".4g"
     mean, middle, low, high = (format(value, form) for value in (spread.mean, spread.iqm, *interval))
     return f"{quantity} mean {mean}, IQM {middle} (95 % interval {low} to {high})"
-
-
-def _show_candidate(result: RunComparison, candidate: Candidate) -> None:
-    out = output.out()
-    question = f"\n{candidate.side.name} against {result.baseline.name}: "
-    out.print(Text.assemble(question, (candidate.verdict, "bold")))
-    for line in describe_candidate(result, candidate):
-        out.print(f"  {line}")
-    for key, (value, before) in candidate.recipe_changes.items():
-        out.print(f"  recipe: {key}: {format_value(key, before)} -> {format_value(key, value)}")
-    if not candidate.recipe_changes:
-        out.print("  recipe: the same")
 
 
 def describe_candidate(result: RunComparison, candidate: Candidate) -> list[str]:

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 ALPHA = 0.05  # a difference is significant below this p-value; intervals have the level 1 - ALPHA
 POWER = 0.8
 _RESAMPLES = 9999
+_NORMAL = statistics.NormalDist()
 _LEAST_PAIRS, _LEAST_SEEDS = 6, 4  # the fewest differing pairs, and seeds per recipe, that can reach `ALPHA`
 
 
@@ -163,7 +164,7 @@ def _success_interval(change: Array) -> tuple[float, float]:
     """
     episodes, changed = change.size + 2, float(np.abs(change).sum())
     centre = float(change.sum()) / episodes
-    half = _quantiles()[0] * math.sqrt((changed + 1) / episodes - centre**2) / math.sqrt(episodes)
+    half = _NORMAL.inv_cdf(1 - ALPHA / 2) * math.sqrt((changed + 1) / episodes - centre**2) / math.sqrt(episodes)
     return max(-1.0, centre - half), min(1.0, centre + half)
 
 
@@ -195,9 +196,5 @@ def _sample_size(difference: float, std: float, least: int) -> int | None:
     """Return for how many samples a t-test would find the difference: ((z_a + z_b) std / difference)^2."""
     if difference == 0 or not math.isfinite(std):
         return None
-    return max(least, math.ceil((sum(_quantiles()) * std / difference) ** 2))
-
-
-def _quantiles() -> tuple[float, float]:
-    normal = statistics.NormalDist()
-    return normal.inv_cdf(1 - ALPHA / 2), normal.inv_cdf(POWER)
+    quantiles = _NORMAL.inv_cdf(1 - ALPHA / 2) + _NORMAL.inv_cdf(POWER)
+    return max(least, math.ceil((quantiles * std / difference) ** 2))

@@ -83,7 +83,7 @@ def summarize(path: Path) -> RunSummary:
     try:
         return _summarize(run, run.status())
     except (ArtifactError, OSError, ValueError, TypeError, KeyError) as error:
-        problem = _first_line(str(error)).removeprefix(f"{path}/")
+        problem = str(error).partition("\n")[0].removeprefix(f"{path}/")
         reason = problem if run.status_file.is_file() else "no run.json"
         return RunSummary(path, task=path.parent.name, state="damaged", reason=reason)
 
@@ -140,7 +140,7 @@ def _state(run: RunDirectory, status: dict[str, Any]) -> tuple[str, str]:
     if state == "running" and is_being_written(run.path):  # the lock of a killed training is free
         return "running", ""
     if state not in ("running", "interrupted"):
-        return "failed", _first_line(str(status.get("error") or ""))
+        return "failed", str(status.get("error") or "").partition("\n")[0]
     seed = _whole(_first_number(status.get("seed")))
     job = None if seed is None else read_job(run.path.parent, seed)  # of a run that a cluster executes or will resume
     return ("stopped", "") if job is None or job.state == "ended" else (job.state, job.describe())
@@ -154,10 +154,6 @@ def list_waiting(root: Path = ROOT) -> Iterator[RunSummary]:
                 if find_run_of_seed(folder, job.seed) is None:
                     path = folder / f"(seed {job.seed})"
                     yield RunSummary(path, task=job.task, seed=job.seed, state=job.state, reason=job.describe())
-
-
-def _first_line(text: str) -> str:
-    return text.partition("\n")[0]
 
 
 def read_table(path: Path) -> Rows:

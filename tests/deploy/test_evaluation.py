@@ -80,7 +80,7 @@ def test_a_server_that_does_not_run_its_policy_is_said_to(reach_server, rlctl):
         done = rlctl("eval", "reach", "--policy", f"ws://{reach_server.address}", "--episodes", 1)
     finally:
         reach_server.post("/resume")
-    assert "for 120 of 120 answers the server did not run the policy, because it held or stopped" in done.stdout
+    assert "for 120 of 120 answers the server held or stopped instead of running the policy" in done.stdout
 
 
 def test_a_server_that_is_not_there_or_of_another_task(reach_server, capfd):
