@@ -15,7 +15,7 @@ from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvChanges, EnvSpec, read_parameters
 from rlctl.errors import UsageError, check_name, did_you_mean, short_repr
 from rlctl.policy.shipped import Interval
-from rlctl.storage import files, untrusted
+from rlctl.storage import untrusted
 from rlctl.task.events import Event, RangeLimits, set_color
 from rlctl.task.events.event import read_range
 
@@ -120,11 +120,6 @@ class Robustness(_Content):
         """Return the worst cell of all maps with its map; None where nothing was varied."""
         cells = ((varied, cell) for varied in self.maps for cell in varied.cells)
         return min(cells, key=lambda pair: pair[1].score, default=None)
-
-
-def write(path: Path, result: Robustness) -> None:
-    """Write a result, atomically."""
-    files.write_json(path, result.model_dump(mode="json"))
 
 
 def read(path: Path) -> Robustness:

@@ -28,6 +28,7 @@ from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
+from rlctl.storage import files
 from rlctl.version import collect_versions
 
 ASK_ABOVE_S = 600.0  # rlctl asks before it starts a measurement that takes longer than this [s]
@@ -162,7 +163,7 @@ def _store(file: Path, result: Robustness) -> None:
         if before.model_dump(mode="json", exclude=measured) == result.model_dump(mode="json", exclude=measured):
             result = result.model_copy(update={"maps": result.maps or before.maps, "push": result.push or before.push})
     try:
-        robustness.write(file, result)
+        files.write_json(file, result.model_dump(mode="json"))
     except OSError as error:
         output.err().print(f"warning: {file}: not written: {error.strerror}")
 

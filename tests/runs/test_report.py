@@ -10,12 +10,12 @@ import subprocess
 import pytest
 
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.evaluation import robustness
 from rlctl.evaluation.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.recipe.sources import parse_settings, resolve
 from rlctl.run.directory import RunDirectory
 from rlctl.runs.report import content
 from rlctl.runs.report.write import write_report
+from rlctl.storage import files
 from rlctl.training.status import find_recipe_changes
 
 LARGEST = 2_000_000  # [bytes]
@@ -140,7 +140,7 @@ def test_robustness_is_in_it_where_it_was_measured(group):
         deterministic=True, nominal=Outcome(success_rate=0.5, **outcome),
         maps=[RobustnessMap(axes=[axis], cells=cells), RobustnessMap(axes=grid, cells=pairs)],
     )  # fmt: skip
-    robustness.write(group[0] / "robustness.json", result)
+    files.write_json(group[0] / "robustness.json", result.model_dump(mode="json"))
     page = write(group[0])
     assert "worst cell, 20 episodes at mass 0.6: success 30.0%, return 1" in page
     assert "with nothing varied: success " in page
