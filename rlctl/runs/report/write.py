@@ -59,7 +59,8 @@ def _escape_html(value: Any) -> Any:
 
 
 def _values(report: RunReport, is_html: bool, pictures: bool, episodes: int) -> dict[str, Any]:
-    first = report.runs[0]
+    file = report.runs[0].run.recipe_file
+    recipe = file.read_text(encoding="utf-8", errors="replace").strip() if file.is_file() else "(missing)"
     verdicts, notes = _compare(report, episodes)
     values = {
         "title": report.title,
@@ -81,9 +82,7 @@ def _values(report: RunReport, is_html: bool, pictures: bool, episodes: int) -> 
         ],
         "commands": content.list_commands(report),
         "recipe_name": report.recipes[0].name,
-        "recipe": first.run.recipe_file.read_text(encoding="utf-8", errors="replace").strip()
-        if first.run.recipe_file.is_file()
-        else "(missing)",
+        "recipe": recipe,
     }
     return {**values, **_draw(report, pictures)} if is_html else values
 
