@@ -55,14 +55,16 @@ def train(
     root: str | Path = "runs",
     check: bool = True,
     initial_policy: str | os.PathLike[str] | None = None,
+    demos: str | os.PathLike[str] | None = None,
     **recipe: Any,
 ) -> TrainResult:
     """Train as `rlctl train` does; `load_policy` and `evaluate` accept the result's `run`.
 
     Keywords are the keys of a recipe (`docs/recipe.md`): `train("reach", seed=1, algo_kwargs={"gamma": 0.97})`. They
-    override those of `config`, a recipe file. `initial_policy` is a run, a policy file or a task's name, like `--from`.
-    In a script, call it below `if __name__ == "__main__":`, because worker processes may import the script. Raises the
-    exceptions of `rlctl.errors`.
+    override those of `config`, a recipe file. `initial_policy` is a run, a policy file or a task's name, like `--from`;
+    `demos` are demonstrations to clone first, like `--demos`. In a script, call it below
+    `if __name__ == "__main__":`, because worker processes may import the script. Raises the exceptions of
+    `rlctl.errors`.
     """
     from rlctl.run.train_request import TrainRequest
     from rlctl.training.request import run_training
@@ -75,6 +77,7 @@ def train(
         root=Path(root),
         check=check,
         initial_policy=None if initial_policy is None else os.fspath(initial_policy),
+        demos=None if demos is None else os.fspath(demos),
     )
     return run_training(request)
 

@@ -228,8 +228,11 @@ def test_nodes_get_a_copy_of_the_task(cluster, node, rlctl, tmp_path):
 
 @slow
 def test_a_cluster_that_is_gone(cluster, tmp_path):
-    """The last test of this cluster: it ends."""
-    (tmp_path / "cluster.yaml").write_text("cpus: 1\n")
+    """The last test of this cluster. Ray ends a process that stays connected to a lost cluster, after a minute."""
+    import ray
+
+    ray.shutdown()
+    (tmp_path / "cluster.yaml").write_text("cpus: 1\nlease_s: 3\n")
     driver = Driver(tmp_path, "--on", f"ray:{cluster.address}", "--set", "eval.every_steps=640", steps=400_000)
     run, pid = driver.wait_for_checkpoint()
     for kind in ("gcs_server", "raylet"):
@@ -238,7 +241,7 @@ def test_a_cluster_that_is_gone(cluster, tmp_path):
     assert code == 3
     group = run.parent.relative_to(tmp_path)
     assert f"error: --on ray: the cluster has not answered for 30 s; resume with --resume {group}" in printed
-    assert has_ended(pid)
+    wait_for(lambda: has_ended(pid), 30)
 
 
 @slow

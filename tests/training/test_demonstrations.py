@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import rlctl
 from rlctl.environments.dict_spaces import take_row
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
@@ -122,8 +123,9 @@ def test_the_policy_of_step_0_acts_as_the_demonstrations(record, train, monkeypa
     assert run.status()["demos"]["path"] == str(record(env))
 
 
-def test_discrete_actions_are_cloned(record, train):
-    run = train("Discrete", TINY, demos=str(record("Discrete", "sign"))).run
+def test_discrete_actions_are_cloned(record, tmp_path):
+    demos = record("Discrete", "sign")
+    run = rlctl.train(f"{ENVS}:Discrete", demos=demos, root=tmp_path, check=False, **TINY).run
     policy = load_policy(run.policy_file("0"))
     assert [int(policy.predict(np.array([x], np.float32))) for x in (-0.3, -0.1, 0.1, 0.3)] == [1, 1, 0, 0]
 

@@ -14,11 +14,14 @@ import urllib.request
 
 import pytest
 
+import rlctl
 from rlctl.errors import RecipeError, UsageError
 from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
 from rlctl.training import tracking
 from rlctl.training.seeds import train_seeds
+from rlctl.tuning.tune import tune
+from rlctl.tuning.tune_request import TuneRequest
 from tests.training.conftest import ENVS, SMALL_PPO
 
 KEY = "0123456789abcdef0123456789abcdef01234567"
@@ -192,6 +195,23 @@ def test_seeds_are_grouped_in_mlflow(mlflow, tmp_path):
         expect_whole(read_points(mlflow, run), [64, 128, 192, 256], [128, 256])
         files = {file.path for file in mlflow.list_artifacts(run.info.run_id)}
         assert files == {"recipe.yaml", "best.safetensors", "report.html"}
+
+
+@pytest.mark.slow  # two tiny trainings of a robot, one with a film of the arm
+def test_trials_are_grouped_and_a_film_is_sent_to_mlflow(mlflow, tmp_path):
+    tiny = {"n_envs": 2, "algo_kwargs": {"n_steps": 32, "batch_size": 32}, "eval": {"episodes": 2, "every_steps": 64}}
+    settings = {**tiny, "total_timesteps": 128, "track": "mlflow"}
+    rlctl.train("reach", root=tmp_path / "runs", check=False, **settings)
+    request = TuneRequest("reach", trials=2, search=["algo_kwargs.gamma=0.9:0.99"], root=tmp_path, settings=settings)
+    tune(request)
+    runs = mlflow.search_runs([mlflow.get_experiment_by_name("reach").experiment_id])
+    alone = [run for run in runs if "group" not in run.data.tags]
+    trials = [run for run in runs if "group" in run.data.tags]
+    assert [{file.path for file in mlflow.list_artifacts(run.info.run_id)} for run in alone] == [
+        {"recipe.yaml", "best.safetensors", "report.html", "film.mp4"}
+    ]
+    assert trials
+    assert {run.data.tags["group"] for run in trials} == {folder.name for folder in tmp_path.glob("reach/*_tune")}
 
 
 @pytest.mark.slow
