@@ -20,21 +20,26 @@ from rlctl.version import PACKAGE_FOLDER
 
 POLICY = "a policy file"
 EPISODE = "a recorded episode"
-RUN = "run.json"
+RUN, GROUP, TUNING = "run.json", "group.json", "tune.json"
 
 _MODULE_ID = re.compile(r"^([\w.]+):(?:[\w.-]+/)?[\w.-]+-v\d+$")
 
 
 def load(task: str, named_by: str) -> Callable[..., Any]:
     """Import a task that a file of kind `named_by` names; raises `ArtifactError` if it is not an environment."""
-    if not task.isprintable():
-        raise _make_error(task, named_by, "it contains unprintable characters")
-    if installed.find(task) is None and ":" in task:
-        _look_before_import(task, named_by)
+    check_source(task, named_by)
     constructor = registry.load(task)
     if not _may_be_called(task, constructor):
         raise _make_error(task, named_by, "it is not an environment class")
     return constructor
+
+
+def check_source(task: str, named_by: str) -> None:
+    """Raise `ArtifactError` if the source of a task shows that it is not an environment; import nothing."""
+    if not task.isprintable():
+        raise _make_error(task, named_by, "it contains unprintable characters")
+    if installed.find(task) is None and ":" in task:
+        _look_before_import(task, named_by)
 
 
 def _make_error(task: str, named_by: str, why: str) -> ArtifactError:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from rlctl import output
+from rlctl.environments import named_task
 from rlctl.errors import RlctlError, UsageError
 from rlctl.evaluation.evaluate import GroupScore, evaluate_group
 from rlctl.evaluation.request import EvalRequest
@@ -64,6 +65,7 @@ def train_seeds(
     else:
         check_arguments(request)
         group, resume = read_group(Path(str(request.resume))), request
+        named_task.check_source(group.task, named_task.GROUP)
     with RunLock(group.path, "group"):
         return _train(group, resume, jobs, episodes, make_trainings)
 

@@ -6,13 +6,15 @@ it is below the median of the others at the same evaluation.
 """
 
 import math
+import os
 import shlex
 from collections.abc import Mapping
 from typing import Any
 
 from rlctl import output
+from rlctl.environments import named_task
 from rlctl.environments.spec import merge
-from rlctl.errors import TaskError, UsageError, explain_missing_package
+from rlctl.errors import ArtifactError, TaskError, UsageError, explain_missing_package
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.recipe.recipe import Recipe
 from rlctl.recipe.sources import find_config, resolve_with_stages
@@ -44,7 +46,11 @@ def tune(
     except ModuleNotFoundError as error:
         raise UsageError(explain_missing_package("rlctl tune", error.name, "tune")) from None
     # Read twice: first to refuse a folder that is no tuning before locking it, then again under the lock.
-    tuning = _begin(request, request.task or "") if request.resume is None else find(request.resume, request.root)
+    if request.resume is None:
+        tuning = _begin(request, request.task or "")
+    else:
+        tuning = find(request.resume, request.root)
+        _check_resumed(tuning)
     with RunLock(tuning.path, "tuning"):
         return _search(load(tuning.path), jobs, make_trainings)
 
@@ -69,6 +75,14 @@ def _begin(request: TuneRequest, task: str) -> Tuning:
     )
     tuning.save()
     return tuning
+
+
+def _check_resumed(tuning: Tuning) -> None:
+    """Raise `ArtifactError` for a tuning, perhaps somebody else's, that would run a program or create a database."""
+    named_task.check_source(tuning.task, named_task.TUNING)
+    kind, _, file = (tuning.storage or "").partition(":///")
+    if kind == "sqlite" and not os.path.isfile(file):
+        raise ArtifactError(f"{tuning.path}: {file}, the database of its trials, does not exist in the current folder")
 
 
 def _check_storage(url: str) -> None:

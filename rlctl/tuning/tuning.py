@@ -125,7 +125,10 @@ def load(folder: Path) -> Tuning:
     content = files.read_json(file)
     try:
         json.dumps(content, allow_nan=False)  # raises for NaN, also within the values of trials
-        return pydantic.TypeAdapter(Tuning).validate_python({**content, "path": folder})
+        tuning = pydantic.TypeAdapter(Tuning).validate_python({**content, "path": folder})
+        if len({trial.number for trial in tuning.trials}) != len(tuning.trials):
+            raise ValueError
+        return tuning
     except (ValueError, TypeError):  # pydantic's is a ValueError
         raise ArtifactError(f"{file}: damaged: it does not describe a tuning") from None
 

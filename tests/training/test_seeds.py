@@ -244,6 +244,15 @@ def test_the_file_of_a_group_names_no_other_place(change, tmp_path):
         read_group(group.path)
 
 
+def test_a_group_of_somebody_else_runs_no_script(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    group = create_group(TrainRequest("stranger.py:main", settings=TINY, root=tmp_path), [0])
+    (tmp_path / "stranger.py").write_text("open('ran', 'w')")
+    with pytest.raises(ArtifactError, match=r"group\.json names 'stranger\.py:main' as its task"):
+        train_seeds(TrainRequest(resume=str(group.path)))
+    assert not (tmp_path / "ran").exists()
+
+
 def test_a_group_of_another_version(tmp_path):
     (tmp_path / "group.json").write_text('{"task": "reach", "seeds": [0], "options": ["--json=/elsewhere"]}')
     with pytest.raises(ArtifactError, match="written by another version of rlctl"):

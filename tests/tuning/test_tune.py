@@ -304,6 +304,28 @@ def test_a_damaged_tuning(tmp_path):
         resume(tmp_path)
 
 
+SOUND = {"task": LINE, "config": None, "settings": {}, "metric": "return", "trials_per_step": 2, "seed": 0, "steps": []}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"task": "stranger.py:main"},
+            r"tune\.json names 'stranger\.py:main' as its task, but stranger\.py does not",
+        ),
+        ({"storage": "sqlite:///new.db"}, r"new\.db, the database of its trials, does not exist"),
+    ],
+)
+def test_a_tuning_of_somebody_else_runs_no_script_and_creates_no_database(tmp_path, monkeypatch, change, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "stranger.py").write_text("open('ran', 'w')")
+    (tmp_path / "tune.json").write_text(json.dumps({**SOUND, **change}))
+    with pytest.raises(ArtifactError, match=message):
+        resume(tmp_path)
+    assert {file.name for file in tmp_path.iterdir()} == {"stranger.py", "tune.json"}
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -311,13 +333,13 @@ def test_a_damaged_tuning(tmp_path):
         {"trials": [{"number": 0, "step": 0, "values": {}, "state": "done", "score": float("nan")}]},
         {"trials": [{"number": 0, "step": 0, "values": {"algo_kwargs.gamma": float("nan")}}]},
         {"steps": [[{"key": "algo_kwargs.gamma", "low": 5.0, "high": -1.0}]]},
+        {"trials": [{"number": 0, "step": 0, "values": {}}] * 2},
     ],
 )
 def test_a_tuning_with_impossible_numbers_is_damaged(tmp_path, change):
-    sound = {"task": LINE, "config": None, "settings": {}, "metric": "return", "trials_per_step": 2, "seed": 0}
-    (tmp_path / "tune.json").write_text(json.dumps({**sound, "steps": []}))
+    (tmp_path / "tune.json").write_text(json.dumps(SOUND))
     assert load(tmp_path).trials_per_step == 2
-    (tmp_path / "tune.json").write_text(json.dumps({**sound, "steps": [], **change}))
+    (tmp_path / "tune.json").write_text(json.dumps({**SOUND, **change}))
     with pytest.raises(ArtifactError, match="damaged"):
         load(tmp_path)
 
