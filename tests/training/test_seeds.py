@@ -249,7 +249,7 @@ def test_a_group_of_somebody_else_runs_no_script(tmp_path, monkeypatch):
     group = create_group(TrainRequest("stranger.py:main", settings=TINY, root=tmp_path), [0])
     (tmp_path / "stranger.py").write_text("open('ran', 'w')")
     with pytest.raises(ArtifactError, match=r"group\.json names 'stranger\.py:main' as its task"):
-        train_seeds(TrainRequest(resume=str(group.path)))
+        train_seeds(TrainRequest(resume=str(group.path)), None)
     assert not (tmp_path / "ran").exists()
 
 
