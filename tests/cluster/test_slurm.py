@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import dataclasses
+import re
 import signal
 import threading
 
@@ -117,7 +118,7 @@ def test_a_full_disk_on_a_node_is_an_error_of_its_run(train, slurm, tmp_path, ca
     (tmp_path / "cluster.yaml").write_text("setup: [ulimit -f 8]\n")
     result = train("0", LONG)
     assert result.failed == {0: 5}
-    assert "seed 0: error: File too large" in capsys.readouterr().err
+    assert re.search(r"seed 0: error: \S+: File too large", capsys.readouterr().err)
     job = read_job(result.score.group.path, 0)
     assert job.attempts == 1
     (tmp_path / "cluster.yaml").write_text("cpus: 1\n")
