@@ -94,7 +94,7 @@ def test_ci_workflow_installs_rlctl_from_a_place_that_exists() -> None:
 def test_ci_workflow_and_a_new_plugin_install_without_an_index(tmp_path: Path) -> None:
     repository, root = tmp_path / "repository", EXAMPLES.parent
     shutil.copytree(EXAMPLES / "my_task", repository)
-    tracked = ("pyproject.toml", "README.md", "LICENSE", "rlctl", "plugins")
+    tracked = ("pyproject.toml", "README.md", "LICENSE", "constraints.txt", "rlctl", "plugins")
     (repository / "rlctl").mkdir()
     for name in tracked:
         copy = shutil.copytree if (root / name).is_dir() else shutil.copy
@@ -102,7 +102,7 @@ def test_ci_workflow_and_a_new_plugin_install_without_an_index(tmp_path: Path) -
     scripts = _environment_without_rlctl(tmp_path / "venv")
     workflow = yaml.safe_load((EXAMPLES / "ci" / "rlctl.yml").read_text())
     offline = {"PIP_NO_INDEX": "1", "PIP_NO_BUILD_ISOLATION": "0"}  # pip reads the second the wrong way round
-    env = {**os.environ, **offline, "RLCTL": workflow["env"]["RLCTL"], "PATH": f"{scripts}:{os.environ['PATH']}"}
+    env = {**os.environ, **offline, **workflow["env"], "PATH": f"{scripts}:{os.environ['PATH']}"}
 
     def shell(command: str) -> str:
         done = subprocess.run(command, shell=True, cwd=repository, env=env, capture_output=True, text=True, check=False)
@@ -150,3 +150,15 @@ def test_my_task_as_a_wheel(tmp_path: Path) -> None:
     assert (empty / "runs" / "latest" / "policies" / "best.safetensors").is_file()
 
     run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(project / "tests"), cwd=empty, path=site)
+
+
+def test_the_check_env_action_runs(tmp_path: Path) -> None:
+    """The text of its step, as GitHub's runner executes it."""
+    action = yaml.safe_load((EXAMPLES / "ci" / "check-env" / "action.yml").read_text())
+    (step,) = [step for step in action["runs"]["steps"] if step.get("id") == "check"]
+    env = {**os.environ, "TASK": "pointmass.py:PointMass", "ARGUMENTS": "--select RL1", "NO_COLOR": "1"}
+    env |= {"RUNNER_TEMP": str(tmp_path), "GITHUB_OUTPUT": str(tmp_path / "output")}
+    env["PATH"] = f"{Path(sys.executable).parent}:{env['PATH']}"
+    done = subprocess.run(["bash", "-e", "-c", step["run"]], cwd=EXAMPLES / "bare_env", env=env, check=False)
+    assert done.returncode == 0
+    assert json.loads(Path((tmp_path / "output").read_text().partition("=")[2].strip()).read_text())["findings"] == []

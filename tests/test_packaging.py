@@ -64,7 +64,10 @@ def test_no_folder_of_the_sdist_has_a_readme_alone():
     assert {folder for folder in folders if not any(place.is_relative_to(folder) for place in full)} == set()
 
 
-@pytest.mark.parametrize("file", [".github/workflows/ci.yml", ".github/workflows/nightly.yml", "examples/ci/rlctl.yml"])
+@pytest.mark.parametrize(
+    "file",
+    [".github/workflows/ci.yml", ".github/workflows/nightly.yml", "examples/ci/rlctl.yml", "examples/ci/check-env.yml"],
+)
 def test_what_pins_the_packages_is_in_the_key_of_the_cache(file):
     workflow = yaml.safe_load((ROOT / file).read_text())
     steps = [step for job in workflow["jobs"].values() for step in job["steps"]]

@@ -52,8 +52,8 @@ def check_env(
         return
     if task is None:
         raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")
-    if json is not None and (form or output):
-        raise UsageError("--json and --format or -o exclude each other")
+    if json == "-" and (form or output):
+        raise UsageError("--json - prints only JSON: leave out --format and -o, or give --json a file")
     known = set() if baseline is None else read_baseline(Path(baseline))
     spec = parse_changes(settings).apply(EnvSpec(task))
     report = check(spec, rules=choose_rules(select, ignore), strict=strict, env_timeout_s=env_timeout)

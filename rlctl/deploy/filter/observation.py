@@ -167,12 +167,12 @@ class SensorChecks:
         # Comparing bytes takes a tenth of the time of `all()`.
         if np.isfinite(values).tobytes() != self._all_finite:
             index = int(np.argmin(np.isfinite(values)))
-            fault = ("finite", self._name(index), float(values[index]), math.inf)
+            fault = ("not finite", self._name(index), float(values[index]), math.inf)
         elif self._has_range and (outside := self._find_outside(values)) is not None:
-            low, high = float(self._low[outside]), float(self._high[outside])
-            fault = ("range", self._name(outside), float(values[outside]), low if values[outside] < low else high)
+            value, low, high = (float(array[outside]) for array in (values, self._low, self._high))
+            fault = ("out of range", self._name(outside), value, low if value < low else high)
         elif not abs(age_s) <= self._oldest:  # from the future: the clocks differ, so its age is unknown
-            fault = ("stale", "age", age_s, self._oldest)
+            fault = ("too old", "observation", age_s, self._oldest)
         if self._frozen:
             fault = self._check_frozen(values) or fault
         return fault

@@ -173,12 +173,12 @@ class SafetyFilter:
         try:
             values, (age,) = self.layout.flatten(observation), read_numbers(age_s)
         except ValueError as error:  # no numbers, or an age that is not one number
-            return self.fail("observation", short_repr(str(error), 200))
+            return self.fail("invalid observation", short_repr(str(error), 200))
         fault = self._sensors.check(values, float(age))
         self._observed = True
         if fault is not None:
             kind, name, value, limit = fault
-            return self.fail(f"{kind} {name}", value, limit)
+            return self.fail(f"{name} {kind}", value, limit)
         if self._measured is not None and self._command is not None:
             self._command.measure(values[self._measured])
         self._fault = ""
@@ -232,7 +232,7 @@ class SafetyFilter:
         """Return and record why an action cannot be used; empty if it can."""
         fault = ""
         if problem:
-            fault = "action"
+            fault = "invalid action"
         elif requested is None:
             fault = "" if self.state == "stopped" or self._ordered else "no action"
         elif self._measured is not None and self._command is not None and self._command.position is None:

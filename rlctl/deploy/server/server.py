@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
+import numpy as np
 from aiohttp import web
 
 from rlctl.deploy.filter.limits import Limits
@@ -43,9 +44,13 @@ class PolicyServer:
         self._manual: Any | None = None  # the action of an override; None: the policy acts
         self._order: str | None = None  # the operator's last order, which later clients get too; None: no order
         self._limits = limits
-        numbers = sum(map(math.prod, ObservationLayout(policy.info.env).shapes.values()))
+        shapes = ObservationLayout(policy.info.env).shapes
+        numbers = sum(map(math.prod, shapes.values()))
         self.largest_message = 64 * numbers + 64 * 1024  # text with names
         """Largest size of a request [bytes]."""
+        # The first answer of a process is slow, because libraries load modules for it: no robot shall wait for that.
+        Session(0, lambda: policy, limits).answer({name: np.zeros(shape) for name, shape in shapes.items()})
+        self._log.write("started", rlctl=__version__, limits=str(request.limits or ""), **_describe_policy(policy))
         self.posting = self._open_session()  # the session of clients that post
 
     @property
@@ -92,6 +97,7 @@ class PolicyServer:
 
     def close(self) -> None:
         """Close the log and the recording."""
+        self._log.write("ended")
         self._log.close()
         if self._recording is not None:
             self._recording.close()
@@ -217,11 +223,12 @@ class PolicyServer:
             policy = await asyncio.to_thread(load_served_policy, file)
             policy.check_replaces(self.policy.info.env)
         except RlctlError as error:
-            self._log.write("policy refused", name=file.name, value=short_repr(str(error), 200))
+            problem = str(error).replace(f"{file.parent}/", "")  # a temporary folder
+            self._log.write("policy refused", name=file.name, value=short_repr(problem, 200))
             raise
         self.policy = policy
         self.measurements.policy_changes += 1
-        self._log.write("policy", name=file.name, value=f"step {policy.info.training_steps}")
+        self._log.write("policy", **_describe_policy(policy))
 
     def count_states(self) -> collections.Counter[str]:
         """Return how many clients are in each state."""
@@ -251,6 +258,10 @@ class PolicyServer:
             "counts": dict(self.count_interventions().most_common(20)),
             "clients": [_describe(session) for session in self._sessions.values() if session.safety.steps],
         }
+
+
+def _describe_policy(policy: ServedPolicy) -> dict[str, Any]:
+    return {"name": policy.file.name, "sha256": policy.sha256, "training_steps": policy.info.training_steps}
 
 
 def _describe(session: Session) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from rlctl.policy.file import DETERMINISTIC, PolicyFile, PolicyInfo
 from rlctl.policy.network import Network
 from rlctl.policy.numpy_policy import NumpyPolicy, check_playable
 from rlctl.policy.policy import Policy
+from rlctl.storage import files, untrusted
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -26,6 +27,7 @@ class ServedPolicy:
 
     file: Path
     info: PolicyInfo
+    sha256: str  # of the file
     make_actor: Callable[[], Policy]  # returns the policy of one client, with its own recurrent state
     network: Network | None = None  # None for an ONNX file, which outputs only the action
 
@@ -54,13 +56,14 @@ class ServedPolicy:
 
 def load_served_policy(file: Path) -> ServedPolicy:
     """Load a `.safetensors` or `.onnx` file and act once; raises `ArtifactError` for an invalid policy."""
+    sha256 = files.digest(untrusted.read_bytes(file))
     if file.suffix == ".onnx":
         from rlctl.policy.onnx_policy import OnnxPolicy  # only here: it imports onnxruntime
 
         policy = OnnxPolicy.load(file)
-        return ServedPolicy(file, policy.info, lambda: OnnxPolicy(policy.info, policy.session))
+        return ServedPolicy(file, policy.info, sha256, lambda: OnnxPolicy(policy.info, policy.session))
     actor = check_playable(PolicyFile.read(file)).actor_only()
-    return ServedPolicy(file, actor.info, lambda: NumpyPolicy(actor), Network(actor))
+    return ServedPolicy(file, actor.info, sha256, lambda: NumpyPolicy(actor), Network(actor))
 
 
 _MAX_AGE_S = 1e9
@@ -95,9 +98,7 @@ class Session:
 
     def answer(self, request: Any) -> dict[str, Any]:
         """Return the answer to a request: an action within the limits, the state, and any error."""
-        now = time.monotonic()
-        self.check_watchdog(now)
-        self._last_s = now
+        self.check_watchdog(time.monotonic())
         self._adopt_policy()
         error = ""
         policy_action = None
@@ -106,7 +107,7 @@ class Session:
             observation, age_s = self._read(request)
         except ObservationError as problem:
             error = str(problem)
-            self.safety.fail("observation", short_repr(error, 200))
+            self.safety.fail("invalid observation", short_repr(error, 200))
         else:
             self.observation = observation
             if self.safety.observe(observation, age_s):
@@ -126,6 +127,7 @@ class Session:
             answer["reason"] = self.safety.reason
         if error:
             answer["error"] = error
+        self._last_s = time.monotonic()  # the watchdog measures the client, not this answer
         return answer
 
     def _read(self, request: Any) -> tuple[Any, float]:

@@ -104,15 +104,21 @@ def test_a_fault_holds_and_its_end_goes_on(arm):
     for _ in range(3):
         moved = run_filter(safety, REST, [1.0, 1.0])
     held = run_filter(safety, observe_at(np.nan, 0.0), [5.0, 5.0])
-    assert (safety.state, safety.reason) == ("holding", "finite positions[0]")
+    assert (safety.state, safety.reason) == ("holding", "positions[0] not finite")
     assert held.tolist() == moved.tolist() == [1.0, 1.0]
     assert run_filter(safety, REST, [2.0, 2.0]) == pytest.approx([1.5, 1.5])  # blended in again
     assert safety.state == "running"
-    assert safety.counts == {"finite positions[0]": 1}
+    assert safety.counts == {"positions[0] not finite": 1}
 
 
 @pytest.mark.parametrize(
-    ("action", "fault"), [([np.nan, 0.0], "action"), ([np.inf, 0.0], "action"), ([1.0], "action"), (None, "no action")]
+    ("action", "fault"),
+    [
+        ([np.nan, 0.0], "invalid action"),
+        ([np.inf, 0.0], "invalid action"),
+        ([1.0], "invalid action"),
+        (None, "no action"),
+    ],
 )
 def test_a_policy_that_cannot_act_is_a_fault(arm, action, fault):
     safety = make_filter(arm, command="action", safe_action=[0.5, 0.0])
@@ -133,7 +139,7 @@ def test_checks_of_sensors(arm):
     assert not safety.observe(np.array([0, 0, 0, 1.5, 0], np.float32))
     assert not safety.observe(observe_at(0.0, 0.3), age_s=0.31)  # older than three periods
     assert not safety.observe(None)
-    assert list(safety.counts) == ["frozen positions", "range goal[1]", "stale age", "missing"]
+    assert list(safety.counts) == ["positions frozen", "goal[1] out of range", "observation too old", "missing"]
     safety.limit(None)
     assert safety.state == "stopped"
 
@@ -207,7 +213,7 @@ def test_choices_are_held_too():
     assert run_filter(safety, np.array([np.nan, 0.0]), 7) == 5
     for wrong in (8, 6.5, np.nan, 1e300, "no", 10**400):
         assert run_filter(safety, np.zeros(2), wrong) == 5
-        assert (safety.state, safety.reason) == ("holding", "action")
+        assert (safety.state, safety.reason) == ("holding", "invalid action")
     with pytest.raises(UsageError, match="choices"):
         SafetyFilter(info, Limits.model_validate({"limits": {"all": {"action": [0, 1]}}}))
 

@@ -1,5 +1,6 @@
 """The policy server: its protocol, orders, limits, watchdog, and another policy without a gap."""
 
+import hashlib
 import json
 import threading
 import time
@@ -115,7 +116,7 @@ def test_json_for_curl(serve):
     status, text = server.post("/act", b'{"goal": [1, 2, 3], "goal": [1, 2, 3]}')
     assert (status, json.loads(text)["error"]) == (400, "key goal is given twice")
     status, text = server.post("/act", {"goal": [1, 2, float("nan")], "positions": [0, 0]})
-    assert (status, json.loads(text)["state"], json.loads(text)["reason"]) == (200, "holding", "finite goal[2]")
+    assert (status, json.loads(text)["state"], json.loads(text)["reason"]) == (200, "holding", "goal[2] not finite")
     assert server.post("/act", b"{")[0] == 400
     assert server.post("/act", b" " * 1_000_000)[0] == 413
     assert server.get("/healthz") == (200, "OK\n")
@@ -206,6 +207,8 @@ def test_the_watchdog(serve, tmp_path):
         assert client.act({**OBSERVATION, "reset": True})["reason"] == "stopped by hand"
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert ("state", "stopped") in [(line["kind"], line.get("name")) for line in lines]
+    assert lines[0]["kind"] == "started"
+    assert lines[0]["sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def test_orders_are_for_all_clients_also_later_ones(serve):
