@@ -32,7 +32,9 @@ _CONTINUOUS = frozenset({"sac", "td3", "ddpg", "tqc", "crossq"})
 
 def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm:
     """Build the model of a recipe on vector environments; raises `RecipeError` if they do not fit together."""
-    _check_device(device)
+    if device.startswith("cuda") and (torch.device(device).index or 0) >= (count := torch.cuda.device_count()):
+        # SB3 would silently take the CPU.
+        raise UsageError(f"--device {device}: torch sees {count} CUDA devices here; use cpu or auto")
     cls = ALGORITHMS[recipe.algo]
     kwargs = _algorithm_kwargs(recipe)
     if recipe.her is not None:
@@ -69,7 +71,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
             model.policy.own_arguments = model.policy_kwargs | use_sde  # type: ignore[assignment]
             check_policy_class(model, recipe.algo, pack(model, recipe.algo, env.workers.spec, env.workers.info))
         return model
-    except (RlctlError, KeyboardInterrupt):
+    except RlctlError:
         raise
     except Exception as error:
         own = import_named(recipe.policy_kwargs)
@@ -97,26 +99,13 @@ def _use_fused_adam(model: BaseAlgorithm) -> None:
                     group["fused"] = True
 
 
-def _check_device(device: str) -> None:
-    # SB3 silently takes the CPU where there is no GPU.
-    if device == "auto":
-        return
-    requested = torch.device(device)
-    if requested.type == "cuda" and (requested.index or 0) >= torch.cuda.device_count():
-        raise UsageError(
-            f"--device {device}: torch sees {torch.cuda.device_count()} CUDA devices here; use cpu or auto"
-        )
-
-
 def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """Raise `RecipeError` for spaces that SB3 refuses with an unclear message, or only during training."""
     needed = spaces.Discrete if algo == "dqn" else spaces.Box if algo in _CONTINUOUS else spaces.Space
     if not isinstance(action_space, needed):
         others = {spaces.Box: "ppo or sac", spaces.Discrete: "ppo or dqn"}.get(type(action_space), "ppo")
-        raise RecipeError(
-            f"{algo} cannot be used here: it needs {needed.__name__} actions, these are {short_repr(action_space)}; "
-            f"try {others}"
-        )
+        kind, actions = needed.__name__, short_repr(action_space)
+        raise RecipeError(f"{algo} cannot be used here: it needs {kind} actions, these are {actions}; try {others}")
     for what, space, advice in (
         ("observation", observation_space, "observe values less start"),
         ("action", action_space, "add start in step"),
@@ -172,7 +161,6 @@ def _is_real(space: spaces.Space[Any]) -> bool:
 
 
 def _check_memory(recipe: Recipe, env: VecEnv) -> None:
-    """Raise `RecipeError` for a buffer that does not fit into the free memory."""
     parts = [(math.prod(part.shape or ()), part.dtype) for part in split_space(env.observation_space).values()]
     action = math.prod(env.action_space.shape or ()) * _FLOAT32
     if recipe.algo in ON_POLICY:
@@ -184,7 +172,5 @@ def _check_memory(recipe: Recipe, env: VecEnv) -> None:
         row = 2 * observation + action + 3 * _FLOAT32
     free = measure_free_memory()
     if free is not None and rows * row > _USABLE_SHARE * free:
-        raise RecipeError(
-            f"algo_kwargs.{key}: {recipe.algo_kwargs.get(key)} needs {format_bytes(rows * row)} of memory, but only "
-            f"{format_bytes(free)} are free; reduce it"
-        )
+        needs, are, given = format_bytes(rows * row), format_bytes(free), recipe.algo_kwargs.get(key)
+        raise RecipeError(f"algo_kwargs.{key}: {given} needs {needs} of memory, but only {are} are free; reduce it")

@@ -18,17 +18,12 @@ import torch
 from numpy.typing import NDArray
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile
 from rlctl.run.directory import RunDirectory
 from rlctl.storage import files
-from rlctl.training import replay_segments, snapshot
-from rlctl.training.callbacks import Callbacks
-from rlctl.training.learner import begin_next_episodes
-from rlctl.training.replay_segments import ReplaySegments, Segment
+from rlctl.training.replay_segments import Segment
 from rlctl.training.rollouts import WorkerVecEnv
 from rlctl.training.snapshot import Tensors
 from rlctl.training.status import Progress
@@ -49,7 +44,7 @@ class State(pydantic.BaseModel):
     callbacks: list[dict[str, Any]] = []  # plain data of `Callbacks.take`
     segments: list[Segment] = []  # the segments of the replay buffer
     computed_with: dict[str, str]  # what bit-exact results depend on: versions, processor, threads
-    sha256: dict[str, str]
+    sha256: dict[str, str] = {}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,91 +56,18 @@ class Checkpoint:
     tensors: Tensors = dataclasses.field(repr=False)
 
 
-class CheckpointFolders:
-    """Writes the checkpoint folders of a run, and restores the training from one."""
-
-    def __init__(
-        self, run: RunDirectory, model: BaseAlgorithm, env: WorkerVecEnv, callbacks: Callbacks, keep: int
-    ) -> None:
-        self._run = run
-        self._callbacks = callbacks
-        self._model = model
-        self._env = env
-        self._keep = keep
-        self._replay: ReplaySegments | None = None
-        if isinstance(model, OffPolicyAlgorithm):
-            assert model.replay_buffer is not None  # SB3 makes it in its constructor
-            self._replay = ReplaySegments(run.replay_segments, model.replay_buffer)
-
-    @property
-    def _added(self) -> int:
-        """Number of transitions added to the replay buffer; a step of all environments is one."""
-        return self._model.num_timesteps // self._env.num_envs
-
-    def save(self, policy: PolicyFile, progress: Progress) -> None:
-        """Write a checkpoint of the current boundary; raises `OSError` if it cannot be written."""
-        tensors, plain = snapshot.take(self._model)
-        of_callbacks, plain_of_callbacks = self._callbacks.take()
-        tensors |= of_callbacks | _environment_tensors(self._env)
-        segments: list[Segment] = []
-        if self._replay is not None:
-            segments = self._replay.save(self._added)
-            tensors |= replay_segments.hindsight_tensors(self._replay.buffer)
-        contents = {
-            _POLICY: policy.encode(),
-            _TENSORS: save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()}),
-        }
-        state = State(
-            run=self._run.id(),
-            step=self._model.num_timesteps,
-            model=plain,
-            progress=progress,
-            callbacks=plain_of_callbacks,
-            segments=segments,
-            computed_with=self.computed_with(),
-            sha256={name: files.digest(content) for name, content in contents.items()},
-        )
-        with files.whole_folder(self._run.checkpoint(state.step)) as folder:
-            for name, content in contents.items():
-                files.write_new(folder / name, content)
-            plain_state = state.model_dump(mode="json")
-            files.write_new(folder / _STATE, json.dumps({"sha256": _seal(plain_state), "state": plain_state}).encode())
-
-    def computed_with(self) -> dict[str, str]:
-        """Return what bit-exact results of this training depend on."""
-        return {
-            **collect_versions(),
-            "machine": platform.machine(),
-            "processor": f"{_cpu_vendor()} {torch.backends.cpu.get_cpu_capability()}",
-            "threads": str(torch.get_num_threads()),
-            "device": str(self._model.device),
-        }
-
-    def remove_old(self) -> None:
-        """Remove all checkpoints except the newest `keep`, and replay segments that none of these needs."""
-        for old in self._run.checkpoints()[: -self._keep]:
-            files.remove_tree(old)
-        if self._replay is not None:
-            replay_segments.remove_unnamed(self._run.replay_segments, _named_segments(self._run))
-
-    def restore(self, checkpoint: Checkpoint) -> str | None:
-        """Restore a checkpoint; if an environment cannot be restored, start new episodes and return a message."""
-        model, tensors = self._model, checkpoint.tensors
-        try:
-            snapshot.restore(model, tensors, checkpoint.state.model)
-            if self._replay is not None:
-                self._replay.load(checkpoint.state.segments, self._added)
-                replay_segments.restore_hindsight(self._replay.buffer, tensors)
-            mismatch = _restore_environments(self._env, tensors)
-        except (ArtifactError, KeyError) as error:
-            raise ArtifactError(f"{checkpoint.folder}: {error}") from None
-        # SB3 resets the environments if this is None; it has no other use here.
-        model._last_obs = self._env.workers.observations()
-        if mismatch is not None:
-            begin_next_episodes(model)
-            if self._replay is not None:
-                self._replay.mark_last_changed(self._added)
-        return mismatch
+def write(path: Path, state: State, policy: PolicyFile, tensors: Tensors) -> None:
+    """Write the folder of a checkpoint, whose `state` gets the digests; raises `OSError` if it cannot be written."""
+    contents = {
+        _POLICY: policy.encode(),
+        _TENSORS: save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()}),
+    }
+    state.sha256 = {name: files.digest(content) for name, content in contents.items()}
+    plain_state = state.model_dump(mode="json")
+    contents[_STATE] = json.dumps({"sha256": _seal(plain_state), "state": plain_state}).encode()
+    with files.whole_folder(path) as folder:
+        for name, content in contents.items():
+            files.write_new(folder / name, content)
 
 
 def read_newest(run: RunDirectory) -> tuple[Checkpoint | None, list[str]]:
@@ -195,12 +117,24 @@ def _seal(state: Any) -> str:
     return files.digest(json.dumps(state, sort_keys=True).encode())
 
 
-def _named_segments(run: RunDirectory) -> list[Segment]:
+def list_segments(run: RunDirectory) -> list[Segment]:
+    """Return the replay segments that a run's checkpoints name."""
     named: list[Segment] = []
     for folder in run.checkpoints():
         with contextlib.suppress(ArtifactError):  # a damaged checkpoint needs no segments any more
             named += _read_state(folder).segments
     return named
+
+
+def describe_computation(device: torch.device) -> dict[str, str]:
+    """Return what bit-exact results of a training depend on."""
+    return {
+        **collect_versions(),
+        "machine": platform.machine(),
+        "processor": f"{_cpu_vendor()} {torch.backends.cpu.get_cpu_capability()}",
+        "threads": str(torch.get_num_threads()),
+        "device": str(device),
+    }
 
 
 def _cpu_vendor() -> str:
@@ -219,7 +153,7 @@ def find_differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
     return [f"{name} {old} -> {new}" for name, (old, new) in pairs.items() if old != new]
 
 
-def _environment_tensors(env: WorkerVecEnv) -> Tensors:
+def environment_tensors(env: WorkerVecEnv) -> Tensors:
     """Return the numbers, actions and last observations of the running episodes."""
     histories = [env.join_actions(index) for index in range(env.num_envs)]
     last = env.workers.arrays.observation
@@ -231,7 +165,7 @@ def _environment_tensors(env: WorkerVecEnv) -> Tensors:
     }
 
 
-def _restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
+def restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
     """Replay the running episodes; return a message if an environment does not reach its saved state."""
     steps = tensors["environments/steps"].tolist()
     if len(steps) != env.num_envs:

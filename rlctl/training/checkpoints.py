@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.own_modules import describe_change
@@ -13,9 +15,11 @@ from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from rlctl.storage import files
 from rlctl.storage.table import Table
+from rlctl.training import checkpoint, replay_segments, snapshot
 from rlctl.training.callbacks import Callbacks
-from rlctl.training.checkpoint import Checkpoint, CheckpointFolders, find_differences
-from rlctl.training.learner import Learner
+from rlctl.training.checkpoint import Checkpoint
+from rlctl.training.learner import Learner, begin_next_episodes
+from rlctl.training.replay_segments import ReplaySegments
 from rlctl.training.snapshot import check_finite
 
 STEP_LABEL = "training step "  # start of the `policy` text of a saved episode; the step's number follows
@@ -34,7 +38,9 @@ class Checkpoints:
         self.saved_step: int | None = None  # step of the last complete checkpoint
         self.problem = ""  # the last write that failed, and why
         self._learner = learner
-        self._folders = CheckpointFolders(run, learner.model, learner.env, callbacks, learner.recipe.checkpoint.keep)
+        self._replay: ReplaySegments | None = None
+        if isinstance(learner.model, OffPolicyAlgorithm):
+            self._replay = ReplaySegments(run.replay_segments, learner.model.replay_buffer)
         self._warn = warn
         self._next_s = time.monotonic()
         self._uncounted_checkpoints = 1  # checkpoints that are written even if not due: the last one
@@ -92,7 +98,7 @@ class Checkpoints:
             if self._reported:
                 self._warn(f"saved again, at step {self.saved_step:,}")
             self._reported.clear()
-            self.attempt("old checkpoints", self._folders.remove_old)
+            self.attempt("old checkpoints", self._remove_old)
             self.callbacks.call("on_checkpoint")
         now = time.monotonic()
         self._next_s = now + (1 + self._uncounted_checkpoints) * (now - began) / CHECKPOINT_TIME_SHARE
@@ -108,23 +114,69 @@ class Checkpoints:
         progress.metrics_sha256, progress.evals_sha256 = self.metrics.digest(), self.evals.digest()
         self._write_best()
         policy.write(self.run.last_policy)
-        self._folders.save(policy, progress)
+        self._write_checkpoint(policy)
         self.saved_step = policy.info.training_steps
 
-    def restore(self, checkpoint: Checkpoint, changed: Sequence[str]) -> str:
+    def _write_checkpoint(self, policy: PolicyFile) -> None:
+        learner = self._learner
+        tensors, plain = snapshot.take(learner.model)
+        of_callbacks, plain_of_callbacks = self.callbacks.take()
+        tensors |= of_callbacks | checkpoint.environment_tensors(learner.env)
+        segments = []
+        if self._replay is not None:
+            segments = self._replay.save(self._added)
+            tensors |= replay_segments.hindsight_tensors(self._replay.buffer)
+        state = checkpoint.State(
+            run=self.run.id(),
+            step=learner.steps,
+            model=plain,
+            progress=learner.progress,
+            callbacks=plain_of_callbacks,
+            segments=segments,
+            computed_with=checkpoint.describe_computation(learner.model.device),
+        )
+        checkpoint.write(self.run.checkpoint(state.step), state, policy, tensors)
+
+    @property
+    def _added(self) -> int:
+        """Number of transitions added to the replay buffer; a step of all environments is one."""
+        return self._learner.steps // self._learner.env.num_envs
+
+    def _remove_old(self) -> None:
+        """Remove all checkpoints except the newest `keep`, and replay segments that none of these needs."""
+        for old in self.run.checkpoints()[: -self._learner.recipe.checkpoint.keep]:
+            files.remove_tree(old)
+        if self._replay is not None:
+            self._replay.remove_others(checkpoint.list_segments(self.run))
+
+    def restore(self, saved: Checkpoint, changed: Sequence[str]) -> str:
         """Restore a checkpoint; return a message with the reasons, `changed` and others, why it is not exact."""
-        file = checkpoint.folder / "policy.safetensors"
+        learner, file = self._learner, saved.folder / "policy.safetensors"
         info = PolicyFile.read_info(file)
-        info.check_fits(self._learner.curriculum.goal, file)
-        if change := describe_change(info.policy_kwargs, describe_network(self._learner.rollouts.model.policy)):
+        info.check_fits(learner.curriculum.goal, file)
+        if change := describe_change(info.policy_kwargs, describe_network(learner.model.policy)):
             raise ArtifactError(f"{file}: {change}; put it back, or begin a new training: --from {file}")
-        mismatch = self._folders.restore(checkpoint)
-        inexact = [*changed, *find_differences(checkpoint.state.computed_with, self._folders.computed_with())]
-        inexact += [mismatch] if mismatch else []
-        inexact += self.callbacks.restore(checkpoint.tensors, checkpoint.state.callbacks)
-        self.saved_step = checkpoint.state.step
+        try:
+            snapshot.restore(learner.model, saved.tensors, saved.state.model)
+            if self._replay is not None:
+                self._replay.load(saved.state.segments, self._added)
+                replay_segments.restore_hindsight(self._replay.buffer, saved.tensors)
+            mismatch = checkpoint.restore_environments(learner.env, saved.tensors)
+        except (ArtifactError, KeyError) as error:
+            raise ArtifactError(f"{saved.folder}: {error}") from None
+        # SB3 resets the environments if this is None; it has no other use here.
+        learner.model._last_obs = learner.env.workers.observations()
+        now = checkpoint.describe_computation(learner.model.device)
+        inexact = [*changed, *checkpoint.find_differences(saved.state.computed_with, now)]
+        if mismatch is not None:
+            inexact.append(mismatch)
+            begin_next_episodes(learner.model)
+            if self._replay is not None:
+                self._replay.mark_last_changed(self._added)
+        inexact += self.callbacks.restore(saved.tensors, saved.state.callbacks)
+        self.saved_step = saved.state.step
         exactness = f"not bit-exact: {'; '.join(inexact)}" if inexact else "bit-exact"
-        return f"resuming at step {checkpoint.state.step:,}, {exactness}"
+        return f"resuming at step {self.saved_step:,}, {exactness}"
 
     def cut_back(self, step: int) -> list[str]:
         """Return the run folder to its state at a step; return warnings. Later checkpoints are set aside."""

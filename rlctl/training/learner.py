@@ -149,9 +149,7 @@ def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
         except RlctlError as error:
             raise type(error)(f"{where}: {error}", details=error.details) from None
         if difference := info.find_difference(first, "stage 1's"):
-            raise RecipeError(
-                f"{where}: {difference}. One policy learns in all stages: leave out the task parameter that changes it"
-            )
+            raise RecipeError(f"{where}: {difference}. One policy learns in all stages: leave out what changes it")
         if list(info.reward_weights) != list(first.reward_weights):
             raise RecipeError(
                 f"{where}: its reward terms are {', '.join(info.reward_weights)}, "

@@ -99,9 +99,7 @@ class TrainingLoop:
     def _announce_stop(self) -> None:
         if self.stop_signal is not None and not self._stop_announced:
             self._stop_announced = True
-            self._display.message(
-                "stopping after this update, with a checkpoint; press Ctrl-C again to stop immediately"
-            )
+            self._display.message("stopping after this update, with a checkpoint; Ctrl-C again stops immediately")
 
     def _stop_if_requested(self) -> None:
         if self.stop_signal is None:
@@ -120,12 +118,10 @@ class TrainingLoop:
         self.learner.progress.done = True
         # Retry once: no later checkpoint will be written.
         if not self.checkpoints.save() and not self.checkpoints.save():
-            raise ArtifactError(
-                f"{self.checkpoints.run.path}: the training is done, but could not be saved: {self.checkpoints.problem}"
-            )
+            problem = self.checkpoints.problem
+            raise ArtifactError(f"{self.checkpoints.run.path}: the training is done, but could not be saved: {problem}")
 
     def _explain_fault(self, error: TaskError) -> TaskError:
-        """Save the actions of the failed training episode; return the error with the commands to use next."""
         lines = [str(self.evaluator.episodes.keep_failed(error, self.learner.env.workers.spec))]
         if step := self.checkpoints.saved_step:  # at step 0 there is nothing to resume
             lines.append(f"checkpoint at step {step:,} is intact; resume with: {self._resume_command}")

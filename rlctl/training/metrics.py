@@ -1,6 +1,7 @@
 """The rows of `metrics.csv`, and the same numbers for TensorBoard and the display."""
 
 import contextlib
+import functools
 import os
 import platform
 import time
@@ -102,8 +103,7 @@ class _EventFile(TensorBoardOutputFormat):
 
     def __init__(self, folder: Path, warn: Callable[[str], None]) -> None:
         self._folder = folder
-        self._warn = warn
-        self._problem = ""
+        self._warn = functools.cache(warn)  # each warning once
         self._file: RecordWriter | None = None
 
     def write(self, key_values: dict[str, Any], key_excluded: Mapping[str, tuple[str, ...]], step: int = 0) -> None:
@@ -128,12 +128,8 @@ class _EventFile(TensorBoardOutputFormat):
             self._file.flush()
         except OSError as error:
             problem = error.strerror or str(error)
-            if problem != self._problem:
-                self._warn(f"warning: not saved: TensorBoard log: {problem}; metrics.csv has the same numbers")
-            self._problem = problem
+            self._warn(f"warning: not saved: TensorBoard log: {problem}; metrics.csv has the same numbers")
             self.close()
-        else:
-            self._problem = ""
 
     def _open(self) -> RecordWriter:
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -145,10 +141,10 @@ class _EventFile(TensorBoardOutputFormat):
 
     def close(self) -> None:
         """Close the file."""
-        before, self._file = self._file, None
-        if before is not None:
-            with contextlib.suppress(OSError):  # already reported
-                before.close()
+        with contextlib.suppress(OSError):  # already reported
+            if self._file is not None:
+                self._file.close()
+        self._file = None
 
 
 def make_logger(
@@ -159,8 +155,7 @@ def make_logger(
 ) -> Logger:
     """Return a logger that writes to a TensorBoard folder; `warn` is called if it cannot.
 
-    TensorBoard hides what was written after the step `resumed_at`. `parameters` are the hyperparameters of its HPARAMS
-    table, which compares runs.
+    TensorBoard hides what was written after the step `resumed_at`; its HPARAMS table has the `parameters`.
     """
     events = _EventFile(folder, warn)
     if resumed_at is not None:
@@ -173,11 +168,6 @@ def make_logger(
 
 def list_parameters(recipe: Recipe) -> dict[str, bool | str | float]:
     """Return the hyperparameters for TensorBoard: the algorithm, its parameters, seed and size of the training."""
-    values: dict[str, Any] = {
-        "algo": recipe.algo,
-        "seed": recipe.seed,
-        "n_envs": recipe.n_envs,
-        "total_timesteps": recipe.total_timesteps,
-        **recipe.algo_kwargs,
-    }
+    names = ("algo", "seed", "n_envs", "total_timesteps")
+    values: dict[str, Any] = {name: getattr(recipe, name) for name in names} | recipe.algo_kwargs
     return {name: value for name, value in values.items() if isinstance(value, bool | str | int | float)}

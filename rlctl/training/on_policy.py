@@ -22,8 +22,6 @@ _ROWS = 4096  # observations in one forward pass
 
 @dataclasses.dataclass(frozen=True)
 class _SegmentValues:
-    """What the networks compute for a segment."""
-
     values: NDArray[np.float32]  # shape (environments, steps)
     log_probs: NDArray[np.float32]
     last_values: NDArray[np.float32]  # values of the observations after the last step, shape (environments,)
@@ -95,7 +93,6 @@ class OnPolicyRollouts(Rollouts):
         return to_network_layout(rows, split_space(self.model.observation_space)[key])
 
     def _evaluate_segment(self, observations: Arrays, actions: NDArray[Any], final: Arrays) -> _SegmentValues:
-        """Evaluate all steps of a segment in batches, and the final observations of truncated episodes."""
         policy, (n_envs, steps) = self.model.policy, actions.shape[:2]
         flat = {key: rows[:, :-1].reshape(n_envs * steps, *rows.shape[2:]) for key, rows in observations.items()}
         chosen = self._to_actions(actions.reshape(n_envs * steps, -1))

@@ -115,10 +115,8 @@ def _write_graph(actor: _Actor, model: Any) -> NDArray[np.uint8]:
             raise ValueError(f"features of shape {shape} for 2 observations; features_dim requires {expected}")
         return _export(actor, batch_of_two)
     except Exception as error:  # any exception from the user's module or torch's exporter
-        name = type(actor.extractor).__name__
-        raise RecipeError(
-            f"policy_kwargs: {name} cannot be used: {short_repr(describe_exception(error), 300)}"
-        ) from error
+        name, problem = type(actor.extractor).__name__, short_repr(describe_exception(error), 300)
+        raise RecipeError(f"policy_kwargs: {name} cannot be used: {problem}") from error
     finally:
         model.policy.set_training_mode(was_training)
 

@@ -88,6 +88,13 @@ class ReplaySegments:
         buffer.pos, buffer.full = added % buffer.buffer_size, added >= buffer.buffer_size
         self._segments, self._written = list(segments), added
 
+    def remove_others(self, named: Iterable[Segment]) -> None:
+        """Remove the segments that no checkpoint names."""
+        names = {segment.name for segment in named}
+        for file in self.folder.glob("*.safetensors"):
+            if file.name not in names:
+                files.remove(file)
+
     def _read(self, segment: Segment) -> None:
         file = self.folder / segment.name
         indices = np.arange(segment.first, segment.last) % self.buffer.buffer_size
@@ -97,14 +104,6 @@ class ReplaySegments:
                 array[indices] = stored[name]
         except (OSError, KeyError, ValueError) as error:
             raise ArtifactError(f"{file}: does not fit this recipe: {error}") from None
-
-
-def remove_unnamed(folder: Path, named: Iterable[Segment]) -> None:
-    """Remove the segments that no checkpoint names."""
-    names = {segment.name for segment in named}
-    for file in folder.glob("*.safetensors"):
-        if file.name not in names:
-            files.remove(file)
 
 
 def _arrays(buffer: ReplayBuffer) -> Tensors:

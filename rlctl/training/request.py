@@ -80,11 +80,9 @@ def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> Tra
 
 
 def _raise_if_evaluations_failed(run: RunDirectory, progress: Progress) -> None:
-    if progress.failed_evaluations:
-        raise TaskError(
-            f"{run.path}: the training is done, but {progress.failed_evaluations} of its evaluations failed, "
-            f"the first {progress.first_failure}"
-        )
+    if count := progress.failed_evaluations:
+        failures = f"{count} of its evaluations failed, the first {progress.first_failure}"
+        raise TaskError(f"{run.path}: the training is done, but {failures}")
 
 
 def show(result: TrainResult, json: str | None) -> None:

@@ -17,7 +17,7 @@ from rlctl.run.group import Group, create_group, parse_seeds, read_group
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.start import check_arguments, find_start
-from rlctl.training.trainings import MakeTrainings, Trainings, make_local_trainings
+from rlctl.training.trainings import MakeTrainings, make_local_trainings
 
 
 class SeedsFailed(RlctlError):
@@ -73,9 +73,13 @@ def train_seeds(
 def _train(
     group: Group, resume: TrainRequest, jobs: int | None, episodes: int, make_trainings: MakeTrainings
 ) -> SeedsResult:
-    requests = {seed: _make_request(group, seed, resume) for seed in group.seeds if _is_waiting(group, seed, resume)}
+    has_changes = resume != TrainRequest(resume=resume.resume, root=resume.root)
+    waiting = [seed for seed in group.seeds if has_changes or not group.is_done(seed)]
+    requests = {seed: _make_request(group, seed, resume) for seed in waiting}
     trainings = make_trainings(group.path, str(group.request.task), len(requests), jobs)
-    _print_start(group, len(requests), trainings)
+    done = f"{len(group.seeds) - len(waiting)} done, " if len(waiting) < len(group.seeds) else ""
+    state = f"{done}{trainings.describe()}" if waiting else "all done: nothing to train; to train longer, give -n"
+    output.print_notes([f"{group.path}: {output.format_count(len(group.seeds), 'seed')}, {state}"])
     calls = [
         functools.partial(trainings.train, request_of_seed, functools.partial(_print_line, seed))
         for seed, request_of_seed in requests.items()
@@ -88,7 +92,6 @@ def _train(
 
 
 def _begin(request: TrainRequest, seeds: str) -> Group:
-    """Make a new group after checking its task and recipe, which all seeds share."""
     if request.task is None or request.resume is not None:
         raise UsageError("--seeds starts a new group: give TASK and leave out --resume")
     if "seed" in request.settings:
@@ -96,14 +99,6 @@ def _begin(request: TrainRequest, seeds: str) -> Group:
     numbers = parse_seeds(seeds)
     find_start(request)
     return create_group(request, numbers)
-
-
-def _print_start(group: Group, waiting: int, trainings: Trainings) -> None:
-    done = len(group.seeds) - waiting
-    state = f"{f'{done} done, ' if done else ''}{trainings.describe()}"
-    if not waiting:
-        state = "all done: nothing to train; to train longer, give -n"
-    output.print_notes([f"{group.path}: {output.format_count(len(group.seeds), 'seed')}, {state}"])
 
 
 def _make_request(group: Group, seed: int, resume: TrainRequest) -> TrainRequest:
@@ -116,12 +111,6 @@ def _make_request(group: Group, seed: int, resume: TrainRequest) -> TrainRequest
         settings = {**group.request.settings, **resume.settings, "seed": seed}
         return dataclasses.replace(request, resume=None, settings=settings)
     return request.to_resume(run.path, resume.settings)
-
-
-def _is_waiting(group: Group, seed: int, resume: TrainRequest) -> bool:
-    """Return whether to train a seed: it has not finished, or `resume` changes arguments."""
-    has_changes = resume != TrainRequest(resume=resume.resume, root=resume.root)
-    return has_changes or not group.is_done(seed)
 
 
 def _print_line(seed: int, line: str) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import shlex
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
@@ -49,12 +49,13 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
     display.phase(f"building {format_count(recipe.n_envs, 'environment')}, importing PyTorch")
     with contextlib.ExitStack() as stack:
         # The workers build their environments, and the check runs, while this process imports torch.
-        workers = stack.enter_context(_make_workers(specs[start.stage - 1], recipe.n_envs, start, display))
+        make_workers = functools.partial(Workers, timeout_s=request.env_timeout_s, on_output=display.message)
+        workers = stack.enter_context(make_workers(specs[start.stage - 1], recipe.n_envs))
         checked = _begin_check(specs[-1], request.env_timeout_s) if request.check and start.run is None else None
         from rlctl.training.evaluator import EvaluationEpisodes, Evaluator
         from rlctl.training.loop import TrainingLoop
 
-        learner = _build_learner(start, specs, workers, display)
+        learner = _build_learner(start, specs, workers, make_workers, display)
         if start.run is None:
             _warn_of_opposite_weights(specs, display)
         if checked is not None:
@@ -66,8 +67,7 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
             display.message(f"warning: {run.path}: this file system has no locks: let only one process train this run")
         checkpoints = _open_run(run, start, learner, display)
         n_envs = min(recipe.eval.episodes, available_cores())
-        make_workers = functools.partial(_make_workers, specs[-1], n_envs, start, display)
-        episodes = EvaluationEpisodes(learner, make_workers, checkpoints)
+        episodes = EvaluationEpisodes(learner, functools.partial(make_workers, specs[-1], n_envs), checkpoints)
         stack.callback(episodes.close)
         evaluator = Evaluator(learner, episodes, checkpoints, display)
         if start.run is not None:
@@ -84,22 +84,17 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
             raise
 
 
-def _make_workers(spec: EnvSpec, n_envs: int, start: Start, display: Display) -> Workers:
-    return Workers(spec, n_envs, timeout_s=start.request.env_timeout_s, on_output=display.message)
-
-
 def _warn_of_opposite_weights(specs: list[EnvSpec], display: Display) -> None:
-    """Warn of reward weights with the opposite sign of the task's own."""
     own = getattr(registry.load(specs[0].task), "reward_weights", {})
     for name, weight in dict.fromkeys(pair for spec in specs for pair in spec.reward_weights.items()):
         if float(own.get(name, 0.0)) * weight < 0.0:
-            display.message(
-                f"warning: reward_weights.{name}: {weight:g} has the opposite sign of "
-                f"the task's own, {float(own[name]):g}"
-            )
+            task_own = f"the task's own, {float(own[name]):g}"
+            display.message(f"warning: reward_weights.{name}: {weight:g} has the opposite sign of {task_own}")
 
 
-def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display: Display) -> Learner:
+def _build_learner(
+    start: Start, specs: list[EnvSpec], workers: Workers, make_workers: Callable[..., Workers], display: Display
+) -> Learner:
     from rlctl.policy.torch_policy import pin_threads
     from rlctl.training.algorithms import build_model
     from rlctl.training.learner import Curriculum, Learner, check_stages
@@ -110,7 +105,7 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
     pin_threads()
     recipe, goal = start.recipe, workers.info
     if len(specs) > 1:  # check every stage now, not after hours of training
-        with _make_workers(specs[0], 1, start, display) as probe:
+        with make_workers(specs[0], 1) as probe:
             goal = check_stages(specs, probe)
     # A plain Gymnasium environment shows only at the end of an episode whether it reports success.
     if workers.info.reward_weights and not workers.info.has_success:
@@ -134,7 +129,6 @@ def _build_learner(start: Start, specs: list[EnvSpec], workers: Workers, display
 
 
 def _refuse_success_rates(start: Start) -> None:
-    """Raise `RecipeError` if the recipe needs success rates, which the task does not report."""
     recipe, problem = start.recipe, f"{start.task} does not report success"
     if recipe.stop_success is not None:
         raise RecipeError(f"stop_success: {problem}; leave it out")
@@ -147,7 +141,6 @@ def _refuse_success_rates(start: Start) -> None:
 
 
 def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Checkpoints:
-    """Restore the checkpoint, if any, and return the writer of the run folder."""
     from rlctl.training.checkpoints import Checkpoints
     from rlctl.training.metrics import list_parameters, make_logger
 
@@ -189,7 +182,6 @@ def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[CheckReport]:
 
 
 def _refuse_errors(report: CheckReport, display: Display) -> None:
-    """Raise `AnswerIsNo` if the check found an error, `TaskError` if the environment failed; show the warnings."""
     if report.records.built is None:
         return  # the workers build it too, and report the error
     task, findings = shlex.quote(report.task), report.verdict.findings

@@ -175,7 +175,6 @@ def _restore_normalizer(model: BaseAlgorithm, tensors: Tensors) -> None:
 
 
 def _rollout_tensors(model: BaseAlgorithm) -> Tensors:
-    """Return what the next step depends on besides the environments."""
     tensors: Tensors = {"rollout/starts": np.asarray(model._last_episode_starts)}
     states: Any = getattr(model, "_last_lstm_states", None)
     for kind, pair in zip(("pi", "vf"), states or (), strict=False):

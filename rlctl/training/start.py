@@ -106,17 +106,14 @@ def _find_new(request: TrainRequest, task: str) -> Start:
         callbacks = _load_callbacks(recipe)
     check_installed(recipe)
     source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
-    if request.demos is not None and recipe.algo in ("dqn", "recurrent_ppo"):
-        raise RecipeError(
-            f"--demos: {recipe.algo} cannot clone demonstrations; use ppo, a2c, sac, tqc, crossq, td3 or ddpg"
-        )
+    if request.demos is not None and (algo := recipe.algo) in ("dqn", "recurrent_ppo"):
+        raise RecipeError(f"--demos: {algo} cannot clone demonstrations; use ppo, a2c, sac, tqc, crossq, td3 or ddpg")
     notes = tuple(filter(None, [describe_rounding(recipe)]))
     demos = describe_demonstrations(Path(request.demos)) if request.demos is not None else None
     return Start(request, task, recipe, notes=notes, callbacks=callbacks, source=source, demos=demos)
 
 
 def _find_checkpoint(request: TrainRequest) -> Start:
-    """Find a run, lock it, and read its newest undamaged checkpoint; refuse a changed task without --force."""
     from rlctl.training import checkpoint
 
     run = lookup.find_run(request.resume, request.root, to_train=True)
@@ -136,14 +133,10 @@ def _find_checkpoint(request: TrainRequest) -> Start:
         newest, damage = checkpoint.read_newest(run)
         if newest is None and status.get("status") == "finished":
             command = shlex.join(["rlctl", "train", task, "--from", str(run.path)])
-            raise ArtifactError(
-                f"{run.path}: finished, and its checkpoints were removed; "
-                f"to start a new training from its policy: {command}"
-            )
-        if newest is not None and request.settings:
-            newest = _reopen(newest, before, recipe)
+            raise ArtifactError(f"{run.path}: finished, and its checkpoints were removed; train from it: {command}")
         notes = ["no checkpoint yet: the training starts from step 0"]
         if newest is not None:
+            newest = _reopen(newest, before, recipe)
             notes = [f"warning: {problem}; resuming from step {newest.state.step:,}" for problem in damage]
         if store.is_cached(run.path) and (names := own_modules.list_names(recipe)):
             raise UsageError(
@@ -176,7 +169,6 @@ def _reopen(newest: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:
 
 
 def _load_callbacks(recipe: Recipe) -> dict[str, Callback]:
-    """Import and build the callbacks of a recipe; raises `RecipeError` for a name that is no callback."""
     return {name: _load_callback(name, arguments or {}) for name, arguments in recipe.callbacks.items()}
 
 

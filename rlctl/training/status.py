@@ -22,8 +22,6 @@ from rlctl.version import collect_versions
 if TYPE_CHECKING:
     from rlctl.training.start import Start
 
-_STATUS: dict[type[BaseException], str] = {Interrupted: "interrupted", DivergedError: "diverged"}
-
 
 @dataclasses.dataclass
 class Progress:
@@ -43,16 +41,13 @@ class Progress:
     evals_bytes: int = 0  # sizes of the tables [bytes]
     metrics_sha256: str = ""
     evals_sha256: str = ""  # hashes of these bytes; empty if there was no table yet
-    recent: list[EpisodeResult] = dataclasses.field(default_factory=list)
-    """Training episodes that ended after the last row of metrics."""
+    recent: list[EpisodeResult] = dataclasses.field(default_factory=list)  # episodes that ended after the last row
     steps_to_learn: int = 0  # environment steps in the replay buffer whose updates are still due
     stage: int = 0  # stage of the curriculum, from 1; 0 where there is none
     stage_began: int = 0  # environment steps at the start of the stage
     last_segment: int = 0  # step of the last `on_segment` of callbacks
-    logged: dict[str, float | None] = dataclasses.field(default_factory=dict)
-    """Numbers of callbacks for the next row of metrics, by column."""
-    parameters: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Parameters of the algorithm that callbacks have changed."""
+    logged: dict[str, float | None] = dataclasses.field(default_factory=dict)  # by callbacks, for the next row
+    parameters: dict[str, float] = dataclasses.field(default_factory=dict)  # what callbacks have changed
     stop_reason: str = ""  # why a callback ended the training
     stage_episodes: list[float | None] = dataclasses.field(default_factory=list)
     """Success (0 or 1; None if not reported) or return of the stage's last episodes, as its promotion rule needs."""
@@ -81,15 +76,10 @@ def write_start(run: RunDirectory, start: Start) -> None:
     if start.run is not None:
         changes |= {"resumed": _now(), "resumed_at_step": start.step}
     else:
-        changes |= {
-            "id": uuid.uuid4().hex,
-            "started": _now(),
-            "folder": os.environ.get("RLCTL_FOLDER") or os.getcwd(),  # a task's path may be relative to it
-        }
-        if start.source is not None:
-            changes["from"] = start.source
-        if start.demos is not None:
-            changes["demos"] = start.demos
+        folder = os.environ.get("RLCTL_FOLDER") or os.getcwd()  # a task's path may be relative to it
+        changes |= {"id": uuid.uuid4().hex, "started": _now(), "folder": folder}
+        sources = {"from": start.source, "demos": start.demos}
+        changes |= {name: source for name, source in sources.items() if source is not None}
     run.write_status(changes)
 
 
@@ -106,7 +96,7 @@ def find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
 
 def write_failure(run: RunDirectory, error: BaseException) -> None:
     """Write the status and error of a training that ended early."""
-    kind = _STATUS.get(type(error), "failed")
+    kind = {Interrupted: "interrupted", DivergedError: "diverged"}.get(type(error), "failed")
     if run.status_file.exists() and not isinstance(error, RunTaken):  # else the run was removed or taken over
         run.write_status({"status": kind, "error": str(error) or repr(error), "ended": _now()})
 

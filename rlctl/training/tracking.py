@@ -86,12 +86,8 @@ def _shorten(text: str) -> str:
 
 
 class _Sender:
-    """Sends what is new in a run folder to a tracker."""
-
     def __init__(self, run: RunDirectory, name: str, warn: Callable[[str], None]) -> None:
-        self._run = run
-        self._name = name
-        self._warn = warn
+        self._run, self._name, self._warn = run, name, warn
         self._tracker: Tracker | None = None
         self._loaders: dict[Path, Any] = {}  # of TensorBoard files; each yields an event once
         self._sent: dict[str, Any] = {"id": "", "steps": {}, "files": {}}  # last step per metric, version per file
@@ -217,8 +213,7 @@ class _Wandb:
         self._run.log({**values, "steps": step})
 
     def save(self, file: Path) -> None:
-        show = {".html": self._library.Html, ".mp4": self._library.Video}.get(file.suffix)
-        if show is not None:
+        if show := {".html": self._library.Html, ".mp4": self._library.Video}.get(file.suffix):
             self._run.log({file.stem: show(str(file))})
         else:
             kind = "model" if file.suffix == ".safetensors" else "recipe"
@@ -235,9 +230,8 @@ class _Trackio(_Wandb):
         trackio = self._library = importlib.import_module("trackio")
         warnings.showwarning = lambda message, *_: run.warn(str(message))
         self.id = run.id or run.name
-        self._run = trackio.init(
-            **run.arguments | {"name": self.id}, embed=False, auto_log_cpu=False, auto_log_gpu=False
-        )
+        quiet = dict.fromkeys(("embed", "auto_log_cpu", "auto_log_gpu"), False)
+        self._run = trackio.init(**run.arguments | quiet | {"name": self.id})
 
     def log(self, step: int, seconds: float, values: Mapping[str, float]) -> None:
         self._run.log(dict(values), step=step)

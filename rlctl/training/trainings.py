@@ -25,15 +25,10 @@ from rlctl.rollout.workers import available_cores
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.signals import HandledSignals
 
-CORES_PER_TRAINING = 2  # one for the workers, one for the updates
+_CORES_PER_TRAINING = 2  # one for the workers, one for the updates
 _WATCH_S = 0.25
 _ASK_S = 0.5
 Result = TypeVar("Result")
-
-
-def choose_jobs(jobs: int | None, waiting: int) -> int:
-    """Return how many of `waiting` trainings run at a time: `jobs`, else as many as the cores allow."""
-    return min(jobs or max(1, available_cores() // CORES_PER_TRAINING), max(waiting, 1))
 
 
 class Detached(Exception):
@@ -57,10 +52,8 @@ class Trainings:
 
     def describe(self) -> str:
         """Return as text where trainings run, and how many at a time."""
-        return (
-            f"{self._jobs} at a time: a training uses {CORES_PER_TRAINING} cores of {available_cores()}; "
-            "change with --jobs"
-        )
+        cores = f"{_CORES_PER_TRAINING} cores of {available_cores()}"
+        return f"{self._jobs} at a time: a training uses {cores}; change with --jobs"
 
     def run(self, calls: Sequence[Callable[[], Result]], resume_command: str) -> list[Result]:
         """Return the results of the calls. Raises `Interrupted` after a signal, with the command to resume."""
@@ -118,8 +111,8 @@ MakeTrainings = Callable[[Path, str, int, int | None], Trainings]
 
 
 def make_local_trainings(folder: Path, task: str, waiting: int, jobs: int | None) -> Trainings:
-    """Return trainings on this machine."""
-    return Trainings(choose_jobs(jobs, waiting))
+    """Return trainings on this machine: `jobs` at a time, else as many as the cores allow."""
+    return Trainings(min(jobs or max(1, available_cores() // _CORES_PER_TRAINING), max(waiting, 1)))
 
 
 def train_in_child(

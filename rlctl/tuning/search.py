@@ -208,7 +208,6 @@ def _has_finished(run: RunDirectory | None) -> bool:
 def _note_end(
     tuning: Tuning, trial: Trial, run: RunDirectory | None, code: int, lines: list[str], *, pruned: bool
 ) -> None:
-    """Store in a trial how its training ended; `lines` is its output."""
     trial.problem = ""
     if code == 0 and _has_finished(run):
         trial.state, trial.score = "done", tuning.measure(trial)

@@ -86,7 +86,6 @@ def _check_resumed(tuning: Tuning) -> None:
 
 
 def _check_storage(url: str) -> None:
-    """Raise `UsageError` for a storage that cannot be opened."""
     import optuna
 
     try:
@@ -96,15 +95,13 @@ def _check_storage(url: str) -> None:
 
 
 def _check(dimension: Dimension, task: str, request: TuneRequest) -> None:
-    first = dimension.key.partition(".")[0]
-    if dimension.key in ("seed", "total_timesteps", "stop_success") or first in ("eval", "checkpoint"):
-        raise UsageError(f"--search {dimension.key}: not a hyperparameter: it changes the measurement, not the policy")
+    key, first = dimension.key, dimension.key.partition(".")[0]
+    if key in ("seed", "total_timesteps", "stop_success") or first in ("eval", "checkpoint"):
+        raise UsageError(f"--search {key}: not a hyperparameter: it changes the measurement, not the policy")
     if first in _CHANGE_THE_RETURN and request.metric == "return":
-        raise UsageError(
-            f"--search {dimension.key}: it changes the reward, so returns are not comparable; use --metric success"
-        )
+        raise UsageError(f"--search {key}: it changes the reward, so returns are not comparable; use --metric success")
     for value in dimension.ends():
-        resolve_with_stages(task, request.config, merge(request.settings, nest({dimension.key: value})))
+        resolve_with_stages(task, request.config, merge(request.settings, nest({key: value})))
 
 
 def _evaluate_often_enough(recipe: Recipe, settings: Mapping[str, Any]) -> dict[str, Any]:

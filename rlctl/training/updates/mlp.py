@@ -75,11 +75,10 @@ class MlpStack:
         return values
 
     def _get_buffers(self, use: str, batch: int) -> list[Floats]:
-        buffers = self._buffers.get((use, batch))
-        if buffers is None:
+        if (use, batch) not in self._buffers:
             shapes = [(self.count, batch, layer.bias.shape[2]) for layer in self._layers]
-            buffers = self._buffers[use, batch] = [np.empty(shape, np.float32) for shape in shapes]
-        return buffers
+            self._buffers[use, batch] = [np.empty(shape, np.float32) for shape in shapes]
+        return self._buffers[use, batch]
 
     def _activate(self, values: Floats) -> None:
         if self._uses_tanh:
@@ -128,11 +127,6 @@ def is_mlp(modules: Iterable[nn.Module]) -> bool:
     on_cpu = all(parameter.device.type == "cpu" for module in modules for parameter in module.parameters())
     known = len(set(hidden)) <= 1 and all(kind in _ACTIVATIONS for kind in hidden)
     return on_cpu and set(kinds[::2]) == {nn.Linear} and known
-
-
-def count_weights(modules: Iterable[nn.Module]) -> int:
-    """Return the number of weights of the linear layers: multiplications per row of a batch."""
-    return sum(module.weight.numel() for module in modules if isinstance(module, nn.Linear))
 
 
 def join_outputs(linears: Sequence[nn.Linear]) -> nn.Linear:
@@ -196,9 +190,10 @@ class SideBySide:
     """Runs calls on two threads, for small networks or on one core on one; the results are bit-exact either way."""
 
     def __init__(self, networks: Sequence[Iterable[nn.Module]], batch_size: int) -> None:
-        smallest = min(count_weights(network) for network in networks)
+        linears = [[module for module in network if isinstance(module, nn.Linear)] for network in networks]
+        multiplications = batch_size * min(sum(linear.weight.numel() for linear in row) for row in linears)
         self._second: ThreadPoolExecutor | None = None
-        if batch_size * smallest >= _WORTHWHILE and available_cores() > 1:
+        if multiplications >= _WORTHWHILE and available_cores() > 1:
             self._second = ThreadPoolExecutor(1, initializer=_prepare_thread)
 
     def make_stacks(self, networks: Iterable[Iterable[nn.Module]]) -> list[MlpStack]:

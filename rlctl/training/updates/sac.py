@@ -64,10 +64,11 @@ class SacUpdate:
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
 
     def _update(self, batch: Batch, logged: dict[str, list[float]], *, learns_actor: bool, with_loss: bool) -> None:
-        if self._model.use_sde:
-            self._model.actor.reset_noise()
-        coefficient = self._read_coefficient()
-        sample = None
+        model = self._model
+        if model.use_sde:
+            model.actor.reset_noise()
+        tensor = model.ent_coef_tensor if model.ent_coef_optimizer is None else model.log_ent_coef.exp()
+        coefficient, sample = float(tensor.item()), None
         if learns_actor:
             sample = self._actor.sample(batch.features, "learning")
             self._update_coefficient(sample, logged)
@@ -79,13 +80,7 @@ class SacUpdate:
         if sample is not None:
             logged["actor_loss"].append(self._update_actor(batch.features, sample, coefficient))
 
-    def _read_coefficient(self) -> float:
-        model = self._model
-        tensor = model.ent_coef_tensor if model.ent_coef_optimizer is None else model.log_ent_coef.exp()
-        return float(tensor.item())
-
     def _update_coefficient(self, sample: Sample, logged: dict[str, list[float]]) -> None:
-        """Update the entropy coefficient if it is learned."""
         model = self._model
         if model.ent_coef_optimizer is None:
             return

@@ -70,7 +70,7 @@ class SquashedGaussianActor:
             if self._mean_limit is not None:
                 mean = mean.clip(-self._mean_limit, self._mean_limit)
             noise = latent @ self._actor.action_dist.exploration_mat.numpy()
-            std = np.sqrt(np.square(latent) @ self._read_variances() + self._epsilon)
+            std = np.sqrt(np.square(latent) @ np.exp(2 * self._actor.log_std.numpy()) + self._epsilon)
             log_std, z = np.log(std), noise / std
         else:
             log_std = values[-1][0, :, self._count :].clip(_LOG_STD_MIN, _LOG_STD_MAX)
@@ -82,11 +82,6 @@ class SquashedGaussianActor:
         squashing = np.log(1 - np.square(action) + self._epsilon)
         log_prob = (np.square(z) * -0.5 - log_std - squashing - LOG_SQRT_TAU).sum(1, keepdims=True)
         return Sample(values, noise, std, action, log_prob)
-
-    def _read_variances(self) -> Floats:
-        """Return exp(2 log_std), of gSDE."""
-        variances: Floats = np.exp(2 * self._actor.log_std.numpy())
-        return variances
 
     def backpropagate(self, sample: Sample, to_action: Floats, to_log_prob: float) -> None:
         """Set the gradients of the weights from those of sampled actions and of their log-probabilities."""
@@ -108,7 +103,7 @@ class SquashedGaussianActor:
         """Set the gradient of `log_std`, and return that of the latent values."""
         # noise = latent @ matrix, where matrix = exp(log_std) * normal numbers, and
         # std^2 = latent^2 @ exp(2 log_std) + epsilon.
-        matrix, variances = self._actor.action_dist.exploration_mat.numpy(), self._read_variances()
+        matrix, variances = self._actor.action_dist.exploration_mat.numpy(), np.exp(2 * self._actor.log_std.numpy())
         precision = np.reciprocal(np.square(sample.std))
         to_noise = to_mean - sample.noise * precision * to_log_prob
         to_variance = (np.square(sample.noise) * precision - 1) * precision * (0.5 * to_log_prob)
