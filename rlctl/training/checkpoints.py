@@ -5,8 +5,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.own_modules import describe_change
@@ -15,11 +13,10 @@ from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from rlctl.storage import files
 from rlctl.storage.table import Table
-from rlctl.training import checkpoint, replay_segments, snapshot
+from rlctl.training import checkpoint, snapshot
 from rlctl.training.callbacks import Callbacks
-from rlctl.training.checkpoint import Checkpoint
+from rlctl.training.checkpoint import Checkpoint, ReplaySegments
 from rlctl.training.learner import Learner, begin_next_episodes
-from rlctl.training.replay_segments import ReplaySegments
 from rlctl.training.snapshot import check_finite
 
 STEP_LABEL = "training step "  # start of the `policy` text of a saved episode; the step's number follows
@@ -39,8 +36,8 @@ class Checkpoints:
         self.problem = ""  # the last write that failed, and why
         self._learner = learner
         self._replay: ReplaySegments | None = None
-        if isinstance(learner.model, OffPolicyAlgorithm):
-            self._replay = ReplaySegments(run.replay_segments, learner.model.replay_buffer)
+        if (buffer := getattr(learner.model, "replay_buffer", None)) is not None:
+            self._replay = ReplaySegments(run.replay_segments, buffer)
         self._warn = warn
         self._next_s = time.monotonic()
         self._uncounted_checkpoints = 1  # checkpoints that are written even if not due: the last one
@@ -125,7 +122,7 @@ class Checkpoints:
         segments = []
         if self._replay is not None:
             segments = self._replay.save(self._added)
-            tensors |= replay_segments.hindsight_tensors(self._replay.buffer)
+            tensors |= checkpoint.hindsight_tensors(self._replay.buffer)
         state = checkpoint.State(
             run=self.run.id(),
             step=learner.steps,
@@ -160,7 +157,7 @@ class Checkpoints:
             snapshot.restore(learner.model, saved.tensors, saved.state.model)
             if self._replay is not None:
                 self._replay.load(saved.state.segments, self._added)
-                replay_segments.restore_hindsight(self._replay.buffer, saved.tensors)
+                checkpoint.restore_hindsight(self._replay.buffer, saved.tensors)
             mismatch = checkpoint.restore_environments(learner.env, saved.tensors)
         except (ArtifactError, KeyError) as error:
             raise ArtifactError(f"{saved.folder}: {error}") from None
