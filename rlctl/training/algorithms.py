@@ -89,7 +89,7 @@ def keep_compiler_out() -> None:
 
 
 def _use_fused_adam(model: BaseAlgorithm) -> None:
-    """Let Adam update all weights in one call: same results, and small networks spend most time on calls."""
+    """Let Adam update all weights in one call: with small networks most time is spent on calls. Same results."""
     parts = [model, *(getattr(model.policy, name, None) for name in ("actor", "critic")), model.policy]
     for part in parts:
         for name in ("optimizer", "ent_coef_optimizer"):

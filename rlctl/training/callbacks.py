@@ -99,7 +99,7 @@ class Callback:
         """Called after every evaluation."""
 
     def on_checkpoint(self, training: Training) -> None:
-        """Called when a checkpoint was written. The clock decides when, so nothing that matters may change here."""
+        """Called when a checkpoint was written. When depends on the clock, so do not change the training here."""
 
     def on_end(self, training: Training) -> None:
         """Called when the training is done and everything is written."""

@@ -152,7 +152,7 @@ class Checkpoints:
         info = PolicyFile.read_info(file)
         info.check_fits(learner.curriculum.goal, file)
         if change := describe_change(info.policy_kwargs, describe_network(learner.model.policy)):
-            raise ArtifactError(f"{file}: {change}; put it back, or begin a new training: --from {file}")
+            raise ArtifactError(f"{file}: {change}; restore it, or start a new training with --from {file}")
         try:
             snapshot.restore(learner.model, saved.tensors, saved.state.model)
             if self._replay is not None:

@@ -30,7 +30,7 @@ from rlctl.training.start import Start, describe_demonstrations
 
 _STATE, _SUCCESS = "observation.state", "next.success"  # LeRobot's names
 REHEARSAL_SHARE = 0.25
-"""Share of an off-policy training in which the actor continues to learn from the demonstrations."""
+"""Share of an off-policy training in which the actor also learns from the demonstrations, fewer and fewer times."""
 _UPDATES, _BATCH, _RATE = 3000, 256, 1e-3
 _STD = 0.1  # exploration after cloning; the entropy of such noise is about SAC's target
 _CONSTANT = 1e-8  # variance below which an observation counts as constant
@@ -68,7 +68,7 @@ def _check(episode: Demonstration, env: EnvInfo) -> None:
         shape = None if values is None else values.shape[1:]
         if values is None or shape != (space.shape or ()):
             raise ArtifactError(
-                f"{episode.name}: its {name} has the shape {shape}, the task's {space.shape}: is it of another task?"
+                f"{episode.name}: its {name} has the shape {shape}, the task's {space.shape}: from another task?"
             )
         if not np.isfinite(values).all():
             raise ArtifactError(f"{episode.name}: an {name} is not finite")
@@ -103,7 +103,7 @@ def _read(path: Path, task: str) -> list[Demonstration]:
 def _read_own(file: Path, task: str) -> Demonstration:
     episode = load_episode(file)
     if make_slug(episode.info.spec.task) != make_slug(task):
-        raise ArtifactError(f"{file}: an episode of {episode.info.spec.task}, not of {task}")
+        raise ArtifactError(f"{file}: an episode of the task {episode.info.spec.task}, not of {task}")
     observations = {key: rows[: len(episode.actions)] for key, rows in split(episode.observations).items()}
     return Demonstration(
         str(file), observations, episode.actions, False if episode.info.failure else episode.info.success
@@ -165,7 +165,7 @@ def clone(start: Start, rollouts: Rollouts, env: EnvInfo, show: Callable[[str], 
     if start.checkpoint is not None and not rehearses:
         return
     if start.run is not None and describe_demonstrations(path) != start.demos:
-        raise ArtifactError(f"{path}: the demonstrations have changed since this training began; put them back")
+        raise ArtifactError(f"{path}: the demonstrations have changed since this training began; restore them")
     cloning = Cloning(read_demonstrations(path, start.task, env), rollouts.model, recipe.total_timesteps)
     if rehearses:
         rollouts.rehearse = cloning.rehearse
@@ -207,7 +207,7 @@ class Cloning:
         return f"cloned {format_count(self._episodes, 'demonstration')} ({len(self._actions):,} steps, {error})"
 
     def rehearse(self, updates: int) -> None:
-        """Learn from the demonstrations after off-policy updates, whose new critic would else spoil the actor.
+        """Learn from the demonstrations again after off-policy updates: the new critic would otherwise spoil the actor.
 
         The weight of the loss grows with the values, as in TD3+BC, https://arxiv.org/abs/2106.06860.
         """

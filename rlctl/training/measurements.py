@@ -1,7 +1,7 @@
 """The columns of `metrics.csv` and `evals.csv`, except steps, time and stage.
 
 Actions, exploration, values and gradients are read from SB3's buffers and optimisers after an update. These depend on
-steps only, so a resumed run measures the same. A value that does not exist, e.g. limits of discrete actions, is None.
+steps only, so a resumed run measures the same. A value that does not exist is None.
 """
 
 import dataclasses
@@ -136,7 +136,7 @@ def _measure_exploration(space: spaces.Space[Any], entropy_loss: Any) -> float |
 
 
 def _read_value(last: LastSteps | None, log: Mapping[str, Any]) -> float | None:
-    """Return the critic's mean value. The off-policy actor's loss is minus it; SAC's includes the entropy bonus."""
+    """Return the critic's mean value: off-policy minus the actor's loss, which includes SAC's entropy bonus."""
     if last is not None and last.values is not None:
         return float(last.values.mean())
     loss = log.get("train/actor_loss")

@@ -124,8 +124,8 @@ def _check_goals(env: EnvInfo) -> None:
     achieved, desired = parts["achieved_goal"], parts["desired_goal"]
     if achieved.shape != desired.shape or not isinstance(desired, spaces.Box) or is_image_space(desired):
         raise RecipeError(
-            f"her: achieved_goal is {achieved}, desired_goal {desired}: hindsight exchanges them, so both must "
-            "be a Box of the same shape, not an image"
+            f"her: achieved_goal is {achieved}, desired_goal {desired}: hindsight replaces one by the other, so "
+            "both must be a Box of the same shape, not an image"
         )
 
 

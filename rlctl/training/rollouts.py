@@ -127,11 +127,11 @@ class WorkerVecEnv(VecEnv):
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Raise `NotImplementedError`: workers play whole segments."""
-        raise NotImplementedError("workers play segments; nothing steps them one by one")
+        raise NotImplementedError("workers play whole segments, not single steps")
 
     def step_wait(self) -> Any:
         """Raise `NotImplementedError`: workers play whole segments."""
-        raise NotImplementedError("workers play segments; nothing steps them one by one")
+        raise NotImplementedError("workers play whole segments, not single steps")
 
     def close(self) -> None:
         """End the workers."""
@@ -141,18 +141,18 @@ class WorkerVecEnv(VecEnv):
         """Return `render_mode`, None per environment; raise `AttributeError` for other names."""
         if attr_name == "render_mode":
             return [None] * self.num_envs
-        raise AttributeError(f"worker environments do not hand out attributes: {attr_name}")
+        raise AttributeError(f"attributes of environments in workers cannot be read: {attr_name}")
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Raise `AttributeError`: attributes of environments in workers cannot be set."""
-        raise AttributeError(f"worker environments take no attributes: {attr_name}")
+        raise AttributeError(f"attributes of environments in workers cannot be set: {attr_name}")
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """Call `compute_reward`, which SB3's hindsight replay needs; raise `AttributeError` for any other method."""
         if method_name == "compute_reward":  # of SB3's hindsight replay; its infos are empty
             rewards = self.workers.compute_rewards(*method_args[:2])
             return [rewards for _ in self._get_indices(indices)]
-        raise AttributeError(f"worker environments hand out no methods: {method_name}")
+        raise AttributeError(f"methods of environments in workers cannot be called: {method_name}")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """Return False per environment: no wrapper is visible from outside the workers."""

@@ -66,7 +66,7 @@ def track(run: RunDirectory, tracker: str, show: Callable[[str], None]) -> Itera
         child.close(_END_S)
         reader.wait()
         if child.process.returncode != 0:
-            warn(f"its process ended too early, or was not done {_END_S:g} s after the training")
+            warn(f"its process ended too early, or had not finished {_END_S:g} s after the training")
 
 
 def main(connection: Connection, folder: str, tracker: str) -> None:

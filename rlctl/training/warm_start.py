@@ -51,7 +51,7 @@ def load_source(source: Mapping[str, Any], model: Any, env: EnvInfo) -> str:
     if len(policy.actor_only().tensors) < len(policy.tensors):
         return f"{text}: its actor, critic and normalisation"
     return (
-        f"{text}: its actor and normalisation; it has no critic, so training starts with a new one, and the first "
+        f"{text}: its actor and normalisation; it has no critic, so training starts with a new one: the first "
         "updates may lower the score"
     )
 

@@ -218,7 +218,5 @@ def test_a_schedule_that_sb3_callbacks_replace_is_reported(train, capsys):
 
 
 def test_a_callback_cannot_reach_into_the_environments(train):
-    with pytest.raises(
-        TaskError, match=r"on_segment at step 64: AttributeError: worker environments hand out no metho"
-    ):
+    with pytest.raises(TaskError, match=r"on_segment at step 64: AttributeError: methods of environments in workers"):
         train("Line", {**SMALL_PPO, "callbacks": {f"{SB3}:ReachesIn": None}})

@@ -186,7 +186,7 @@ NEEDS = (
             "OtherGoal",
             {},
             "her: achieved_goal is Box(-1.0, 1.0, (2,), float32), desired_goal Box(-1.0, 1.0, (3,), float32): "
-            "hindsight exchanges them, so both must be a Box of the same shape, not an image",
+            "hindsight replaces one by the other, so both must be a Box of the same shape, not an image",
         ),
         (
             "Plane",

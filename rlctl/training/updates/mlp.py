@@ -130,7 +130,7 @@ def is_mlp(modules: Iterable[nn.Module]) -> bool:
 
 
 def join_outputs(linears: Sequence[nn.Linear]) -> nn.Linear:
-    """Return a layer with the outputs of all `linears`, which have the same inputs; call `share_joined` later."""
+    """Return a layer with the outputs of all `linears`, which have the same inputs; then call `share_joined`."""
     joined = nn.Linear(linears[0].in_features, sum(linear.out_features for linear in linears))
     joined.weight.data = torch.cat([linear.weight.data for linear in linears])
     joined.bias.data = torch.cat([linear.bias.data for linear in linears])
