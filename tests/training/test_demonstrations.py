@@ -214,7 +214,7 @@ def flip_success(info):
 
 
 BAD = {
-    "of another task": ("Discrete", {}, "000000.npz: an episode of .*:Line, not of .*:Discrete"),
+    "of another task": ("Discrete", {}, "000000.npz: an episode of the task .*:Line, not of .*:Discrete"),
     "not a number": (
         "Line",
         {"observations": lambda v: np.full_like(v, np.nan)},
