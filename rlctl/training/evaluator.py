@@ -153,17 +153,14 @@ class Evaluator:
         else:
             row = self._note(episodes, policy)
         progress.last_eval = steps
-        if not self._learner.is_at_end:  # at the end all findings are printed
-            self._report_findings()
-        while progress.next_eval <= steps:
-            progress.next_eval += self._recipe.eval.every_steps or self._recipe.total_timesteps
-        return row
-
-    def _report_findings(self) -> None:
-        for finding in diagnose(self._checkpoints.run):
+        findings = [] if self._learner.is_at_end else diagnose(self._checkpoints.run)  # at the end all are printed
+        for finding in findings:
             if finding.grade == Grade.WARNING and finding.id not in self._reported_findings:
                 self._reported_findings.add(finding.id)
                 self._display.message(finding.line)
+        while progress.next_eval <= steps:
+            progress.next_eval += self._recipe.eval.every_steps or self._recipe.total_timesteps
+        return row
 
     def _note_failure(self, error: RlctlError) -> None:
         progress, steps = self._learner.progress, self._learner.steps

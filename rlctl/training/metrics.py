@@ -148,26 +148,19 @@ class _EventFile(TensorBoardOutputFormat):
 
 
 def make_logger(
-    folder: Path,
-    warn: Callable[[str], None],
-    resumed_at: int | None = None,
-    parameters: Mapping[str, bool | str | float] | None = None,
+    folder: Path, warn: Callable[[str], None], resumed_at: int | None = None, recipe: Recipe | None = None
 ) -> Logger:
     """Return a logger that writes to a TensorBoard folder; `warn` is called if it cannot.
 
-    TensorBoard hides what was written after the step `resumed_at`; its HPARAMS table has the `parameters`.
+    TensorBoard hides what was written after the step `resumed_at`; its HPARAMS table has values of the recipe.
     """
     events = _EventFile(folder, warn)
     if resumed_at is not None:
         events.add(Event(step=resumed_at + 1, session_log=SessionLog(status=SessionLog.START)))
-    elif parameters:
-        for summary in hparams(dict(parameters), dict.fromkeys(_COMPARED, 0.0)):  # type: ignore[no-untyped-call]
+    elif recipe is not None:
+        names = ("algo", "seed", "n_envs", "total_timesteps")
+        values = {name: getattr(recipe, name) for name in names} | recipe.algo_kwargs
+        parameters = {name: value for name, value in values.items() if isinstance(value, bool | str | int | float)}
+        for summary in hparams(parameters, dict.fromkeys(_COMPARED, 0.0)):  # type: ignore[no-untyped-call]
             events.add(Event(summary=summary))
     return Logger(str(folder), [events])
-
-
-def list_parameters(recipe: Recipe) -> dict[str, bool | str | float]:
-    """Return the hyperparameters for TensorBoard: the algorithm, its parameters, seed and size of the training."""
-    names = ("algo", "seed", "n_envs", "total_timesteps")
-    values: dict[str, Any] = {name: getattr(recipe, name) for name in names} | recipe.algo_kwargs
-    return {name: value for name, value in values.items() if isinstance(value, bool | str | int | float)}

@@ -1,7 +1,6 @@
 """PPO, A2C and recurrent PPO on segments played by workers: values and log-probabilities in batched passes."""
 
 import dataclasses
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -163,6 +162,5 @@ class OnPolicyRollouts(Rollouts):
         return chosen.flatten() if isinstance(self.model.action_space, spaces.Discrete) else chosen.float()
 
 
-def _slices(count: int) -> Iterator[slice]:
-    for low in range(0, count, _ROWS):
-        yield slice(low, min(low + _ROWS, count))
+def _slices(count: int) -> list[slice]:
+    return [slice(low, low + _ROWS) for low in range(0, count, _ROWS)]

@@ -142,10 +142,10 @@ def _refuse_success_rates(start: Start) -> None:
 
 def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Checkpoints:
     from rlctl.training.checkpoints import Checkpoints
-    from rlctl.training.metrics import list_parameters, make_logger
+    from rlctl.training.metrics import make_logger
 
     resumed_at = None if start.run is None else start.step
-    learner.model.set_logger(make_logger(run.tensorboard, display.message, resumed_at, list_parameters(start.recipe)))
+    learner.model.set_logger(make_logger(run.tensorboard, display.message, resumed_at, start.recipe))
     callbacks = Callbacks(start.callbacks, learner, run.path, display.message)
     checkpoints = Checkpoints(learner, run, callbacks, display.message)
     for note in start.notes:

@@ -82,16 +82,12 @@ def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> No
         _restore_rollout(model, tensors)
         for name in plain["counters"].keys() & set(_COUNTERS):  # only these: a file must not choose attributes to set
             setattr(model, name, plain["counters"][name])
-        _restore_randomness(tensors)
+        # The generators that updates draw from; gSDE's matrices are drawn again by updates.
+        torch.set_rng_state(torch.from_numpy(tensors["randomness/torch"].copy()))
+        keys, position, has_gauss, cached = (tensors[f"randomness/numpy/{part}"] for part in _NUMPY)
+        np.random.set_state(("MT19937", keys, int(position), int(has_gauss), float(cached)))  # noqa: NPY002 (SB3 draws there)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         raise ArtifactError(f"does not fit this recipe: {' '.join(str(error).split())[:200]}") from None
-
-
-def _restore_randomness(tensors: Tensors) -> None:
-    """Restore the generators that updates draw from; gSDE's matrices are drawn again by updates."""
-    torch.set_rng_state(torch.from_numpy(tensors["randomness/torch"].copy()))
-    keys, position, has_gauss, cached = (tensors[f"randomness/numpy/{part}"] for part in _NUMPY)
-    np.random.set_state(("MT19937", keys, int(position), int(has_gauss), float(cached)))  # noqa: NPY002 (SB3 draws there)
 
 
 _NUMPY = ("keys", "position", "has_gauss", "cached")

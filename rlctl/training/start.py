@@ -96,8 +96,15 @@ def check_arguments(request: TrainRequest) -> None:
         raise UsageError(f"--demos {request.demos}: no such file or folder")
     if not _DEVICE.fullmatch(request.device):  # checked before slow imports
         raise UsageError(f"--device {request.device!r}: no such device; give cpu, cuda, cuda:1, or auto")
-    if request.resume is not None:
-        _check_resume(request)
+    if request.resume is None:
+        return
+    given = {"--config": request.config, "--demos": request.demos, "--from": request.initial_policy}
+    for option, value in given.items():
+        if value is not None:
+            raise UsageError(f"{option} and --resume exclude each other: the run has its own recipe and policy")
+    for key in request.settings:
+        if key != "total_timesteps":
+            raise UsageError(f"--resume uses the run's own recipe: {key} cannot be changed; only -n can")
 
 
 def _find_new(request: TrainRequest, task: str) -> Start:
@@ -148,16 +155,6 @@ def _find_checkpoint(request: TrainRequest) -> Start:
     except BaseException:
         lock.release()
         raise
-
-
-def _check_resume(request: TrainRequest) -> None:
-    given = {"--config": request.config, "--demos": request.demos, "--from": request.initial_policy}
-    for option, value in given.items():
-        if value is not None:
-            raise UsageError(f"{option} and --resume exclude each other: the run has its own recipe and policy")
-    for key in request.settings:
-        if key != "total_timesteps":
-            raise UsageError(f"--resume uses the run's own recipe: {key} cannot be changed; only -n can")
 
 
 def _reopen(newest: Checkpoint, before: Recipe, recipe: Recipe) -> Checkpoint:

@@ -30,8 +30,8 @@ class _Layer:
         weights, biases = [linear.weight for linear in linears], [linear.bias for linear in linears]
         self.parameters = [_share(weights), _share(biases)]
         self.weight, self.bias = self.parameters[0].numpy(), self.parameters[1].numpy()[:, None, :]
-        self.weight_gradient = _share_gradients(weights)
-        self.bias_gradient = _share_gradients(biases)[:, None, :]
+        self.weight_gradient = share_gradients(weights)
+        self.bias_gradient = share_gradients(biases)[:, None, :]
 
 
 class MlpStack:
@@ -158,12 +158,6 @@ def clip_norm(gradients: Iterable[Floats], limit: float) -> None:
             gradient *= limit / (norm + 1e-6)
 
 
-def allocate_gradient(parameter: Tensor) -> Floats:
-    """Give a parameter a gradient, and return it as an array."""
-    gradient: Floats = _share_gradients([parameter])[0]
-    return gradient
-
-
 def _share(parameters: Sequence[Tensor]) -> Tensor:
     """Make parameters of equal shape slices of one array; return it."""
     shared = torch.stack([parameter.data for parameter in parameters])
@@ -172,7 +166,7 @@ def _share(parameters: Sequence[Tensor]) -> Tensor:
     return shared
 
 
-def _share_gradients(parameters: Sequence[Tensor]) -> Floats:
+def share_gradients(parameters: Sequence[Tensor]) -> Floats:
     """Give parameters of equal shape gradients that are slices of one array; return it."""
     shared = torch.zeros(len(parameters), *parameters[0].shape)
     for parameter, part in zip(parameters, shared, strict=True):

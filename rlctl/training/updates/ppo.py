@@ -17,7 +17,7 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution, Sta
 from stable_baselines3.common.utils import explained_variance
 
 from rlctl.environments.dict_spaces import join, split
-from rlctl.training.updates.mlp import LOG_SQRT_TAU, Floats, MlpStack, SideBySide, allocate_gradient, clip_norm, is_mlp
+from rlctl.training.updates.mlp import LOG_SQRT_TAU, Floats, MlpStack, SideBySide, clip_norm, is_mlp, share_gradients
 
 _FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
 
@@ -31,7 +31,7 @@ class PpoUpdate:
         self._policy = policy
         networks = (_actor_modules(policy), _critic_modules(policy))
         self._actor, self._critic = (MlpStack([network]) for network in networks)
-        self._log_std_gradient = allocate_gradient(policy.log_std)
+        self._log_std_gradient = share_gradients([policy.log_std])[0]
         self._gradients = [*self._actor.gradients, *self._critic.gradients, self._log_std_gradient]
         self._side_by_side = SideBySide(networks, model.batch_size)
 
@@ -104,7 +104,8 @@ class PpoUpdate:
         logged["loss"] = [losses["policy_gradient_loss"] + entropy_loss + model.vf_coef * losses["value_loss"]]
         if model.target_kl is not None and losses["approx_kl"] > 1.5 * model.target_kl:
             return False
-        self._step()
+        clip_norm(self._gradients, model.max_grad_norm)
+        self._policy.optimizer.step()
         return True
 
     def _compute_actor_gradients(self, batch: dict[str, NDArray[Any]], clip_range: float) -> dict[str, float]:
@@ -168,10 +169,6 @@ class PpoUpdate:
         # std^2 = latent^2 @ exp(2 log_std) + epsilon; no gradient flows into the latent values, as in SB3.
         of_variance = np.square(actor[-2][0]).T @ (to_log_std / np.square(std))
         np.multiply(of_variance, np.exp(2 * self._policy.log_std.numpy()), out=self._log_std_gradient)
-
-    def _step(self) -> None:
-        clip_norm(self._gradients, self._model.max_grad_norm)
-        self._policy.optimizer.step()
 
     def _log(self, logged: dict[str, list[float]], clip_range: float, clip_range_vf: float | None) -> None:
         model, logger = self._model, self._model.logger

@@ -23,9 +23,9 @@ from rlctl.training.updates.mlp import (
     Floats,
     MlpStack,
     SideBySide,
-    allocate_gradient,
     is_mlp,
     join_outputs,
+    share_gradients,
     share_joined,
 )
 
@@ -53,7 +53,7 @@ class SquashedGaussianActor:
         modules = _list_modules(actor)
         if actor.use_sde:
             self._network = MlpStack([modules])
-            self._log_std_gradient = allocate_gradient(actor.log_std)
+            self._log_std_gradient = share_gradients([actor.log_std])[0]
         else:
             heads = [modules[-1], actor.log_std]
             joined = join_outputs(heads)
