@@ -150,7 +150,7 @@ def test_a_module_that_changed_is_not_resumed(train, resume, tmp_path, key, name
     result = train("Line", {**TINY, "policy_kwargs": {key: f"{nets}:{name}"}})
     nets.write_text(nets.read_text() + "# changed\n")
     with pytest.raises(
-        ArtifactError, match=rf"changing\.py, with {name}, is not the file that it was trained with; put it"
+        ArtifactError, match=rf"changing\.py, with {name}, is not the file that it was trained with; restore it"
     ):
         resume(result, total_timesteps=256)
 

@@ -56,7 +56,7 @@ def test_a_shipped_actor_gets_a_fresh_critic(train, capfd):
     shipped = PolicyFile.read(find_shipped_policy("reach")).tensors
     begun = PolicyFile.read(result.run.policy_file("0")).tensors
     assert_same_but_for_first_observations({name: begun[name] for name in shipped}, shipped)
-    assert "it has no critic, so training starts with a new one, and the first updates" in capfd.readouterr().err
+    assert "it has no critic, so training starts with a new one: the first updates" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
