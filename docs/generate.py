@@ -28,10 +28,10 @@ _LINE = 120  # [characters]
 _KWARGS = ("algo_kwargs", "policy_kwargs")
 _HEAD = """# Recipes
 
-A recipe says how to train a task. It is made from the defaults on this page, then the task's own recipe (a YAML file
-beside its module: `rlctl tasks show TASK` prints it), then `--config FILE`, then `--set KEY=VALUE` and the other flags
-of `rlctl train`. Every training writes the recipe it used to `recipe.yaml` of its run, which is itself a valid
-`--config`.
+A recipe says how to train a task. rlctl merges four sources; a later one overrides an earlier one: the defaults on this
+page, the task's own recipe (a YAML file next to its module: `rlctl tasks show TASK` prints it), `--config FILE`, and
+`--set KEY=VALUE` with the other flags of `rlctl train`. Every training writes the result to `recipe.yaml` of its run,
+which is itself a valid `--config`.
 
 ```yaml
 algo: ppo
@@ -43,13 +43,13 @@ eval: {every_steps: 20_000, episodes: 50}
 ```
 
 YAML 1.2: `3e-4` is a number, `1e6` is a whole number where one is expected, `on` is text. Anchors, aliases and tags are
-not supported. `--set` takes a key with dots: `--set algo_kwargs.gamma=0.98`. `check-env`, `eval` and `replay` take
-those of `task`, `reward_weights`, `randomize` and `events`; `--set randomize=false` also leaves out the events that a
+not supported. A key of `--set` has dots: `--set algo_kwargs.gamma=0.98`. `check-env`, `eval` and `replay` accept only
+keys of `task`, `reward_weights`, `randomize` and `events`; `--set randomize=false` also turns off the events that the
 policy was trained with.
 
-A default with *rlctl* is chosen by rlctl; the others are those of Stable-Baselines3.
+Defaults marked *rlctl* are chosen by rlctl; all others are those of Stable-Baselines3.
 
-Presets come with rlctl and go over the task's own recipe like a file, by `--config presets/NAME`:
+`--config presets/NAME` uses a recipe that comes with rlctl. It overrides the task's own recipe, as a file does:
 
 {presets}
 
@@ -57,7 +57,7 @@ This page is generated: `python docs/generate.py`. For editors there is a
 [JSON schema](../rlctl/recipe/recipe.schema.json): `rlctl recipe --schema`.
 """
 _STAGES = """
-Stages are a curriculum. Each changes the recipe's own task, and all but the last say when they end:
+Stages are a curriculum. Each stage changes the recipe's own task; all but the last need a rule that ends them:
 
 ```yaml
 stages:

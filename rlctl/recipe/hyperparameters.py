@@ -62,7 +62,7 @@ class _OnPolicy(_Learning):
     use_sde: Switch = False
     """State-dependent exploration (gSDE)."""
     sde_sample_freq: _Count | Literal[-1] = -1
-    """Steps between new gSDE noise; -1: once per rollout."""
+    """Steps after which gSDE draws new noise; -1: once per rollout."""
 
 
 class Ppo(_OnPolicy):
@@ -130,7 +130,7 @@ class _MaximumEntropy(_Continuous):
     use_sde: Switch = False
     """State-dependent exploration (gSDE)."""
     sde_sample_freq: _Count | Literal[-1] = -1
-    """Steps between new gSDE noise; -1: once per rollout."""
+    """Steps after which gSDE draws new noise; -1: once per rollout."""
     use_sde_at_warmup: Switch = False
     """Whether to use gSDE instead of random actions before `learning_starts`."""
 

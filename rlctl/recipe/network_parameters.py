@@ -23,7 +23,7 @@ class _FeaturesExtractor(Parameters):
     cnn_output_dim: _Width = 256
     """Number of features per image of a dict observation."""
     normalized_image: Switch = False
-    """Whether images are in [0, 1] already."""
+    """Whether the values of images are already in [0, 1]."""
 
 
 class _Lstm(Parameters):
@@ -44,7 +44,6 @@ class _ActorAndCritic(Parameters):
 
 
 def _accept_arguments(value: Any, check: Any, info: ValidationInfo) -> Any:
-    """Accept any arguments for a user's features extractor."""
     return value if isinstance(value, dict) and info.data.get("features_extractor_class") else check(value)
 
 

@@ -41,21 +41,11 @@ class NormalizeSettings(Section):
     observation: Switch = True
     """Whether to normalise observations."""
     reward: Switch = True
-    """Whether to scale rewards by the deviation of the return."""
+    """Whether to divide rewards by the standard deviation of the return."""
     clip_observation: Number = Field(10.0, gt=0)
     """Bound of normalised observations."""
     clip_reward: Number = Field(10.0, gt=0)
     """Bound of normalised rewards."""
-
-    @pydantic.model_validator(mode="after")
-    def _check_bounds(self) -> NormalizeSettings:
-        for name, normalized in (("observation", self.observation), ("reward", self.reward)):
-            bound = f"clip_{name}"
-            if not normalized and getattr(self, bound) != type(self).model_fields[bound].default:
-                raise ValueError(
-                    f"{bound} has no effect with {name}: false, because only normalised values are clipped"
-                )
-        return self
 
 
 class EvalSettings(Section):
@@ -68,7 +58,7 @@ class EvalSettings(Section):
     episodes: Whole = Field(20, ge=1, le=1_000_000)
     """Episodes per evaluation, the same seeds each time."""
     deterministic: Switch = True
-    """Whether to take the mean action, and not a sample."""
+    """Whether the policy takes its mean action instead of a random sample."""
 
 
 class Hindsight(Section):
@@ -115,7 +105,7 @@ class Recipe(Section):
     time_feature: Switch = False
     """Whether the policy also observes the remaining fraction of the episode, from 1 to 0, as rl-zoo3's agents do."""
     overlap: Switch = True
-    """Off-policy: whether the learner updates while environments play, with a policy one chunk (`train_freq`) older."""
+    """Off-policy: whether environments play during an update; their policy is then one chunk (`train_freq`) older."""
     n_envs: Whole = Field(8, ge=1, le=_MOST_ENVS)
     """Number of parallel environments."""
     total_timesteps: Whole = Field(300_000, ge=1, le=_MOST_STEPS)
@@ -129,9 +119,9 @@ class Recipe(Section):
     checkpoint: CheckpointSettings = CheckpointSettings()
     """Which checkpoints are kept."""
     callbacks: dict[str, dict[str, Any] | None] = {}
-    """Callbacks: classes of yours by `FILE.py:CLASS` or `MODULE:CLASS`, and their arguments; see docs/callbacks.md."""
+    """Callbacks: your own classes, as `FILE.py:CLASS` or `MODULE:CLASS`, and their arguments; see docs/callbacks.md."""
     track: Literal["wandb", "mlflow", "trackio"] | None = None
-    """Experiment tracker that metrics, policy, report and film are also sent to; null: none."""
+    """Experiment tracker that also gets metrics, policy, report and film; null: none."""
     stages: Annotated[list[Stage], pydantic.AfterValidator(check_promotions)] = []
     """Curriculum: what each stage changes, and when it ends."""
 
@@ -150,8 +140,8 @@ class Recipe(Section):
         dropped = self.algo_kwargs.get("top_quantiles_to_drop_per_net", 0)
         if dropped >= (quantiles := self.policy_kwargs.get("n_quantiles", _QUANTILES)):
             raise ValueError(
-                f"algo_kwargs.top_quantiles_to_drop_per_net: drops {dropped} of {quantiles}, so none is left; "
-                "it must be below policy_kwargs.n_quantiles"
+                f"algo_kwargs.top_quantiles_to_drop_per_net: {dropped} of {quantiles} quantiles are dropped, so none "
+                "remains; it must be below policy_kwargs.n_quantiles"
             )
         return self
 
@@ -200,7 +190,7 @@ class Source:
     """Values of a recipe, and their source."""
 
     name: str
-    """Empty for the command line and for function arguments: errors need not name their place."""
+    """Empty for the command line and for function arguments, which errors need not name."""
     values: Mapping[str, Any]
     file: Path | None = None
 

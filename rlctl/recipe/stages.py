@@ -19,7 +19,7 @@ class Promotion(Section):
     mean_return: Number | None = Field(None, alias="return")
     """Mean return to reach."""
     window: Whole = Field(100, ge=1, le=1_000_000)
-    """Number of finished training episodes of the stage that are averaged; promotion needs at least that many."""
+    """Number of last training episodes that are averaged; the stage lasts at least that many."""
     min_steps: Whole = Field(0, ge=0)
     """Minimum length of the stage in environment steps, all environments together."""
 
@@ -48,7 +48,7 @@ class Stage(Section):
     events: dict[str, dict[str, Any]] = {}
     """Changes of the recipe's `events`."""
     level: Number = Field(1.0, ge=0, le=1)
-    """How far event ranges written `{from: ..., to: ...}` have widened: 0 is `from`, 1 is `to`."""
+    """Width of event ranges written `{from: ..., to: ...}`: 0 is `from`, 1 is `to`."""
     promote: Promotion | None = None
     """When the stage ends; the last stage has none."""
 

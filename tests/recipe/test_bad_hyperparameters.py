@@ -64,7 +64,7 @@ NETWORK = "expected [64, 64] or {pi: [64, 64], vf: [64, 64]}, got "
         ("td3", "target_noise_clip=-0.5", "expected a number >= 0, got -0.5"),
         ("dqn", "exploration_final_eps=2", "expected a number in [0, 1], got 2"),
         ("dqn", "target_update_interval=0", "expected a whole number in [1, 1e9], got 0"),
-        ("tqc", "top_quantiles_to_drop_per_net=25", "drops 25 of 25, so none is left; it must be below "),
+        ("tqc", "top_quantiles_to_drop_per_net=25", "25 of 25 quantiles are dropped, so none remains; it "),
         (
             "ppo",
             "net_arch=[-1]",

@@ -117,10 +117,6 @@ def test_what_looks_wrong_and_is_right(tmp_path):
         ("normalize.observation=1", "normalize.observation: expected true or false, got 1"),
         ("normalize.clip_reward=.inf", "normalize.clip_reward: expected a number > 0, got inf"),
         ("normalize.clip_observation=-1", "normalize.clip_observation: expected a number > 0, got -1"),
-        (
-            "normalize={reward: false, clip_reward: 1}",
-            "normalize: clip_reward has no effect with reward: false, because only normalised values are clipped",
-        ),
         ("reward_weights.a=.nan", "reward_weights.a: expected a number, got nan"),
         ("reward_weights.a=true", "reward_weights.a: expected a number, got True"),
         ("events.mass=3", "events.mass: expected a mapping, got 3"),
