@@ -202,7 +202,6 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
 
 
 def _is_in_old_gym(name: str) -> bool:
-    """Return whether an id is registered with the old gym package, if that is imported."""
     old = getattr(sys.modules.get("gym"), "envs", None)
     known = getattr(old, "registry", {})
     return name in getattr(known, "env_specs", known)

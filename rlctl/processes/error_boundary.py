@@ -121,7 +121,6 @@ def report_unexpected(error: Exception) -> int:
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:
-    """Return whether an allocation failed: in Python, the library loader, or torch."""
     while error is not None:
         text = str(error).lower()
         refused = isinstance(error, ImportError | OSError | RuntimeError) and any(words in text for words in _NO_MEMORY)

@@ -136,15 +136,12 @@ def measure_free_memory() -> int | None:
 
 
 def _read_machine() -> int | None:
-    try:
+    with contextlib.suppress(OSError, StopIteration, ValueError):
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration, ValueError):  # not Linux: only the installed memory is known
-        pass
-    try:
+    with contextlib.suppress(OSError, ValueError):  # not Linux: only the installed memory is known
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError):
-        return None
+    return None
 
 
 def _read_control_groups() -> list[int]:

@@ -47,17 +47,9 @@ def describe_entry(entry: installed.TaskEntry, *, check: bool) -> ListedTask:
         problem = f"{entry.recipe_file}: {error}"
     if check and problem is None:
         problem = installed.check_import(entry)
-    return ListedTask(
-        name=entry.name,
-        target=entry.target,
-        distribution=entry.distribution,
-        version=entry.version,
-        summary=summary,
-        algo=algo,
-        success=score.get("success"),
-        mean_return=score.get("mean_return"),
-        problem=problem,
-    )
+    success, mean_return = score.get("success"), score.get("mean_return")
+    declared = entry.name, entry.target, entry.distribution, entry.version
+    return ListedTask(*declared, summary, algo, success, mean_return, problem)
 
 
 def read_summary(entry: installed.TaskEntry) -> str:

@@ -114,7 +114,6 @@ def _list_actions(content: Json) -> list[Row]:
 
 
 def _list_joints(joints: Json | None) -> list[Row]:
-    """Return the joints that the action moves: position limits, top speed, largest torque, where they are known."""
     if joints is None:
         return []
     columns = [
