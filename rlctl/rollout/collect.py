@@ -37,7 +37,7 @@ class Episode:
         return self.trajectory
 
     def describe(self, spec: EnvSpec, env: EnvInfo, policy: str) -> RecordedEpisode:
-        """Return the episode, which must have been recorded, as a file holds it; `policy` is text for people."""
+        """Return the recorded episode in the form of a file; `policy` is the policy's name, for people."""
         info = EpisodeInfo(
             spec=spec,
             seed=self.result.seed,
@@ -126,7 +126,7 @@ class _Recorder:
         self.steps += steps
         if self._record:
             segment = workers.arrays.segment
-            first = 1 if self._parts else 0  # the last observation of the segment before
+            first = 1 if self._parts else 0  # row 0 repeats the last observation of the previous segment
             observations = {key: rows[env, first : steps + 1].copy() for key, rows in segment.observation.items()}
             actions, rewards, terms = (
                 rows[env, :steps].copy() for rows in (segment.action, segment.reward, segment.terms)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shlex
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -39,8 +40,7 @@ class SetEvents:
     """Replace the events by those of a spec that is equal otherwise."""
 
     spec: EnvSpec
-    push: dict[str, Any] | None = None
-    """Parameters of `rlctl.task.events.push` and `every_s`: a push that the task does not offer."""
+    push: dict[str, Any] | None = None  # parameters of `task.events.push`, and `every_s`, of a push that is added
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +54,8 @@ class Attach:
 class BeginEpisodes:
     """Begin episodes and replay actions in them."""
 
-    episodes: dict[int, tuple[int, NDArray[Any]]]
-    """Per environment the seed, and the actions so far, shape (steps, ...)."""
-    may_fail: bool = False  # whether a failing episode is reported like one that ended, instead of raising
+    episodes: dict[int, tuple[int, NDArray[Any]]]  # per environment the seed, and the actions, shape (steps, ...)
+    may_fail: bool = False  # whether an episode that fails is treated as one that ended; else its error is raised
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,8 +63,7 @@ class LoadPolicy:
     """Set the policy: one whose parameters are in shared memory, or another one by its name."""
 
     info: PolicyInfo | None = None
-    layout: list[tuple[str, tuple[int, ...], str]] = dataclasses.field(default_factory=list)
-    """Name, shape and dtype of each array of numbers."""
+    layout: Sequence[tuple[str, tuple[int, ...], str]] = ()  # name, shape and dtype of each array of numbers
     other: str = ""  # an exported file, or a baseline; see `players.named.make_player`
 
 
@@ -126,10 +124,8 @@ class EpisodeResult:
 class Answer:
     """The answer of a worker; it contains only what the message asks for."""
 
-    ended: list[EpisodeResult] = dataclasses.field(default_factory=list)
-    """Episodes that ended while a segment was played."""
-    left: list[int] = dataclasses.field(default_factory=list)
-    """Environments whose episode ended or failed while its actions were replayed."""
+    ended: Sequence[EpisodeResult] = ()  # episodes that ended while a segment was played
+    left: Sequence[int] = ()  # environments whose episode ended or failed while its actions were replayed
     info: EnvInfo | None = None  # description of the environments, if it has changed
     rewards: NDArray[np.float64] | None = None  # those of `ComputeRewards`, shape (n,)
 

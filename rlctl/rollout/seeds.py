@@ -24,5 +24,5 @@ def episode_seed(run_seed: int, stream: Stream, env_index: int, episode: int) ->
 
 
 def episode_seeds(run_seed: int, stream: Stream, episodes: int) -> list[int]:
-    """Return the seeds of a numbered list of episodes, the same whichever environment plays each of them."""
+    """Return the seeds of a numbered list of episodes; any environment may play any of them."""
     return [episode_seed(run_seed, stream, 0, index) for index in range(episodes)]

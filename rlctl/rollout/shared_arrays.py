@@ -79,8 +79,8 @@ class SharedArrays:
             | {f"segment/observation/{k}": ((n_envs, steps + 1, *shape), d) for k, (shape, d) in observation.items()},
         )
         self.inside = arrays["inside"]
-        """Episode seed, step and row of the segment of an environment's present call, shape (n_envs, 3): names the
-        episode if its worker dies or hangs. Step 0 is the reset; a negative step: no call."""
+        """Episode seed, step and row of the segment during a call of each environment, shape (n_envs, 3); errors name
+        them if a worker dies or hangs. Step 0 is the reset; the step is negative outside of calls."""
         self.observation = {key: arrays[f"observation/{key}"] for key in observation}
         """The present observations, by key."""
         self.segment = SegmentArrays(

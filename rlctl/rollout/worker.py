@@ -86,7 +86,6 @@ class Worker:
         return self._info
 
     def _set_events(self, message: messages.SetEvents) -> EnvInfo:
-        """Replace the events of all environments; a new episode must begin afterwards."""
         spec, added = message.spec, {}
         if message.push is not None:
             added["push at mid-episode"] = Event("interval", push, enabled=True, **message.push)
@@ -134,13 +133,12 @@ class Worker:
             except FailedInEpisode as failure:
                 if not message.may_fail:
                     raise
-                # The episode did not fail before, so its state differs now: the environment begins its next episode.
+                # It did not fail the first time, so its state differs now: the environment begins its next episode.
                 left.append(env)
                 write_stderr(f"{failure} when it was replayed")
         return left
 
     def _begin(self, episode: RunningEpisode, seed: int) -> None:
-        """Begin an episode and write its first observation."""
         self._arrays.inside[episode.index] = seed, 0, -1
         self._writer.write(self._arrays.observation, episode.index, episode.start(seed))
 

@@ -38,8 +38,8 @@ class Workers:
 
     Building starts at once and the first use waits for it, so that a caller can do its own slow imports in the
     meantime. An error in an environment raises `TaskError` with the episode's seed and step, and so does a worker that
-    dies or does not answer within `timeout_s`. After an error the workers are closed. Lines printed by environments go
-    to `on_output`, from a thread, or else to stderr.
+    dies or does not answer within `timeout_s`. After an error the workers are closed. Lines printed by environments are
+    passed to `on_output`, in a thread, or else written to stderr.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ class Workers:
         hangs, or does not return n finite numbers.
         """
         self._wait_until_built()
-        # Contiguous rows, so that sums in the environment round as in its own process.
+        # Contiguous rows: sums over other layouts may be rounded differently.
         goals = np.ascontiguousarray(achieved), np.ascontiguousarray(desired)
         self._send(0, messages.ComputeRewards(*goals))
         rewards = self._wait("in compute_reward")[0].rewards
