@@ -19,16 +19,12 @@ Vector = tuple[float, float, float]
 
 
 class MassState(NamedTuple):
-    """Pose and velocity of a link's centre of mass, world frame. Plain floats: faster than arrays for single values."""
+    """Pose and velocity of a link's centre of mass, world frame. Plain floats are faster here than arrays."""
 
-    position: Vector
-    """[m]"""
-    orientation: tuple[float, float, float, float]
-    """Quaternion (x, y, z, w) of the inertial frame."""
-    velocity: Vector
-    """[m/s]"""
-    angular_velocity: Vector
-    """[rad/s]"""
+    position: Vector  # [m]
+    orientation: tuple[float, float, float, float]  # quaternion (x, y, z, w) of the inertial frame
+    velocity: Vector  # [m/s]
+    angular_velocity: Vector  # [rad/s]
 
     @property
     def roll_pitch_yaw(self) -> Vector:
@@ -39,12 +35,9 @@ class MassState(NamedTuple):
 class Contacts(NamedTuple):
     """Points where a body touches another: one element per point."""
 
-    links: list[str]
-    """The body's own link, or its base."""
-    forces: Array
-    """Normal forces [N], shape (points,), 0 or more."""
-    distances: Array
-    """Distances [m], shape (points,), negative where the bodies overlap: `rewards.penetration` takes them."""
+    links: list[str]  # the body's own link, or its base
+    forces: Array  # normal forces [N], shape (points,), 0 or more
+    distances: Array  # [m], shape (points,), negative where the bodies overlap, as in `rewards.penetration`
 
 
 class Body(Properties):
@@ -112,7 +105,7 @@ class Body(Properties):
     def joint_torques(self) -> Array:
         """Torques [N m] or forces [N] that the motors gave in the last physics step, shape (joints,).
 
-        Those of `drive_to` and `drive_at` within their force limits, and those set by `set_torques`.
+        They include those of `drive_to` and `drive_at`, limited by their maximum force, and those of `set_torques`.
         """
         torques: Array | None = self._cache.get("torques")
         if torques is None:
@@ -131,8 +124,8 @@ class Body(Properties):
     def joint_reaction(self, joint: str) -> Array:
         """Return the force [N] and torque [N m] that a joint carried in the last physics step, shape (6,).
 
-        It acts on the link that the joint moves, in the axes of that link's inertial frame and about its centre of
-        mass, without the torque of the joint's own motor. If a load hangs from the joint, the force points up.
+        Both act on the link that the joint moves, in the axes of that link's inertial frame; the torque is about its
+        centre of mass, without that of the joint's own motor. If a load hangs from the joint, the force points up.
         """
         if joint not in self._force_sensors:
             raise TaskError(f"joint {joint!r} has no force sensor: call add_force_sensor({joint!r}) in build")
@@ -148,8 +141,8 @@ class Body(Properties):
     ) -> Array:
         """Return joint positions [rad or m], shape (joints,), that bring a link's frame to a world pose.
 
-        `position` [m]; `orientation` is a quaternion (x, y, z, w), by default any. The search starts at the present
-        joint positions and stops within 0.1 mm or after 100 iterations, even if the pose is out of reach.
+        `position` [m]; `orientation` is a quaternion (x, y, z, w), by default any will do. The search starts at the
+        current joint positions and stops within 0.1 mm or after 100 iterations, even if the pose is out of reach.
         """
         pose = [position] if orientation is None else [position, orientation]
         solution = pybullet.calculateInverseKinematics(
@@ -182,8 +175,9 @@ class Body(Properties):
     def mass_state(self, link: str) -> MassState:
         """Return where the centre of mass of a link, or of the base, is and how it moves.
 
-        A link's position and orientation are those at the beginning of the last physics step (substep), as PyBullet
-        gives them without `computeForwardKinematics`; velocities, and all of the base, are those at its end.
+        The position and orientation of a link are from the beginning of the last physics step (substep), because
+        PyBullet computes them without `computeForwardKinematics`. Its velocities, and all values of the base, are from
+        the end of that step.
         """
         state = self._cache.get(("mass", link))
         if state is None:
@@ -225,7 +219,7 @@ class Body(Properties):
     def distance_to(self, other: Body, link: str | None = None) -> float:
         """Return the shortest distance [m] between the collision shapes of two bodies, negative where they overlap.
 
-        With `link`, of that link of this body.
+        If `link` is given, only that link of this body is measured.
         """
         index = {} if link is None else {"linkIndexA": self._part_index(link)}
         points = pybullet.getClosestPoints(self.id, other.id, 100.0, **index, physicsClientId=self.client)
@@ -260,7 +254,7 @@ class Body(Properties):
         self._cache.clear()
 
     def add_velocity(self, velocity: Sequence[float]) -> None:
-        """Add to the velocity of the base [m/s], world frame; its joints move along."""
+        """Add to the velocity of the base [m/s], world frame; all links move with it."""
         linear, angular = pybullet.getBaseVelocity(self.id, physicsClientId=self.client)
         pybullet.resetBaseVelocity(self.id, np.add(linear, velocity).tolist(), angular, physicsClientId=self.client)
         self._cache.clear()

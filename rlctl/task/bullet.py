@@ -20,7 +20,7 @@ _INSTALL = (
 
 
 class _LazyModule:
-    """Imports its module on first use; from then on it shares the module's namespace, so that calls cost the same."""
+    """Imports its module on first use, and then shares its namespace: later calls take no extra time."""
 
     __slots__ = ("__dict__", "_name")
 

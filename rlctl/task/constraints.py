@@ -16,12 +16,12 @@ _APART = 0.01  # [m]; frames farther apart would jump together and make the worl
 
 @dataclasses.dataclass(frozen=True)
 class Attachment:
-    """A frame on a link: where a constraint holds it."""
+    """A frame on a link, at which a constraint acts."""
 
     body: Body
     link: str
     position: Point = (0.0, 0.0, 0.0)
-    """[m], in the link's frame, of a base in its inertial frame."""
+    """[m], in the link's frame; for a base, in its inertial frame."""
     orientation: Point = (0.0, 0.0, 0.0, 1.0)
     """Quaternion (x, y, z, w), in the same frame."""
 
@@ -72,9 +72,9 @@ class Joined:
 class Constraints:
     """The part of `Sim` that connects links. Call it in `build`: constraints last as long as the world.
 
-    `max_force` [N], of gears [N m], is the largest force of a constraint; a stronger load pulls the frames apart.
-    A constraint yields slightly: a free body of any mass hangs 1.2 mm too low with physics steps of 1/240 s; the error
-    falls with the square of the step.
+    `max_force` is the largest force of a constraint [N], for gears the largest torque [N m]; a stronger load pulls the
+    frames apart. A constraint is not exact: with physics steps of 1/240 s a free body of any mass hangs 1.2 mm too low.
+    The error is proportional to the square of the step.
     """
 
     client: int
@@ -84,12 +84,8 @@ class Constraints:
     ) -> None:
         """Gear two joints of a body: the position of `driven` is `ratio` times that of `driver`.
 
-        `stiffness` is the part of an error that a physics step removes, in (0, 1].
+        `stiffness` is the fraction of the position error that one physics step removes, in (0, 1].
         """
-        if ratio == 0:
-            raise TaskError(
-                f"gear of {driver!r} and {driven!r}: the ratio must not be 0; to fix a joint, change the model"
-            )
         _ = body.find_joints([driver, driven])  # raises for one that does not move
         indices = [body.all_joint_names.index(joint) for joint in (driven, driver)]
         links, axis = (body.id, indices[0], body.id, indices[1]), (0, 0, 1)
@@ -100,17 +96,14 @@ class Constraints:
         self._change_constraint(constraint, max_force, gearRatio=-ratio, erp=stiffness)
 
     def connect_point(self, first: Attachment, second: Attachment, *, max_force: float = 1e4) -> Joined:
-        """Hold a point of a link on a point of another, free to rotate: closes a loop, which a URDF cannot contain."""
+        """Join a point of a link to a point of another; both links can rotate. A URDF cannot describe such a loop."""
         return self._connect(pybullet.JOINT_POINT2POINT, first, second, max_force)
 
     def connect_fixed(self, first: Attachment, second: Attachment, *, max_force: float = 1e4) -> Joined:
-        """Hold a frame of a link on a frame of another: both move as one."""
+        """Join a frame of a link to a frame of another: both links move as one."""
         return self._connect(pybullet.JOINT_FIXED, first, second, max_force)
 
     def _connect(self, kind: int, first: Attachment, second: Attachment, max_force: float) -> Joined:
-        for end in (first, second):
-            if end.body.client != self.client:
-                raise TaskError(f"constraint: body {end.body.name!r} belongs to another world; load it in this build")
         joined = Joined(first, second)
         if joined.gap > _APART:
             raise TaskError(

@@ -25,7 +25,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     """Steps a `Task`: act, physics, terminated, rewards, interval events, observe.
 
     `info` holds `reward_terms` (weighted; they add up to the reward), `metrics` (every raw term), `is_success`
-    where the task defines it, and `events` (what was drawn) on the steps that had any.
+    where the task defines it, and, in steps with events, `events` (the drawn values).
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         check_definition(task)
         self.task = task
         self.name = type(task).__name__
-        # Of the instance: gymnasium.Env shares one dict between all environments.
+        # gymnasium.Env has one dict for all environments.
         self.metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / task.control_dt)}
         if render_mode not in (None, "human", "rgb_array"):
             raise RecipeError(f"render_mode {render_mode!r} is not one of: human, rgb_array")
@@ -87,13 +87,13 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.observation_sizes, self.observation_space = self._format.sizes, self._format.space
 
     def set_level(self, level: float) -> None:
-        """Set how far ranges written `{from: ..., to: ...}` have widened, in [0, 1], from the next reset on."""
+        """Set the level of ranges written `{from: ..., to: ...}`, from 0 (`from`) to 1 (`to`), for the next resets."""
         if not 0.0 <= level <= 1.0:
             raise RecipeError(f"level: {level!r} is not in [0, 1]")
         self.level = float(level)
 
     def set_events(self, events: EventSettings, added: Mapping[str, Event] | None = None) -> None:
-        """Replace the events that act by those of `events` and the `added` ones; call `reset` afterwards.
+        """Let only the events of `events` and the `added` ones act; call `reset` afterwards.
 
         The world is not built again. Raises `RecipeError` for invalid events.
         """
@@ -222,13 +222,13 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         return self._format.assemble(self._signals.observe(self.task.observe()), self._step)
 
     def move_markers(self) -> None:
-        """Move the markers in the world of an environment that renders to the task's present positions."""
+        """Move the drawn markers to their current positions in the task."""
         positions = self.task.markers()
         for name, marker in self._markers.items():
             self.sim.move_marker(marker, positions[name])
 
     def render(self) -> Any:
-        """Return an RGB image of shape (240, 320, 3) in `rgb_array` mode; the window shows itself in `human`."""
+        """Return an RGB image of shape (240, 320, 3) in `rgb_array` mode; None in `human` mode, which has a window."""
         if self.render_mode != "rgb_array":
             return None
         self.move_markers()
@@ -245,7 +245,7 @@ def _make_world(task: Task, sim: str, render_mode: str | None) -> Sim:
         iterations, gui = task.solver_iterations, render_mode == "human"
         return Sim(control_dt=task.control_dt, substeps=task.substeps, solver_iterations=iterations, gui=gui)
     if render_mode is not None:
-        raise UsageError("--sim mujoco has no pictures and no window; a recording shows the episode in 3-D")
+        raise UsageError("--sim mujoco draws no pictures and no window; record the episode to see it in 3-D")
     world: Any = MujocoSim(control_dt=task.control_dt, substeps=task.substeps, solref=solref)
     return world  # type: ignore[no-any-return]  # has the methods of Sim; UsageError for those without an equivalent
 

@@ -66,7 +66,7 @@ def _judge_inertia(body: Body, index: int, inertial: ElementTree.Element) -> str
     if mass == 0 or element is None:
         return ""
     ixx, iyy, izz, ixy, ixz, iyz = (float(element.get(name, 0)) for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
-    moments = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])  # rising
+    moments = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])  # in ascending order
     written = ", ".join(f"{moment:.3g}" for moment in moments)
     if moments[0] <= 0:
         return f"principal moments {written} kg m^2 are not all above 0, as those of a link of {mass:g} kg are."

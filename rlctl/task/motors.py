@@ -20,18 +20,18 @@ _NUMBER = (int, float, np.number)
 class Joints:
     """Joints in the order of the action's elements; every other field has one element per joint, or is empty.
 
-    Positions are in [rad], of sliding joints in [m]; torques in [N m], forces in [N].
+    Units: [rad] and [N m] for rotating joints, [m] and [N] for sliding joints.
     """
 
     names: Sequence[str]
     default_positions: Sequence[float] = ()
-    """Where the robot starts and, with `action_scale`, where action 0 sends it."""
+    """Start positions; with `action_scale` also the target of action 0."""
     action_scale: Sequence[float] = ()
-    """Only if an action sends the joints to `default_positions + action_scale * action`."""
+    """Only if the target of an action is `default_positions + action_scale * action`."""
     stiffness: Sequence[float] = ()
-    """Of the position controller that follows the action [N m/rad]."""
+    """Stiffness of the position controller that follows the action [N m/rad]."""
     damping: Sequence[float] = ()
-    """Of that controller [N m s/rad]."""
+    """Damping of the same controller [N m s/rad]."""
     low: Sequence[float] = ()
     """Lower position limits."""
     high: Sequence[float] = ()
@@ -44,8 +44,8 @@ class Joints:
             values = [float(value) for value in getattr(self, field.name)]
             if values and (len(values) != len(self.names) or not all(map(math.isfinite, values))):
                 raise TaskError(
-                    f"joints: {field.name} has {len(values)} values, or one that is not finite, for "
-                    f"{len(self.names)} joints; leave out unknown values"
+                    f"joints: {field.name} must have {len(self.names)} finite values, one per joint, but is "
+                    f"{list(values)}; leave it out if a value is unknown"
                 )
             object.__setattr__(self, field.name, tuple(values))
         object.__setattr__(self, "names", tuple(self.names))
@@ -63,8 +63,8 @@ class Motors:
     """The part of `Body` that drives its joints.
 
     `joints` are names, by default all in `joint_names` order. Arrays have one element per named joint; a limit may
-    also be one number for all. Forces are in [N m], of sliding joints in [N]; speeds in [rad/s], of sliding joints in
-    [m/s]. `_command` and `_limit_speeds` are PyBullet's; `MujocoBody` has its own.
+    also be one number for all. Units: [N m] and [rad/s] for rotating joints, [N] and [m/s] for sliding joints.
+    `MujocoBody` overrides `_command` and `_limit_speeds`, which call PyBullet.
     """
 
     client: int
@@ -113,7 +113,7 @@ class Motors:
     ) -> None:
         """Set position targets [rad or m]; the default limits of speed and force are those of the model file.
 
-        `gain` is the part of the position error that a physics step removes, in (0, 1].
+        `gain` is the fraction of the position error that one physics step removes, in (0, 1].
         """
         # Tuples, because two arrays cannot be compared by `!=`.
         speeds, forces = (
@@ -162,7 +162,7 @@ class Motors:
     ) -> None:
         """Set velocity targets [rad/s or m/s]; the default limit of the force is that of the model file.
 
-        A velocity of 0 is a brake of that force.
+        A target of 0 brakes the joint with at most that force.
         """
         chosen = self.find_joints(joints)
         targets = self._read_values("velocities", velocities, len(chosen))
@@ -208,8 +208,8 @@ class Motors:
     def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
         """Apply `torques` [N m or N] to the joints in all substeps of the next step.
 
-        For joints whose motors are disabled: see `disable_motors`. Raises `TaskError` for a joint that its default
-        motor holds in place.
+        Disable the motors of these joints first, with `disable_motors`. Raises `TaskError` for a joint whose default
+        motor still holds it in place.
         """
         chosen = self.find_joints(joints)
         given = self._apply_strength(self._read_values("torques", torques, len(chosen)), chosen)
@@ -235,13 +235,11 @@ class Motors:
         self.motor_strength = strength
 
     def cap_joint_speed(self, speed: float) -> None:
-        """Limit the speed of all joints to `speed` [rad/s or m/s], whatever pushes them.
+        """Limit the speed of all joints to `speed` [rad/s or m/s], even under external forces.
 
         PyBullet has one such limit per body, which also applies to the base of a free body. `Sim.load` sets it for a
         fixed body to the highest speed limit of the joints in the URDF.
         """
-        if speed <= 0:
-            raise TaskError(f"cap_joint_speed: {speed:g} is not above 0")
         pybullet.changeDynamics(self.id, -1, maxJointVelocity=speed, physicsClientId=self.client)
 
     def describe_joints(
@@ -253,7 +251,10 @@ class Motors:
         """
         chosen = self.find_joints(joints)
         low, high = self.joint_low[chosen], self.joint_high[chosen]
-        speed, torque = self.joint_max_speed[chosen], self.joint_max_force[chosen]
+        speed, torque = (
+            limits.tolist() if (limits > 0).all() and np.isfinite(limits).all() else ()
+            for limits in (self.joint_max_speed[chosen], self.joint_max_force[chosen])
+        )
         bounded = bool((low < high).all() and np.isfinite([low, high]).all())
         return Joints(
             names=[self.joint_names[joint] for joint in chosen],
@@ -261,10 +262,6 @@ class Motors:
             action_scale=action_scale,
             low=low.tolist() if bounded else (),
             high=high.tolist() if bounded else (),
-            max_speed=speed.tolist() if _are_limits(speed) else (),
-            max_torque=torque.tolist() if _are_limits(torque) else (),
+            max_speed=speed,
+            max_torque=torque,
         )
-
-
-def _are_limits(values: Array) -> bool:
-    return bool((values > 0).all() and np.isfinite(values).all())

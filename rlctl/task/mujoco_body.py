@@ -39,7 +39,7 @@ class MujocoBody(Motors):
         self.base_name: str = child.worldbody.first_body().name
         self.terrain = None
         self.geom_links: list[str] = [geom.parent.name for geom in child.geoms]
-        """By geom."""
+        """Name of the link of each geom."""
         self.moving: set[str] = set()
         """Links that are not fixed to the world."""
         for link in child.bodies[1:]:  # a parent comes before its children
@@ -52,7 +52,7 @@ class MujocoBody(Motors):
         self.friction = {
             link: _read(part, "contact/lateral_friction", default=_FRICTION) for link, part in links.items()
         }
-        """By link."""
+        """Lateral friction by link."""
         self.spin = {link: _read(part, "contact/spinning_friction") for link, part in links.items()}
         """Spinning friction by link [m]."""
         speeds = [_read(self._joints[joint.name], "limit", "velocity") for joint in child.joints]

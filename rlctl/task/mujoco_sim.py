@@ -1,6 +1,6 @@
 """The world of a task in MuJoCo instead of PyBullet, with the same methods: to test if a policy depends on the engine.
 
-Models are the same URDF files. Motors work as in PyBullet: a row of the solver demands a velocity with a bounded force.
+Models are the same URDF files. Motors work as in PyBullet: the solver drives joints to a velocity with limited force.
 Contacts differ: they are soft, with the time constant `solref` [s] of at least two physics steps. Methods without an
 equivalent in MuJoCo are not defined here or in `MujocoBody`; using one raises `UsageError`.
 """
@@ -144,7 +144,7 @@ class MujocoSim:
         return name
 
     def add_force_sensor(self, joint: str, link: str) -> None:
-        """Measure force and torque of a joint at the centre of mass of its `link`; both names with that of the body."""
+        """Measure force and torque of a joint at the centre of mass of `link`; both names are "BODY/NAME"."""
         part, kinds = self._spec.body(link), self.mujoco.mjtSensor
         part.add_site(name=joint, pos=part.ipos)
         for name, kind in ((joint, kinds.mjSENS_FORCE), (f"{joint} torque", kinds.mjSENS_TORQUE)):

@@ -19,9 +19,9 @@ class _Dynamics(NamedTuple):
 
 
 class Properties(Motors):
-    """The part of `Body` that events change: relative to the values of the built world, which a reset restores.
+    """The part of `Body` whose values events change; a reset restores the values of the built world.
 
-    `links` and `joints` are names, `base_name` included; by default all of them.
+    `links` are names, which may include `base_name`, and `joints` are names; by default all are changed.
     """
 
     base_name: str
@@ -65,7 +65,7 @@ class Properties(Motors):
 
     @cached_property
     def _damping(self) -> list[float]:
-        pybullet.syncBodyInfo(physicsClientId=self.client)  # getJointInfo returns what was loaded, until then
+        pybullet.syncBodyInfo(physicsClientId=self.client)  # without it getJointInfo returns the values of the file
         return [pybullet.getJointInfo(self.id, i, physicsClientId=self.client)[6] for i in self.joint_indices]
 
     @cached_property
@@ -101,7 +101,7 @@ class Properties(Motors):
         return sum(dynamics.mass for dynamics in self._dynamics.values())
 
     def find_trunk(self) -> str | None:
-        """Return the link that travels: a free base, or one carried by a sliding joint longer than 100 m, else None."""
+        """Return the link that moves through the world: a free base, or a link on a sliding joint longer than 100 m."""
         if not self.fixed:
             return self.base_name
         if not self._links:
@@ -132,8 +132,8 @@ class Properties(Motors):
     def set_contact_stiffness(self, stiffness: float, links: Sequence[str] = ()) -> None:
         """Set the stiffness of a contact point of the links [N/m], until the next reset.
 
-        Contacts are rigid by default. After the first call they are springs, if very stiff ones: PyBullet cannot
-        return to rigid contacts.
+        Contacts are rigid by default. After the first call they stay springs, very stiff ones after a reset, because
+        PyBullet cannot make them rigid again.
         """
         self._changed.add("_contacts")
         engine = pybullet.getPhysicsEngineParameters(physicsClientId=self.client)
@@ -145,7 +145,7 @@ class Properties(Motors):
     def scale_joint_damping(self, factor: float, joints: Sequence[str] = ()) -> None:
         """Set the joints' damping to `factor` times the built world's values, until the next reset.
 
-        Raises `TaskError` if all of these are 0, which no factor changes.
+        Raises `TaskError` if all of these are 0, because no factor can change that.
         """
         nominal, chosen = self._damping, self.find_joints(joints)
         if not any(nominal[index] for index in chosen):

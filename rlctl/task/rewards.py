@@ -57,7 +57,7 @@ def forward_while_alive(velocity: Array, heading: Array, alive: bool) -> float:
 
 
 def alive(terminated: bool) -> float:
-    """Return 1 in every step that does not end the episode, else 0."""
+    """Return 0 in a step that terminates the episode, else 1."""
     return 0.0 if terminated else 1.0
 
 
@@ -75,7 +75,7 @@ def posture(orientation: Array) -> float:
 
 
 def fallen(height: float, lowest: float) -> float:
-    """Return 1 where a height is below the lowest that counts as standing, both [m], else 0."""
+    """Return 1 if `height` is below `lowest`, the smallest height of a standing robot, both [m], else 0."""
     return float(height < lowest)
 
 
@@ -85,7 +85,7 @@ def speed(velocity: Array) -> float:
 
 
 def grasp(distance: float, scale: float, held: bool) -> float:
-    """Return half for nearness to the object (`closeness`), and half for holding it: in [0, 1]."""
+    """Return 0.5 `closeness` to the object, plus 0.5 while it is held: in [0, 1]."""
     return 0.5 * closeness(distance, scale) + (0.5 if held else 0.0)
 
 

@@ -39,7 +39,7 @@ def _check_joint_names(path: Path) -> None:
 class Sim(Constraints):
     """A PyBullet world of its own.
 
-    `control_dt` [s] is simulated by one call with `substeps` physics steps: forces then act on every one of them.
+    One call of PyBullet simulates `control_dt` [s] in `substeps` physics steps, so that a force acts in all of them.
     """
 
     def __init__(self, *, control_dt: float, substeps: int, solver_iterations: int = 50, gui: bool = False) -> None:
@@ -72,7 +72,7 @@ class Sim(Constraints):
         pybullet.setGravity(0.0, 0.0, -gravity, physicsClientId=self.client)
 
     def set_contact_erp(self, erp: float) -> None:
-        """Set the part of a contact's depth that a physics step removes, in (0, 1]: Bullet's error reduction parameter.
+        """Set the fraction of a contact's depth that one physics step removes, in (0, 1]: Bullet's contact ERP.
 
         The default is 0.2. Call it in `build`: resets keep the value.
         """
@@ -154,12 +154,12 @@ class Sim(Constraints):
 
     @property
     def deepest_contact(self) -> float:
-        """How far two bodies overlap at most [m], at the end of the last step; 0 where none do."""
+        """The largest overlap of two bodies [m] at the end of the last step; 0 if none overlap."""
         points = pybullet.getContactPoints(physicsClientId=self.client)
         return max((-float(point[8]) for point in points if point[8] < 0.0), default=0.0)
 
     def save(self) -> None:
-        """Save the present world for `restore`."""
+        """Save the current world for `restore`."""
         self._saved = pybullet.saveState(physicsClientId=self.client)
         self._built_gravity = None
         for body in self.bodies.values():
@@ -189,7 +189,7 @@ class Sim(Constraints):
     def push(self, body: str, force: Sequence[float], duration_s: float, link: str | None = None) -> None:
         """Push a link, or the base, at its centre of mass with `force` [N, world frame] for `duration_s` [s].
 
-        The push acts in whole control steps, at least one, from the next one on; a reset ends it.
+        The duration is rounded to control steps, at least one. The push begins with the next step; a reset ends it.
         """
         pushed = self.body(body)
         index = -1 if link is None else pushed._part_index(link)

@@ -65,14 +65,14 @@ class Task:
         raise NotImplementedError
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Start an episode in the restored world; all chance comes from `rng`."""
+        """Start an episode in the restored world; take all random numbers from `rng`."""
 
     def act(self, action: NDArray[Any]) -> None:
         """Set motor targets from an action that is inside `action_space`."""
         raise NotImplementedError
 
     def observe(self) -> dict[str, NDArray[np.float64]]:
-        """Return what the policy sees, by name; the order is the order in the observation."""
+        """Return what the policy sees, by name; the observation has the same order."""
         raise NotImplementedError
 
     def rewards(self, action: NDArray[Any]) -> dict[str, float]:
@@ -80,15 +80,15 @@ class Task:
         raise NotImplementedError
 
     def is_success(self) -> bool | None:
-        """Say whether the goal holds now; an episode succeeds if it does at its end. Optional."""
+        """Return whether the goal is reached now; an episode succeeds if it is reached at its end. Optional."""
         return None
 
     def is_terminated(self) -> bool:
-        """Say whether the episode is over for a reason of its own (a fall); never for time. Optional."""
+        """Return whether the episode ends, for example after a fall; the time limit is not part of it. Optional."""
         return False
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> NDArray[Any]:
-        """Return the rewards of steps for other desired goals: both of shape (n, size) -> (n,). Optional.
+        """Return the rewards, shape (n,), of steps for other desired goals; goals have shape (n, size). Optional.
 
         Hindsight replay (`her` in a recipe) needs it. Observe `observation`, `achieved_goal` and `desired_goal` in
         the layout "dict". The result is the weighted sum of `rewards`, computed from the goals only: `info` is empty.
@@ -101,7 +101,7 @@ class Task:
         return {}
 
     def describe_joints(self) -> Joints | None:
-        """Return the joints that the action moves, in its order, for controllers of the real robot. Optional.
+        """Return the joints that the action moves, in the action's order, for controllers of the real robot. Optional.
 
         Called once, after `build`. Leave out unknown values; `Body.describe_joints` reads the limits.
         """

@@ -14,8 +14,8 @@ def rough_heights(
     """Return heights [m] of shape (along x, along y): uniform in [0, roughness] at points `cell` [m] apart.
 
     The ground covers `size` [m], centred at 0, 0. Within `flat_radius` [m] of the centre, where a robot starts, its
-    height is 0; it reaches full roughness at twice that radius. Equal seeds give equal ground. Raises `TaskError` for
-    a negative roughness, and for a size of less than two cells.
+    height is 0; from there the roughness rises to its full value at twice that radius. Equal seeds give equal ground.
+    Raises `TaskError` for a negative roughness, and for a size of less than two cells.
     """
     if roughness < 0:
         raise TaskError(f"terrain: roughness {roughness:g} m is negative")

@@ -36,8 +36,6 @@ def test_mistakes_in_a_gear(sim, tmp_path):
     wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
     with pytest.raises(TaskError, match=r"^model.urdf has no joint 'letf_joint'. Did you mean 'left_joint'\?"):
         sim.connect_gear(wheels, "letf_joint", "right_joint", ratio=1.0)
-    with pytest.raises(TaskError, match=r"^gear of 'left_joint' and 'right_joint': the ratio must not be 0"):
-        sim.connect_gear(wheels, "left_joint", "right_joint", ratio=0.0)
 
 
 def hang(sim, tmp_path, connect, **limits):
@@ -96,10 +94,6 @@ def test_a_link_or_a_world_that_is_not_there(sim, tmp_path):
         sim.connect_point(Attachment(arm, "tipp"), Attachment(arm, "base"))
     with pytest.raises(TaskError, match=r"^no body 'cube'\. Loaded: arm\.$"):
         sim.connect_point(Attachment(arm, "tip"), Attachment(sim.body("cube"), "baseLink"))
-    other = Sim(control_dt=1 / 60, substeps=4)
-    with pytest.raises(TaskError, match=r"^constraint: body 'arm' belongs to another world; load it in this build$"):
-        other.connect_point(Attachment(arm, "tip"), Attachment(arm, "arm"))
-    other.close()
 
 
 def test_constraints_after_a_restore(sim, tmp_path):

@@ -97,12 +97,6 @@ def test_the_speed_limits_of_the_file(sim, tmp_path):
     assert np.abs(wheels.joint_velocities) == pytest.approx([5, 5])  # and of whatever pushes
 
 
-def test_a_cap_of_nothing(sim, tmp_path):
-    wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
-    with pytest.raises(TaskError, match=r"^cap_joint_speed: 0 is not above 0$"):
-        wheels.cap_joint_speed(0)
-
-
 def test_no_damping_to_scale(sim, tmp_path):
     wheels = sim.load("wheels", models.two_wheels(tmp_path), fixed=True)
     with pytest.raises(TaskError, match=r"^model.urdf: these joints have no damping to scale; use set_joint_damping$"):

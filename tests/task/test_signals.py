@@ -215,8 +215,7 @@ def test_everything_comes_from_the_seed(make):
         (
             Clock,
             {"noisy_angle": {"of": "angel"}},
-            "events.noisy_angle: nothing observed is called 'angel'. Did you mean 'angle'? "
-            "There is: time, angle, start.",
+            "events.noisy_angle: no observation 'angel'. Did you mean 'angle'? There is: time, angle, start.",
         ),
         (Clock, {"noisy_angle": {"std": -0.1}}, "events.noisy_angle.std: -0.1 is not at least 0."),
         (Clock, {"late_action": {"steps": 1.5}}, "events.late_action.steps: 1.5 is not a whole number."),

@@ -83,7 +83,7 @@ class Signals:
                 )
         pictures = {name: (0, 255) for name, value in first.items() if np.asarray(value).dtype == np.uint8}
         self._bounds = {**pictures, **bounds}
-        self._observation_signals: list[tuple[list[str], Signal]] | None = []
+        self._observation_signals: dict[str, Signal] = {}  # by event
         self._action_signals: list[Signal] = []
         self.drawn: dict[str, Drawn] = {}
         """Values drawn for this episode, by event."""
@@ -92,7 +92,7 @@ class Signals:
         """Start an episode; each event uses its own random stream."""
         self.drawn = {}
         self._streams, self._level = streams, level
-        self._observation_signals = None  # begins with the first observation
+        self._observation_signals = {}  # they begin with the first observation
         self._action_signals = [self._start(event, self._zero_action()) for event in self._on_action]
 
     def try_once(self) -> None:
@@ -110,34 +110,22 @@ class Signals:
             raise TaskError(
                 f"events.{event.name}: its function must return the drawn values and a signal, not {result!r}"
             )
-        drawn, signal = result
-        _check_drawn(event.name, drawn)
-        self.drawn[event.name] = drawn
+        self.drawn[event.name], signal = result
+        _check_drawn(event.name, self.drawn[event.name])
         return signal  # type: ignore[no-any-return]
 
     def observe(self, parts: Parts) -> Parts:
         """Return an observation with noise and delay, as the policy sees it."""
-        if self._observation_signals is None:
-            return self._observe_first(parts)
-        for names, signal in self._observation_signals:
-            parts = self._apply(signal, names, parts)
-        return parts
-
-    def _observe_first(self, parts: Parts) -> Parts:
-        self._observation_signals = []
         for event in self._on_observation:
-            names = self._of[event.name]
-            signal = self._start(event, {name: parts[name] for name in names})
-            self._observation_signals.append((names, signal))
-            parts = self._apply(signal, names, parts)
+            observed = {name: parts[name] for name in self._of[event.name]}
+            if event.name not in self._observation_signals:
+                self._observation_signals[event.name] = self._start(event, observed)
+            changed = dict(self._observation_signals[event.name](observed))
+            for name in observed:
+                if name in self._bounds:
+                    changed[name] = np.clip(changed[name], *self._bounds[name])
+            parts = {**parts, **changed}
         return parts
-
-    def _apply(self, signal: Signal, names: list[str], parts: Parts) -> Parts:
-        changed = dict(signal({name: parts[name] for name in names}))
-        for name in names:
-            if name in self._bounds:
-                changed[name] = np.clip(changed[name], *self._bounds[name])
-        return {**parts, **changed}
 
     def act(self, action: Any) -> Any:
         """Return an action with noise and delay, as the motors get it; it stays inside the action space."""
@@ -151,11 +139,9 @@ class Signals:
 
 
 def _find_observed(event: BoundEvent, first: Parts) -> list[str]:
-    of = event.event.of
-    names = [of] if isinstance(of, str) else list(of)
+    names = [event.event.of] if isinstance(event.event.of, str) else list(event.event.of)
     for name in names:
-        nothing = f"events.{event.name}: nothing observed is called"
-        check_name(name, first, nothing, event.error, listed="There is")
+        check_name(name, first, f"events.{event.name}: no observation", event.error, listed="There is")
     return names or list(first)
 
 

@@ -26,7 +26,7 @@ def scale_mass(sim: Sim, rng: Rng, *, body: str, factor: Positive, links: Sequen
 
 @acts_at("reset", "start", "interval")
 def set_friction(sim: Sim, rng: Rng, *, body: str, friction: NotNegative, links: Sequence[str] = ()) -> Drawn:
-    """Set the lateral friction of `links`, or of the whole body; a contact has the product of its two bodies'."""
+    """Set the lateral friction of `links`, or of the whole body; that of a contact is the product of both bodies'."""
     drawn = float(rng.uniform(*friction))
     sim.body(body).set_friction(drawn, links)
     return {"friction": drawn}
@@ -36,7 +36,7 @@ def set_friction(sim: Sim, rng: Rng, *, body: str, friction: NotNegative, links:
 def set_contact_stiffness(sim: Sim, rng: Rng, *, body: str, stiffness: Positive, links: Sequence[str] = ()) -> Drawn:
     """Set the stiffness of contacts with `links`, or with the whole body [N/m]; its logarithm is drawn uniformly.
 
-    It is that of a contact point: a foot that carries 50 N on one point sinks 5 mm into ground of 1e4 N/m. A policy
+    It applies to each contact point: a foot that carries 50 N on one point sinks 5 mm into ground of 1e4 N/m. A policy
     trained with soft and stiff contacts depends less on the physics engine.
     """
     drawn = float(np.exp(rng.uniform(*np.log(stiffness))))
@@ -62,7 +62,7 @@ def scale_joint_damping(sim: Sim, rng: Rng, *, body: str, factor: NotNegative, j
 
 @acts_at("reset", "start", "interval")
 def set_joint_damping(sim: Sim, rng: Rng, *, body: str, damping: NotNegative, joints: Sequence[str] = ()) -> Drawn:
-    """Set the damping of `joints`, or of all [N m s/rad or N s/m]: for models that have none to scale."""
+    """Set the damping of `joints`, or of all [N m s/rad or N s/m]: for models without damping that could be scaled."""
     drawn = float(rng.uniform(*damping))
     sim.body(body).set_joint_damping(drawn, joints)
     return {"damping": drawn}
@@ -172,16 +172,16 @@ def noise(rng: Rng, first: Parts, *, std: NotNegative) -> tuple[Drawn, Signal]:
 def delay(rng: Rng, first: Parts, *, steps: Steps) -> tuple[Drawn, Signal]:
     """Delay all values by some control steps; the number is drawn once per episode, both ends included.
 
-    Until then an observation is the episode's first, and an action is 0, or the action nearest to 0.
+    In these first steps the observation is the first of the episode, and the action is 0 or the nearest to 0.
     """
     drawn = int(rng.integers(int(steps[0]), int(steps[1]) + 1))
     past = deque([_copy_parts(first)] * drawn, maxlen=drawn + 1)
 
-    def late(parts: Parts) -> Parts:
+    def postpone(parts: Parts) -> Parts:
         past.append(_copy_parts(parts))
         return past[0]
 
-    return {"steps": float(drawn)}, late
+    return {"steps": float(drawn)}, postpone
 
 
 def _copy_parts(parts: Parts) -> Parts:

@@ -115,7 +115,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 def acts_at(*when: When, **nominal: float) -> Callable[[_Function], _Function]:
     """Mark an event function with its possible moments; an unmarked function may act at any.
 
-    `nominal` are the values of parameters for which it changes nothing.
+    `nominal` has, for some parameters, the value with which the function changes nothing.
     """
 
     def mark(function: _Function) -> _Function:
@@ -131,7 +131,7 @@ class Event:
 
     `when` is one of
     - `reset`: before the task's own reset, for properties such as a mass;
-    - `start`: after it, for a state such as joint angles or velocities;
+    - `start`: after the task's reset, for a state such as joint angles or velocities;
     - `interval`: every `every_s` seconds of an episode;
     - `observation`: on the observations, or only on the names in `of`, at every step;
     - `action`: on the action that `Task.act` gets, at every step.
@@ -174,7 +174,7 @@ class Event:
         return {name: limits for name, limits in found.items() if limits is not None}
 
     def nominal(self, parameter: str) -> float | None:
-        """Return the value of a parameter for which nothing changes; None if there is no such number."""
+        """Return the value of a parameter with which the event changes nothing; None if there is no such value."""
         return _nominal.get(self.function, {}).get(parameter)
 
     def with_parameters(self, name: str, changes: Mapping[str, Any]) -> Event:
