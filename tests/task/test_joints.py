@@ -62,5 +62,5 @@ def test_joints_are_those_of_the_action(task):
 
 @pytest.mark.parametrize("values", [[1.0], [1.0, np.inf]])
 def test_values_must_fit_the_names(values):
-    with pytest.raises(TaskError, match="leave out unknown values"):
+    with pytest.raises(TaskError, match="must have 2 finite values, one per joint"):
         Joints(["hip", "knee"], action_scale=values)
