@@ -13,7 +13,7 @@ from rlctl.exporting.policy_file import export_actor
 from rlctl.exporting.request import ExportRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.shipped import MeasuredScore, Provenance, find_shipped_policy, list_shipped
-from rlctl.recipe.sources import resolve_packaged
+from rlctl.recipe.sources import resolve_with_stages
 from rlctl.run.directory import RunDirectory
 from rlctl.run.lookup import find_policy
 
@@ -98,7 +98,7 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
     tensors = PolicyFile.read(find_shipped_policy("reach")).tensors
     PolicyFile(info, {**tensors, "policy/value_net.weight": np.zeros((1, 64), np.float32)}).write(run.best_policy)
     run.write_status({"task": "reach", "git_commit": "abc"})
-    run.write_recipe(resolve_packaged("reach"))
+    run.write_recipe(resolve_with_stages("reach"))
     target = tmp_path / "reach.safetensors"
     exported = export_actor(ExportRequest(str(run.path), checkpoint="best", policy=target, episodes=3))
     policy = PolicyFile.read(target)

@@ -40,19 +40,15 @@ def load(task: str) -> Callable[..., Any]:
     if ":" in task:
         append_to_path(os.getcwd())
         return _load_target(task, task)
-    if task.endswith(".py") and (file := Path(task).expanduser()).is_file():
-        classes = _list_classes(file)
-        forms = " or ".join(f"{task}:{name}" for name in classes) or f"{task}:CLASS; it defines no class"
-        raise UsageError(f"{task}: give the class too: {forms}")
+    for file in (Path(task).expanduser(), Path(f"{task}.py"), Path(f"{task.lower()}.py")):
+        if file.suffix == ".py" and file.is_file():
+            forms = " or ".join(f"{file}:{name}" for name in _list_classes(file)) or f"{file}:CLASS"
+            raise UsageError(f"no task {task!r} is installed; to name a class in {file}: {forms}")
     if task and Path(task).is_dir():
         raise UsageError(
             f"{task} is a folder, not a task: pip install -e {task} installs a plugin; or name a class: "
             f"{task}/FILE.py:CLASS"
         )
-    for name in (f"{task}.py", f"{task.lower()}.py"):
-        if task.isidentifier() and Path(name).is_file() and (classes := _list_classes(Path(name))):
-            own = task if task in classes else classes[0]
-            raise UsageError(f"no task {task!r} is installed; to name the class in {name}: {name}:{own}")
     names = [entry.name for entry in installed.list_installed()]
     raise UsageError(
         f"no task {task!r}.{did_you_mean(task, names)} Installed: {', '.join(dict.fromkeys(names)) or 'none'}. "
@@ -185,7 +181,9 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
             return gymnasium.make(task, disable_env_checker=True, **parameters)
         except gymnasium.error.UnregisteredEnv:
             name = task.rpartition(":")[2]
-            if _is_in_old_gym(name):
+            old = getattr(sys.modules.get("gym"), "envs", None)  # imported, so an id may be registered there
+            registry = getattr(old, "registry", {})
+            if name in getattr(registry, "env_specs", registry):
                 raise OldGymError(
                     f"{name} is registered with the old gym package; Gymnasium cannot find it there"
                 ) from None
@@ -199,9 +197,3 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
 
     constructor.gymnasium_id = task  # type: ignore[attr-defined]
     return constructor
-
-
-def _is_in_old_gym(name: str) -> bool:
-    old = getattr(sys.modules.get("gym"), "envs", None)
-    known = getattr(old, "registry", {})
-    return name in getattr(known, "env_specs", known)

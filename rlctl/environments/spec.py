@@ -244,18 +244,12 @@ def check_fields(task: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     checked = {}
     for key, value in values.items():
         check_name(key, fields, f"task.{key}: {task.__name__} has no parameter", RecipeError)
-        _check_number(key, hints[key], value)
+        is_text = hints[key] in (int, float) and isinstance(value, bool | str)
+        if is_text or (isinstance(value, float) and math.isnan(value)):  # pydantic accepts them as numbers
+            raise RecipeError(f"task.{key}: expected a number, got {short_repr(repr(value))}")
         adapter = pydantic.TypeAdapter(hints[key])
         try:
             checked[key] = adapter.validate_python(value)
         except pydantic.ValidationError as error:
             raise RecipeError(validation.explain_invalid(error, adapter, value, f"task.{key}")) from None
     return checked
-
-
-def _check_number(key: str, hint: Any, value: Any) -> None:
-    """Raise `RecipeError` for text, bools and nan, which pydantic would accept as numbers."""
-    if hint in (int, float) and isinstance(value, bool | str):
-        raise RecipeError(f"task.{key}: expected a number, got {short_repr(repr(value))}")
-    if isinstance(value, float) and math.isnan(value):
-        raise RecipeError(f"task.{key}: expected a number, got nan")

@@ -212,7 +212,7 @@ def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
     try:
         return Recipe.model_validate(values)
     except pydantic.ValidationError as error:
-        schema = build_schema(values.get("algo", "ppo"))
+        schema = build_schema(str(values.get("algo", "ppo")))
 
         def explain(problem: Any, path: validation.Place) -> str:
             origins = (source if isinstance(source, str) else source.find(path) for source in sources)
@@ -222,13 +222,9 @@ def validate(values: Mapping[str, Any], *sources: Source | str) -> Recipe:
         raise RecipeError(validation.explain_all(error, schema, explain)) from None
 
 
-def build_schema(algo: Any = None) -> validation.Schema:
-    """Return the JSON schema of a recipe, with the parameters of `algo` and its networks; do not modify it."""
-    return _build_schema(algo if isinstance(algo, str) and algo in ALGORITHMS else None)
-
-
 @functools.cache
-def _build_schema(algo: str | None) -> validation.Schema:
+def build_schema(algo: str | None = None) -> validation.Schema:
+    """Return the JSON schema of a recipe, with the parameters of `algo` and its networks; do not modify it."""
     schema = Recipe.model_json_schema()
     _add_descriptions(schema, Recipe)
     for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):

@@ -56,15 +56,10 @@ def resolve(
     return recipe
 
 
-def resolve_with_stages(task: str, config: Path | None, settings: Mapping[str, Any]) -> Recipe:
+def resolve_with_stages(task: str, config: Path | None = None, settings: Mapping[str, Any] | None = None) -> Recipe:
     """Resolve a recipe, including the stages that the task's class declares; the task is imported."""
     constructor: Any = registry.load(task)
-    return resolve(task, config, settings, constructor.stages if registry.is_task(constructor) else ())
-
-
-def resolve_packaged(task: str, settings: Mapping[str, Any] | None = None) -> Recipe:
-    """Return the packaged recipe of a task, with the stages that its class declares; the task is imported."""
-    return resolve_with_stages(task, None, settings or {})
+    return resolve(task, config, settings or {}, constructor.stages if registry.is_task(constructor) else ())
 
 
 def fill_defaults(recipe: Recipe) -> Recipe:

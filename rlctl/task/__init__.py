@@ -13,5 +13,5 @@ from rlctl.task.constraints import Attachment as Attachment
 from rlctl.task.events import Event as Event
 from rlctl.task.motors import Joints as Joints
 from rlctl.task.sim import Sim as Sim
+from rlctl.task.sim import rough_heights as rough_heights
 from rlctl.task.task import Task as Task
-from rlctl.task.terrain import rough_heights as rough_heights

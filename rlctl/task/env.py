@@ -88,8 +88,6 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 
     def set_level(self, level: float) -> None:
         """Set the level of ranges written `{from: ..., to: ...}`, from 0 (`from`) to 1 (`to`), for the next resets."""
-        if not 0.0 <= level <= 1.0:
-            raise RecipeError(f"level: {level!r} is not in [0, 1]")
         self.level = float(level)
 
     def set_events(self, events: EventSettings, added: Mapping[str, Event] | None = None) -> None:
@@ -183,7 +181,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             bad = next((name for name, term in terms.items() if not math.isfinite(term)), "sum")
             raise TaskError(f"{self.name}: reward term {bad!r} is {terms.get(bad, reward)} at step {self._step}")
         info: dict[str, Any] = {"reward_terms": terms, "metrics": {name: raw[name] for name in weights}}
-        if self._acting.has_intervals:
+        if self._acting.periods:
             drawn = self._acting.run_due(self._step, self.sim, self._streams, self._episode_level)
             info.update({"events": drawn} if drawn else {})
         if self.has_success:

@@ -38,7 +38,8 @@ def _find_faults(body: Body, root: ElementTree.Element) -> Iterator[tuple[str, s
         if inertial is not None and (fault := _find_bad_number(inertial, body.inertia_from_file)):
             yield name, fault
             continue
-        if not _is_heavy(body, index):
+        # Frames of a gram with a rounded-up inertia are common and harmless: they keep the solver stable.
+        if body._dynamics[index].mass <= 0.01 * body.total_mass():
             continue
         if inertial is None or inertial.find("mass") is None:
             yield name, "no <inertial>, so PyBullet gives it a mass of 1 kg. Write its mass and inertia."
@@ -53,11 +54,6 @@ def _find_bad_number(inertial: ElementTree.Element, inertia_used: bool) -> str:
             if not re.fullmatch(_NUMBER, value.strip()):
                 return f"{element.tag} {name}={value!r} is not a number; PyBullet reads its first digits, or 0."
     return ""
-
-
-def _is_heavy(body: Body, index: int) -> bool:
-    # Frames of a gram with a rounded-up inertia are common and harmless: they keep the solver stable.
-    return bool(body._dynamics[index].mass > 0.01 * body.total_mass())
 
 
 def _judge_inertia(body: Body, index: int, inertial: ElementTree.Element) -> str:

@@ -109,9 +109,12 @@ class Sim(Constraints):
                 raise TaskError(
                     f"{path.name} contains the pose of its body: position, orientation and fixed are for URDF"
                 )
-            body_id = self._load_scene(path, flags)
-            # A base without mass stays where it is.
-            fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0
+            load, options = (pybullet.loadMJCF, {"flags": flags}) if path.suffix == ".xml" else (pybullet.loadSDF, {})
+            ids = self._call_loader(path, load, **options)
+            if len(ids) != 1:
+                raise TaskError(f"{path} contains {len(ids)} bodies; split it into files of one body each")
+            body_id = int(ids[0])
+            fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0  # a base without mass
         else:
             body_id = self._call_loader(path, pybullet.loadURDF, position, orientation, useFixedBase=fixed, flags=flags)
         body = self.bodies[name] = Body(self.client, self._substeps, name, body_id, path, fixed)
@@ -120,13 +123,6 @@ class Sim(Constraints):
         if path.suffix == ".urdf" and fixed and speeds.size and (speeds > 0).all():
             body.cap_joint_speed(float(speeds.max()))
         return body
-
-    def _load_scene(self, path: Path, flags: int) -> int:
-        load, options = (pybullet.loadMJCF, {"flags": flags}) if path.suffix == ".xml" else (pybullet.loadSDF, {})
-        ids = self._call_loader(path, load, **options)
-        if len(ids) != 1:
-            raise TaskError(f"{path} contains {len(ids)} bodies; split it into files of one body each")
-        return int(ids[0])
 
     def _call_loader(self, path: Path, load: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         call = functools.partial(load, str(path), *args, **kwargs, physicsClientId=self.client)
@@ -216,10 +212,7 @@ class Sim(Constraints):
     def add_height_field(
         self, name: str, heights: Array, *, cell: float, color: Sequence[float] = (0.55, 0.6, 0.5)
     ) -> Body:
-        """Add rough ground: `heights` [m] of shape (along x, along y), above z = 0, `cell` [m] apart, centred at 0, 0.
-
-        `rlctl.task.terrain` makes heights from a seed.
-        """
+        """Add rough ground, centred at 0, 0: `heights` [m] above z = 0, `cell` [m] apart, as of `rough_heights`."""
         self._check_new(name)
         rows, columns = heights.shape
         shape = pybullet.createCollisionShape(
@@ -264,8 +257,8 @@ class Sim(Constraints):
     ) -> NDArray[np.uint8]:
         """Draw the world on the CPU and return an RGB image of shape (height, width, 3).
 
-        The camera is at `eye` [m] and looks at `target` [m], with a vertical `field_of_view` [degrees]. `Task.observe`
-        may call it. It takes 20-40 ms at 320x240.
+        The camera is at `eye` [m] and looks at `target` [m], with a vertical `field_of_view` [degrees]. It takes 20 to
+        40 ms at 320x240.
         """
         view = pybullet.computeViewMatrix(eye, target, up)
         projection = pybullet.computeProjectionMatrixFOV(field_of_view, width / height, 0.05, 10.0)
@@ -280,3 +273,25 @@ class Sim(Constraints):
         if self.client >= 0 and pybullet.isConnected(physicsClientId=self.client):
             pybullet.disconnect(physicsClientId=self.client)
         self.client = -1
+
+
+def rough_heights(
+    seed: int, *, size: tuple[float, float], cell: float, roughness: float, flat_radius: float = 0.0
+) -> Array:
+    """Return heights [m] of shape (along x, along y): uniform in [0, roughness] at points `cell` [m] apart.
+
+    The ground covers `size` [m], centred at 0, 0. Within `flat_radius` [m] of the centre, where a robot starts, its
+    height is 0; from there the roughness rises to its full value at twice that radius. Equal seeds give equal ground.
+    Raises `TaskError` for a negative roughness, and for a size of less than two cells.
+    """
+    if roughness < 0:
+        raise TaskError(f"terrain: roughness {roughness:g} m is negative")
+    rows, columns = (round(length / cell) + 1 for length in size)
+    if min(rows, columns) < 3:
+        raise TaskError(f"terrain: {size[0]:g} m x {size[1]:g} m is less than two cells of {cell:g} m")
+    heights = np.random.default_rng(seed).uniform(0.0, roughness, (rows, columns))
+    x, y = ((np.arange(count) - (count - 1) / 2) * cell for count in heights.shape)
+    if flat_radius > 0:
+        distance = np.hypot(x[:, None], y[None, :])
+        heights *= np.clip((distance - flat_radius) / flat_radius, 0.0, 1.0)
+    return heights

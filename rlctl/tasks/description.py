@@ -44,7 +44,7 @@ def describe(task: str) -> Description:
     Raises `UsageError` for an unknown name, `TaskError` for a task that cannot be built.
     """
     constructor: Any = registry.load(task)
-    recipe = sources.resolve_packaged(task)
+    recipe = sources.resolve_with_stages(task)
     # The last stage is the full task. Parts of stacked observations have no names.
     spec = dataclasses.replace(recipe.env_specs(task)[-1], frame_stack=1, time_feature=False)
     env = spec.make()

@@ -46,7 +46,8 @@ def create(name: str) -> NewPlugin:
     folder = Path(name)
     if os.path.lexists(folder):
         raise UsageError(f"{folder} already exists; choose another name or another folder")
-    sources = _read_sources()
+    templates = sorted(TEMPLATE.rglob(f"*{_SUFFIX}"))
+    sources = {file.relative_to(TEMPLATE).with_suffix(""): file.read_text(encoding="utf-8") for file in templates}
     cls = _make_class_name(name, "".join(sources.values()))
     content = {
         Path(*(package if part == "package" else part for part in path.parts)): string.Template(text).substitute(
@@ -106,11 +107,6 @@ def _check(name: str, package: str) -> None:
     spec = importlib.util.find_spec(package)
     if spec is not None and spec.origin is not None:  # without an origin it is only a folder on the path
         raise UsageError(f"name {name!r}: module {package!r} already exists ({spec.origin}); choose another name")
-
-
-def _read_sources() -> dict[Path, str]:
-    files = sorted(TEMPLATE.rglob(f"*{_SUFFIX}"))
-    return {file.relative_to(TEMPLATE).with_suffix(""): file.read_text(encoding="utf-8") for file in files}
 
 
 def _make_class_name(name: str, used: str) -> str:

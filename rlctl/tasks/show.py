@@ -28,7 +28,9 @@ def show(description: Description, json: str | None) -> None:
     definition = content["definition"]
     parts = _list_quantities(content["observations"])
     _print_section(f"observation  {_shorten(content['observation_space'])}", parts)
-    _print_section(f"action  {_shorten(content['action_space'])}", _list_actions(content))
+    meaning = definition["action_meaning"] if definition else ""
+    actions = [(meaning,)] if meaning else _list_quantities(content["actions"])
+    _print_section(f"action  {_shorten(content['action_space'])}", actions)
     _print_section("joints", _list_joints(content["joints"]))
     parameters = _list_parameters(content["parameters"], recipe.task)
     _print_section("parameters  --set task.NAME=VALUE", parameters, none="none")
@@ -106,11 +108,6 @@ def _format_bounds(low: float | None, high: float | None) -> str:
     if low is None and high is None:
         return "unbounded"
     return f"{'-inf' if low is None else _format_value(low)} to {'inf' if high is None else _format_value(high)}"
-
-
-def _list_actions(content: Json) -> list[Row]:
-    meaning = content["definition"]["action_meaning"] if content["definition"] else ""
-    return [(meaning,)] if meaning else _list_quantities(content["actions"])
 
 
 def _list_joints(joints: Json | None) -> list[Row]:

@@ -14,7 +14,7 @@ from rlctl.environments.registry import find_git_commit, identify_task
 from rlctl.errors import DivergedError, Interrupted, RlctlError, RunTaken
 from rlctl.policy.file import PolicyInfo
 from rlctl.recipe.recipe import Recipe, find_difference
-from rlctl.recipe.sources import resolve_packaged
+from rlctl.recipe.sources import resolve_with_stages
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.directory import RunDirectory
 from rlctl.version import collect_versions
@@ -87,7 +87,7 @@ def find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
     """Return the keys and values in which a recipe differs from the task's own, without values derived from these."""
     chosen = {key: getattr(recipe, key) for key in ("algo", "n_envs", "total_timesteps")}
     try:
-        packaged, adapted = resolve_packaged(task), resolve_packaged(task, chosen)
+        packaged, adapted = resolve_with_stages(task), resolve_with_stages(task, None, chosen)
     except RlctlError:  # the packaged recipe is invalid; --config or --set corrected it
         return {}
     own = {key: value for key, value in chosen.items() if value != getattr(packaged, key)}

@@ -4,7 +4,7 @@ import pytest
 
 from rlctl.errors import UsageError
 from rlctl.recipe.recipe import Recipe
-from rlctl.recipe.sources import fill_defaults, resolve_packaged
+from rlctl.recipe.sources import fill_defaults, resolve_with_stages
 from rlctl.tuning.space import Dimension, get_value, list_usual_steps, nest, parse_search
 
 
@@ -60,7 +60,7 @@ def keys(steps):
 
 
 def test_the_usual_ladder_is_around_the_recipe():
-    recipe = resolve_packaged("reach")
+    recipe = resolve_with_stages("reach")
     steps = list_usual_steps(recipe)
     assert keys(steps) == [["learning_rate"], ["n_steps", "batch_size"], ["gamma"]]
     for dimension in (each for step in steps for each in step):

@@ -34,7 +34,7 @@ class ActingEvents:
         self._events: dict[When, list[BoundEvent]] = {"reset": [], "start": [], "interval": []}
         for event in events.values():
             self._events.get(event.event.when, []).append(event)
-        self._periods = [max(1, round(event.event.every_s / control_dt)) for event in self._events["interval"]]
+        self.periods = [max(1, round(event.event.every_s / control_dt)) for event in self._events["interval"]]
 
     def run(self, when: When, sim: Sim, streams: Streams, level: float) -> dict[str, Drawn]:
         """Call the events at a moment; return the values that they drew, by name."""
@@ -42,13 +42,8 @@ class ActingEvents:
 
     def run_due(self, step: int, sim: Sim, streams: Streams, level: float) -> dict[str, Drawn]:
         """Call the interval events whose period ends at `step`."""
-        due = zip(self._events["interval"], self._periods, strict=True)
+        due = zip(self._events["interval"], self.periods, strict=True)
         return {event.name: event(sim, streams[event.name], level) for event, period in due if step % period == 0}
-
-    @property
-    def has_intervals(self) -> bool:
-        """Whether any event acts during an episode."""
-        return bool(self._periods)
 
     def try_once(self, moments: Iterable[When], sim: Sim) -> None:
         """Call events once, to find mistakes: a name that the world does not have, or a result of the wrong type."""
@@ -93,16 +88,15 @@ class Signals:
         self.drawn = {}
         self._streams, self._level = streams, level
         self._observation_signals = {}  # they begin with the first observation
-        self._action_signals = [self._start(event, self._zero_action()) for event in self._on_action]
+        if self._on_action:
+            low, high = self._space.low, self._space.high  # type: ignore[attr-defined]
+            zero = {_ACTION: np.clip(np.zeros_like(low), low, high)}
+            self._action_signals = [self._start(event, zero) for event in self._on_action]
 
     def try_once(self) -> None:
         """Begin every signal once, to find mistakes."""
         self.begin(defaultdict(lambda: np.random.default_rng(0)), 1.0)
         self.observe(self._first)
-
-    def _zero_action(self) -> Parts:
-        low, high = self._space.low, self._space.high  # type: ignore[attr-defined]
-        return {_ACTION: np.clip(np.zeros_like(low), low, high)}
 
     def _start(self, event: BoundEvent, first: Parts) -> Signal:
         result = event(self._streams[event.name], first, self._level)
