@@ -32,8 +32,7 @@ class EnvSpec:
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}  # in the models that embed it
 
     task: str  # as the user wrote it; see `rlctl.environments.registry`
-    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Keyword arguments of the task's constructor."""
+    parameters: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # keyword arguments of the constructor
     reward_weights: Mapping[str, float] = dataclasses.field(default_factory=dict)  # weights that differ from the task's
     randomize: bool = False  # whether all events of the task act
     events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)

@@ -189,8 +189,7 @@ class Recipe(Section):
 class Source:
     """Values of a recipe, and their source."""
 
-    name: str
-    """Empty for the command line and for function arguments, which errors need not name."""
+    name: str  # empty for the command line and for function arguments, which errors need not name
     values: Mapping[str, Any]
     file: Path | None = None
 

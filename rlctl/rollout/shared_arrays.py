@@ -81,8 +81,7 @@ class SharedArrays:
         self.inside = arrays["inside"]
         """Episode seed, step and row of the segment during a call of each environment, shape (n_envs, 3); errors name
         them if a worker dies or hangs. Step 0 is the reset; the step is negative outside of calls."""
-        self.observation = {key: arrays[f"observation/{key}"] for key in observation}
-        """The present observations, by key."""
+        self.observation = {key: arrays[f"observation/{key}"] for key in observation}  # the current ones, by key
         self.segment = SegmentArrays(
             {key: arrays[f"segment/observation/{key}"] for key in observation},
             {key: arrays[f"segment/final/{key}"] for key in observation},

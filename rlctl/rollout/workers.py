@@ -210,8 +210,7 @@ class Workers:
         """
         self._wait_until_built()
         # Contiguous rows: sums over other layouts may be rounded differently.
-        goals = np.ascontiguousarray(achieved), np.ascontiguousarray(desired)
-        self._send(0, messages.ComputeRewards(*goals))
+        self._send(0, messages.ComputeRewards(np.ascontiguousarray(achieved), np.ascontiguousarray(desired)))
         rewards = self._wait("in compute_reward")[0].rewards
         assert rewards is not None  # the answer to ComputeRewards has them
         return rewards

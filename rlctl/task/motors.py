@@ -24,19 +24,13 @@ class Joints:
     """
 
     names: Sequence[str]
-    default_positions: Sequence[float] = ()
-    """Start positions; with `action_scale` also the target of action 0."""
-    action_scale: Sequence[float] = ()
-    """Only if the target of an action is `default_positions + action_scale * action`."""
-    stiffness: Sequence[float] = ()
-    """Stiffness of the position controller that follows the action [N m/rad]."""
-    damping: Sequence[float] = ()
-    """Damping of the same controller [N m s/rad]."""
-    low: Sequence[float] = ()
-    """Lower position limits."""
+    default_positions: Sequence[float] = ()  # start positions; with `action_scale` also the target of action 0
+    action_scale: Sequence[float] = ()  # only if the target of an action is `default_positions + action_scale * action`
+    stiffness: Sequence[float] = ()  # of the position controller that follows the action [N m/rad]
+    damping: Sequence[float] = ()  # of the same controller [N m s/rad]
+    low: Sequence[float] = ()  # lower position limits
     high: Sequence[float] = ()
-    max_speed: Sequence[float] = ()
-    """[rad/s or m/s]."""
+    max_speed: Sequence[float] = ()  # [rad/s or m/s]
     max_torque: Sequence[float] = ()
 
     def __post_init__(self) -> None:

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from rlctl.errors import RecipeError
 from rlctl.task import Event, events
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
@@ -167,12 +166,6 @@ def test_a_level_holds_for_whole_episodes(make):
     assert env.step([0.0])[4]["events"]["friction"]["friction"] == 0.5
     env.reset(seed=0)
     assert env.step([0.0])[4]["events"]["friction"]["friction"] == 1.5
-
-
-@pytest.mark.parametrize("level", [-0.1, 1.5, float("nan")])
-def test_a_level_that_is_none(make, level):
-    with pytest.raises(RecipeError, match=r"^level: .* is not in \[0, 1\]$"):
-        make(Cart()).set_level(level)
 
 
 def test_an_event_of_the_authors_own(make):

@@ -29,10 +29,8 @@ class RangeLimits:
 
     low: float = -math.inf
     high: float = math.inf
-    above: bool = False
-    """Whether `low` itself is excluded."""
-    whole: bool = False
-    """Whole numbers only; the upper end of the range is included."""
+    above: bool = False  # whether `low` itself is excluded
+    whole: bool = False  # whole numbers only; the upper end of the range is included
 
     def find_violation(self, value: float) -> str:
         """Return why a value is outside the limits; empty if it is inside."""
