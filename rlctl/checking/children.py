@@ -20,9 +20,8 @@ from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finish
 from rlctl.checking.rules import Experiment, NotApplicable, NotJudged, RuleFinding
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill, anonymous_file
+from rlctl.processes.child_process import ChildEndedError, ChildProcess, LineReader, Standstill, anonymous_file
 from rlctl.processes.messages import send
-from rlctl.processes.printed_lines import LineReader
 
 
 def main(

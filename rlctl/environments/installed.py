@@ -3,13 +3,15 @@
 import dataclasses
 import functools
 import importlib.metadata
+import importlib.util
+import os
 import re
 import sys
 from collections.abc import Iterator
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
-from rlctl.environments.plugin_code import find_module_file
 from rlctl.errors import describe_exception, short_repr
 
 GROUP = "rlctl.tasks"
@@ -156,3 +158,25 @@ def check_import(entry: TaskEntry, timeout_s: float = 60.0) -> str | None:
         return f"import did not finish within {timeout_s:.0f} s"
     lines = [line[1:] for line in child.stdout.splitlines() if line.startswith("@")]
     return (lines[-1] or None) if lines else f"import ended the process with exit code {child.returncode}"
+
+
+def find_module_file(module: str, *, in_current_folder: bool = False) -> Path | None:
+    """Find a module's file; unlike `find_spec` on a dotted name this imports no parent package.
+
+    `in_current_folder` looks there as well, after all folders of `sys.path`.
+    """
+    head, *rest = module.split(".")
+    try:
+        spec = importlib.util.find_spec(head)
+        if spec is None and in_current_folder:
+            spec = PathFinder.find_spec(head, [os.getcwd()])
+        for depth, _ in enumerate(rest, start=2):
+            if spec is None:
+                return None
+            name = ".".join(module.split(".")[:depth])
+            path = spec.submodule_search_locations
+            specs = (finder.find_spec(name, path) for finder in sys.meta_path if hasattr(finder, "find_spec"))
+            spec = next((candidate for candidate in specs if candidate is not None), None)
+    except (ImportError, ValueError):
+        return None
+    return Path(spec.origin) if spec and spec.origin and spec.has_location else None

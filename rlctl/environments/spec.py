@@ -13,8 +13,7 @@ from annotated_types import Ge, Le
 from pydantic import AfterValidator, PlainSerializer
 
 from rlctl.environments import named_task
-from rlctl.environments.plugin_code import call_plugin
-from rlctl.environments.registry import is_task, load, make_slug, may_make_environments
+from rlctl.environments.registry import call_plugin, is_task, load, make_slug, may_make_environments
 from rlctl.errors import RecipeError, TaskError, check_name, short_repr
 from rlctl.storage import validation
 

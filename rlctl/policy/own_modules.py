@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.environments import registry
-from rlctl.environments.plugin_code import import_file
+from rlctl.environments.registry import import_file
 from rlctl.errors import ArtifactError, RecipeError, RlctlError
 from rlctl.recipe.recipe import Recipe
 from rlctl.storage import files

@@ -9,8 +9,14 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from rlctl.processes import messages
-from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill
-from rlctl.processes.printed_lines import MAX_LINE_BYTES, LineFilter, LineReader
+from rlctl.processes.child_process import (
+    MAX_LINE_BYTES,
+    ChildEndedError,
+    ChildProcess,
+    LineFilter,
+    LineReader,
+    Standstill,
+)
 
 _CHECK_EVERY_S = 0.2
 

@@ -25,8 +25,8 @@ from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.policy.players.named import SERVER, make_player
 from rlctl.policy.players.player import Player
+from rlctl.processes.child_process import write_stderr
 from rlctl.processes.pool import answer_messages
-from rlctl.processes.printed_lines import write_stderr
 from rlctl.rollout import messages
 from rlctl.rollout.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
 from rlctl.rollout.running_episode import ObservationWriter, RunningEpisode, compute_rewards

@@ -20,9 +20,8 @@ from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
 from rlctl.policy.file import PolicyFile
-from rlctl.processes.child_process import anonymous_file
+from rlctl.processes.child_process import anonymous_file, write_stderr
 from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault
-from rlctl.processes.printed_lines import write_stderr
 from rlctl.rollout import messages
 from rlctl.rollout.messages import Answer, EpisodeResult, Message, format_hint, make_error
 from rlctl.rollout.shared_arrays import PolicyNumbers, SharedArrays

@@ -16,7 +16,7 @@ from pydantic_core import to_jsonable_python
 
 from rlctl.checking.leaves import Leaf, find_leaves
 from rlctl.environments import installed, registry
-from rlctl.environments.plugin_code import call_plugin
+from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.recipe import recipe as recipes

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl.environments.dict_spaces import join
-from rlctl.environments.plugin_code import call_plugin
+from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.shared_arrays import SegmentArrays

@@ -9,7 +9,7 @@ from typing import Any
 from rlctl import output
 from rlctl.errors import ArtifactError, TaskError
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.processes.printed_lines import write_stderr
+from rlctl.processes.child_process import write_stderr
 from rlctl.recipe.recipe import Recipe
 from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest

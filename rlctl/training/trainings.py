@@ -19,8 +19,7 @@ from typing import Any, TypeVar
 
 from rlctl.errors import Interrupted
 from rlctl.processes import error_boundary, messages
-from rlctl.processes.child_process import ChildEndedError, ChildProcess
-from rlctl.processes.printed_lines import LineReader
+from rlctl.processes.child_process import ChildEndedError, ChildProcess, LineReader
 from rlctl.rollout.workers import available_cores
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.signals import HandledSignals

@@ -10,8 +10,7 @@ import time
 import pytest
 
 from rlctl.processes import messages
-from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill
-from rlctl.processes.printed_lines import LineReader
+from rlctl.processes.child_process import ChildEndedError, ChildProcess, LineReader, Standstill
 
 HERE = "tests.processes.test_child_process"
 

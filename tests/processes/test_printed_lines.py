@@ -2,7 +2,7 @@
 
 import os
 
-from rlctl.processes.printed_lines import MAX_LINE_BYTES, MAX_LINES_PER_S, LineFilter, LineReader
+from rlctl.processes.child_process import MAX_LINE_BYTES, MAX_LINES_PER_S, LineFilter, LineReader
 
 
 def forward_lines(content: bytes, receive=None):

@@ -15,8 +15,8 @@ from rlctl.deploy.identify.log import Array, Log
 from rlctl.deploy.identify.parameters import Unknowns
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
+from rlctl.processes.child_process import write_stderr
 from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault, answer_messages
-from rlctl.processes.printed_lines import write_stderr
 from rlctl.rollout.messages import describe_failure, make_error
 
 _TRIALS = 12  # per unknown, and for one unknown more
