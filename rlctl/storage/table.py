@@ -58,12 +58,15 @@ class Table:
         if self._pending:
             # If a user edits or removes the file during a training, rows are lost, but the training continues.
             size = min(self.size, _read_size(self.path))
-            header = self.path.read_text(encoding="utf-8", errors="replace").partition("\n")[0] if size else ""
-            content = self._format_rows(next(csv.reader([header]), None)).encode()
+            content = self._format_rows(self._read_columns() if size else None).encode()
             files.append(self.path, content, size)
             self.size, self._pending = size + len(content), []
         if sync and self.size:
             files.sync(self.path)
+
+    def _read_columns(self) -> list[str]:
+        with self.path.open(encoding="utf-8", errors="replace") as file:
+            return next(csv.reader([file.readline()]), [])
 
     def _format_rows(self, columns: list[str] | None) -> str:
         text = io.StringIO()
