@@ -58,9 +58,9 @@ class TaskEntry:
 def list_installed() -> list[TaskEntry]:
     """Return every installed task, sorted by name. Of two with the same name, rlctl's own or the first can be used.
 
-    The result is cached until `sys.path` changes.
+    The result is cached until `sys.path` or a folder on it changes.
     """
-    return list(_list_installed(tuple(sys.path)))
+    return list(_list_installed(tuple((folder, _find_state(folder or os.curdir)) for folder in sys.path)))
 
 
 def find(name: str) -> TaskEntry | None:
@@ -70,8 +70,16 @@ def find(name: str) -> TaskEntry | None:
     return next((entry for entry in list_installed() if entry.name == name), None)
 
 
+def _find_state(folder: str) -> tuple[int, ...]:
+    try:
+        state = os.stat(folder)
+    except OSError:
+        return ()
+    return state.st_dev, state.st_ino, state.st_mtime_ns
+
+
 @functools.lru_cache(maxsize=4)
-def _list_installed(path: tuple[str, ...]) -> list[TaskEntry]:
+def _list_installed(path: tuple[tuple[str, tuple[int, ...]], ...]) -> list[TaskEntry]:
     # A checkout on sys.path may declare the same tasks as its own installation: the first one is used.
     declared: dict[tuple[str, str], TaskEntry] = {}
     for distribution in importlib.metadata.distributions():
