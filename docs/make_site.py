@@ -29,7 +29,7 @@ API = {  # modules, or names with the classes that they return
     "rlctl.task": ["rlctl.task"],
     "rlctl.task.rewards": ["rlctl.task.rewards"],
     "rlctl.task.events": ["rlctl.task.events"],
-    "rlctl.deploy": [f"rlctl.deploy.filter.{name}" for name in ("limits", "safety_filter", "safety_events")],
+    "rlctl.deploy": [f"rlctl.deploy.filter.{name}" for name in ("limits", "safety_filter", "bounds.SafetyEvent")],
     "rlctl.errors": ["rlctl.errors"],
 }
 

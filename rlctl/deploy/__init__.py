@@ -6,15 +6,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rlctl.deploy.filter.bounds import SafetyEvent
     from rlctl.deploy.filter.limits import Limits, read_limits
-    from rlctl.deploy.filter.safety_events import SafetyEvent
     from rlctl.deploy.filter.safety_filter import SafetyFilter
 
 __all__ = ["Limits", "SafetyEvent", "SafetyFilter", "read_limits"]
 
 _MODULES = {
     "Limits": "limits",
-    "SafetyEvent": "safety_events",
+    "SafetyEvent": "bounds",
     "SafetyFilter": "safety_filter",
     "read_limits": "limits",
 }

@@ -8,10 +8,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.deploy.filter.bounds import Bounds
+from rlctl.deploy.filter.bounds import Bounds, Intervention
 from rlctl.deploy.filter.fitting import FittedLimits
 from rlctl.deploy.filter.limits import Limits
-from rlctl.deploy.filter.safety_events import Intervention
 
 Array = NDArray[np.float64]
 _MAX_STEPS = 1e9
@@ -33,7 +32,6 @@ class Command:
         self, limits: Limits, fitted: FittedLimits, bounds: Bounds, report: Callable[[Intervention], None]
     ) -> None:
         self._bounds, self._report = bounds, report
-        self.names = bounds.names  # of the joints
         assert isinstance(fitted.space, spaces.Box)  # what has bounds
         self._space = fitted.space
         self._safe, self._home = fitted.safe, fitted.home

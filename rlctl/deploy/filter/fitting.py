@@ -17,10 +17,9 @@ from rlctl.task.motors import Joints
 
 Array = NDArray[np.float64]
 
+_MOVING = ("position", "step", "speed")  # commands that move joints to positions
 _CAN_BE_LIMITED = {
-    "position": ("position", "speed", "acceleration", "action"),
-    "step": ("position", "speed", "acceleration", "action"),
-    "speed": ("position", "speed", "acceleration", "action"),
+    **dict.fromkeys(_MOVING, ("position", "speed", "acceleration", "action")),
     "torque": ("torque", "rate", "action"),
     "action": ("rate", "action"),
 }
@@ -89,7 +88,7 @@ def _make_bounds(
     timed = limits.command == "speed" or any(joint.speed or joint.acceleration or joint.rate for joint in joints)
     if timed and control_dt is None:
         raise RecipeError(_NO_CONTROL_DT)
-    dt, is_value = control_dt or 1.0, limits.command in ("position", "torque", "action")
+    dt, is_value, moves = control_dt or 1.0, limits.command not in ("step", "speed"), limits.command in _MOVING
     scale, offset = _choose_units(limits, space, known, names)
     if not is_value and offset.any():
         raise RecipeError(f"limits: offset: with command: {limits.command} action 0 must be no motion; leave it out")
@@ -133,8 +132,8 @@ def _make_bounds(
         _drop_infinite(change),
         precision=8.0 * digits,
         resolution=factor * digits,
-        position_name=limits.command if limits.command in ("torque", "action") else "position",
-        speed_name="rate" if limits.command in ("torque", "action") else "speed",
+        position_name="position" if moves else limits.command,
+        speed_name="speed" if moves else "rate",
     )
 
 
@@ -168,8 +167,7 @@ def _list_known(limits: Limits, joints: Joints | None, index: int) -> dict[str, 
     known: dict[str, Any] = {}
     if joints is None:
         return known
-    measured = limits.measured.position is not None
-    moves = limits.command in ("position", "step", "speed")
+    measured, moves = limits.measured.position is not None, limits.command in _MOVING
     if joints.low and joints.high and (limits.command == "position" or (moves and measured)):
         low, high = joints.low[index], joints.high[index]
         known |= {"position": (low, high)} if low < high else {}
@@ -239,7 +237,7 @@ def _check_home(limits: Limits, bounds: Bounds | None, home: Array | None) -> No
         if limits.on_fault == "home":
             raise RecipeError("limits: on_fault: home: it needs the home position; write home: [positions]")
         return
-    if limits.command in ("torque", "action") or bounds is None:
+    if limits.command not in _MOVING or bounds is None:
         raise RecipeError(f"limits: home: actions that command {limits.command!r} cannot bring a robot to positions")
     if ((home < bounds.position[0]) | (home > bounds.position[1])).any():
         raise RecipeError("limits: home: outside the position limits")
@@ -250,11 +248,8 @@ def _check_measured(limits: Limits, bounds: Bounds | None, measured: slice | Non
     if measured is not None or bounds is None:
         return
     moves = bounds.speed is not None or bounds.change is not None or limits.blend_in_s > 0
-    if (
-        (limits.command == "position" and moves)
-        or (not bounds.is_value and bounds.bounds_position)
-        or limits.home is not None
-    ):
+    needs_start = limits.command == "position" and moves
+    if needs_start or (not bounds.is_value and bounds.bounds_position) or limits.home is not None:
         raise RecipeError(
             "limits: these limits need the positions of the joints; write measured: {position: NAME} "
             f"with the name of the observation, one of {', '.join(layout.slices)}"
@@ -263,10 +258,8 @@ def _check_measured(limits: Limits, bounds: Bounds | None, measured: slice | Non
 
 def _make_safe_command(limits: Limits, bounds: Bounds | None, count: int) -> Array:
     safe = _read_list(limits, "safe_action", count)
-    if safe is not None and limits.command not in ("torque", "action"):
-        raise RecipeError(
-            "limits: safe_action: with positions, steps and speeds the safe action is no motion; leave it out"
-        )
+    if safe is not None and limits.command in _MOVING:
+        raise RecipeError(f"limits: safe_action: with command: {limits.command} it is no motion; leave it out")
     if bounds is None:
         return np.zeros(count)
     command = bounds.offset + (np.zeros(count) if safe is None else safe) * bounds.factor

@@ -10,13 +10,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.deploy.filter.bounds import Intervention, Kind, SafetyEvent
 from rlctl.deploy.filter.command import Command, UnsafeCommand
 from rlctl.deploy.filter.fitting import fit_limits
 from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.deploy.filter.observation import ObservationError, SensorChecks, read_numbers
-from rlctl.deploy.filter.safety_events import Intervention, Kind, SafetyEvent
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import UsageError, short_repr
+from rlctl.policy.players.player import Exploration, Player
 
 Array = NDArray[Any]
 FilterState = Literal["idle", "running", "holding", "stopped"]
@@ -36,8 +37,8 @@ class SafetyFilter:
     `stopped`, which only `resume` leaves. Holding ends when the fault that caused it ends. While holding or
     stopped a robot is braked within its limits and kept where it is, or brought home.
 
-    `info` describes the policy's environment (`policy.info.env`), `limits` is a file or its content; by default
-    only the policy's action bounds apply. Raises `RecipeError` for limits that do not fit the policy.
+    `info` is `policy.info.env`; `limits` a file, its content, or None for the policy's action bounds alone. Raises
+    `RecipeError` for limits that do not fit the policy.
     """
 
     def __init__(
@@ -49,23 +50,24 @@ class SafetyFilter:
         self.limits, self.layout, self.control_dt = limits, fitted.layout, fitted.control_dt
         self._space, self._measured, self._home = fitted.space, fitted.measured, fitted.home
         self._sensors = SensorChecks(limits, fitted.layout, fitted.control_dt)
-        self._command: Command | None = None
-        if fitted.bounds is not None:
-            self._command = Command(limits, fitted, fitted.bounds, self._record_intervention)
+        bounds = fitted.bounds
+        self._joints = [] if bounds is None else bounds.names
+        self._command = None if bounds is None else Command(limits, fitted, bounds, self._record_intervention)
         self._clock = clock
         self._history: collections.deque[SafetyEvent | Intervention] = collections.deque(maxlen=_MAX_EVENTS)
-        self._limits_acted: dict[str, NDArray[np.int64]] = {}
+        count = math.prod(fitted.space.shape or ())
+        self._limits_acted = collections.defaultdict[str, NDArray[np.int64]](lambda: np.zeros(count, np.int64))
         self._faults: collections.Counter[str] = collections.Counter()
         self.on_event: Callable[[SafetyEvent | Intervention], None] | None = None
         """Called with each event, those of one limit in a step together."""
         self.steps = 0  # actions since the filter was created
         self.state: FilterState = "idle"
         self.reason = ""  # why it is holding or stopped
-        self._zeros = np.zeros(math.prod(fitted.space.shape or ()))
-        self._all_finite = b"\x01" * len(self._zeros)
+        self._all_finite = b"\x01" * count
         self._fault = ""
         self._observed = self._ordered = self._goes_home = False
-        self._manual: Array | None = None
+        self.manual: Array | None = None
+        """The action of an override; None: the policy acts."""
 
     def reset(self) -> None:
         """Begin an episode. A stop, a `hold` or `home`, and an override stay in effect."""
@@ -97,8 +99,7 @@ class SafetyFilter:
 
     def resume(self) -> None:
         """Let the policy act again from the robot's present position; a fault that persists holds it again at once."""
-        self._ordered = False
-        self._fault = ""
+        self._ordered, self._fault = False, ""
         if self._command is not None and self.state == "stopped":
             self._command.begin_from_measured()
         self.begin_blend()
@@ -112,12 +113,11 @@ class SafetyFilter:
         if action is not None:
             action, fault = self._read_action(action)
             if action is None:
-                expected = f"{len(self._zeros)} finite numbers" if self._command else f"one of {self._space}"
-                raise ValueError(f"override: expected {expected}, got {fault}")
-        if (action is None) != (self._manual is None):
+                raise ValueError(f"override: expected an action of {self._space}, got {fault}")
+        if (action is None) != (self.manual is None):
             self.begin_blend()
             self._record("state", "policy" if action is None else "override")
-        self._manual = action
+        self.manual = action
 
     @property
     def events(self) -> list[SafetyEvent]:
@@ -126,27 +126,15 @@ class SafetyFilter:
 
     def find_last_events(self, count: int) -> list[SafetyEvent]:
         """Return the last events, oldest first."""
-        events: list[SafetyEvent] = []
-        for record in reversed(self._history):
-            if len(events) >= count:
-                break
-            events += reversed(record.list_events())
-        return events[:count][::-1]
+        return [event for record in list(self._history)[-count:] for event in record.list_events()][-count:]
 
     @property
     def counts(self) -> collections.Counter[str]:
         """Number of interventions per limit and joint, and of each fault, since the filter was created."""
         counts = collections.Counter(self._faults)
-        if self._command is not None:
-            for limit, times in self._limits_acted.items():
-                acted = zip(self._command.names, times.tolist(), strict=True)
-                counts.update({f"{joint}.{limit}": count for joint, count in acted if count})
+        for limit, times in self._limits_acted.items():
+            counts.update({f"{self._joints[index]}.{limit}": int(times[index]) for index in np.flatnonzero(times)})
         return counts
-
-    @property
-    def is_overridden(self) -> bool:
-        """Whether an override replaces the policy's actions."""
-        return self._manual is not None
 
     def begin_blend(self) -> None:
         """Blend gradually into the next actions, as after a change of the policy."""
@@ -166,19 +154,17 @@ class SafetyFilter:
     def observe(self, observation: Any, age_s: float = 0.0) -> bool:
         """Check an observation in the policy's form; None: it is missing. Return whether it may be used.
 
-        `age_s` is its age [s]. A negative age, of an observation from the future, has the same limit.
+        The limit of its age `age_s` [s] also applies to a negative age, of an observation from the future.
         """
         if observation is None:
             return self.fail("missing")
         try:
-            values, (age,) = self.layout.flatten(observation), read_numbers(age_s)
-        except ValueError as error:  # no numbers, or an age that is not one number
+            values = self.layout.flatten(observation)
+        except ValueError as error:
             return self.fail("invalid observation", short_repr(str(error), 200))
-        fault = self._sensors.check(values, float(age))
         self._observed = True
-        if fault is not None:
-            kind, name, value, limit = fault
-            return self.fail(f"{name} {kind}", value, limit)
+        if (fault := self._sensors.check(values, age_s)) is not None:
+            return self.fail(*fault)
         if self._measured is not None and self._command is not None:
             self._command.measure(values[self._measured])
         self._fault = ""
@@ -194,7 +180,7 @@ class SafetyFilter:
     def limit(self, action: Any | None) -> Array:
         """Return the robot's action for the policy's action; None: the policy could not act."""
         self.steps += 1
-        requested, problem = (self._manual, "") if self._manual is not None else self._read_action(action)
+        requested, problem = (self.manual, "") if self.manual is not None else self._read_action(action)
         fault = self._fault or self._find_fault(requested, problem)
         if self.state != "stopped" and not self._ordered:
             self._update_state(fault)
@@ -217,37 +203,31 @@ class SafetyFilter:
             numbers = read_numbers(action)  # a copy: a policy may write the next one into the same memory
         except ObservationError as error:
             return None, str(error)
-        if numbers.shape != self._zeros.shape:
-            return None, f"shape {numbers.shape}"
-        if np.isfinite(numbers).tobytes() != self._all_finite:
-            return None, "not finite"
-        if self._command is None:
+        is_valid = np.isfinite(numbers).tobytes() == self._all_finite
+        if is_valid and self._command is None:
             with np.errstate(invalid="ignore"):
                 choice = self._choose(numbers)
-            if not self._space.contains(choice) or (choice.ravel() != numbers).any():
-                return None, f"{short_repr(numbers.tolist())}"
-        return numbers, ""
+            is_valid = self._space.contains(choice) and bool((choice.ravel() == numbers).all())
+        return (numbers, "") if is_valid else (None, short_repr(numbers.tolist()))
 
     def _find_fault(self, requested: Array | None, problem: str) -> str:
         """Return and record why an action cannot be used; empty if it can."""
-        fault = ""
         if problem:
             fault = "invalid action"
-        elif requested is None:
-            fault = "" if self.state == "stopped" or self._ordered else "no action"
-        elif self._measured is not None and self._command is not None and self._command.position is None:
+        elif requested is None and self.state != "stopped" and not self._ordered:
+            fault = "no action"
+        elif requested is not None and self._measured is not None and self._command and self._command.position is None:
             fault = "no position"
-        if fault:
-            self._record("fault", fault, problem)
+        else:
+            return ""
+        self._record("fault", fault, problem)
         return fault
 
     def _update_state(self, fault: str) -> None:
         """Enter the state for this step's fault, or for its end."""
-        if fault and self.limits.on_fault == "stop":
-            self._enter("stopped", fault)
-        elif fault:
+        if fault:
             self._goes_home = self.limits.on_fault == "home"
-            self._enter("holding", fault)
+            self._enter("stopped" if self.limits.on_fault == "stop" else "holding", fault)
         elif self.state != "running":
             self.begin_blend()
             self._enter("running", "")
@@ -266,9 +246,7 @@ class SafetyFilter:
 
     def _record_intervention(self, intervention: Intervention) -> None:
         intervention.time_s = self._clock()
-        if (counts := self._limits_acted.get(intervention.limit)) is None:
-            counts = self._limits_acted[intervention.limit] = np.zeros(len(intervention.acted), np.int64)
-        np.add(counts, intervention.acted, out=counts)
+        self._limits_acted[intervention.limit] += intervention.acted
         self._append(intervention)
 
     def _record(self, kind: Kind, name: str, value: float | str = "", limit: float | None = None) -> None:
@@ -280,3 +258,43 @@ class SafetyFilter:
         self._history.append(event)
         if self.on_event is not None:
             self.on_event(event)
+
+
+class LimitedPlayer(Player):
+    """Plays another player's actions within limits; reports the number of interventions."""
+
+    def __init__(self, player: Player, info: EnvInfo, limits: Limits) -> None:
+        self._player = player
+        self._safety = SafetyFilter(info, limits)
+        self._before: collections.Counter[str] = collections.Counter()
+
+    @property
+    def state(self) -> Any:
+        """Recurrent state of the player."""
+        return self._player.state
+
+    def explore(self, exploration: Exploration) -> None:
+        """Let the player explore."""
+        self._player.explore(exploration)
+
+    def begin_segment(self, seed: int, step: int) -> None:
+        """Begin a segment at a step of an episode."""
+        self._player.begin_segment(seed, step)
+
+    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+        """Return the limited action twice, to record and to step with."""
+        if step == 0:
+            self._safety.resume()
+            self._safety.reset()
+            self._before = self._safety.counts
+        policy_action = self._player.act(observation, seed, step)[1] if self._safety.observe(observation) else None
+        action = self._safety.limit(policy_action)
+        return action, action
+
+    def close(self) -> None:
+        """Close the player."""
+        self._player.close()
+
+    def report(self) -> dict[str, Any]:
+        """Return the player's report with the number of interventions per limit and of faults in this episode."""
+        return {**self._player.report(), "interventions": dict(self._safety.counts - self._before)}

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.deploy.filter.safety_events import Intervention, SafetyEvent
+from rlctl.deploy.filter.bounds import Intervention, SafetyEvent
 from rlctl.deploy.server.messages import as_json
 from rlctl.errors import ArtifactError, short_repr
 

@@ -14,9 +14,9 @@ import aiohttp
 import numpy as np
 from aiohttp import web
 
+from rlctl.deploy.filter.bounds import SafetyEvent
 from rlctl.deploy.filter.limits import Limits
 from rlctl.deploy.filter.observation import ObservationLayout
-from rlctl.deploy.filter.safety_events import SafetyEvent
 from rlctl.deploy.server import messages
 from rlctl.deploy.server.records import EventLog, Measurements, RerunLog
 from rlctl.deploy.server.request import ServeRequest
@@ -271,7 +271,7 @@ def _describe(session: Session) -> dict[str, Any]:
         "number": session.number,
         "state": safety.state,
         "reason": safety.reason,
-        "overridden": safety.is_overridden,
+        "overridden": safety.manual is not None,
         "steps": safety.steps,
         "control_error": safety.control_error,
         "action": None if session.action is None else session.action.ravel()[:32],

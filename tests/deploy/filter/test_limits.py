@@ -85,7 +85,7 @@ def test_what_is_wrong_in_a_file(write, text, message):
         (("[-1, 1]", "[20, 30]"), "elbow: no action keeps these limits and the policy's own action bounds"),
         (
             ("home: [0, 0]", "safe_action: [0, 0]"),
-            "safe_action: with positions, steps and speeds the safe action is no motion",
+            "safe_action: with command: position it is no motion; leave it out",
         ),
         (("home: [0, 0]", "scale: [1, 1, 1]"), "scale has 3 numbers, the action 2"),
     ],

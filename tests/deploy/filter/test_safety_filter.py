@@ -168,7 +168,7 @@ def test_a_hand_chooses_what_the_policy_could_choose(arm):
     choices = arm.model_copy(update={"action_space": space_to_json(spaces.Discrete(3))})
     safety = SafetyFilter(choices)
     for action in ([3], [-1], [1.5]):
-        with pytest.raises(ValueError, match=r"one of Discrete\(3\)"):
+        with pytest.raises(ValueError, match=r"an action of Discrete\(3\)"):
             safety.override(action)
     safety.override([2])
     assert run_filter(safety, REST, 0) == 2
@@ -183,7 +183,7 @@ def test_a_hand_takes_over_gradually_and_within_limits(arm):
     assert run_filter(safety, REST, [0.5, 0.5])[0] == pytest.approx(1.0)
     safety.override(None)
     assert [run_filter(safety, REST, [0.5, 0.5])[0] for _ in range(2)] == pytest.approx([0.75, 0.5])
-    with pytest.raises(ValueError, match="2 finite numbers"):
+    with pytest.raises(ValueError, match=r"expected an action of Box\(.*, got \[1\.0\]"):
         safety.override([1.0])
     with pytest.raises(UsageError, match="the limits define no home"):
         safety.home()

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from rlctl.deploy.filter.safety_events import SafetyEvent
+from rlctl.deploy.filter.bounds import SafetyEvent
 from rlctl.deploy.server.records import EventLog
 from rlctl.errors import ArtifactError
 from tests.deploy.server.serving import OBSERVATION, RunningServer, write_policy
