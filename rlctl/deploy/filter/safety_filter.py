@@ -78,7 +78,7 @@ class SafetyFilter:
         if self.state != "stopped" and not self._ordered:
             self._enter("idle", "")
 
-    def stop(self, reason: str = "stopped") -> None:
+    def stop(self, reason: str = "stop ordered") -> None:
         """Stop; only `resume` leaves this state."""
         self._ordered = False
         self._enter("stopped", reason)

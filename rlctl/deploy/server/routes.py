@@ -2,12 +2,13 @@
 
 import asyncio
 import hmac
+import math
 import os
 import re
 import resource
 import tempfile
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -20,8 +21,7 @@ from rlctl.deploy.server.server import PolicyServer
 from rlctl.errors import RlctlError, UsageError, did_you_mean
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-_Handler = web.RequestHandler
-_Times = dict[_Handler, float]
+_Connection = web.RequestHandler
 
 BACKLOG = 64  # connections that the kernel accepts before the loop sees them
 _FIRST_REQUEST_S = 10.0
@@ -51,32 +51,30 @@ class Connections:
     """The connections of a server, oldest first.
 
     A connection that sends no complete request header in time is closed. If too many are open, the server closes the
-    one that has waited longest, then the one whose request has taken longest, but never a WebSocket client.
+    one whose last request is the oldest, but never a WebSocket client.
     """
 
     def __init__(self, allowed: int) -> None:
         self._allowed = allowed
-        self._waiting: _Times = {}  # time.monotonic() at which it is closed
-        self._answering: _Times = {}
-        self._clients: _Times = {}
+        self._until: dict[_Connection, float | None] = {}
+        """The `time.monotonic()` at which each is closed; infinite during a request, None for a WebSocket client."""
 
-    def accept(self, handler: _Handler) -> _Handler:
+    def accept(self, connection: _Connection) -> _Connection:
         """Register a new connection, and close an old one if too many are open."""
-        self._waiting[handler] = time.monotonic() + _FIRST_REQUEST_S
-        if self._count() > self._allowed:
+        self._until[connection] = time.monotonic() + _FIRST_REQUEST_S
+        if len(self._until) > self._allowed:
             self._forget_closed()
-            for handler_to_close in [*self._waiting, *self._answering][: max(0, self._count() - self._allowed)]:
-                self._close(handler_to_close)
-        return handler
+            closable = [other for other, until in self._until.items() if until is not None]
+            for other in closable[: max(0, len(self._until) - self._allowed)]:
+                self._close(other)
+        return connection
 
     @web.middleware
     async def follow(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Answer a request, and count its connection as active until then. A middleware of aiohttp."""
         connection = request.protocol
-        is_client = request.headers.get("Upgrade", "").lower() == "websocket"
-        group = self._clients if is_client else self._answering
-        self._waiting.pop(connection, None)
-        group[connection] = time.monotonic()
+        self._until.pop(connection, None)
+        self._until[connection] = None if _is_websocket(request) else math.inf
         try:
             return await handler(request)
         except (ConnectionError, web.RequestPayloadError, RuntimeError):
@@ -84,9 +82,9 @@ class Connections:
                 raise
             return web.Response(status=400)  # the client disconnected during its request; nobody receives this answer
         finally:
-            group.pop(connection, None)
+            self._until.pop(connection, None)
             if connection.transport is not None:
-                self._waiting[connection] = time.monotonic() + _NEXT_REQUEST_S
+                self._until[connection] = time.monotonic() + _NEXT_REQUEST_S
 
     async def close_slow(self) -> None:
         """Close connections that have waited too long; runs until cancelled."""
@@ -94,23 +92,21 @@ class Connections:
             await asyncio.sleep(1.0)
             self._forget_closed()
             now = time.monotonic()
-            for handler in [handler for handler, until in self._waiting.items() if until < now]:
-                self._close(handler)
-
-    def _count(self) -> int:
-        return len(self._waiting) + len(self._answering) + len(self._clients)
+            for connection in [connection for connection, until in self._until.items() if until and until < now]:
+                self._close(connection)
 
     def _forget_closed(self) -> None:
         oldest = time.monotonic() + _FIRST_REQUEST_S - 1.0  # newer ones may not be connected yet
-        closed = [handler for handler, until in self._waiting.items() if handler.transport is None and until < oldest]
-        for handler in closed:
-            del self._waiting[handler]
+        self._until = {
+            connection: until
+            for connection, until in self._until.items()
+            if connection.transport is not None or until is None or until >= oldest
+        }
 
-    def _close(self, handler: _Handler) -> None:
-        self._waiting.pop(handler, None)
-        self._answering.pop(handler, None)
-        if handler.transport is not None:
-            handler.transport.abort()  # at once: nothing more is sent
+    def _close(self, connection: _Connection) -> None:
+        self._until.pop(connection, None)
+        if connection.transport is not None:
+            connection.transport.abort()  # at once: nothing more is sent
 
 
 _MAX_POLICY_SIZE = 64 * 2**20  # [bytes]
@@ -155,10 +151,8 @@ class Routes:
                 return await handler(request)
             except web.HTTPClientError as error:  # an unknown path, another method, too long a body
                 known = [resource.canonical for resource in request.app.router.resources()]
-                hint = (
-                    f"{did_you_mean(request.path, known)} There are: {', '.join(known)}" if error.status == 404 else ""
-                )
-                return _refuse(error.status, f"{request.method} {request.path}: {error.reason}.{hint}", error.headers)
+                hint = did_you_mean(request.path, known) if error.status == 404 else ""
+                return _refuse(error.status, f"{request.method} {request.path}: {error.reason}.{hint}")
         self.server.measurements.refused += 1
         return _refuse(*problem)
 
@@ -172,7 +166,7 @@ class Routes:
         self.server.close()
 
     async def _serve_root(self, request: web.Request) -> web.StreamResponse:
-        if request.headers.get("Upgrade", "").lower() == "websocket":
+        if _is_websocket(request):
             return await self.server.serve_client(request)
         policy = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'"
         return web.Response(text=self.page, content_type="text/html", headers={"Content-Security-Policy": policy})
@@ -214,9 +208,8 @@ class Routes:
         # The format of safetensors begins with the length of its header, in JSON.
         suffix = ".safetensors" if content[8:9] == b"{" else ".onnx"
         with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
-            file = Path(folder) / (
-                name if _FILE_NAME.fullmatch(name) and name.endswith(suffix) else f"uploaded{suffix}"
-            )
+            is_usable = _FILE_NAME.fullmatch(name) and name.endswith(suffix)
+            file = Path(folder) / (name if is_usable else f"uploaded{suffix}")
             await asyncio.to_thread(file.write_bytes, content)
             try:
                 await self.server.replace_policy(file)
@@ -238,6 +231,10 @@ class Routes:
         return web.json_response(messages.as_json(self.server.describe()))
 
 
+def _is_websocket(request: web.Request) -> bool:
+    return request.headers.get("Upgrade", "").lower() == "websocket"
+
+
 async def _answer_health(request: web.Request) -> web.Response:
     return web.Response(text="OK\n")
 
@@ -251,9 +248,8 @@ async def _read_body(request: web.Request, max_size: int) -> bytes:
         raise web.HTTPRequestTimeout from None
 
 
-def _refuse(status: int, text: str, headers: Mapping[str, str] | None = None) -> web.Response:
-    allowed = {name: value for name, value in (headers or {}).items() if name == "Allow"}
-    return web.json_response({"error": text}, status=status, headers=allowed)
+def _refuse(status: int, text: str) -> web.Response:
+    return web.json_response({"error": text}, status=status)
 
 
 def _find_problem(request: web.Request, is_local: bool, key: str | None) -> tuple[int, str] | None:
@@ -267,8 +263,7 @@ def _find_problem(request: web.Request, is_local: bool, key: str | None) -> tupl
         return 403, "this server answers to localhost only"
     if origin is not None and page_host != host:
         return 403, "requests from other sites are refused"
-    page = request.path == "/" and request.headers.get("Upgrade", "").lower() != "websocket"
-    if key is None or request.path == "/healthz" or page:
+    if key is None or request.path == "/healthz" or (request.path == "/" and not _is_websocket(request)):
         return None
     if hmac.compare_digest(request.headers.get("Authorization", "").encode(), f"Api-Key {key}".encode()):
         return None

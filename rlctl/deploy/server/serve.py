@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import gc
 import logging
 import os
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING
 from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.deploy.server.request import KEY_VARIABLE, LOOPBACK, ServeRequest
 from rlctl.deploy.server.session import load_served_policy
-from rlctl.errors import ArtifactError, RlctlError, UsageError, explain_missing_package
+from rlctl.errors import RlctlError, UsageError, explain_missing_package
 from rlctl.storage import untrusted
 
 if TYPE_CHECKING:
@@ -49,12 +48,9 @@ def _read_key(file: Path | None) -> str | None:
     if file is None:
         key = os.environ.get(KEY_VARIABLE)
         return key.strip() if key else None
-    try:
-        key = untrusted.read_bytes(file, _LONGEST_KEY).decode().strip()
-    except UnicodeDecodeError as error:
-        raise ArtifactError(f"{file}: the key cannot be read: {error}") from None
-    if not key or not key.isprintable():
-        raise UsageError(f"--key-file {file}: the file contains no key; write the key as one line of text")
+    key = untrusted.read_bytes(file, _LONGEST_KEY).decode(errors="replace").strip()
+    if not key or not key.isprintable() or not key.isascii():
+        raise UsageError(f"--key-file {file}: the file contains no key; write the key as one line of ASCII text")
     return key
 
 
@@ -95,11 +91,8 @@ async def serve_until(
                 lambda: connections.accept(web_server()), request.host, request.port, backlog=BACKLOG
             )
         except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                hint = "choose another one, or --port 0 for any free port"
-                raise UsageError(f"port {request.port} is in use; {hint}") from None
-            option = f"--host {request.host} --port {request.port}"
-            raise UsageError(f"{option}: {error.strerror or error}") from None
+            reason = f"{error.strerror or error}; --port 0 takes any free port"
+            raise UsageError(f"--host {request.host} --port {request.port}: {reason}") from None
         if handle_signals:
             _handle_signals(server, end)
         gc.collect()

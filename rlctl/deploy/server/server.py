@@ -154,7 +154,9 @@ class PolicyServer:
                     raise messages.MessageError("text frame received; send binary frames of msgpack")
                 answer = session.answer(messages.unpack(message.data))
             except messages.MessageError as error:
-                await self._send_error(socket, session, str(error))
+                self.measurements.errors += 1
+                self._write_fault(session, "message", str(error))
+                await socket.send_str(str(error))
                 ready = time.perf_counter()
                 continue
             if before_s is not None:
@@ -163,11 +165,6 @@ class PolicyServer:
             ready = time.perf_counter()
             before_s = ready - begin
             self.measure(session, answer, before_s)
-
-    async def _send_error(self, socket: web.WebSocketResponse, session: Session, text: str) -> None:
-        self.measurements.errors += 1
-        self._write_fault(session, "message", text)
-        await socket.send_str(text)
 
     def measure(self, session: Session, answer: dict[str, Any], seconds: float) -> None:
         """Record the duration [s] and the outcome of an answer."""

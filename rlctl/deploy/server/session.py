@@ -144,13 +144,8 @@ class Session:
         if not is_number or abs(age_s) > _MAX_AGE_S:
             raise ObservationError(f"age_s is {short_repr(age_s)}, not a number of seconds")
         layout = self.safety.layout
-        if WHOLE in fields and WHOLE not in layout.shapes:
-            if others := [short_repr(name) for name in fields if name != WHOLE]:
-                raise ObservationError(
-                    f"{WHOLE} and {', '.join(others[:8])} exclude each other; send names or the flat vector"
-                )
-            return layout.read(fields[WHOLE]), float(age_s)
-        return layout.read(fields), float(age_s)
+        is_flat = list(fields) == [WHOLE] and WHOLE not in layout.shapes
+        return layout.read(fields[WHOLE] if is_flat else fields), float(age_s)
 
     def _adopt_policy(self) -> None:
         if (policy := self._policy()) is not self._served:
@@ -168,13 +163,6 @@ class Session:
     def order(self, order: str) -> None:
         """Obey an operator's order: stop, home, hold or resume."""
         self._by_watchdog = False  # only the operator ends an operator's order
-        match order:
-            case "stop":
-                self.safety.stop("stopped by hand")
-            case "home":
-                self.safety.home("sent home by hand")
-            case "hold":
-                self.safety.hold("held by hand")
-            case "resume":
-                self._last_s = None
-                self.safety.resume()
+        if order == "resume":
+            self._last_s = None
+        getattr(self.safety, order)()

@@ -61,10 +61,7 @@ def test_the_protocol(serve):
     [
         ({"positions": [0, 0]}, "observation names missing: goal"),
         ({**OBSERVATION, "gaol": 1}, "observation names unknown: gaol (Did you mean 'goal'?)"),
-        (
-            {**OBSERVATION, "observation": FLAT},
-            "observation and positions, goal exclude each other; send names or the flat",
-        ),
+        ({**OBSERVATION, "observation": FLAT}, "observation names unknown: observation"),
         ({"observation": FLAT[:3]}, "observation 'observation' has shape (3,), the policy takes (5,)"),
         ({**OBSERVATION, "goal": "near"}, "observation 'goal' is <U4, not numbers"),
         ({**OBSERVATION, "goal": [[1], [2, 3]]}, "observation 'goal' is not an array of numbers"),
@@ -97,8 +94,9 @@ def pack_array(dtype="<f8", shape=(1,)):
         (pack_array("|O"), "unsupported array dtype |O"),
         (pack_array("|V8"), "unsupported array dtype |V8"),
         (pack_array("<c8"), "unsupported array dtype <c8"),
-        (pack_array(shape=[2**60]), "the data of an array has another size than shape "),
-        (pack_array(shape=[-1]), "invalid array shape [-1]"),
+        (pack_array(shape=[2**60]), "the data of an array does not have shape "),
+        (pack_array(shape=[[1]]), "the data of an array does not have shape [[1]] and dtype float64"),
+        (pack_array(shape=None), "the data of an array does not have shape None"),
     ],
 )
 def test_what_is_not_a_message_gets_a_text_frame(serve, content, error):
@@ -157,10 +155,7 @@ def test_a_key(serve, tmp_path, monkeypatch):
 def test_an_unknown_path_is_refused_with_a_hint(serve):
     server = serve()
     status, text = server.post("/resme")
-    assert (status, json.loads(text)["error"].partition(" There are")[0]) == (
-        404,
-        "POST /resme: Not Found. Did you mean '/resume'?",
-    )
+    assert (status, json.loads(text)["error"]) == (404, "POST /resme: Not Found. Did you mean '/resume'?")
     assert server.get("/stop")[0] == 405
 
 
@@ -186,7 +181,7 @@ def test_a_port_in_use(serve):
 
     from rlctl.deploy.server.serve import run_server
 
-    with pytest.raises(UsageError, match=f"port {first.port} is in use"):
+    with pytest.raises(UsageError, match=f"--port {first.port}: .* in use; --port 0 takes any free port"):
         asyncio.run(asyncio.to_thread(run_server, server, print))
 
 
@@ -204,7 +199,7 @@ def test_the_watchdog(serve, tmp_path):
         time.sleep(0.2)  # silent after a request that began an episode
         assert client.act(OBSERVATION)["state"] == "stopped"
         server.post("/stop")  # now a person has stopped it
-        assert client.act({**OBSERVATION, "reset": True})["reason"] == "stopped by hand"
+        assert client.act({**OBSERVATION, "reset": True})["reason"] == "stop ordered"
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert ("state", "stopped") in [(line["kind"], line.get("name")) for line in lines]
     assert lines[0]["kind"] == "started"
@@ -218,7 +213,7 @@ def test_orders_are_for_all_clients_also_later_ones(serve):
     with server.client() as one:
         assert one.act(OBSERVATION)["actions"] == pytest.approx(np.array([[0.2, 0.3]]))  # 1 rad/s from 0.1 and 0.2
         assert json.loads(server.post("/stop")[1])["order"] == "stop"
-        assert one.act({**OBSERVATION, "reset": True})["reason"] == "stopped by hand"
+        assert one.act({**OBSERVATION, "reset": True})["reason"] == "stop ordered"
         with server.client() as two:
             assert two.act(OBSERVATION)["state"] == "stopped"
             server.post("/home")
