@@ -1,19 +1,6 @@
 """Robot learning in simulation, end to end: check an environment, train, evaluate, export, replay.
 
-    cli           the command line: parse, call one function, print
-    tuning        trainings that are compared, to find hyperparameters
-    checking  training  evaluation  exporting  replaying    the five verbs
-    runs  tasks  importing    what can be asked of runs and of tasks; models of other libraries
-    deploy        what comes after export: safety filter, policy server, physical values of the robot
-    rollout       many environments in worker processes; seeds; episodes
-    processes     one watched child process
-    run  policy  recipe       the three formats: run folder and episodes, policy file, recipe
-    environments  from what the user typed to an environment
-    task          for authors of tasks: Task, Sim, Body, Event, rewards
-    storage       atomic files, tables, YAML, and reading what others may have written
-    errors        every error that a user can cause, with its exit code
-
-From Python: `rlctl.make`, `check_env`, `train`, `evaluate`, `load_policy`. `docs/architecture.md` is a tour.
+From Python: `rlctl.make`, `check_env`, `train`, `evaluate`, `load_policy`. `docs/architecture.md` explains the folders.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 _LONGEST = 400  # [characters] of another library's message
-_MOST_LINES = 80  # of a plugin's traceback
+_MOST_FRAMES = 40  # of a plugin's traceback: an endless recursion has a thousand
 _OURS = Path(__file__).parent
 _IMPORTLIB = Path(importlib.__file__).parent
 
@@ -128,11 +128,7 @@ def format_plugin_traceback(error: BaseException) -> str:
         frames = frames.tb_next
     if frames is None and not isinstance(error, SyntaxError):  # its message names the line
         return ""
-    lines = "".join(traceback.format_exception(type(error), error, frames)).splitlines(keepends=True)
-    left_out = len(lines) - _MOST_LINES
-    if left_out > 0:  # an endless recursion
-        lines[_MOST_LINES // 2 : -_MOST_LINES // 2] = [f"  ... {left_out} lines left out ...\n"]
-    return "".join(lines)
+    return "".join(traceback.format_exception(type(error), error, frames, limit=-_MOST_FRAMES))
 
 
 def _is_plugin_file(file: str) -> bool:

@@ -50,11 +50,7 @@ def _list_paths(incomplete: str, pattern: str) -> list[str]:
     return [str(path) for path in sorted(folder.glob(pattern))[:_MOST]]
 
 
-_COMPLETIONS = {
-    "task": complete_task,
-    "run": complete_run,
-    "algorithm": complete_algorithm,
-}
+_COMPLETIONS = {"task": complete_task, "run": complete_run, "algorithm": complete_algorithm}
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:

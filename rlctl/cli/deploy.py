@@ -60,8 +60,7 @@ def identify(
     ] = None,
     excite: Annotated[Path | None, Option("Instead, write a safe trajectory to play and log.", metavar="FILE")] = None,
     events: Annotated[
-        list[str],
-        Option("Estimate the values of this event only; repeatable.", ("--event",), metavar="NAME"),
+        list[str], Option("Estimate the values of this event only; repeatable.", ("--event",), metavar="NAME")
     ] = [],
     seconds: Annotated[float, Option("Length of the trajectory of --excite [s].", min=1.0, max=3600.0)] = 10.0,
     settings: Settings = [],
@@ -80,11 +79,5 @@ def identify(
         return
     if log is None or excite is not None:
         raise UsageError("give either --excite FILE or --log FILE")
-    result = identify(
-        spec,
-        log,
-        events=events,
-        seed=seed,
-        report=lambda line: output.err().print(f"identify: {line}"),
-    )
+    result = identify(spec, log, events=events, seed=seed, report=lambda line: output.err().print(f"identify: {line}"))
     show(result, json)

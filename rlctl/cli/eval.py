@@ -29,8 +29,7 @@ def evaluate(
     ] = [],
     push: Annotated[bool, Option("Find the smallest push at which the policy fails.", ("--push",))] = False,
     sim: Annotated[
-        str | None,
-        Option("Play in MuJoCo too, with soft, medium and stiff contacts.", metavar="mujoco[:SOLREF]"),
+        str | None, Option("Play in MuJoCo too, with soft, medium and stiff contacts.", metavar="mujoco[:SOLREF]")
     ] = None,
     yes: Yes = False,
     on: On = None,

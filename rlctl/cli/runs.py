@@ -61,8 +61,7 @@ def report_runs(
     format: Annotated[Literal["html", "md"], Option("A page, or text for pull requests.")] = "html",
     pictures: Annotated[bool, Option("Do not replay episodes to draw pictures.", ("/--no-pictures",))] = True,
     episodes: Annotated[
-        int,
-        Option("Episodes that each run plays to compare recipes; 0: do not compare.", min=0, max=1_000_000),
+        int, Option("Episodes that each run plays to compare recipes; 0: do not compare.", min=0, max=1_000_000)
     ] = 100,
 ) -> None:
     """Write the result of runs as one file: verdict, curves, evaluations, diagnosis, pictures, how to reproduce it."""
@@ -113,8 +112,7 @@ def import_run(
     algo: Annotated[str | None, Option("Its algorithm, if the file does not name it.")] = None,
     settings: Settings = [],
     output: Annotated[
-        Path | None,
-        Option("Policy file to write. Default: MODEL.safetensors.", ("--output", "-o"), metavar="FILE"),
+        Path | None, Option("Policy file to write. Default: MODEL.safetensors.", ("--output", "-o"), metavar="FILE")
     ] = None,
     json: Json = None,
 ) -> None:

@@ -12,12 +12,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Limits", "SafetyEvent", "SafetyFilter", "read_limits"]
 
-_MODULES = {
-    "Limits": "limits",
-    "SafetyEvent": "bounds",
-    "SafetyFilter": "safety_filter",
-    "read_limits": "limits",
-}
+_MODULES = {"Limits": "limits", "SafetyEvent": "bounds", "SafetyFilter": "safety_filter", "read_limits": "limits"}
 
 
 def __getattr__(name: str) -> Any:

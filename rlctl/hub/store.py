@@ -9,7 +9,6 @@ import hashlib
 import importlib
 import os
 import re
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
@@ -70,7 +69,7 @@ def fetch(address: str) -> Path:
         folder = _cache() / _check_digest(base, hashlib.sha256(content).hexdigest(), expected)
         if not folder.exists():
             manifest = _parse_manifest(content, base)
-            with _temporary_folder() as new:
+            with _create_folder() as new:
                 for name, entry in manifest.files.items():
                     target = new / name
                     target.parent.mkdir(parents=True, exist_ok=True)
@@ -148,7 +147,7 @@ def _fetch_file(store: Any, path: str, address: str, expected: str) -> Path:
     name = PurePosixPath(path).name
     if expected and (cached := _cache() / expected / name).is_file():
         return cached
-    with _temporary_folder() as new:
+    with _create_folder() as new:
         folder = _cache() / _check_digest(address, _download(store, path, address, new / name, None), expected)
         if not folder.exists():
             _move_to_cache(new, folder)
@@ -184,18 +183,15 @@ def _cache() -> Path:
 
 
 @contextlib.contextmanager
-def _temporary_folder() -> Iterator[Path]:
+def _create_folder() -> Iterator[Path]:
     _cache().mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(prefix="new-", dir=_cache()))
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix="new-", dir=_cache(), ignore_cleanup_errors=True) as folder:
+        yield Path(folder)
 
 
 def _move_to_cache(new: Path, folder: Path) -> None:
     try:
         new.rename(folder)
     except OSError:
-        if not folder.is_dir():  # another process has downloaded the same
+        if not folder.is_dir():  # it is one if another process has downloaded the same
             raise

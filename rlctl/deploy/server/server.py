@@ -122,8 +122,7 @@ class PolicyServer:
         if len(self._sessions) > self.request.max_clients:  # one of them is `posting`
             self.measurements.refused += 1
             return web.Response(
-                status=503,
-                text=f"{self.request.max_clients} clients are connected; --max-clients allows no more\n",
+                status=503, text=f"{self.request.max_clients} clients are connected; --max-clients allows no more\n"
             )
         session = self._open_session()
         self.measurements.connections += 1
