@@ -64,14 +64,12 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         hints = typing.get_type_hints(request, include_extras=True)
         fields = [field for field in dataclasses.fields(request) if _find_option(hints[field.name])]
         parameters += [_make_parameter(field.name, hints[field.name], _find_default(field)) for field in fields]
-        requests[parameter.name] = (request, {field.name: _turns_off(hints[field.name]) for field in fields})
+        requests[parameter.name] = (request, [field.name for field in fields])
 
     def run(**values: Any) -> None:
         output.results()  # reserves stdout for the result: plugins print to stderr from now on
         for name, (request, fields) in requests.items():
-            # A flag that turns a field off is True if the field must become False.
-            arguments = {field: values.pop(field) != turns_off for field, turns_off in fields.items() if turns_off}
-            values[name] = request(**arguments, **{field: values.pop(field) for field in fields if field in values})
+            values[name] = request(**{field: values.pop(field) for field in fields})
         return function(**values)
 
     run.__name__, run.__doc__ = function.__name__, function.__doc__
@@ -84,11 +82,6 @@ def _find_option(annotation: Any) -> Option | None:
     return next((data for data in getattr(annotation, "__metadata__", ()) if isinstance(data, Option)), None)
 
 
-def _turns_off(annotation: Any) -> bool:
-    option = _find_option(annotation)
-    return option is not None and any(flag.startswith("/") for flag in option.flags)
-
-
 def _find_default(field: dataclasses.Field[Any]) -> Any:
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
@@ -96,24 +89,19 @@ def _find_default(field: dataclasses.Field[Any]) -> Any:
 def _make_parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
     if (option := _find_option(annotation)) is not None:
         kind = annotation.__origin__
-        default = False if _turns_off(annotation) else default
-        annotation = Annotated[kind, _make_typer_option(option, shows_default=kind is not bool)]
+        make = typer.Argument if isinstance(option, Argument) else typer.Option
+        made: Any = make(
+            *option.flags,
+            help=option.help,
+            metavar=option.metavar,
+            min=option.min,
+            max=option.max,
+            autocompletion=None if option.completes is None else _COMPLETIONS[option.completes],
+            show_default=option.default_text or kind is not bool,
+        )
+        annotation = Annotated[kind, made]
     default = inspect.Parameter.empty if default is dataclasses.MISSING else default
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
-
-def _make_typer_option(option: Option, *, shows_default: bool) -> Any:
-    """Return Typer's option or argument for a request's field."""
-    make = typer.Argument if isinstance(option, Argument) else typer.Option
-    return make(
-        *(flag.removeprefix("/") for flag in option.flags),
-        help=option.help,
-        metavar=option.metavar,
-        min=option.min,
-        max=option.max,
-        autocompletion=None if option.completes is None else _COMPLETIONS[option.completes],
-        show_default=option.default_text or shows_default,
-    )
 
 
 def choose_checkpoint(checkpoint: str, pretrained: bool) -> str:

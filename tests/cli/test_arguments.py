@@ -26,9 +26,13 @@ class Picking:
 def app():
     """A command that prints the request that it gets, and an option of its own."""
 
-    def pick(request: Picking, loud: Annotated[bool, Option("Print twice.", ("--loud",))] = False) -> None:
+    def pick(
+        request: Picking,
+        loud: Annotated[bool, Option("Print twice.", ("--loud",))] = False,
+        polite: Annotated[bool, Option("Do not say please.", (" /--rude",))] = True,
+    ) -> None:
         """Pick."""
-        print(request, loud)
+        print(request, loud, polite)
 
     app = typer.Typer()
     app.command()(command(pick))
@@ -45,7 +49,11 @@ def app():
 )
 def test_the_command_line_fills_a_request(app, arguments, filled, loud):
     result = CliRunner().invoke(app, arguments)
-    assert result.output == f"{filled} {loud}\n"
+    assert result.output == f"{filled} {loud} True\n"
+
+
+def test_a_flag_turns_a_parameter_off(app):
+    assert CliRunner().invoke(app, ["cup", "--rude"]).output.endswith("False False\n")
 
 
 def test_what_a_field_does_not_take_and_help(app):
