@@ -85,23 +85,22 @@ class ObservationLayout:
 
 def read_numbers(values: Any) -> NDArray[np.float64]:
     """Return a flat float64 copy of real numbers; raises `ObservationError` for everything else."""
+    with np.errstate(over="ignore"):  # numbers too large for float64 become infinite
+        return _read_array(values, "a value").astype(np.float64).ravel()
+
+
+def _read_array(values: Any, name: str) -> Array:
     try:
         array = np.asarray(values)
     except ValueError:  # lists of different lengths
-        raise ObservationError("a value that is not an array of numbers") from None
+        array = np.array(None)
     if array.dtype.kind not in "biuf":
-        raise ObservationError(f"values of type {array.dtype}, not real numbers")
-    with np.errstate(over="ignore"):  # numbers too large for float64 become infinite
-        return array.astype(np.float64).ravel()
+        raise ObservationError(f"{name} is not an array of numbers")
+    return array
 
 
 def _convert(value: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
-    try:
-        array = np.asarray(value)
-    except ValueError:  # lists of different lengths
-        raise ObservationError(f"observation {name!r} is not an array of numbers") from None
-    if array.dtype.kind not in "biuf":
-        raise ObservationError(f"observation {name!r} is {array.dtype}, not numbers")
+    array = _read_array(value, f"observation {name!r}")
     if array.shape != shape:
         # A flat array is reshaped; otherwise only axes of length 1 may differ, so a transposed image is refused.
         axes, expected = ([axis for axis in sizes if axis != 1] for sizes in (array.shape, shape))

@@ -95,10 +95,8 @@ class Follower:
         return errors
 
     def _choose_begin(self, smoothed: Array) -> Array:
-        """Return the start states: each column smoothed, or measured where that predicts the next row better.
-
-        Smoothing removes noise, but also the peaks of a joint under a quickly changing torque.
-        """
+        """Return the start states: each column smoothed, or measured where that predicts the next row better."""
+        # Smoothing removes noise, but also the peaks of a joint under a quickly changing torque.
         self._env.set_events(EventSettings(False, {}))
         starts = range(0, len(self._actions) - 1, max(1, len(self._actions) // _COMPARED_ROWS))
         errors = []

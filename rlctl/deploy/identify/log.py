@@ -26,10 +26,7 @@ MIN_ROWS = 20
 
 @dataclasses.dataclass(frozen=True)
 class Log:
-    """The commands of a robot and its measured joint states: a row per control step.
-
-    `positions[t]` and `velocities[t]` were measured when `actions[t]` was commanded.
-    """
+    """Commands of a robot and its joint states when each was commanded: a row per control step."""
 
     joints: tuple[str, ...]
     actions: Array  # shape (T, actions)

@@ -70,10 +70,7 @@ class Unknowns:
 
 
 def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: str) -> Unknowns:
-    """Return the unknown values of a task's events, or of the chosen events.
-
-    Raises `UsageError` for an unknown name, an event that no log can determine, and if there is no value to estimate.
-    """
+    """Return what to estimate of all events, or the chosen ones; raises `UsageError` if that is nothing."""
     for name in chosen:
         check_name(name, events, f"--event: {task} has no event", UsageError)
     parameters: list[Parameter] = []

@@ -31,10 +31,7 @@ _HTTP_CONNECTIONS = 16  # connections for HTTP requests
 
 
 def count_allowed_connections(max_clients: int) -> int:
-    """Return how many connections may be open, so that the server can always accept a stop request.
-
-    Raises `UsageError` if this process may open too few files for `max_clients`.
-    """
+    """Return how many connections may be open, so that a stop is always accepted; raises `UsageError` if too few."""
     limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed = limit - len(os.listdir("/proc/self/fd" if os.path.isdir("/proc/self/fd") else "/dev/fd"))
     allowed -= BACKLOG + _RESERVED_FILES

@@ -63,7 +63,7 @@ def test_the_protocol(serve):
         ({**OBSERVATION, "gaol": 1}, "observation names unknown: gaol (Did you mean 'goal'?)"),
         ({**OBSERVATION, "observation": FLAT}, "observation names unknown: observation"),
         ({"observation": FLAT[:3]}, "observation 'observation' has shape (3,), the policy takes (5,)"),
-        ({**OBSERVATION, "goal": "near"}, "observation 'goal' is <U4, not numbers"),
+        ({**OBSERVATION, "goal": "near"}, "observation 'goal' is not an array of numbers"),
         ({**OBSERVATION, "goal": [[1], [2, 3]]}, "observation 'goal' is not an array of numbers"),
         ({**OBSERVATION, "age_s": "old"}, "age_s is old, not a number of seconds"),
         ({**OBSERVATION, "age_s": 1e300}, "age_s is 1e+300, not a number of seconds"),
