@@ -26,11 +26,7 @@ _PIPED_WIDTH = 1000  # nothing folds: a line stays a line for grep
 
 @functools.cache
 def results() -> TextIO:
-    """Return the stream of results: the stdout this process was started with.
-
-    Afterwards file descriptor 1 points to stderr, so that output of PyBullet, a plugin or a worker never mixes
-    with a result.
-    """
+    """Return the stream of results, the original stdout. From then on descriptor 1 is stderr, for other output."""
     try:
         sys.stdout.flush()
         # A terminal has its own encoding; files and pipes get UTF-8.

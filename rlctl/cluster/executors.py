@@ -19,10 +19,7 @@ _NOT_ON_SLURM = {
 def choose_executor(
     on: str | None, cluster: Path | None = None, *, detach: bool = False, verb: str = "train"
 ) -> MakeTrainings:
-    """Return the factory of trainings for `local`, `slurm`, `ray`, `ray:auto` or `ray:HOST:PORT`.
-
-    Raises `UsageError` for any other value, and `RecipeError` for an invalid `cluster.yaml`.
-    """
+    """Return the factory of trainings for `--on`; raises `UsageError`, or `RecipeError` for `cluster.yaml`."""
     kind, address = _parse(on, verb)
     if detach and kind != "slurm":
         raise UsageError(f"--detach is for --on slurm: trainings on {kind} end with this process")

@@ -265,10 +265,7 @@ def _read_beat(folder: Path) -> str:
 
 
 def run_on_node(works: Path, index: int) -> int:
-    """Execute the work at an index and record its state in the job file.
-
-    Return 143 if SLURM must requeue the job, otherwise the exit code of the training.
-    """
+    """Execute a work, record it in its job file; return its exit code, or 143 if SLURM must requeue the job."""
     work = Work(**files.read_json(works)[index])
     folder = work.folder
     before = read_job(folder, work.seed)

@@ -146,10 +146,7 @@ def describe_driver(task: str) -> dict[str, Any]:
 
 
 def compare_versions(task: str, versions: Mapping[str, str], source_sha256: str | None) -> list[str]:
-    """Compare this machine's rlctl, task and libraries with the driver's; return warnings for different libraries.
-
-    Raises `ArtifactError` for a different rlctl or task file.
-    """
+    """Return warnings for different libraries; raises `ArtifactError` for a different rlctl or task file."""
     here, node = collect_versions(), platform.node()
     if here["rlctl"] != versions["rlctl"]:
         both = here["rlctl"], versions["rlctl"]

@@ -79,10 +79,7 @@ def fetch(address: str) -> Path:
 
 
 def push(contents: Mapping[str, Path | bytes], address: str) -> Manifest:
-    """Upload files, by their paths below an address, and last their manifest. Returns the manifest.
-
-    Raises `ArtifactError` where the address cannot be written.
-    """
+    """Upload files by their paths below an address, then their manifest; raises `ArtifactError` if that fails."""
     data = {name: untrusted.read_bytes(value) if isinstance(value, Path) else value for name, value in contents.items()}
     entries = {name: StoredFile(size=len(value), sha256=files.digest(value)) for name, value in data.items()}
     manifest = Manifest(files=entries)

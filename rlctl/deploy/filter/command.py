@@ -103,10 +103,7 @@ class Command:
         return target
 
     def rest(self, go_home: bool) -> NDArray[Any]:
-        """Return the action that brakes the robot and keeps it where it is, or brings it home.
-
-        Raises `UnsafeCommand`.
-        """
+        """Return the action that brakes the robot and keeps it there, or brings it home; raises `UnsafeCommand`."""
         self._smooth = None
         present = self._present(None)
         home = self._home if go_home else None
@@ -115,10 +112,7 @@ class Command:
         return self._move(self._zeros if home is None or self.position is None else home - self.position)
 
     def stand_still(self) -> NDArray[Any]:
-        """Return the action of the last command that kept its limits: its value, or no motion. Forgets all smoothing.
-
-        A stopped robot gets it if even braking is unsafe.
-        """
+        """Return the last command that kept its limits, or no motion: for a robot for which even braking is unsafe."""
         self._smooth = self._blend_from = None
         self._blend_left, self._before = 0, self._zeros
         if not self._bounds.is_value:
@@ -181,10 +175,7 @@ class Command:
         return sent if self._is_action else self._bounds.offset + sent * self._bounds.factor
 
     def _as_action(self, command: Array, direction: NDArray[np.int64] | None = None) -> NDArray[Any]:
-        """Return the action of a command, of the space's shape and type.
-
-        Whole numbers are rounded to the nearest one, or per joint in a `direction`: -1 down, 1 up.
-        """
+        """Return the action of a command; whole numbers are rounded, or per joint: -1 down, 1 up."""
         action = command if self._is_action else (command - self._bounds.offset) / self._bounds.factor
         if self._space.dtype.kind != "f":
             action = (

@@ -138,10 +138,7 @@ def _make_bounds(
 
 
 def _describe_numbers(dtype: Any) -> tuple[float, float]:
-    """Return the largest allowed action and the relative precision of its type.
-
-    Unbounded actions get this bound, so that differences of two commands stay finite.
-    """
+    """Return the largest action, with which differences stay finite, and the relative precision of its type."""
     if np.dtype(dtype).kind == "f":
         return min(float(np.finfo(dtype).max), 1e30), float(np.finfo(dtype).eps)
     return min(float(np.iinfo(dtype).max), 2.0**53), float(np.finfo(np.float64).eps)
@@ -160,10 +157,8 @@ def _merge(limits: Limits, name: str, known: dict[str, Any]) -> JointLimits:
 
 
 def _list_known(limits: Limits, joints: Joints | None, index: int) -> dict[str, Any]:
-    """Return one joint's limits in the task's robot model, as far as the filter can keep them.
-
-    Model files write a missing limit as 0, or as a lower end that is not below the upper end.
-    """
+    """Return one joint's limits in the task's robot model, as far as the filter can keep them."""
+    # Model files write a missing limit as 0, or as a lower end that is not below the upper end.
     known: dict[str, Any] = {}
     if joints is None:
         return known

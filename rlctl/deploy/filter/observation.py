@@ -43,10 +43,7 @@ class ObservationLayout:
                 self.size += math.prod(part)
 
     def read(self, values: Any) -> Any:
-        """Return an observation in the policy's form, from values by name or the flat vector.
-
-        Raises `ObservationError` that names missing and unknown observations and wrong shapes.
-        """
+        """Return values by name, or the flat vector, in the policy's form; raises `ObservationError`."""
         if isinstance(values, dict):
             parts = self._read_names(values)
             if isinstance(self.space, spaces.Dict):
@@ -68,10 +65,7 @@ class ObservationLayout:
         return {name: _convert(values[name], name, shape, self._dtypes[name]) for name, shape in known.items()}
 
     def flatten(self, observation: Any) -> NDArray[np.float64]:
-        """Return the numbers of an observation without its images, shape (size,).
-
-        Raises `ObservationError` for values that are not numbers, or too few or many.
-        """
+        """Return the numbers of an observation without its images, shape (size,); raises `ObservationError`."""
         parts = split(observation)
         keys = [SINGLE] if SINGLE in parts else [*self.slices]
         if missing := [key for key in keys if key not in parts]:

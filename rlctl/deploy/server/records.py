@@ -176,10 +176,7 @@ class _Handler(logging.handlers.RotatingFileHandler):
 
 
 class RerunLog:
-    """Collects rows and writes them in batches: a thousand times cheaper than one by one.
-
-    Raises `ArtifactError` for a file that cannot be written.
-    """
+    """Writes rows in batches, which costs a thousandth; raises `ArtifactError` if the file cannot be written."""
 
     def __init__(self, file: Path) -> None:
         import rerun as rr  # takes a second

@@ -190,10 +190,7 @@ class PolicyServer:
                 recording.add(f"{root}/observation/{name}", flat[part].copy())
 
     def give_order(self, order: str) -> int:
-        """Order all clients, present and future, to stop, home, hold or resume; return how many there are.
-
-        Raises `UsageError` for home if the limits define none.
-        """
+        """Give an order to all present and later clients; return their number. Raises `UsageError` without a home."""
         for session in self._sessions.values():
             session.order(order)
         self._order = None if order == "resume" else order
@@ -201,20 +198,14 @@ class PolicyServer:
         return len(self._sessions)
 
     def override(self, action: Any | None) -> None:
-        """Override the actions of all present and later clients; None ends the override.
-
-        Raises `ValueError` for an invalid action.
-        """
+        """Override all present and later clients; None ends it. Raises `ValueError` for an invalid action."""
         for session in self._sessions.values():
             session.safety.override(action)
         self._manual = action
         self._log.write("order", name="policy" if action is None else "override")
 
     async def replace_policy(self, file: Path) -> None:
-        """Replace the policy from each client's next step on.
-
-        Raises `RlctlError` for an invalid policy or one for another robot; the old policy then keeps acting.
-        """
+        """Replace the policy from the next steps on; if it does not fit, raise `RlctlError` and keep the old one."""
         try:
             policy = await asyncio.to_thread(load_served_policy, file)
             policy.check_replaces(self.policy.info.env)

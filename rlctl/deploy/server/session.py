@@ -70,10 +70,7 @@ _MAX_AGE_S = 1e9
 
 
 class Session:
-    """The successive episodes of one client.
-
-    `policy` returns the policy to act with; a new one takes over at the next step, with a blend.
-    """
+    """The episodes of one client. A new policy that `policy` returns takes over at the next step, with a blend."""
 
     def __init__(self, number: int, policy: Callable[[], ServedPolicy], limits: Limits | None) -> None:
         self.number = number
