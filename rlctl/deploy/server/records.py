@@ -1,6 +1,7 @@
 """What a server records: its measurements, its event log as rotated JSON lines, and its Rerun recording."""
 
 import collections
+import contextlib
 import datetime
 import json
 import logging
@@ -8,7 +9,6 @@ import logging.handlers
 import os
 import resource
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -114,7 +114,7 @@ class EventLog:
     """
 
     def __init__(self, file: Path | None, *, max_file_size: int = _MAX_FILE_SIZE) -> None:
-        self._handler: _Handler | None = None
+        self._handler: logging.Handler = logging.NullHandler()
         self._repeated: dict[tuple[int, str], tuple[float, int]] = {}
         if file is None:
             return
@@ -126,8 +126,6 @@ class EventLog:
 
     def write(self, kind: str, client: int | None = None, *, time_s: float | None = None, **fields: Any) -> None:
         """Write an event with its time, `time_s` [s since 1970] or now."""
-        if self._handler is None:
-            return
         at = datetime.datetime.fromtimestamp(time.time() if time_s is None else time_s, datetime.UTC)
         line = {"time": at.isoformat(timespec="milliseconds"), "kind": kind, "client": client, **fields}
         text = json.dumps(as_json({key: value for key, value in line.items() if value not in (None, "")}))
@@ -135,8 +133,6 @@ class EventLog:
 
     def write_event(self, client: int, event: SafetyEvent | Intervention) -> None:
         """Write the events of a safety filter."""
-        if self._handler is None:
-            return
         counts = dict.fromkeys(event.names, 1) if event.kind == "state" else self._count(client, event.names)
         if counts:
             for record in event.list_events():
@@ -160,8 +156,7 @@ class EventLog:
 
     def close(self) -> None:
         """Close the file."""
-        if self._handler is not None:
-            self._handler.close()
+        self._handler.close()
 
 
 class _Handler(logging.handlers.RotatingFileHandler):
@@ -182,10 +177,8 @@ class RerunLog:
         import rerun as rr  # takes a second
 
         self._rerun = rr
-        self._rows: dict[str, list[tuple[float, Any]]] = {}
-        self._count = 0
+        self._rows: collections.deque[tuple[str, float, Any]] = collections.deque(maxlen=_MAX_ROWS)
         self._file, self._warned = file, False
-        self._lock = threading.Lock()
         self._stream = rr.RecordingStream("rlctl serve")
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
@@ -196,22 +189,21 @@ class RerunLog:
             raise ArtifactError(f"{file}: the recording cannot be written: {reason}") from None
 
     def add(self, entity: str, values: Any) -> None:
-        """Add numbers at the present time; dropped while too many rows wait for `flush`."""
-        with self._lock:
-            if self._count < _MAX_ROWS:
-                self._count += 1
-                self._rows.setdefault(entity, []).append((time.time(), values))
+        """Add numbers at the present time; the oldest are dropped if too many rows wait for `flush`."""
+        self._rows.append((entity, time.time(), values))
 
     def flush(self) -> None:
         """Write the collected rows; any thread may call this."""
-        with self._lock:
-            rows, self._rows, self._count = self._rows, {}, 0
+        rows = collections.defaultdict[str, list[tuple[float, Any]]](list)
+        with contextlib.suppress(IndexError):  # nothing is left
+            while True:
+                entity, second, values = self._rows.popleft()
+                rows[entity].append((second, np.ravel(values)))
         try:
             for entity, samples in rows.items():
-                times = np.array([second for second, _ in samples])
+                times, columns = (np.array(column, np.float64) for column in zip(*samples, strict=True))
                 index = self._rerun.TimeColumn("time", timestamp=times)
-                values = np.array([np.ravel(value) for _, value in samples], np.float64)
-                self._stream.send_columns(entity, [index], self._rerun.Scalars.columns(scalars=values))
+                self._stream.send_columns(entity, [index], self._rerun.Scalars.columns(scalars=columns))
             self._stream.flush()
         except RuntimeError as error:  # what Rerun raises when the disk is full
             if not self._warned:
