@@ -35,16 +35,16 @@ OptionalTask = Annotated[str | None, Argument(TASK_FORMS, metavar="TASK", comple
 RunName = Annotated[
     str | None, Argument("Run folder, policy file, task name, or latest.", completes="run", default_text="latest")
 ]
-Checkpoint = Annotated[str, Option("Which policy of the run.", metavar="best|last|STEP")]
+Checkpoint = Annotated[str, Option("The policy of the run to use.", metavar="best|last|STEP")]
 Pretrained = Annotated[bool, Option("The policy that ships with the task.", ("--pretrained",))]
 Settings = Annotated[
     list[str], Option("Set a key, e.g. task.tolerance=0.02, randomize=true.", ("--set",), metavar="KEY=VALUE")
 ]
 EpisodeSeed = Annotated[int, Option("Seed of the list of episodes.", min=0)]
-Json = Annotated[str | None, Option("Write JSON too; - for stdout, alone.", metavar="FILE")]
+Json = Annotated[str | None, Option("Also write the result as JSON; - writes only JSON, to stdout.", metavar="FILE")]
 Yes = Annotated[bool, Option("Do not ask.", ("--yes",))]
 Config = Annotated[Path | None, Option("Recipe that overrides the task's own, or presets/NAME.", metavar="FILE")]
-RunsFolder = Annotated[Path, Option("Where run folders go.", ("--output", "-o"), metavar="FOLDER")]
+RunsFolder = Annotated[Path, Option("Folder for the folders of runs.", ("--output", "-o"), metavar="FOLDER")]
 EnvTimeout = Annotated[
     float, Option("How long a step or reset may take.", ("--env-timeout",), metavar="SECONDS", min=0.1, max=1e6)
 ]

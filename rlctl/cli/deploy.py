@@ -58,7 +58,9 @@ def identify(
             metavar="FILE",
         ),
     ] = None,
-    excite: Annotated[Path | None, Option("Instead, write a safe trajectory to play and log.", metavar="FILE")] = None,
+    excite: Annotated[
+        Path | None, Option("Read no log; write a safe trajectory to play and log.", metavar="FILE")
+    ] = None,
     events: Annotated[
         list[str], Option("Estimate the values of this event only; repeatable.", ("--event",), metavar="NAME")
     ] = [],

@@ -46,7 +46,7 @@ def evaluate(
     chosen = dataclasses.replace(options, checkpoint=choose_checkpoint(options.checkpoint, pretrained))
     request = EvalRequest(**vars(chosen), changes=parse_changes(settings))
     if on is not None and not vary and sim is None:
-        raise UsageError("--on plays the cells of a map: give --vary or --sim too")
+        raise UsageError("--on needs a robustness map: give --vary or --sim too")
     if vary or push or sim is not None:
         unsupported = {"--policy": request.baseline, "--limits": request.limits, "--record": request.record}
         if option := next((name for name, value in unsupported.items() if value is not None), None):

@@ -16,9 +16,12 @@ def export(
     c: Annotated[bool, Option("Write a C99 header and source file without dependencies.", ("--c",))] = False,
     policy: Annotated[
         Path | None,
-        Option("Instead, write the policy with its measured score, as plugins ship it (.safetensors).", metavar="FILE"),
+        Option(
+            "Write only the policy with its measured score, in the form that plugins ship (.safetensors).",
+            metavar="FILE",
+        ),
     ] = None,
-    dataset: Annotated[DatasetFormat | None, Option("Instead, write episodes of the policy as a dataset.")] = None,
+    dataset: Annotated[DatasetFormat | None, Option("Write only a dataset: episodes of the policy.")] = None,
     episodes: Annotated[int, Option("Episodes of the dataset.", min=1)] = 100,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,

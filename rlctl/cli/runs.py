@@ -80,13 +80,13 @@ def compare_runs(
     ],
     episodes: Annotated[int, Option("Episodes that each run plays.", min=2, max=1_000_000)] = 100,
     seed: EpisodeSeed = 0,
-    task: Annotated[str | None, Option("Evaluate all on this task.")] = None,
+    task: Annotated[str | None, Option("Evaluate all policies on this task.")] = None,
     settings: Settings = [],
     threshold: Annotated[
         float | None, Option("Report the steps until this success rate (or return); default for success: 0.9.")
     ] = None,
     force: Annotated[bool, Option("Compare even if the task has changed.", ("--force",))] = False,
-    gate: Annotated[Literal["not-worse"] | None, Option("Exit 1 if one is worse than the first.")] = None,
+    gate: Annotated[Literal["not-worse"] | None, Option("Exit 1 if any is worse than the first.")] = None,
     json: Json = None,
 ) -> None:
     """Test whether a policy, or a recipe trained with several seeds, is better than another."""
@@ -130,7 +130,7 @@ def remove_runs(
     keep_best: Annotated[
         int | None,
         Option(
-            "Keep the N best runs of each task, remove the other finished or failed ones; groups stay.",
+            "Keep the N best runs of each task and all groups; remove the other finished or failed runs.",
             metavar="N",
             min=0,
         ),
@@ -138,7 +138,7 @@ def remove_runs(
     yes: Yes = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Remove runs, never one that is being trained."""
+    """Remove runs, except those that are being trained."""
     from rlctl.runs.listing import plan_removal, remove_with_report
 
     remove_with_report(plan_removal(runs, keep_best=keep_best), yes=yes, dry_run=dry_run)

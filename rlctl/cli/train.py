@@ -68,7 +68,7 @@ class TrainFlags(RecipeFlags):
 def train(
     flags: TrainFlags,
     request: TrainRequest,
-    seeds: Annotated[str | None, Option("Train these seeds, each an ordinary run, as a group.", metavar="0-4")] = None,
+    seeds: Annotated[str | None, Option("Train a group: one run for each of these seeds.", metavar="0-4")] = None,
     jobs: Jobs = None,
     on: On = None,
     cluster: Cluster = None,

@@ -35,7 +35,7 @@ def choose_executor(
 
 
 def choose_cell_player(on: str | None, cluster: Path | None = None) -> PlayCells | None:
-    """Return what plays the cells of a robustness map, None for this machine; raises as `choose_executor`."""
+    """Return the player of a robustness map's cells, None for this machine; same errors as `choose_executor`."""
     kind, address = _parse(on, "eval")
     if kind == "local":
         return None

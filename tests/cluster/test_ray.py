@@ -1,4 +1,4 @@
-"""Trainings and cells on a real Ray: a head and a node of this machine, which is lost."""
+"""Trainings and cells on a real Ray on this machine: a head and a second node, which the tests kill."""
 
 import concurrent.futures
 import contextlib

@@ -1,4 +1,4 @@
-"""Arrays of jobs on a fake SLURM: requeue, resume, retries, a driver that comes back, and what it says of errors."""
+"""Arrays of jobs on a fake SLURM: requeue, resume, retries, a restarted driver, and errors of SLURM."""
 
 import concurrent.futures
 import dataclasses

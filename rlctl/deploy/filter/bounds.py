@@ -23,7 +23,7 @@ class Bounds:
     """The limits of a policy's actions as arrays, an element per joint.
 
     A command is a value (positions, torques, plain actions) or a change of a measured position (steps, speeds). Both
-    move by `x` in a control step; the arrays bound `x`, its change, and where it leads.
+    move by `x` in a control step; the arrays bound `x`, its change, and the position after it.
     """
 
     names: list[str]  # of the joints

@@ -55,7 +55,7 @@ def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
         if limits.joints is not None and known is not None and limits.joints != list(known.names):
             for name in limits.joints:
                 check_name(name, known.names, "limits: joints: no joint", RecipeError, listed="Known")
-            raise RecipeError(f"limits: joints: the action's order is {', '.join(known.names)}")
+            raise RecipeError(f"limits: joints: write them in the action's order: {', '.join(known.names)}")
         names = limits.joints or (list(known.names) if known else [f"action[{index}]" for index in range(count)])
         if len(names) != count or len(set(names)) != count:
             raise RecipeError(f"limits: joints: {len(set(names))} different names, the action has {count} elements")
@@ -91,7 +91,7 @@ def _make_bounds(
     dt, is_value, moves = control_dt or 1.0, limits.command not in ("step", "speed"), limits.command in _MOVING
     scale, offset = _choose_units(limits, space, known, names)
     if not is_value and offset.any():
-        raise RecipeError(f"limits: offset: with command: {limits.command} action 0 must be no motion; leave it out")
+        raise RecipeError(f"limits: offset: leave it out; with command: {limits.command}, action 0 means no motion")
     factor = scale * (dt if limits.command == "speed" else 1.0)
     largest, digits = _describe_numbers(space.dtype)
     low = np.maximum(np.maximum(space.low.ravel(), -largest), _gather(joints, "action", -np.inf, 0))
@@ -254,7 +254,7 @@ def _check_measured(limits: Limits, bounds: Bounds | None, measured: slice | Non
 def _make_safe_command(limits: Limits, bounds: Bounds | None, count: int) -> Array:
     safe = _read_list(limits, "safe_action", count)
     if safe is not None and limits.command in _MOVING:
-        raise RecipeError(f"limits: safe_action: with command: {limits.command} it is no motion; leave it out")
+        raise RecipeError(f"limits: safe_action: leave it out; with command: {limits.command}, it means no motion")
     if bounds is None:
         return np.zeros(count)
     command = bounds.offset + (np.zeros(count) if safe is None else safe) * bounds.factor

@@ -125,9 +125,9 @@ def _find_danger(env: TaskEnv, joints: dict[str, tuple[Any, int]]) -> tuple[str,
             middle, half = (low + high) / 2, (high - low) * (0.5 - _MARGIN)
             largest = max(largest, abs(position - middle) / half)
             if largest > 1:
-                return f"{name} comes near its end", largest
+                return f"joint {name} comes near the end of its range", largest
         if limit > 0 and speed > 1.05 * limit:
-            return f"{name} turns faster than its {limit:.3g} rad/s", largest
+            return f"joint {name} is faster than its top speed, {limit:.3g} rad/s", largest
     if env.task.is_terminated():
         return "the episode ends", largest
     bodies = {id(body): body for body, _ in joints.values() if body.fixed}.values()

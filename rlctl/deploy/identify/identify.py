@@ -103,7 +103,7 @@ def identify(
             names = [parameter.name for parameter in unknowns.parameters] + [unknowns.delay] * bool(unknowns.delay)
             raise AnswerIsNo(
                 f"{log_file}: nothing moves in this log, so it contains no information about "
-                f"{', '.join(names)}; a trajectory that moves: rlctl identify {spec.task} --excite FILE"
+                f"{', '.join(names)}; to create a trajectory that moves: rlctl identify {spec.task} --excite FILE"
             )
         follower = Follower(env, log, unknowns)
         weights = 1.0 / follower.spread
@@ -116,7 +116,7 @@ def identify(
             notes = "; ".join(dict.fromkeys(value.note for value in values))
             raise AnswerIsNo(
                 f"{log_file}: this log determines none of the values: {notes}\n"
-                f"a trajectory that moves more: rlctl identify {spec.task} --excite FILE"
+                f"to create a trajectory that moves more: rlctl identify {spec.task} --excite FILE"
             )
         return _summarise(spec.task, log_file, follower, log, best, values, delay_known)
     finally:
@@ -193,7 +193,7 @@ def _estimate_value(
         note = f"this log contains no information about {parameter.name}"
     elif min(position, 1 - position) < 0.005:
         end = parameter.low if position < 0.5 else parameter.high
-        note = f"at the end of its search range, {end:.3g}: something else may differ"
+        note = f"the estimate is at the end of its search range, {end:.3g}: the cause may be something else"
         known = False
     return IdentifiedValue(
         parameter.name, parameter.event, parameter.key, value, float(low), float(high), bool(known), note

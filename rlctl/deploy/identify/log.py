@@ -142,8 +142,8 @@ def _check_units(path: Path, joints: Sequence[str], positions: Array, expected: 
         largest = float(np.abs(values).max())
         if largest > 2 * math.pi and low < high and largest > 1.2 * max(abs(low), abs(high)):
             raise ArtifactError(
-                f"{path}: {_POSITION}{joint} reaches {largest:.3g}, the joint ends at {max(abs(low), abs(high)):.3g} "
-                "rad: is that degrees? Multiply by pi / 180."
+                f"{path}: {_POSITION}{joint} reaches {largest:.3g}, but the joint's limit is "
+                f"{max(abs(low), abs(high)):.3g} rad; if the log is in degrees, multiply by pi / 180"
             )
 
 

@@ -14,7 +14,9 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 class ServeRequest:
     """The options of `rlctl serve` that are about the server; paths are of files."""
 
-    host: Annotated[str, Option("Address to listen on; others than loopback need a key.")] = "127.0.0.1"
+    host: Annotated[str, Option("Address to listen on; one that other machines can reach requires a key.")] = (
+        "127.0.0.1"
+    )
     port: Annotated[int, Option("Port to listen on; 0: any free port.", min=0, max=65535)] = 8000
     limits: Annotated[Path | None, Option("Safety limits (YAML).", metavar="FILE")] = None
     log: Annotated[Path | None, Option("Log of events, as JSON lines, rotated at 10 MB.", metavar="FILE")] = None

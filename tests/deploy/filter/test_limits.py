@@ -1,4 +1,4 @@
-"""`limits.yaml`: what is wrong in it is said with its line, what was expected, and the closest name."""
+"""Errors in `limits.yaml` name the line, what was expected, and the closest name."""
 
 import pytest
 from gymnasium import spaces
@@ -85,7 +85,7 @@ def test_what_is_wrong_in_a_file(write, text, message):
         (("[-1, 1]", "[20, 30]"), "elbow: no action keeps these limits and the policy's own action bounds"),
         (
             ("home: [0, 0]", "safe_action: [0, 0]"),
-            "safe_action: with command: position it is no motion; leave it out",
+            "safe_action: leave it out; with command: position, it means no motion",
         ),
         (("home: [0, 0]", "scale: [1, 1, 1]"), "scale has 3 numbers, the action 2"),
     ],
@@ -115,9 +115,9 @@ def test_what_the_task_knows_of_its_joints(write, arm):
         ("hip.position", pytest.approx(0.6)),
         ("knee.position", pytest.approx(-1.5)),
     ]
-    with pytest.raises(RecipeError, match="the action's order is hip, knee"):
+    with pytest.raises(RecipeError, match="write them in the action's order: hip, knee"):
         SafetyFilter(arm, write("joints: [knee, hip]"))
-    with pytest.raises(RecipeError, match="action 0 must be no motion"):
+    with pytest.raises(RecipeError, match="action 0 means no motion"):
         SafetyFilter(arm, write("{command: speed, offset: 1}"))
 
 

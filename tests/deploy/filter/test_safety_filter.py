@@ -99,7 +99,7 @@ def test_without_a_file_the_bounds_of_the_policy_hold():
     assert safety.counts == {"action[0].action": 1}
 
 
-def test_a_fault_holds_and_its_end_goes_on(arm):
+def test_a_fault_holds_until_it_ends(arm):
     safety = make_filter(arm, command="position", limits={"all": {"speed": 100}}, blend_in_s=0.1)
     for _ in range(3):
         moved = run_filter(safety, REST, [1.0, 1.0])
@@ -144,7 +144,7 @@ def test_checks_of_sensors(arm):
     assert safety.state == "stopped"
 
 
-def test_a_stop_is_left_on_purpose_only(arm):
+def test_only_resume_ends_a_stop(arm):
     safety = make_filter(arm, command="position", home=[0.5, 0.5], limits={"all": {"speed": 1.0}})
     run_filter(safety, REST, [1.0, 1.0])
     safety.stop("button")
@@ -164,7 +164,7 @@ def test_a_stop_is_left_on_purpose_only(arm):
     ]  # fmt: skip
 
 
-def test_a_hand_chooses_what_the_policy_could_choose(arm):
+def test_an_override_of_choices_must_be_a_choice(arm):
     choices = arm.model_copy(update={"action_space": space_to_json(spaces.Discrete(3))})
     safety = SafetyFilter(choices)
     for action in ([3], [-1], [1.5]):
@@ -174,7 +174,7 @@ def test_a_hand_chooses_what_the_policy_could_choose(arm):
     assert run_filter(safety, REST, 0) == 2
 
 
-def test_a_hand_takes_over_gradually_and_within_limits(arm):
+def test_an_override_begins_gradually_and_within_limits(arm):
     safety = make_filter(arm, command="position", blend_in_s=0.1, limits={"all": {"position": [-1, 1]}})
     for _ in range(3):
         run_filter(safety, REST, [0.5, 0.5])
@@ -218,7 +218,7 @@ def test_choices_are_held_too():
         SafetyFilter(info, Limits.model_validate({"limits": {"all": {"action": [0, 1]}}}))
 
 
-# Whatever goes in, what comes out keeps every limit.
+# For any input the output keeps every limit.
 
 ACTIONS = st.one_of(
     arrays.arrays(np.float64, 2, elements=st.floats(width=64)),

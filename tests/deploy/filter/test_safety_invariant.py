@@ -1,4 +1,4 @@
-"""Whatever goes in, what comes out is finite and within every limit, or the filter has stopped.
+"""For any input the output is finite and within every limit, or the filter has stopped.
 
 Options, observations, actions, ages, orders and clocks are drawn from all that can be written, over the whole range of
 float64. The limits are checked here from their definition alone.

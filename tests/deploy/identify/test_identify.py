@@ -1,4 +1,4 @@
-"""Logs that were made with hidden values give those values back, or say that they do not."""
+"""Logs of a robot with hidden values: identify finds these values, or explains why it cannot."""
 
 import json
 from pathlib import Path
@@ -117,7 +117,7 @@ def test_values_that_the_log_cannot_tell_apart_are_named(real):
     assert found.events() == {"late": {"steps": [1, 1]}}
 
 
-def test_a_log_that_tells_nothing_is_told_so(real, tmp_path):
+def test_a_log_without_information_is_an_error(real, tmp_path):
     # Nothing is touched, so friction leaves no trace.
     with pytest.raises(
         AnswerIsNo, match=r"none of the values: this log contains no information about friction\.friction"
@@ -187,7 +187,7 @@ def slow_down(rows):
     [
         (remove_rows, r"line 11: a gap of 0\.12 s"),
         (turn_back, r"line 11: time does not increase: 0\.16 s, then 0\.001 s"),
-        (write_degrees, r"position_shoulder reaches .*is that degrees\? Multiply by pi / 180"),
+        (write_degrees, r"position_shoulder reaches .*if the log is in degrees, multiply by pi / 180"),
         (drop_column, "no column 'velocity_shoulder'"),
         (rename_joint, r"no joint 'sholder'\. Did you mean 'shoulder'\?|no column 'position_shoulder'"),
         (write_text, "line 8: position_elbow is 'off', not a finite number"),

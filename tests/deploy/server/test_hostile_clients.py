@@ -1,4 +1,4 @@
-"""Clients that flood, send gigabytes, half a frame or die neither block nor end the others."""
+"""Clients that flood the server, send gigabytes or half a frame, or die do not disturb the other clients."""
 
 import contextlib
 import os

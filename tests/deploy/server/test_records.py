@@ -1,4 +1,4 @@
-"""The log of a server: bounded, rotated, and repetitions counted; and its Rerun recording."""
+"""The log of a server is rotated and counts repetitions; its Rerun recording."""
 
 import json
 
