@@ -46,7 +46,6 @@ def choose_cell_player(on: str | None, cluster: Path | None = None) -> PlayCells
 
 
 def _parse(on: str | None, verb: str) -> tuple[str, str]:
-    """Return the executor's kind and its address."""
     on = on or os.environ.get(VARIABLE) or "local"
     kind, _, address = on.partition(":")
     if on == "slurm" and verb in _NOT_ON_SLURM:

@@ -150,7 +150,6 @@ class RayTrainings(Trainings):
     def _follow(
         self, reference: Any, work: Work, job: Job, receive: Callable[[str], None], next_signal: NextSignal
     ) -> int:
-        """Pass on lines and signals until the task has ended; return its exit code."""
         ray = self._ray
         while True:
             done, _ = ray.wait([reference], timeout=_POLL_S)

@@ -119,7 +119,6 @@ class SlurmTrainings(Trainings):
         self._ready.abort()
 
     def _submit(self) -> None:
-        """Submit all works as one array."""
         if not self._works:
             return
         self._works.sort(key=lambda work: work.seed)
@@ -148,7 +147,6 @@ class SlurmTrainings(Trainings):
         )
 
     def _follow(self, seed: int, log: Path, receive: Callable[[str], None], next_signal: NextSignal) -> int:
-        """Pass on the lines of a node's log until its job has ended; return the exit code."""
         position = 0
         while True:
             self._beat()
@@ -176,7 +174,6 @@ class SlurmTrainings(Trainings):
                 files.write_text(self._folder / BEAT_FILE, uuid.uuid4().hex)
 
     def _cancel_waiting(self) -> None:
-        """Cancel the jobs that have not started."""
         for job in list_jobs(self._folder):
             if job.state == "queued":
                 subprocess.run(["scancel", "--state=PENDING", job.place.partition(" ")[2]], check=False)
@@ -215,7 +212,6 @@ def _forward_lines(log: Path, position: int, receive: Callable[[str], None]) -> 
 
 
 def _call(command: list[str]) -> str:
-    """Run a SLURM command and return its output; raise `UsageError` without SLURM, `TaskError` if the command fails."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     except FileNotFoundError:

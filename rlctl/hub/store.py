@@ -96,7 +96,6 @@ def push(contents: Mapping[str, Path | bytes], address: str) -> Manifest:
 
 @contextlib.contextmanager
 def _open_store(address: str) -> Iterator[tuple[Any, str]]:
-    """Open the file system of an address; turn its exceptions into errors that name the address."""
     scheme = address.partition("://")[0]
     try:
         fsspec: Any = importlib.import_module("fsspec")

@@ -145,7 +145,6 @@ class Command:
         return self._reference
 
     def _move(self, target: Array) -> NDArray[Any]:
-        """Return the action for a requested value or motion, within the bounds. Raises `UnsafeCommand`."""
         bounds, reference, before = self._bounds, self._reference, self._before
         x = self._zeros
         if not bounds.is_value:

@@ -77,7 +77,6 @@ def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
 def _make_bounds(
     limits: Limits, space: spaces.Box, names: list[str], control_dt: float | None, known: Joints | None
 ) -> Bounds:
-    """Return the limits as arrays, in the units of a command and per control step."""
     named = limits.joints is not None or known is not None
     listed = "Known" if named else "Write joints: [names, in the action's order], or one of"
     for name in limits.limits.keys() - {"all"}:
@@ -184,7 +183,6 @@ def _check_can_be_limited(limits: Limits, joint: JointLimits, name: str) -> None
 
 
 def _choose_units(limits: Limits, space: spaces.Box, known: Joints | None, names: list[str]) -> tuple[Array, Array]:
-    """Return scale and offset of the command, per joint."""
     scale: Any = 1.0
     offset: Any = 0.0
     if known is not None and known.action_scale and limits.command == "position":
@@ -198,7 +196,6 @@ def _choose_units(limits: Limits, space: spaces.Box, known: Joints | None, names
 
 
 def _spread(key: str, numbers: Any, default: Any, names: list[str]) -> Array:
-    """Return a number per joint: the user's, or the default."""
     values = np.atleast_1d(np.asarray(default if numbers is None else numbers, np.float64))
     if len(values) not in (1, len(names)):
         raise RecipeError(f"limits: {key} has {len(values)} numbers, the action {len(names)}")
@@ -239,7 +236,6 @@ def _check_home(limits: Limits, bounds: Bounds | None, home: Array | None) -> No
 
 
 def _check_measured(limits: Limits, bounds: Bounds | None, measured: slice | None, layout: ObservationLayout) -> None:
-    """Raise `RecipeError` if limits need joint positions and no observation with them is named."""
     if measured is not None or bounds is None:
         return
     moves = bounds.speed is not None or bounds.change is not None or limits.blend_in_s > 0

@@ -211,7 +211,6 @@ class SafetyFilter:
         return (numbers, "") if is_valid else (None, short_repr(numbers.tolist()))
 
     def _find_fault(self, requested: Array | None, problem: str) -> str:
-        """Return and record why an action cannot be used; empty if it can."""
         if problem:
             fault = "invalid action"
         elif requested is None and self.state != "stopped" and not self._ordered:
@@ -224,7 +223,6 @@ class SafetyFilter:
         return fault
 
     def _update_state(self, fault: str) -> None:
-        """Enter the state for this step's fault, or for its end."""
         if fault:
             self._goes_home = self.limits.on_fault == "home"
             self._enter("stopped" if self.limits.on_fault == "stop" else "holding", fault)

@@ -45,8 +45,8 @@ def describe_expected(env: TaskEnv, task: str) -> Expected:
     driven = tuple(described.names) if described else ()
     if not any(body.fixed for body, _ in joints.values()):
         raise UsageError(
-            f"{task}: no body with a fixed base has joints, and a log of joints does not contain the position of a free "
-            "base; hang the robot in a frame to record the log, and give a task that loads it with fixed=True"
+            f"{task}: no body with a fixed base has joints, and a log of joints does not contain the position of a "
+            "free base; hang the robot in a frame to record the log, and give a task that loads it with fixed=True"
         )
     limits = {name: (float(body.joint_low[i]), float(body.joint_high[i])) for name, (body, i) in joints.items()}
     return Expected(limits, driven, int(np.prod(env.action_space.shape or ())), env.task.control_dt)

@@ -127,9 +127,8 @@ def _summarise(
     task: str, file: Path, follower: Follower, log: Log, best: Fit, values: list[IdentifiedValue], delay_known: bool
 ) -> Identification:
     before, after = follower.compare(None, 0), follower.compare(best.at, best.delay)
-    count = len(log.joints)
-    positions, velocities = np.s_[:, :count], np.s_[:, count:]
-    worst = int(np.square(before[positions]).mean(axis=0).argmax())
+    worst = int(np.square(before[:, : len(log.joints)]).mean(axis=0).argmax())
+    positions, velocities = zip(_root_mean_squares(before), _root_mean_squares(after), strict=True)
     measured = np.concatenate([log.positions[start + 1 :][: follower.steps] for start in follower.starts])[:, worst]
     return Identification(
         task=task,
@@ -140,8 +139,8 @@ def _summarise(
         delay_event=follower.unknowns.delay,
         delay=best.delay,
         delay_known=delay_known,
-        position_error=(_root_mean_square(before[positions]), _root_mean_square(after[positions])),
-        velocity_error=(_root_mean_square(before[velocities]), _root_mean_square(after[velocities])),
+        position_error=positions,
+        velocity_error=velocities,
         curves={
             "joint": log.joints[worst],
             "measured": measured.tolist(),
@@ -151,12 +150,13 @@ def _summarise(
     )
 
 
-def _root_mean_square(values: Array) -> float:
-    return float(np.sqrt(np.square(values).mean()))
+def _root_mean_squares(errors: Array) -> list[float]:
+    """Return the error of all positions, and of all velocities."""
+    values: list[float] = np.sqrt(np.square(errors.reshape(len(errors), 2, -1)).mean(axis=(0, 2))).tolist()
+    return values
 
 
 def _estimate_values(unknowns: Unknowns, fit: Fit) -> list[IdentifiedValue]:
-    """Return each value with its interval, and whether the log determines it."""
     if not unknowns.parameters:
         return []
     spans = np.array([parameter.relative_span for parameter in unknowns.parameters])

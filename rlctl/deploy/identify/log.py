@@ -85,7 +85,6 @@ def read_log(path: Path, expected: Expected) -> Log:
 
 
 def _read_columns(path: Path) -> tuple[dict[str, Array], list[int]]:
-    """Return the columns, and the line of each row."""
     try:
         rows = list(csv.reader(io.StringIO(untrusted.read_bytes(path, _MAX_SIZE).decode("utf-8-sig"))))
     except (UnicodeDecodeError, csv.Error) as error:

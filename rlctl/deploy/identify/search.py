@@ -176,7 +176,6 @@ def _compute_cost(follower: Follower, question: FindFit) -> float:
 
 
 def _find_fit(follower: Follower, question: FindFit) -> Fit:
-    """Return the best positions near a trial, with the data for intervals."""
     weights, delay, at = question.weights, question.start.delay, np.array(question.start.at)
 
     def residuals(positions: Array) -> Array:

@@ -199,7 +199,6 @@ class Routes:
         return web.json_response({"overridden": content["action"] is not None})
 
     async def _serve_policy(self, request: web.Request) -> web.Response:
-        """Replace the policy by the file in the body."""
         content = await _read_body(request, _MAX_POLICY_SIZE)
         name = Path(request.query.get("name", "")).name
         # The format of safetensors begins with the length of its header, in JSON.
@@ -237,7 +236,6 @@ async def _answer_health(request: web.Request) -> web.Response:
 
 
 async def _read_body(request: web.Request, max_size: int) -> bytes:
-    """Read a body of at most `max_size` bytes that arrives in time."""
     try:
         async with asyncio.timeout(_BODY_TIMEOUT_S):
             return await request.clone(client_max_size=max_size).read()
