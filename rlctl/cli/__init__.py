@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli import check_env, deploy, eval, export, replay, runs, tasks, train
+from rlctl.cli import deploy, eval, export, runs, tasks, train
 from rlctl.errors import UsageError
 from rlctl.processes import error_boundary
 from rlctl.version import __version__
@@ -30,12 +30,12 @@ def _root(
 
 
 COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
-    "check-env": check_env.check_env,
+    "check-env": tasks.check_env,
     "train": train.train,
     "tune": train.tune,
     "eval": eval.evaluate,
     "export": export.export,
-    "replay": replay.replay,
+    "replay": eval.replay,
     "push": export.push,
     "serve": deploy.serve,
     "identify": deploy.identify,
@@ -66,7 +66,7 @@ def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
         if isinstance(command, typer.Typer):
             app.add_typer(command, name=name)
         else:
-            app.command(name, cls=replay.ReplayCommand if name == "replay" else None)(command)
+            app.command(name, cls=eval.ReplayCommand if name == "replay" else None)(command)
     return app
 
 

@@ -66,7 +66,19 @@ class Bounds:
 
         `before` is the motion of the last step, `reference` the position after it; None if positions are not bounded.
         """
-        return x if self._keeps_all(x, before, reference) else self._bound_in_turn(x, before, reference, on_limit)
+        if self._keeps_all(x, before, reference):
+            return x
+        # In order of importance: the last limit wins.
+        if self.change is not None:
+            x = _clip(x, before - self.change, before + self.change, "acceleration", on_limit)
+        if self.speed is not None:
+            x = _clip(x, -self.speed, self.speed, self.speed_name, on_limit)
+        if not self.is_value:
+            x = _clip(x, self.low, self.high, "action", on_limit)
+        if self.bounds_position and reference is not None and not self._keeps_position(x, reference):
+            room = self._find_room(reference)
+            x = _clip(x, -room[1], room[0], self.position_name, on_limit)
+        return x
 
     def keeps_ends(self, value: Array) -> bool:
         """Return whether a value is within its bounds."""
@@ -123,19 +135,6 @@ class Bounds:
         end = end + reference
         inside = np.minimum(np.maximum(end, self._quick_low), self._quick_high)
         return bool(inside.tobytes() == end.tobytes())
-
-    def _bound_in_turn(self, x: Array, before: Array, reference: Array | None, on_limit: OnLimit) -> Array:
-        """Apply the limits in order of importance: the last one wins."""
-        if self.change is not None:
-            x = _clip(x, before - self.change, before + self.change, "acceleration", on_limit)
-        if self.speed is not None:
-            x = _clip(x, -self.speed, self.speed, self.speed_name, on_limit)
-        if not self.is_value:
-            x = _clip(x, self.low, self.high, "action", on_limit)
-        if self.bounds_position and reference is not None and not self._keeps_position(x, reference):
-            room = self._find_room(reference)
-            x = _clip(x, -room[1], room[0], self.position_name, on_limit)
-        return x
 
     def _find_room(self, reference: Array) -> Array:
         """Return how far a step may go up and down, shape (2, count).

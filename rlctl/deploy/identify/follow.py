@@ -1,20 +1,116 @@
-"""Plays a log's actions in the task's world and compares simulated joint states with the measured ones."""
+"""The unknown values of a task's world; plays a log's actions with them and compares the joint states."""
 
+import dataclasses
+import math
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
 
 from rlctl.deploy.identify.log import Array, Expected, Log
-from rlctl.deploy.identify.parameters import Unknowns
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import TaskError, UsageError
+from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.task.env import TaskEnv
-from rlctl.task.events import EventSettings
+from rlctl.task.events import Event, EventSettings, delay, set_color, shift_gravity
+from rlctl.task.events.event import Widening
 
 WINDOW_S = 1.0
 """The simulation restarts from the measured state after this time [s], so that small errors do not accumulate."""
 _SMOOTHING_ROWS = 9  # rows of the smoothing filter for start states
 _COMPARED_ROWS = 200  # rows at least, to compare smoothed with measured start states
+_WIDER = 2.0  # factor by which the search range is wider than the event's range
+_SMALLEST = 0.01  # of the upper end, where a range begins at 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """A value of an event, searched between `low` and `high`; on a logarithmic scale if both are above 0."""
+
+    event: str
+    key: str
+    low: float
+    high: float
+    nominal: float | None = None  # value in the world as the task builds it, if known
+
+    @property
+    def name(self) -> str:
+        """The name in reports: EVENT.KEY."""
+        return f"{self.event}.{self.key}"
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """Whether the search scale is logarithmic."""
+        return self.low > 0
+
+    def value(self, position: float) -> float:
+        """Return the value at a position in [0, 1] of the range."""
+        change = position * self.relative_span
+        return self.low * math.exp(change) if self.is_logarithmic else self.low + change
+
+    @property
+    def first(self) -> float:
+        """The position to try first: that of the nominal value, or the middle."""
+        if self.nominal is None or not self.low <= self.nominal <= self.high:
+            return 0.5
+        change = math.log(self.nominal / self.low) if self.is_logarithmic else self.nominal - self.low
+        return change / self.relative_span
+
+    @property
+    def relative_span(self) -> float:
+        """Width of the range: of the value's logarithm, or in its own unit."""
+        return math.log(self.high / self.low) if self.is_logarithmic else self.high - self.low
+
+
+@dataclasses.dataclass(frozen=True)
+class Unknowns:
+    """The values to estimate."""
+
+    parameters: tuple[Parameter, ...]
+    delay: str = ""  # the event that delays actions; empty if there is none, or it was not chosen
+    longest_delay: int = 0  # [control steps]
+
+    def settings(self, positions: Collection[float]) -> dict[str, dict[str, float]]:
+        """Return positions in the ranges as a recipe's `events`."""
+        settings: dict[str, dict[str, float]] = {}
+        for parameter, position in zip(self.parameters, positions, strict=True):
+            settings.setdefault(parameter.event, {})[parameter.key] = parameter.value(position)
+        return settings
+
+
+def find_unknowns(events: Mapping[str, Event], chosen: Collection[str], task: str) -> Unknowns:
+    """Return what to estimate of all events, or the chosen ones; raises `UsageError` if that is nothing."""
+    for name in chosen:
+        check_name(name, events, f"--event: {task} has no event", UsageError)
+    parameters: list[Parameter] = []
+    delayed, longest = "", 0
+    for name, event in events.items():
+        ranges = {key: value.end for key, value in event.bind(name).values.items() if isinstance(value, Widening)}
+        is_delay = event.when == "action" and event.function is delay
+        possible = is_delay or (event.when == "reset" and event.function not in (set_color, shift_gravity) and ranges)
+        if name in chosen and not possible:
+            raise UsageError(
+                f"--event: {name} has no physical value that holds for an episode; identify estimates events at "
+                "'reset' and the delay of actions"
+            )
+        if not possible or (chosen and name not in chosen):
+            continue
+        if is_delay:
+            delayed, longest = name, max(5, 2 * int(ranges["steps"][1]))
+        else:
+            parameters += [_make_parameter(name, key, *values, event.nominal(key)) for key, values in ranges.items()]
+    if not parameters and not delayed:
+        raise UsageError(f"{task} has no event with a physical value to estimate: see rlctl tasks show {task}")
+    return Unknowns(tuple(parameters), delayed, longest)
+
+
+def _make_parameter(event: str, key: str, low: float, high: float, nominal: float | None) -> Parameter:
+    if low < 0:
+        middle, half = (low + high) / 2, _WIDER * max((high - low) / 2, 1e-6)
+        return Parameter(event, key, middle - half, middle + half, nominal)
+    if low == 0 and nominal is None:  # such as damping, which is most likely 0
+        nominal = _SMALLEST * max(high, 1e-6)
+    low = low / _WIDER if low > 0 else _SMALLEST * max(high, 1e-6)
+    return Parameter(event, key, low, _WIDER * max(high, low), nominal)
 
 
 def open_world(spec: EnvSpec) -> TaskEnv:

@@ -10,9 +10,8 @@ import numpy as np
 import yaml
 
 from rlctl import output
-from rlctl.deploy.identify.follow import Follower, describe_expected, open_world
+from rlctl.deploy.identify.follow import Follower, Unknowns, describe_expected, find_unknowns, open_world
 from rlctl.deploy.identify.log import Array, Log, check_actions, read_log
-from rlctl.deploy.identify.parameters import Unknowns, find_unknowns
 from rlctl.deploy.identify.search import Fit, search, start_search_workers
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo

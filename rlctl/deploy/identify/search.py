@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.deploy.identify.follow import Follower, open_world
+from rlctl.deploy.identify.follow import Follower, Unknowns, open_world
 from rlctl.deploy.identify.log import Array, Log
-from rlctl.deploy.identify.parameters import Unknowns
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.processes.child_process import write_stderr

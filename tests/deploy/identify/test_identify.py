@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from rlctl.deploy.identify.excite import write_excitation
-from rlctl.deploy.identify.follow import Follower, open_world
+from rlctl.deploy.identify.follow import Follower, Parameter, Unknowns, open_world
 from rlctl.deploy.identify.identify import _estimate_values, identify, show, write_fragment
 from rlctl.deploy.identify.log import Expected, Log, read_log, write_log
-from rlctl.deploy.identify.parameters import Parameter, Unknowns
 from rlctl.deploy.identify.search import Fit, SearchPoint, _choose_starts, _make_trials
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
