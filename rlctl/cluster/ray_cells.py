@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import output
-from rlctl.cluster.ray_connection import Pulse, connect, describe_slots, is_copied
+from rlctl.cluster.ray_trainings import Pulse, connect, describe_slots, is_copied
 from rlctl.cluster.work import ClusterSettings, compare_versions, describe_driver
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError

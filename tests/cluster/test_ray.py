@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from rlctl.cluster.executors import choose_cell_player, choose_executor
-from rlctl.cluster.ray_connection import connect
+from rlctl.cluster.ray_trainings import connect
 from rlctl.errors import TaskError
 from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.vary import measure_robustness
