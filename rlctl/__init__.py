@@ -17,12 +17,9 @@ if TYPE_CHECKING:
 __all__ = ["Callback", "__version__", "check_env", "evaluate", "load_policy", "make", "train"]
 
 _DEFINED_IN = {
+    **dict.fromkeys(("check_env", "evaluate", "load_policy", "train"), "rlctl.api"),
     "Callback": "rlctl.training.callbacks",
-    "check_env": "rlctl.api",
-    "evaluate": "rlctl.api",
-    "load_policy": "rlctl.api",
     "make": "rlctl.environments.spec",
-    "train": "rlctl.api",
 }
 
 

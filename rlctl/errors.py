@@ -75,9 +75,7 @@ class EpisodeFailed(TaskError):
 
     def __init__(self, what: str, env: int, seed: int, step: int, *, hint: str, details: str | None = None) -> None:
         super().__init__(f"{what}\nin environment {env}, episode seed {seed}, step {step}; {hint}", details=details)
-        self.what = what
-        self.env = env
-        self.seed = seed
+        self.what, self.env, self.seed = what, env, seed
         self.step = step  # number of the failed step, from 1; 0 for the reset
         self.actions: Any = None
         """The actions of the episode up to the failed step, shape (step, ...); None if they are unknown."""

@@ -95,10 +95,8 @@ def train(
             return output.print_notes([str(submitted)])
         show_group(result.score, json)
         return result.check()
-    if on is not None or detach:
-        raise UsageError("--on and --detach need several seeds: give --seeds 0-4 or --resume GROUP")
-    if jobs is not None:
-        raise UsageError("--jobs needs several seeds: give --seeds 0-4 or --resume GROUP")
+    if on is not None or detach or jobs is not None:
+        raise UsageError("--jobs, --on and --detach need several seeds: give --seeds 0-4 or --resume GROUP")
     from rlctl.training.request import run_training, show
 
     return show(run_training(request), json)

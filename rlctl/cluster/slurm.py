@@ -126,25 +126,23 @@ class SlurmTrainings(Trainings):
         works = folder / JOBS / f"array-{uuid.uuid4().hex[:8]}.json"
         files.write_json(works, [dataclasses.asdict(work) for work in self._works])
         script = works.with_suffix(".sbatch")
-        files.write_text(script, self._write_script(works))
+        content = _SCRIPT.format(
+            name=f"rlctl-{folder.name}",
+            array=f"0-{len(self._works) - 1}",
+            cpus=self._settings.cpus,
+            output=shlex.quote(f"{os.path.abspath(folder / JOBS)}/slurm-%a.out"),
+            cwd=shlex.quote(os.getcwd()),
+            setup="\n".join(self._settings.setup),
+            python=shlex.quote(sys.executable),
+            works=shlex.quote(os.path.abspath(works)),
+        )
+        files.write_text(script, content)
         command = ["sbatch", "--parsable", *self._settings.sbatch, str(script)]
         number = _call(command).strip().partition(";")[0]
         for index, work in enumerate(self._works):
             write_job(folder, Job(work.seed, work.task, "queued", f"slurm {number}_{index}"))
         with self._queue_lock:
             self._queue_s, self._queue = time.monotonic(), ""  # the old answer does not list the new jobs
-
-    def _write_script(self, works: Path) -> str:
-        return _SCRIPT.format(
-            name=f"rlctl-{self._folder.name}",
-            array=f"0-{len(self._works) - 1}",
-            cpus=self._settings.cpus,
-            output=shlex.quote(f"{os.path.abspath(self._folder / JOBS)}/slurm-%a.out"),
-            cwd=shlex.quote(os.getcwd()),
-            setup="\n".join(self._settings.setup),
-            python=shlex.quote(sys.executable),
-            works=shlex.quote(os.path.abspath(works)),
-        )
 
     def _follow(self, seed: int, log: Path, receive: Callable[[str], None], next_signal: NextSignal) -> int:
         position = 0

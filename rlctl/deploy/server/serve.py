@@ -118,13 +118,11 @@ def _handle_signals(server: PolicyServer, end: asyncio.Event) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, end.set)
-    file = server.policy.file
-    reloads: set[asyncio.Task[None]] = set()
+    file, task = server.policy.file, None
 
     def reload() -> None:
+        nonlocal task  # the loop itself keeps only a weak reference to a task
         task = loop.create_task(_reload(server, file))
-        reloads.add(task)
-        task.add_done_callback(reloads.discard)
 
     loop.add_signal_handler(signal.SIGHUP, reload)
 
