@@ -122,7 +122,10 @@ def _state(generator: Any) -> str:
 def find_assignment(env: Any, name: str) -> tuple[str, int] | None:
     """Return file and line of the first assignment to an attribute, given as `self.rng`; None if there is none."""
     with contextlib.suppress(OSError, TypeError):
-        for cls in type(find_author(env)).__mro__:
+        author = type(find_author(env))
+        for cls in author.__mro__:
+            if cls is not author and cls.__module__.partition(".")[0] in LIBRARIES:
+                continue
             lines, first = inspect.getsourcelines(cls)
             for number, line in enumerate(lines):
                 if re.match(rf"\s*{re.escape(name)}\s*(:[^=]+)?=[^=]", line):

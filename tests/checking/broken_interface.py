@@ -90,6 +90,17 @@ class GuiInReset(Clean):
         pybullet.connect(pybullet.GUI)
 
 
+class ForgetsSeed(Clean):
+    def reset(self, *, seed=None, options=None):
+        return super().reset(options=options)
+
+
+class CountsAsFlag(Clean):
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, int(terminated), truncated, info
+
+
 class Falls(Clean):
     """Falls soon with bad actions, and never ends with good ones; nothing is ever truncated."""
 

@@ -129,6 +129,7 @@ def test_sarif_places_a_finding_at_the_method(broken):
         ("broken_loading.py:Raising", "RL002", 'raise RuntimeError("no licence")'),
         ("broken_import.py:Anything", "RL001", "raise ZeroDivisionError"),
         ("broken_repeats.py:GlobalRandom", "RL301", "def reset(self"),
+        ("broken_interface.py:CountsAsFlag", "RL204", "def step(self, action)"),
     ],
 )
 def test_a_place_is_the_line_that_declares_or_raises(task, rule, line):

@@ -49,6 +49,16 @@ def test_pictures_are_told():
     assert message.startswith("with render_mode='rgb_array' render returns a NoneType")
 
 
+def test_gymnasiums_own_generator_has_no_place():
+    (finding,) = findings(f"{FILE}:ForgetsSeed", "RL311")
+    assert finding.message.startswith("self._np_random is drawn from")
+    assert finding.where is None
+
+
+def test_types_have_an_article():
+    assert messages("CountsAsFlag", "RL204") == ["terminated is an int at step 1"]
+
+
 def test_a_library_that_is_not_installed_is_not_the_environments_fault():
     verdict = verdict_of(f"{FILE}:RenderWithoutLibrary", "RL215")
     assert verdict.findings == []

@@ -87,11 +87,13 @@ def _first_forms(records: Records, what: str, *fine: str) -> Iterator[tuple[Chec
 def _of_form(
     rule: str, message: str, trajectory: CheckedEpisode, form: Form, expected: str, severity: Severity | None = None
 ) -> RuleFinding:
-    return RuleFinding(rule, message, trajectory.at(form.step, type=form.type, expected=expected), severity)
+    call = "step" if form.step else "reset"
+    return RuleFinding(rule, message, trajectory.at(form.step, call=call, type=form.type, expected=expected), severity)
 
 
 def _a(type_name: str) -> str:
-    return type_name if type_name == "NoneType" else f"a {type_name}"
+    article = "an" if type_name[0] in "aeiou" else "a"
+    return type_name if type_name == "NoneType" else f"{article} {type_name}"
 
 
 def select_failures(records: Records, kind: str) -> Iterator[CallFailure]:
