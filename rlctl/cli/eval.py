@@ -69,7 +69,7 @@ def evaluate(
         show_group(scores, json)
         return scores.check(gates)
     result = run_evaluation(request, gates)
-    show(result, json)
+    show(result, json, gates)
     return gates.check(result)
 
 

@@ -10,6 +10,7 @@ from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.evaluate import Evaluation, GroupScore, SeedScore
+from rlctl.evaluation.request import NO_GATES, Gates
 from rlctl.evaluation.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
 from rlctl.evaluation.vary import format_command
 from rlctl.policy.shipped import Interval, MeasuredScore
@@ -19,9 +20,10 @@ _MOST_COLUMNS = 25  # of a map that is drawn
 _NOMINAL, _WORST = "*", "<"
 
 
-def show(result: Evaluation, json: str | None) -> None:
+def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
     """Print the numbers, or JSON alone for `-`."""
-    if output.present(as_json(result), json):
+    missed = gates.list_missed(result.success_rate, result.success_interval, result.returns.mean)
+    if output.present(as_json(result) | {"gates": vars(gates), "gates_missed": missed}, json):
         return
     out, info = output.out(), result.policy
     mode = "" if result.deterministic else ", sampled actions"

@@ -175,7 +175,10 @@ def test_a_gate_on_success_needs_success(tmp_path):
 def test_command_line_gate_and_pure_json(rlctl, reach_run, tmp_path):
     done = rlctl(*("eval", str(reach_run.path), "--episodes", "3", "--min-success", "1", "--json", "-"), cwd=tmp_path)
     assert done.returncode == 1
-    assert json.loads(done.stdout)["policy"]["training_steps"] == 256
+    content = json.loads(done.stdout)
+    assert content["policy"]["training_steps"] == 256
+    assert content["gates"] == {"min_success": 1.0, "min_success_lower": None, "min_return": None}
+    assert [gate.partition(" 0")[0] for gate in content["gates_missed"]] == ["success rate"]
     assert done.stderr.strip().splitlines()[-1].startswith("error: gate missed: success rate 0")
 
 
