@@ -1,7 +1,4 @@
-"""Policy files: `.safetensors` with the network, the normalisation, and JSON that describes how to use them.
-
-They are read without pickle.
-"""
+"""Policy files: `.safetensors`, without pickle, with the network, the normalisation, and JSON that describes them."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ from pydantic import Field
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.named_task import POLICY
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec, PolicySpec
-from rlctl.errors import ArtifactError, short_repr
+from rlctl.errors import ArtifactError
 from rlctl.policy.shipped import Provenance
 from rlctl.storage import files, untrusted
 
@@ -83,13 +80,10 @@ class PolicyFile:
 
     @classmethod
     def read(cls, path: Path) -> PolicyFile:
-        """Read a policy file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
+        """Read a policy file; raises `ArtifactError` if it is missing, damaged, not from rlctl or of a newer format."""
         metadata, info, tensors = _read(path)
         if metadata.get("sha256") != compute_digest(metadata["rlctl"], tensors):
             raise ArtifactError(f"{path}: damaged: its content does not match its sha256")
-        for name, values in tensors.items():
-            if not np.isfinite(values).all():
-                raise ArtifactError(f"{path}: damaged: {short_repr(name)} is not finite")
         return cls(info, tensors, path)
 
     @staticmethod
@@ -138,7 +132,7 @@ def list_actor_tensors(algo: str, names: Iterable[str]) -> list[str]:
 
 
 def compute_digest(info: str, tensors: Tensors) -> str:
-    """Return the sha256 of a policy file's content; it detects damage that would still load."""
+    """Return the sha256 of a policy file's content, to detect damage with which the file still loads."""
     content = hashlib.sha256(info.encode())
     for name, values in sorted(tensors.items()):
         content.update(f"{name} {values.dtype} {values.shape}".encode())

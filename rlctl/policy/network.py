@@ -50,7 +50,7 @@ class Network:
         """The head's output: the mean of the action, for TD3 and DDPG the action, logits, or DQN's values."""
         self.is_squashed = algo in ACTOR_CRITIC or bool(info.policy_kwargs.get("squash_output"))
         """Whether the network's actions are in [-1, 1] and are scaled to the bounds of the Box."""
-        self.ends_with_tanh = self.is_squashed and algo not in DETERMINISTIC  # their head has the tanh
+        self.ends_with_tanh = self.is_squashed and algo not in DETERMINISTIC  # heads of TD3 and DDPG contain it
         """Whether tanh is applied to the head's output plus noise."""
         name = "actor.log_std" if algo in SQUASHED_GAUSSIAN else "log_std"
         self.log_std = read.tensors.get(name)

@@ -50,7 +50,7 @@ class PolicyPlayer(Player):
         self.exploration = exploration
 
     def begin_segment(self, seed: int, step: int) -> None:
-        """Take over changed weights; gSDE draws its matrix for this step."""
+        """Use the present weights; gSDE draws its matrix for this step."""
         self._network.prepare()
         if self._uses_sde and self.exploration.stochastic:
             self._draw_matrix(seed, step)

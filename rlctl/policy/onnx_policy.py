@@ -51,7 +51,7 @@ def encode(model: onnx.ModelProto) -> bytes:
 def check(content: bytes) -> None:
     """Raise `ValueError` for a graph that is damaged, or that has more than a policy needs.
 
-    Loops, branches and functions may never end; a tensor in another file would read a path that the sender chose.
+    A loop may never end, and for a tensor in another file onnxruntime would read a path that the sender chose.
     """
     import onnx
     from google.protobuf.message import DecodeError
@@ -106,7 +106,7 @@ class OnnxPolicy(Policy):
 
     @classmethod
     def load(cls, path: Path) -> OnnxPolicy:
-        """Read an exported file; raises `ArtifactError` if it is missing, damaged, not ours or of a newer format."""
+        """Read an exported file; raises `ArtifactError` if it is missing, damaged, foreign or of a newer format."""
         try:
             session = _open_session(untrusted.read_bytes(path))
             text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)

@@ -74,9 +74,8 @@ def find_class(description: Mapping[str, str]) -> type:
     Raises `ArtifactError` for a module that the user has not named, or that is missing or has changed.
     """
     name = str(description["class"])
-    if description.get("module") == "torch.nn" and inspect.isclass(
-        known := getattr(sys.modules["torch.nn"], name, None)
-    ):
+    known = getattr(sys.modules["torch.nn"], name, None) if description.get("module") == "torch.nn" else None
+    if inspect.isclass(known):
         return known
     file = Path(str(description["file"]))
     shown = f"{file}:{name}"
@@ -84,7 +83,7 @@ def find_class(description: Mapping[str, str]) -> type:
         raise ArtifactError(f"it was trained with {shown}; that file is missing: restore it")
     if (module := _find_module(file)) is None:
         advice = f"give the run, or set {VARIABLE}={file}"
-        raise ArtifactError(f"it was trained with {shown}, which is not imported for a policy file alone; {advice}")
+        raise ArtifactError(f"it was trained with {shown}; a policy file alone never imports it: {advice}")
     cls = getattr(module, name, None)
     if files.digest(file.read_bytes()) != description["sha256"] or not inspect.isclass(cls):
         raise ArtifactError(f"it was trained with {shown}, which has changed; restore the version of the training")
@@ -96,7 +95,7 @@ def _find_module(file: Path) -> Any:
     named = [Path(entry).expanduser().resolve() for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry]
     if file in named:
         return import_file(str(file), file)
-    loaded = [module for module in list(sys.modules.values()) if getattr(module, "__file__", None)]
+    loaded = (module for module in list(sys.modules.values()) if getattr(module, "__file__", None))
     return next((module for module in loaded if Path(str(module.__file__)).resolve() == file), None)
 
 

@@ -47,33 +47,29 @@ class Policy(abc.ABC):
                 raise ValueError(f"observation has {number:g}, the policy expects {dtype}")
             if value is None or value.shape != shape:
                 expected = join({key: shape for key, (shape, _) in self._parts.items()})
-                raise ValueError(
-                    f"observation of shape {map_parts(np.shape, observation)}, the policy expects {expected}"
-                    + _describe_additions(self.info.spec)
-                )
+                problem = f"observation of shape {map_parts(np.shape, observation)}, the policy expects {expected}"
+                raise ValueError(problem + _describe_additions(self.info.spec))
             parts[key] = value
         return parts
 
     def try_once(self, *, deterministic: bool = True) -> None:
         """Act once on an observation of zeros; raises `ValueError` for an action that does not fit the action space.
 
-        A file that does not fit its description raises other exceptions here, too.
+        For a file that does not fit its description, this raises other exceptions, too.
         """
         spaces = split_space(self.observation_space).items()
         zeros = {key: np.full(space.shape or (), getattr(space, "start", 0), space.dtype) for key, space in spaces}
         action = self.predict(join(zeros), deterministic=deterministic)
         self.reset()
         if action.shape != (self.action_space.shape or ()):
-            raise ValueError(
-                f"its actions have shape {action.shape}, those of its action space {self.action_space.shape}"
-            )
+            raise ValueError(f"its actions have shape {action.shape}, its action space has {self.action_space.shape}")
         if not np.isfinite(action).all():
             raise ValueError("its actions are not finite")
 
 
 def _describe_additions(spec: EnvSpec) -> str:
-    """Return which parts of the observation are not from the task, and how to get them."""
+    """Return what rlctl adds to the task's observation, and how to get it."""
     added = ["the remaining fraction of the episode"] if spec.time_feature else []
     if spec.frame_stack > 1:
         added.append(f"{spec.frame_stack} frames")
-    return f", with {' and '.join(added)}, as policy.info.spec.make() returns it" if added else ""
+    return f", including {' and '.join(added)}; policy.info.spec.make() returns these observations" if added else ""

@@ -45,9 +45,8 @@ class Provenance(pydantic.BaseModel, extra="forbid"):
 
 def list_shipped() -> list[str]:
     """Return the installed tasks that ship a policy."""
-    return [
-        entry.name for entry in installed.list_installed() if entry.problem is None and entry.policy_file is not None
-    ]
+    entries = [entry for entry in installed.list_installed() if entry.problem is None]
+    return [entry.name for entry in entries if entry.policy_file is not None]
 
 
 def find_shipped_policy(task: str | None) -> Path:
@@ -59,10 +58,8 @@ def find_shipped_policy(task: str | None) -> Path:
         raise UsageError(f"--pretrained: give a task that ships a policy: {', '.join(list_shipped()) or 'none'}")
     entry = installed.find(task)
     if entry is None:
-        names = [entry.name for entry in installed.list_installed()]
-        raise UsageError(
-            f"no task {task!r} is installed, and only installed tasks ship policies.{did_you_mean(task, names)}"
-        )
+        close = did_you_mean(task, [entry.name for entry in installed.list_installed()])
+        raise UsageError(f"no task {task!r} is installed, and only installed tasks ship policies.{close}")
     if (file := entry.policy_file) is None:
         others = ", ".join(list_shipped()) or "none"
         raise ArtifactError(f"{task} ships no policy; train one: rlctl train {task}. Tasks that ship one: {others}")

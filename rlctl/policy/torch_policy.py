@@ -52,7 +52,7 @@ _LEFT_OUT = (
 
 
 def pin_threads() -> None:
-    """Make torch and NumPy use one thread: the last bits of a result depend on it, and small networks gain nothing."""
+    """Make torch and NumPy use one thread: the last bits of a result depend on the number of threads."""
     torch.set_num_threads(1)
     threadpool_limits(1, "blas")
 
@@ -104,13 +104,9 @@ def _list_missing_arguments(policy: BasePolicy) -> dict[str, Any]:
     if hasattr(policy, "share_features_extractor"):
         missing["share_features_extractor"] = policy.share_features_extractor
     if isinstance(policy, RecurrentActorCriticPolicy):
-        missing |= {
-            "lstm_hidden_size": policy.lstm_actor.hidden_size,
-            "n_lstm_layers": policy.lstm_actor.num_layers,
-            "shared_lstm": policy.shared_lstm,
-            "enable_critic_lstm": policy.enable_critic_lstm,
-            "lstm_kwargs": policy.lstm_kwargs,
-        }
+        lstm = policy.lstm_actor
+        missing |= {"lstm_hidden_size": lstm.hidden_size, "n_lstm_layers": lstm.num_layers}
+        missing |= {name: getattr(policy, name) for name in ("shared_lstm", "enable_critic_lstm", "lstm_kwargs")}
     return missing
 
 
@@ -122,7 +118,8 @@ def build_network(info: PolicyInfo) -> BasePolicy:
     cls: type[BasePolicy] | None = ALGORITHMS[info.algo].policy_aliases.get(info.policy)
     if cls is None:
         raise ArtifactError(f"policy of an unknown kind {info.policy!r} for {info.algo}")
-    kwargs: dict[str, Any] = {"optimizer_class": _NoOptimizer, **info.policy_kwargs}
+    # Acting needs no optimiser, and torch's optimisers import its compiler (0.8 s).
+    kwargs: dict[str, Any] = {"optimizer_class": lambda parameters, **settings: None, **info.policy_kwargs}
     if "activation_fn" in kwargs:
         name = kwargs["activation_fn"]
         kwargs["activation_fn"] = own_modules.find_class(name) if isinstance(name, dict) else ACTIVATIONS[name]
@@ -132,13 +129,6 @@ def build_network(info: PolicyInfo) -> BasePolicy:
         cls = own_modules.find_class(kwargs.pop("policy_class"))
         del kwargs["optimizer_class"]  # a user's own constructor may not have it
     return cls(network_space(observation_space), action_space, lr_schedule=lambda _: 0.0, **kwargs)
-
-
-class _NoOptimizer:
-    """Replaces the optimiser: acting needs none, and torch's optimisers import its compiler (0.8 s)."""
-
-    def __init__(self, parameters: Any, **settings: Any) -> None:
-        del parameters, settings
 
 
 class TorchPolicy(Policy):

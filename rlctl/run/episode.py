@@ -15,7 +15,7 @@ from rlctl.errors import ArtifactError
 from rlctl.storage import files, untrusted
 
 FORMAT = 2
-"""In version 2 each event has its own random stream; episodes of version 1 can be reproduced if no event acts."""
+"""In version 2 each event has its own random stream."""
 
 
 class EpisodeInfo(pydantic.BaseModel, extra="forbid"):

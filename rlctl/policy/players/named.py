@@ -29,7 +29,7 @@ SERVER = ("ws://", "wss://")
 
 
 def make_player(name: str, space: spaces.Space[Any]) -> Player:
-    """Return the player for `zero`, `random`, an exported file, or a function as `load_function` takes it."""
+    """Return the player for `zero`, `random`, an exported file, or the name of a function, see `load_function`."""
     if name == "zero":
         return ZeroPlayer(space)
     if name == "random":
@@ -51,9 +51,8 @@ def load_function(text: str) -> Callable[..., Any]:
         place, _, name = text.rpartition(":")
         raise UsageError(f"--policy {text}: {place} has no function {name!r}") from None
     except RlctlError as error:
-        raise type(error)(
-            f"--policy {text}: {str(error).removeprefix(f'task {text!r}: ')}", details=error.details
-        ) from None
+        problem = str(error).removeprefix(f"task {text!r}: ")
+        raise type(error)(f"--policy {text}: {problem}", details=error.details) from None
 
 
 class ZeroPlayer(Player):
