@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from rlctl import output
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
-from rlctl.errors import ArtifactError, UsageError, did_you_mean
-from rlctl.importing.sb3_model import SavedModel, SavedNormalization, read_model, read_normalization
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.importing.sb3_model import SavedModel, read_model, read_normalization
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.storage import files
@@ -29,20 +28,18 @@ def import_model(
     output: Path | None = None,
     changes: EnvChanges = UNCHANGED,
 ) -> PolicyFile:
-    """Read a model, with its VecNormalize if it has one, and write it as a policy of a task if it acts.
+    """Read a model and its VecNormalize, if it has one; write them as a policy file, after a test that it acts.
 
     Raises `UsageError` if `output` does not end in .safetensors, or if it is None and the file named after the model
     exists; `ArtifactError` for a file that is not a model, or a model for other spaces than the task has.
     """
-    from rlctl.policy.torch_policy import ALGORITHMS, build_network, describe_network, policy_name
+    from rlctl.policy.torch_policy import build_network, describe_network, policy_name
 
     if output is not None and output.suffix != ".safetensors":
         raise UsageError(f"--output {output}: the name of a policy file ends in .safetensors")
     target = output or Path(f"{file.stem}.safetensors")
     if output is None and target.exists():  # rl-zoo3 calls every model best_model.zip
         raise UsageError(f"{target} exists already; give another name: --output FILE")
-    if algo is not None and algo not in ALGORITHMS:
-        raise UsageError(f"--algo {algo}: no such algorithm.{did_you_mean(algo, ALGORITHMS)}")
     model = read_model(file, algo)
     statistics = read_normalization(normalization) if normalization else None
     spec = changes.apply(EnvSpec(task))
@@ -57,7 +54,7 @@ def import_model(
         policy=policy_name(model.algo, env_info.spaces()[0]),
         policy_kwargs=model.policy_kwargs,
         clip_observation=statistics.clip if statistics else None,
-        normalized_keys=list(statistics.mean) if statistics else [],
+        normalized_keys=statistics.keys if statistics else [],
         env=env_info,
         spec=spec,
         training_steps=model.training_steps,
@@ -69,7 +66,7 @@ def import_model(
     except (TypeError, ValueError, AssertionError) as error:
         raise ArtifactError(f"{file}: its policy_kwargs do not make a network for {task}: {error}") from None
     source = f"{file} with {normalization}" if normalization else str(file)
-    policy = PolicyFile(info, _collect_tensors(model, statistics), target)
+    policy = PolicyFile(info, model.tensors | (statistics.tensors if statistics else {}), target)
     _write_checked(target, source, policy)
     return policy
 
@@ -106,7 +103,9 @@ def _find_difference(
     if _describe_shape(space) != _describe_shape(model.observation_space):
         ours, theirs = _flat_part(space), _flat_part(model.observation_space)
         is_stack = ours is not None and theirs is not None and theirs.shape[0] % ours.shape[0] == 0
-        hint = ". Models with VecFrameStack cannot be imported: its first frames are zeros" if is_stack else ""
+        hint = (
+            ". Models with VecFrameStack cannot be imported: it fills the first frames with zeros" if is_stack else ""
+        )
         return f"it observes {_describe_shape(model.observation_space)}, {task} returns {_describe_shape(space)}{hint}"
     same = _describe_shape(action) == _describe_shape(model.action_space)
     if same and isinstance(action, spaces.Box) and isinstance(model.action_space, spaces.Box):
@@ -119,14 +118,6 @@ def _describe_shape(space: spaces.Space[Any]) -> Any:
         return {key: _describe_shape(part) for key, part in space.spaces.items()}
     counts = isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
     return str(space) if counts else f"{type(space).__name__}{space.shape}"
-
-
-def _collect_tensors(model: SavedModel, normalization: SavedNormalization | None) -> dict[str, NDArray[Any]]:
-    tensors = {f"policy/{name}": values for name, values in model.tensors.items()}
-    if normalization is not None:
-        for key, mean in normalization.mean.items():
-            tensors |= {f"normalize/{key}/mean": mean, f"normalize/{key}/var": normalization.var[key]}
-    return tensors
 
 
 def _write_checked(output: Path, source: str, policy: PolicyFile) -> None:

@@ -51,28 +51,28 @@ class SavedModel:
     observation_space: spaces.Space[Any]  # the network's: images have the channels first
     action_space: spaces.Space[Any]
     policy_kwargs: dict[str, Any]  # plain data; `activation_fn` has its name in recipes
-    tensors: dict[str, NDArray[Any]]  # the tensors of the policy, with the names of SB3's `state_dict`
+    tensors: dict[str, NDArray[Any]]  # the tensors of the policy, by the names of policy files
     training_steps: int
     version: str  # the version of Stable-Baselines3; empty if unknown
 
 
 @dataclasses.dataclass(frozen=True)
 class SavedNormalization:
-    """The statistics of a `VecNormalize`, by key of a dict observation; the key is "" for any other observation."""
+    """The statistics of a `VecNormalize`."""
 
-    mean: dict[str, NDArray[np.float64]]
-    var: dict[str, NDArray[np.float64]]
+    keys: list[str]  # of a dict observation; `""` for any other observation
+    tensors: dict[str, NDArray[np.float64]]  # mean and variance, by the names of policy files
     clip: float
 
 
 def read_model(path: Path, algo: str | None = None) -> SavedModel:
     """Read a model.zip; raises `ArtifactError` if it is not a model, is too large, or has unsupported data.
 
-    `algo` is for models whose file fits two algorithms, A2C and PPO, or DDPG and TD3. It raises `UsageError` if the
-    file does not fit it.
+    `algo` chooses between algorithms whose files look the same: A2C and PPO, DDPG and TD3. Raises `UsageError` for any
+    other algorithm than the model's.
     """
     with _explain_errors(path, "a model"), untrusted.open_file(path) as file, zipfile.ZipFile(file) as archive:
-        data = json.loads(_read_member(archive, "data"))
+        data, policy = json.loads(_read_member(archive, "data")), _read_member(archive, "policy.pth")
         if not isinstance(data, dict):
             raise NotPlainData("its data is not a mapping")
         saved_algo = _find_algorithm(data)
@@ -83,7 +83,7 @@ def read_model(path: Path, algo: str | None = None) -> SavedModel:
             observation_space=read_space(_decode(data, "observation_space")),
             action_space=read_space(_decode(data, "action_space")),
             policy_kwargs=_read_policy_kwargs(data),
-            tensors=read_tensors(_read_member(archive, "policy.pth")),
+            tensors={f"policy/{name}": values for name, values in read_tensors(policy).items()},
             training_steps=int(data.get("num_timesteps") or 0),
             version=_read_member(archive, _VERSION).decode().strip() if _VERSION in archive.namelist() else "",
         )
@@ -198,13 +198,12 @@ def read_normalization(path: Path) -> SavedNormalization | None:
             raise NotPlainData(f"an epsilon of {epsilon:g}; only Stable-Baselines3's default, 1e-08, is supported")
         statistics = state["obs_rms"]
         parts = statistics if isinstance(statistics, dict) else {"": statistics}
-        module = "stable_baselines3.common.running_mean_std."
-        fields = {key: _split_object(part, module)[1] for key, part in parts.items()}
-        return SavedNormalization(
-            mean={key: read_array(values["mean"]).astype(np.float64) for key, values in fields.items()},
-            var={key: read_array(values["var"]).astype(np.float64) for key, values in fields.items()},
-            clip=float(state["clip_obs"]),
-        )
+        tensors: dict[str, NDArray[np.float64]] = {}
+        for key, part in parts.items():
+            _, values = _split_object(part, "stable_baselines3.common.running_mean_std.")
+            for name in ("mean", "var"):
+                tensors[f"normalize/{key}/{name}"] = read_array(values[name]).astype(np.float64)
+        return SavedNormalization(list(parts), tensors, float(state["clip_obs"]))
 
 
 def read_tensors(content: bytes) -> dict[str, NDArray[Any]]:
