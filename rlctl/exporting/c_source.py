@@ -152,15 +152,11 @@ def write_c(policy: PolicyFile, file_name: str) -> CSource:
     Raises `UsageError` for images, a user's own network, and networks of more than `LARGEST` weights.
     """
     if (weights := sum(tensor.size for tensor in policy.actor_only().tensors.values())) > LARGEST:
-        raise UsageError(
-            f"export --c: {weights:,} weights are too many for a C file (at most {LARGEST:,}); use export --onnx"
-        )
+        raise UsageError(f"export --c: {weights:,} weights are too many, the limit is {LARGEST:,}; use export --onnx")
     kwargs = policy.info.policy_kwargs
     for key in own_modules.KEYS:
         if isinstance(own := kwargs.get(key), dict):
-            raise UsageError(
-                f"export --c: the layer {own['class']} of policy_kwargs.{key} cannot be written as C; use export --onnx"
-            )
+            raise UsageError(f"export --c: the {key} {own['class']} cannot be written as C; use export --onnx")
     name, network = _make_identifier(file_name), Network(policy)
     layout = Layout(name, policy.info)
     has_images = any(isinstance(layer, ScaleImage) for part in network.parts.values() for layer in part)

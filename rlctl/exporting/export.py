@@ -131,8 +131,8 @@ def format_closed_loop(loop: ClosedLoop) -> str:
 def export_policy(request: ExportRequest) -> list[ExportReport]:
     """Export a policy in one or more formats and verify each file in the policy's own environment.
 
-    The files of several formats differ in their suffix. Raises `UsageError` for a policy that a format cannot hold,
-    and `AnswerIsNo` with the numbers if a file does not act as the policy does; that file is not written.
+    The files of several formats differ in their suffix. Raises `UsageError` if a format cannot represent the policy.
+    Raises `AnswerIsNo` with the numbers if a file does not act as the policy does; that file is not written.
     """
     source, formats, target = lookup.find_policy(request.run, request.checkpoint), request.formats, request.output
     output.print_notes(source.notes)

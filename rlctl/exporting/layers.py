@@ -78,16 +78,10 @@ class Graph:
 
     def model(self, metadata: Mapping[str, str], meaning: str) -> onnx.ModelProto:
         """Return the checked model; raises onnx's `ValidationError` for an invalid graph."""
-        graph = helper.make_graph(
-            self._nodes, "policy", self._inputs, self._outputs, list(self._constants.values()), meaning
-        )
-        model = helper.make_model(
-            graph,
-            producer_name="rlctl",
-            producer_version=__version__,
-            opset_imports=[helper.make_opsetid("", OPSET)],
-            ir_version=IR_VERSION,
-        )
+        constants = list(self._constants.values())
+        graph = helper.make_graph(self._nodes, "policy", self._inputs, self._outputs, constants, meaning)
+        opset, producer = helper.make_opsetid("", OPSET), {"producer_name": "rlctl", "producer_version": __version__}
+        model = helper.make_model(graph, **producer, opset_imports=[opset], ir_version=IR_VERSION)
         helper.set_model_props(model, dict(metadata))
         onnx.checker.check_model(model, full_check=True)
         return model

@@ -18,7 +18,7 @@ class ExportRequest:
     formats: tuple[Format, ...] = ("onnx",)
     checkpoint: str = "best"
     output: Path | None = None
-    """Default: in the run's folder, next to a policy file without a run, or in this folder for a shipped policy."""
+    """Default: the run's `exports/`; the folder of a policy file without a run; this folder for a shipped policy."""
     policy: Path | None = None  # write the actor with its measured score to this file instead, as plugins ship it
     episodes: int = 100  # episodes of that measurement, or of a dataset
     dataset: DatasetFormat | None = None  # write a dataset of episodes instead; `output` is its folder
@@ -26,10 +26,7 @@ class ExportRequest:
     def __post_init__(self) -> None:
         if self.policy is not None and self.policy.suffix != ".safetensors":
             raise UsageError(f"--policy {self.policy}: the name of a policy file ends in .safetensors")
-        if (
-            self.output is not None
-            and self.dataset is None
-            and self.output.suffix not in [f".{name}" for name in self.formats]
-        ):
-            kind = "an ONNX file" if self.formats[0] == "onnx" else "a C file"
-            raise UsageError(f"--output {self.output}: the name of {kind} ends in .{self.formats[0]}")
+        if self.output is None or self.dataset is not None:
+            return
+        if self.output.suffix not in [f".{name}" for name in self.formats]:
+            raise UsageError(f"--output {self.output}: give a name that ends in .{self.formats[0]}")

@@ -31,7 +31,7 @@ MAX_RETURN_DIFFERENCE = 1e-3  # limit of the relative difference of an episode's
 _MIN_OBSERVATIONS = {"onnx": 1000, "c": 2000}
 EPISODES = 20  # episodes that each of the two policies plays in closed loop
 _LAST_BITS = 2.0**-21
-"""Relative change: the last three bits of a float32, about the effect of another order of additions in a network."""
+"""Relative change: the last three bits of a float32, as much as another order of the additions in a network changes."""
 _REPETITIONS = 300
 _WARM_UP = 30
 _CALLS = 10  # calls of a C function per measurement
@@ -45,7 +45,7 @@ class Agreement:
     max_difference: float = 0.0  # largest |difference| of an action element, in the units of the action
     beyond_limit: int = 0  # number of actions that differ by more than the limit; discrete actions that differ at all
     near_ties: int = 0
-    """Number of different discrete actions whose logits are equal within the limit: both choices are right."""
+    """Number of different discrete actions whose logits are equal within the limit: both choices are correct."""
     batch_sizes: list[int] = dataclasses.field(default_factory=lambda: [1])
     """Numbers of observations per call of the exported policy."""
 
@@ -56,9 +56,10 @@ class Agreement:
 
 
 class Comparison:
-    """Collects differences of actions. Call `add` right after the torch policy has acted: it reads its logits."""
+    """Collects differences of the actions of a policy and its export."""
 
-    def __init__(self, torch_policy: TorchPolicy) -> None:
+    def __init__(self, torch_policy: TorchPolicy, exported: Policy) -> None:
+        self.torch_policy, self.exported = torch_policy, exported
         self.agreement = Agreement()
         self._space = torch_policy.action_space
         self._logits: NDArray[np.float32]
@@ -70,8 +71,28 @@ class Comparison:
     def _keep_logits(self, module: Any, inputs: Any, output: Any) -> None:
         self._logits = output.detach().cpu().numpy()
 
+    def add_episodes(self, episodes: Sequence[Episode]) -> None:
+        """Compare the actions of both policies on all observations of episodes."""
+        for episode in episodes:
+            observations, length = episode.recorded.observations, len(episode.recorded.actions)
+            self.torch_policy.reset()
+            self.exported.reset()
+            rows = 1 if self.torch_policy.is_recurrent else length
+            for low in range(0, length, rows):
+                batch = map_parts(operator.itemgetter(slice(low, low + rows)), observations)
+                actions = [self.exported.predict(take_row(batch, row)) for row in range(rows)]
+                self.add(self.torch_policy.act(batch), np.stack(actions))
+            self.agreement.observations += length
+
+    def add_batch(self, exported: OnnxPolicy, episodes: Sequence[Episode]) -> None:
+        """Compare the actions of both policies on the first observations of episodes, in one batch."""
+        first = stack([take_row(episode.recorded.observations, 0) for episode in episodes])
+        self.torch_policy.reset()
+        self.add(self.torch_policy.act(first), exported.start_episodes(first))
+        self.agreement.batch_sizes.append(len(episodes))
+
     def add(self, expected: NDArray[Any], actions: NDArray[Any]) -> None:
-        """Compare two arrays of actions, shape (rows, ...)."""
+        """Compare two arrays of actions, shape (rows, ...); call it right after the torch policy has acted."""
         difference = np.abs(expected.astype(np.float64) - actions).reshape(len(expected), -1)
         # With this comparison NaN is beyond the limit.
         limit = MAX_DIFFERENCE * np.maximum(1.0, np.abs(expected)).reshape(difference.shape)
@@ -148,20 +169,20 @@ def verify(torch_policy: TorchPolicy, exported: Policy, file: Path, workers: Wor
     environment fails.
     """
     min_observations = _MIN_OBSERVATIONS["onnx" if isinstance(exported, OnnxPolicy) else "c"]
-    comparison = Comparison(torch_policy)
+    comparison = Comparison(torch_policy, exported)
     seeds = episode_seeds(0, Stream.VERIFY, EPISODES)
     workers.set_policy(torch_policy.file)
     expected = play_episodes(workers, seeds, record=True)
-    _compare_actions(torch_policy, exported, expected, comparison)
+    comparison.add_episodes(expected)
     if isinstance(exported, OnnxPolicy):
-        _compare_batch(torch_policy, exported, expected, comparison)
+        comparison.add_batch(exported, expected)
     while (observations := comparison.agreement.observations) < min_observations:
         missing = max(1, round(1.1 * len(seeds) * (min_observations / observations - 1.0)))
         seeds = episode_seeds(0, Stream.VERIFY, len(seeds) + missing)
-        _compare_actions(torch_policy, exported, play_episodes(workers, seeds[-missing:], record=True), comparison)
+        comparison.add_episodes(play_episodes(workers, seeds[-missing:], record=True))
     workers.set_other_policy(str(file.resolve()))
     actual = play_episodes(workers, seeds[:EPISODES], record=True)
-    _compare_actions(torch_policy, exported, actual, comparison)
+    comparison.add_episodes(actual)
     comparison.agreement.observations = observations  # counts the original policy's episodes only
     comparison.close()
     loop = compare_episodes(expected, actual)
@@ -189,39 +210,11 @@ def _change_last_bits(values: NDArray[Any]) -> NDArray[Any]:
     return (values * (1.0 + _LAST_BITS)).astype(values.dtype) if values.dtype.kind == "f" else values
 
 
-def _compare_actions(
-    torch_policy: TorchPolicy, exported: Policy, episodes: Sequence[Episode], comparison: Comparison
-) -> None:
-    """Compare the actions of both policies on all observations of episodes."""
-    for episode in episodes:
-        assert episode.trajectory is not None  # recorded
-        observations, length = episode.trajectory.observations, len(episode.trajectory.actions)
-        torch_policy.reset()
-        exported.reset()
-        rows = 1 if torch_policy.is_recurrent else length
-        for low in range(0, length, rows):
-            batch = map_parts(operator.itemgetter(slice(low, low + rows)), observations)
-            actions = [exported.predict(take_row(batch, row)) for row in range(rows)]
-            comparison.add(torch_policy.act(batch), np.stack(actions))
-        comparison.agreement.observations += length
-
-
-def _compare_batch(
-    torch_policy: TorchPolicy, exported: OnnxPolicy, episodes: Sequence[Episode], comparison: Comparison
-) -> None:
-    """Compare the actions of both policies on the first observations of episodes, in one batch."""
-    trajectories = [episode.trajectory for episode in episodes]
-    first = stack([take_row(trajectory.observations, 0) for trajectory in trajectories if trajectory is not None])
-    torch_policy.reset()
-    comparison.add(torch_policy.act(first), exported.start_episodes(first))
-    comparison.agreement.batch_sizes.append(len(episodes))
-
-
 def compare_episodes(expected: Sequence[Episode], actual: Sequence[Episode]) -> ClosedLoop:
     """Compare episodes of the same seeds."""
     pairs = [(ours.result, theirs.result) for ours, theirs in zip(expected, actual, strict=True)]
     returns = np.array([[ours.total_reward, theirs.total_reward] for ours, theirs in pairs])
-    # The mean |return| is there for returns near 0, whose relative difference would be large.
+    # Returns near 0 would have a large relative difference: they are compared with the mean |return|.
     scale = np.maximum(np.abs(returns).max(axis=1), np.abs(returns).mean())
     difference = np.abs(returns[:, 0] - returns[:, 1])
     relative = np.divide(difference, scale, out=np.zeros_like(difference), where=scale > 0)

@@ -159,7 +159,7 @@ def logits_policy(train, write, small, action, logits):
 )
 def test_only_near_ties_may_be_chosen_differently(action, logits, other, near_tie, small, train, write):
     policy = logits_policy(train, write, small, action, logits)
-    comparison = Comparison(policy)
+    comparison = Comparison(policy, policy)
     expected = policy.act(np.zeros((1, 3), np.float32))
     comparison.add(expected, np.array(other))
     seen = comparison.agreement
@@ -168,7 +168,8 @@ def test_only_near_ties_may_be_chosen_differently(action, logits, other, near_ti
 
 
 def test_not_a_number_is_beyond_the_limit(small, train, write):
-    comparison = Comparison(TorchPolicy.load(write(train("ppo", small(), steps=0), "ppo", small())))
+    policy = TorchPolicy.load(write(train("ppo", small(), steps=0), "ppo", small()))
+    comparison = Comparison(policy, policy)
     comparison.add(np.zeros((2, 2), np.float32), np.array([[np.nan, 0.0], [0.0, 0.0]], np.float32))
     assert comparison.agreement.beyond_limit == 1
 
@@ -222,7 +223,7 @@ def test_environment_that_has_changed(small, train, write, tmp_path):
 @pytest.mark.parametrize("name", ["policy.bin", "folder"])
 def test_output_must_be_called_onnx(name, small, train, write, tmp_path):
     path = write(train("ppo", small(), steps=0), "ppo", small())
-    with pytest.raises(UsageError, match=r"the name of an ONNX file ends in \.onnx"):
+    with pytest.raises(UsageError, match=r"give a name that ends in \.onnx"):
         export(path, tmp_path / name)
 
 

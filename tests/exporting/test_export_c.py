@@ -156,7 +156,7 @@ def test_what_c_cannot_carry_is_refused_on_the_command_line(rlctl, small, train,
 
 def test_name_of_the_output(small, train, write, tmp_path):
     path = write(train("ppo", small(), steps=0), "ppo", small())
-    with pytest.raises(UsageError, match=r"the name of a C file ends in \.c"):
+    with pytest.raises(UsageError, match=r"give a name that ends in \.c"):
         export_policy(ExportRequest(str(path), ("c",), "best", tmp_path / "policy.onnx"))
 
 
