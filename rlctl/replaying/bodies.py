@@ -19,7 +19,7 @@ _MESHES = {".obj", ".stl", ".dae", ".glb", ".gltf"}
 def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> tuple[str, BodyMotion] | None:
     """Draw everything under `world/`; `warn` receives messages about what could not be drawn.
 
-    Returns the entity that the camera follows: the trunk of the first robot with a trunk, if it was drawn.
+    Returns what the camera follows: the first robot with a trunk that was drawn, and the entity of the trunk.
     """
     trunks: list[tuple[str, BodyMotion]] = []
     timelines.stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -31,7 +31,7 @@ def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> tuple[str, Bod
         else:
             drawn = draw_shapes(body, timelines, warn)
             if body.trunk is not None:
-                trunk = _entity("world", body.name, body.links[body.trunk]) + "/"
+                trunk = rr.new_entity_path(["world", body.name, body.links[body.trunk]]) + "/"
                 trunks += [(entity, body) for entity in drawn if entity.startswith(trunk)]
         _draw_path(body, timelines)
     for number, (name, positions) in enumerate(scene.markers.items()):
@@ -41,7 +41,7 @@ def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> tuple[str, Bod
 
 def _draw_marker(name: str, positions: NDArray[np.float64], color: tuple[int, int, int], timelines: Timelines) -> None:
     """Draw a labelled point, and a halo that stays visible when a gripper covers the point."""
-    entity, steps = _entity("world", "markers", name), range(len(positions))
+    entity, steps = rr.new_entity_path(["world", "markers", name]), range(len(positions))
     stream = timelines.stream
     # Positions are not static: static data would hide the moving ones.
     point = rr.Points3D.from_fields(radii=0.03, colors=color, labels=name, show_labels=True)
@@ -55,10 +55,6 @@ def _draw_marker(name: str, positions: NDArray[np.float64], color: tuple[int, in
     timelines.send(f"{entity}/halo", steps, rr.Ellipsoids3D.columns(centers=positions))
 
 
-def _entity(*parts: str) -> str:
-    return rr.new_entity_path(list(parts))
-
-
 def _draw_ground(body: BodyMotion, scene: Scene, timelines: Timelines) -> None:
     low, high = bounds(scene)
     center, half = (low + high)[:2] / 2, max(2.0, float((high - low)[:2].max()))
@@ -69,7 +65,7 @@ def _draw_ground(body: BodyMotion, scene: Scene, timelines: Timelines) -> None:
         colors=[_GROUND_COLOR],
         fill_mode=rr.components.FillMode.Solid,
     )
-    timelines.stream.log(_entity("world", body.name), box, static=True)
+    timelines.stream.log(rr.new_entity_path(["world", body.name]), box, static=True)
 
 
 def _draw_terrain(name: str, points: NDArray[np.float64], timelines: Timelines) -> None:
@@ -85,7 +81,7 @@ def _draw_terrain(name: str, points: NDArray[np.float64], timelines: Timelines) 
         triangle_indices=triangles,
         vertex_colors=np.clip(shade * np.array(_GROUND_COLOR), 0, 255).astype(np.uint8),
     )
-    timelines.stream.log(_entity("world", name), mesh, static=True)
+    timelines.stream.log(rr.new_entity_path(["world", name]), mesh, static=True)
 
 
 def bounds(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -100,7 +96,7 @@ def _draw_path(body: BodyMotion, timelines: Timelines) -> None:
     if not body.joint_names:
         return
     points = _path_points(body).astype(np.float32)
-    entity = _entity("world", "paths", body.name)
+    entity = rr.new_entity_path(["world", "paths", body.name])
     timelines.stream.log(entity, rr.LineStrips3D.from_fields(radii=0.004, colors=_PATH_COLOR), static=True)
     segments = [points[step - 1 : step + 1] for step in range(1, len(points))]
     timelines.send(entity, range(1, len(points)), rr.LineStrips3D.columns(strips=segments))
@@ -129,7 +125,7 @@ def draw_shapes(body: BodyMotion, timelines: Timelines, warn: Warn) -> list[str]
         shapes = [shape for shape in body.shapes if shape.link == name]
         if not shapes:
             continue
-        entity = _entity("world", body.name, name)
+        entity = rr.new_entity_path(["world", body.name, name])
         positions, orientations = body.positions[:, link], body.orientations[:, link]
         # A link that never moves has one row.
         rows = 1 if np.ptp(positions, axis=0).max() == np.ptp(orientations, axis=0).max() == 0.0 else len(positions)

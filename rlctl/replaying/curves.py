@@ -62,9 +62,9 @@ class Plot:
 
     @property
     def legend(self) -> tuple[str, tuple[float, float]]:
-        """The corner where a legend needs the least extra room, and an axis range with which it covers no curve.
+        """The corner for the legend, and the smallest axis range in which the legend covers no curve.
 
-        A legend is assumed to cover a third of the width, and a tenth of the height for each of at most six curves.
+        It is assumed to cover a third of the width, and a tenth of the height for each of at most six curves.
         """
         values = self.values[np.isfinite(self.values).all(axis=1)] if self.values.size else np.zeros((1, 1))
         values = values if len(values) else np.zeros((1, 1))

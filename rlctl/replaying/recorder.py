@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,7 +45,7 @@ class Rollout:
     episode: RecordedEpisode
     weighted_terms: NDArray[np.float64]  # shape (T, terms); they add up to the reward
     successes: NDArray[np.bool_] | None
-    """Whether the goal held after each step, shape (T,); None if the environment does not report it."""
+    """Whether the goal was reached after each step, shape (T,); None if the environment does not report it."""
     ended: bool  # whether the environment ended the episode, rather than the list of actions
     log: list[LogEntry]
     dt: float | None  # time between two steps [s]; None if unknown
@@ -98,27 +99,28 @@ def play_episode(
     draw: Warn | None = None,
     watch: Watch = lambda step: None,
 ) -> Rollout:
-    """Play the episode of a seed and record it; `watch` is called after its reset and each of its steps.
+    """Play the episode of a seed and record it; `watch` is called after the reset and after each step.
 
     With `draw` the rollout has a scene, and `draw` receives the reasons for missing parts. Raises `TaskError`, with
     seed and step, for any exception of the environment.
     """
     about, space = describe(env), env.observation_space
     reader = _make_reader(env, draw) if draw is not None else None
-    watches = [watch] if reader is None else [reader.read, watch]
+    read = (lambda step: None) if reader is None else reader.read
+    cast = int if isinstance(env.action_space, spaces.Discrete) else partial(np.array, dtype=env.action_space.dtype)
     steps: list[_Step] = []
     terminated = truncated = False
     with _locate_errors(spec.task, seed, 0):
         observation, info = env.reset(seed=seed)
         first, drawn = _copy_observation(observation, space), _find_events(info, about)
-    for call in watches:
-        call(0)
+        read(0)
+    watch(0)
     while not (terminated or truncated) and (action := choose(observation, len(steps))) is not None:
         with _locate_errors(spec.task, seed, len(steps) + 1):
-            observation, reward, terminated, truncated, info = env.step(_cast_action(action, env.action_space))
+            observation, reward, terminated, truncated, info = env.step(cast(action))
             steps.append(_read_step(action, _copy_observation(observation, space), float(reward), info, about))
-        for call in watches:
-            call(len(steps))
+            read(len(steps))
+        watch(len(steps))
     end = "terminated" if terminated else "truncated: time limit" if truncated else ""
     successes = [step.success for step in steps if step.success is not None]
     return Rollout(
@@ -177,7 +179,7 @@ def _log_steps(steps: Sequence[_Step], end: str) -> Iterator[LogEntry]:
         if bool(step.success) != held:
             held = not held
             yield LogEntry(number, "goal reached") if held else LogEntry(number, "goal lost", "WARN")
-    yield LogEntry(len(steps), end) if end else LogEntry(len(steps), "the recorded actions end here", "WARN")
+    yield LogEntry(len(steps), end) if end else LogEntry(len(steps), "no more recorded actions", "WARN")
     if end and (success := steps[-1].success) is not None:
         yield LogEntry(len(steps), "success") if success else LogEntry(len(steps), "no success", "WARN")
 
@@ -196,26 +198,17 @@ def find_dt(env: Env) -> float | None:
 
 def recorded_actions(episode: RecordedEpisode, env: Env, path: Path | None = None) -> Choose:
     """Return a function that chooses the recorded actions; raises `ArtifactError` if they cannot be replayed."""
-    check_actions(episode, env.action_space.shape or (), path)
-    return lambda _, step: episode.actions[step] if step < len(episode.actions) else None
-
-
-def check_actions(episode: RecordedEpisode, shape: tuple[int, ...], path: Path | None = None) -> None:
-    """Raise `ArtifactError` if the shape of an episode's actions is not that of its task's actions."""
-    if (recorded := episode.actions.shape[1:]) != shape:
-        task = episode.info.spec.task
+    recorded, shape, task = episode.actions.shape[1:], env.action_space.shape or (), episode.info.spec.task
+    if recorded != shape:
         name = path or f"episode of {task}"
         raise ArtifactError(f"{name}: its actions have shape {recorded}, but those of {task} have {shape}")
+    return lambda _, step: episode.actions[step] if step < len(episode.actions) else None
 
 
 def current_versions(task: str) -> dict[str, str]:
     """Return the versions that an episode of a task depends on."""
     origin = registry.find_origin(task)
     return {**collect_versions(), **({origin["distribution"]: origin["version"]} if origin else {})}
-
-
-def _cast_action(action: Any, space: spaces.Space[Any]) -> Any:
-    return int(action) if isinstance(space, spaces.Discrete) else np.array(action, dtype=space.dtype)
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from rlctl.errors import UsageError
 from rlctl.evaluation.players import LoadedPolicy, load_player
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.recipe.sources import parse_changes
-from rlctl.replaying.film import check_file, film_episodes, make_filmable, open_window, show_episodes
+from rlctl.replaying.pictures import check_file, film_episodes, make_filmable, open_window, show_episodes
 from rlctl.replaying.recorder import Choose, Rollout, make_drawable, play_episode, recorded_actions
 from rlctl.replaying.report import ReplayedEpisode, ReplayResult
 from rlctl.replaying.reproduce import print_warning, record_episode, verify_episode
@@ -38,10 +38,7 @@ _OF_POLICIES = {"checkpoint": "--checkpoint and --pretrained", "settings": "--se
 def choose_episodes(
     policy: LoadedPolicy, spec: EnvSpec, episodes: int, seed: int, choice: Choice
 ) -> tuple[list[EpisodeResult], str]:
-    """Play the episodes that `rlctl eval` plays; return the chosen ones, the most extreme first, and a description.
-
-    Raises `UsageError` for failures where the task reports no success.
-    """
+    """Play the episodes that `rlctl eval` plays; return the chosen ones, the worst or best first, and a description."""
     seeds = episode_seeds(seed, Stream.EVAL, episodes)
     with Workers(spec, min(episodes, available_cores())) as workers:
         policy.give_to(workers)
@@ -61,9 +58,14 @@ def _describe_choice(results: Sequence[EpisodeResult], kind: str, count: int) ->
 
 
 def select(results: Sequence[EpisodeResult], choice: Choice) -> list[EpisodeResult]:
-    """Return the results of the chosen episodes, the most extreme first."""
+    """Return the results of the chosen episodes, the worst or best first.
+
+    Raises `UsageError` for failures where the task reports no success.
+    """
     if choice.kind == "failures" and any(result.success is None for result in results):
-        raise UsageError(f"--failures: this task reports no success; use --worst {choice.count}, which goes by return")
+        raise UsageError(
+            f"--failures: this task reports no success; use --worst {choice.count}, which selects by return"
+        )
     candidates = [result for result in results if choice.kind != "failures" or not result.success]
     candidates.sort(key=lambda result: (bool(result.success), result.total_reward), reverse=choice.kind == "best")
     return candidates[: choice.count]
@@ -72,13 +74,15 @@ def select(results: Sequence[EpisodeResult], choice: Choice) -> list[EpisodeResu
 def run_replay(request: ReplayRequest) -> ReplayResult:
     """Record, film, show or verify episodes.
 
-    The actions of a recorded episode are replayed, and its recording is written next to it. With a policy new episodes
-    are played, and each is written as an episode (`.npz`) and a recording (`.rrd`).
+    A recorded episode is replayed with its actions, and its recording (`.rrd`) is written next to it. A policy plays
+    new episodes, and each is written as an episode (`.npz`) and a recording.
     """
     _check_request(request)
     output.results()  # from here on what an environment, or PyBullet's window, prints goes to stderr
     if request.verify is not None:
-        return _verify(request.verify)
+        recorded = _load_episode(request.verify)
+        rollout, verification = verify_episode(recorded, request.verify)
+        return ReplayResult(recorded.info.spec.task, recorded.info.policy, [_summarize(rollout)], verification)
     is_episode = _is_episode(request.source)
     source = _RecordedSource(Path(str(request.source)), request.output) if is_episode else _PolicySource(request)
     spec, seeds, film = source.spec, source.seeds, None
@@ -117,16 +121,11 @@ def _check_request(request: ReplayRequest) -> None:
         check_file(request.video)
     if target is None:
         return
-    if target.suffix == ".rrd" and request.shown > 1:
-        raise UsageError(f"--output {target}: a recording has one episode; give a folder for {request.shown}")
+    count = request.choice.count if request.choice else request.episodes or 1
+    if target.suffix == ".rrd" and count > 1:
+        raise UsageError(f"--output {target}: a recording has one episode; give a folder for {count}")
     if target.suffix != ".rrd" and target.is_file():
         raise UsageError(f"--output {target}: give a folder, or the name of a recording, which ends in .rrd")
-
-
-def _verify(path: Path) -> ReplayResult:
-    episode = _load_episode(path)
-    rollout, verification = verify_episode(episode, path)
-    return ReplayResult(episode.info.spec.task, episode.info.policy, [_summarize(rollout)], verification)
 
 
 def _load_episode(path: Path) -> RecordedEpisode:
@@ -209,11 +208,9 @@ class _PolicySource:
         for episode in episodes:
             before = self._chosen.get(episode.seed, episode.total_reward)
             if before != episode.total_reward:
-                print_warning(
-                    f"warning: seed {episode.seed}: the return is {episode.total_reward:.6g}, but was {before:.6g} "
-                    "when the episode was chosen; the environment may not be deterministic: "
-                    f"rlctl check-env {self.spec.task}"
-                )
+                returns = f"the return is {episode.total_reward:.6g}, but was {before:.6g} when the episode was chosen"
+                advice = f"the environment may not be deterministic: rlctl check-env {self.spec.task}"
+                print_warning(f"warning: seed {episode.seed}: {returns}; {advice}")
         return ReplayResult(self.spec.task, self.name, episodes, policy_file=self._described, choice=self._choice)
 
     def begin(self, env: Env, seed: int) -> Choose:
@@ -237,6 +234,5 @@ class _PolicySource:
 
 def _summarize(rollout: Rollout, recording: Path | None = None, episode: Path | None = None) -> ReplayedEpisode:
     info = rollout.episode.info
-    return ReplayedEpisode(
-        info.seed, rollout.length, info.total_reward, info.success, rollout.env.events, recording, episode
-    )
+    outcome = info.seed, rollout.length, info.total_reward, info.success
+    return ReplayedEpisode(*outcome, rollout.env.events, recording, episode)

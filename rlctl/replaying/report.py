@@ -104,7 +104,15 @@ def as_json(result: ReplayResult) -> dict[str, Any]:
     content: dict[str, Any] = {
         "task": result.task,
         "policy": result.policy,
-        "episodes": [_describe_episode(episode) for episode in result.episodes],
+        "episodes": [
+            {
+                "file": episode.recording,
+                "return": episode.total_reward,
+                "randomized": any(episode.events.values()),
+                **{name: getattr(episode, name) for name in ("episode", "seed", "length", "success", "events")},
+            }
+            for episode in result.episodes
+        ],
         "open": open_command(result),
         "versions": collect_versions(),
     }
@@ -118,16 +126,3 @@ def as_json(result: ReplayResult) -> dict[str, Any]:
             "other_versions": {name: {"recorded": recorded, "now": now} for name, (recorded, now) in versions},
         }
     return content
-
-
-def _describe_episode(episode: ReplayedEpisode) -> dict[str, Any]:
-    return {
-        "file": episode.recording,
-        "episode": episode.episode,
-        "seed": episode.seed,
-        "length": episode.length,
-        "return": episode.total_reward,
-        "success": episode.success,
-        "randomized": any(episode.events.values()),
-        "events": episode.events,
-    }

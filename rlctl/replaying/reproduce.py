@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from rlctl import output
 from rlctl.environments.dict_spaces import Observations, split
 from rlctl.errors import UsageError
-from rlctl.replaying import recorder
-from rlctl.replaying.recorder import Rollout, current_versions, play_episode, recorded_actions
+from rlctl.replaying.recorder import Rollout, current_versions, make_drawable, play_episode, recorded_actions
 from rlctl.replaying.scene import Warn
 from rlctl.rollout.workers import Workers
 from rlctl.run.episode import RecordedEpisode
@@ -66,13 +65,13 @@ def record_episode(
     info, spec = episode.info, episode.info.spec
     if info.failure:
         _replay_failed(episode)
-    with closing(recorder.make_drawable(spec, warn)) as env:
+    with closing(make_drawable(spec, warn)) as env:
         choose = recorded_actions(episode, env)
         rollout = play_episode(env, spec, info.seed, choose, policy=info.policy, draw=warn)
     if info.failure:
-        warn(f"warning: {title}: it failed when it was recorded ({info.failure}), but did not fail now")
+        warn(f"warning: {title}: it failed when it was recorded ({info.failure}), but not when it was replayed")
     elif difference := find_difference(episode, rollout):
-        warn(f"warning: {title}: replayed, it differs from the recorded episode; {difference}")
+        warn(f"warning: {title}: the replayed episode differs from the recorded one; {difference}")
     write_rrd(path, rollout, title=title, warn=warn, several=several)
     return rollout
 
@@ -80,7 +79,6 @@ def record_episode(
 def _replay_failed(episode: RecordedEpisode) -> None:
     """Replay a failed episode in a worker, because it may hang or end its process; raises `TaskError` as it does."""
     with Workers(episode.info.spec, 1) as workers:
-        recorder.check_actions(episode, workers.info.spaces()[1].shape or ())
         workers.replay_actions({0: (episode.info.seed, episode.actions)})
 
 

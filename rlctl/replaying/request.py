@@ -1,4 +1,4 @@
-"""What a replay is asked for: the arguments of `rlctl replay` as data. Imports nothing heavy."""
+"""The arguments of `rlctl replay` as data. Imports nothing that takes time."""
 
 import dataclasses
 from pathlib import Path
@@ -9,7 +9,7 @@ from rlctl.options import Argument, Checkpoint, EpisodeSeed, Option, Settings
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """Episodes by outcome: by success where the task reports it, then by return."""
+    """Which episodes to choose: by success if the task reports it, then by return."""
 
     kind: Literal["worst", "best", "failures"]
     count: int
@@ -32,20 +32,14 @@ class ReplayRequest:
         int | None,
         Option("Episodes to roll out, or to choose from.", min=1, max=1_000_000, default_text="1; 100 to choose from"),
     ] = None
-    worst: Annotated[
-        int | None, Option("Only the N worst of --episodes; N is 1 if left out.", metavar="[N]", min=1)
-    ] = None
+    worst: Annotated[int | None, Option("Only the N worst of --episodes; 1 without N.", metavar="[N]", min=1)] = None
     best: Annotated[int | None, Option("Only the N best of --episodes.", metavar="[N]", min=1)] = None
-    failures: Annotated[
-        int | None, Option("Only N failed episodes of --episodes, the worst first.", metavar="[N]", min=1)
-    ] = None
+    failures: Annotated[int | None, Option("Only the N worst failures of --episodes.", metavar="[N]", min=1)] = None
     seed: EpisodeSeed = 0
     checkpoint: Checkpoint = "best"
     task: Annotated[str | None, Option("Roll out on this task instead of the one it was trained on.")] = None
     settings: Settings = dataclasses.field(default_factory=list)
-    verify: Annotated[
-        Path | None, Option("Replay a recorded episode; exit 1 unless it is identical.", metavar="EPISODE")
-    ] = None
+    verify: Annotated[Path | None, Option("Replay an episode; exit 1 if any bit differs.", metavar="EPISODE")] = None
     gui: Annotated[bool, Option("Show PyBullet's window instead of writing a recording.", ("--gui",))] = False
     sim: Annotated[str | None, Option("Play in MuJoCo instead of PyBullet.", metavar="mujoco[:SOLREF]")] = None
     output: Annotated[
@@ -60,8 +54,3 @@ class ReplayRequest:
         counts: dict[Literal["worst", "best", "failures"], int | None]
         counts = {"worst": self.worst, "best": self.best, "failures": self.failures}
         return next((Choice(kind, count) for kind, count in counts.items() if count is not None), None)
-
-    @property
-    def shown(self) -> int:
-        """How many episodes are shown, at most."""
-        return self.choice.count if self.choice else self.episodes or 1

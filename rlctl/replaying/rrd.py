@@ -24,16 +24,15 @@ Followed = tuple[str, BodyMotion] | None  # what the camera follows: an entity, 
 
 _LEVEL_COLORS = {"INFO": 0x3D7DD8FF, "WARN": 0xC06A00FF, "DEBUG": 0x787878FF}  # readable on white and on black
 _EYE_DIRECTION = np.array([1.0, 0.75, 0.5])  # from the front left, looking down
-_GOAL_MARGIN = 2.5  # distance of the eye in distances of the goal; from 1.9 on it is in a view of 55 degrees
-_PLOT_ROWS = (("reward",), ("action",), ("joints", "observation"))  # by kind; those of a row are tabs
+_GOAL_MARGIN = 2.5  # distance of the eye / distance of the goal; from 1.9 on a view of 55 degrees contains the goal
+_PLOT_ROWS = (("reward",), ("action",), ("joints", "observation"))  # by kind; the plots of a row are tabs
 
 
 def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn, several: bool = False) -> None:
-    """Write a recording atomically. Opens no port.
+    """Write a recording atomically; the same episode always has the same recording id.
 
-    Rows are at the steps of the episode: 0 is the reset; the action, the reward and the state after it have the
-    same number. The same episode always has the same recording id. `warn` receives messages about what cannot be drawn.
-    If `several` recordings are opened together, the viewer shows a list of them.
+    Step 0 is the reset; an action, its reward and the state after it have the same step. `warn` receives messages about
+    what cannot be drawn. If `several` recordings are opened together, the viewer shows a list of them.
     """
     info = rollout.episode.info
     application = f"rlctl_{registry.make_slug(info.spec.task)}"

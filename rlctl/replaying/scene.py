@@ -6,7 +6,6 @@ It is read after every step and drawn when the episode has ended.
 import dataclasses
 import io
 import itertools
-import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, describe_exception
+from rlctl.errors import describe_exception
 from rlctl.replaying.mjcf import Shape, ShapeKind, read_shapes
 from rlctl.task.body import Body
 from rlctl.task.bullet import pybullet
@@ -25,7 +24,7 @@ Env = gymnasium.Env[Any, Any]
 Array = NDArray[np.float64]
 Warn = Callable[[str], None]  # receives a message for the user, about something that cannot be drawn correctly
 
-_GROUND_SIZE = 8.0  # [m]; a body without joints that is wider both ways is the ground
+_GROUND_SIZE = 8.0  # [m]; a body without joints that is longer and wider is the ground
 _INERTIAL_POSE = slice(3, 5)  # of getDynamicsInfo: the centre of mass in the link frame
 _LINK_POSE = slice(4, 6)  # of getLinkState: the link frame in the world
 _MOST_PICTURES = 100  # of an episode: drawing one takes up to 40 ms
@@ -86,34 +85,21 @@ class SceneReader:
 
     def __init__(self, env: TaskEnv) -> None:
         self._env = env
-        self._bodies: list[_BodyReader] = []
-        self._markers: dict[str, list[Array]] = {}
 
     def read(self, step: int) -> None:
         """Read the world after a step; 0 is the reset."""
         if step == 0:  # only now: a reset may load the bodies again
             self._bodies = [_BodyReader(body) for body in self._env.sim.bodies.values()]
-            self._markers = {name: [] for name in self._marker_positions()}
+            self._markers: dict[str, list[Array]] = {}
         for reader in self._bodies:
             reader.read()
-        if self._markers:
-            positions = self._marker_positions()
-            for name, history in self._markers.items():
-                history.append(np.array(positions[name], np.float64))
-
-    def _marker_positions(self) -> dict[str, Array]:
-        try:
-            return self._env.task.markers()
-        except Exception as error:  # a plugin may raise anything
-            message = f"{self._env.name}: markers() raised {type(error).__name__}: {error}"
-            raise TaskError(message, details=traceback.format_exc()) from error
+        for name, position in self._env.task.markers().items():
+            self._markers.setdefault(name, []).append(np.array(position, np.float64))
 
     def scene(self) -> Scene:
         """Return what was read since the last reset."""
-        return Scene(
-            [reader.motion() for reader in self._bodies],
-            {name: np.stack(history) for name, history in self._markers.items()},
-        )
+        markers = {name: np.stack(positions) for name, positions in self._markers.items()}
+        return Scene([reader.describe_motion() for reader in self._bodies], markers)
 
 
 class _BodyReader:
@@ -141,7 +127,7 @@ class _BodyReader:
             poses += [state[_LINK_POSE] for state in states]
         self._poses.append(poses)
 
-    def motion(self) -> BodyMotion:
+    def describe_motion(self) -> BodyMotion:
         body = self.body
         return BodyMotion(
             name=body.name,

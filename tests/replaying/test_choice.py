@@ -28,7 +28,7 @@ def test_success_counts_before_the_return(kind, count, seeds):
 def test_without_success_the_return_counts():
     played = results((None, 1.0), (None, 5.0))
     assert [result.seed for result in select(played, Choice("best", 1))] == [1]
-    with pytest.raises(UsageError, match="reports no success; use --worst 3, which goes by return"):
+    with pytest.raises(UsageError, match="reports no success; use --worst 3, which selects by return"):
         select(played, Choice("failures", 3))
 
 

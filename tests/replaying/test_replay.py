@@ -132,7 +132,7 @@ def test_episode_that_differs_is_reported_and_written(tmp_path):
     record_episode(rollout.episode, path, title="chance", warn=warnings.append)
     assert path.is_file()
     (warning,) = warnings
-    assert warning.startswith("warning: chance: replayed, it differs from the recorded episode; step 6 of 10: ")
+    assert warning.startswith("warning: chance: the replayed episode differs from the recorded one; step 6 of 10: ")
     assert warning.endswith("5 of 11 steps differ")
 
 

@@ -138,7 +138,7 @@ def _draw(report: RunReport, pictures: bool) -> dict[str, Any]:
 
 
 def _take_pictures(report: RunReport) -> Iterator[tuple[str, list[tuple[int, str]]]]:
-    from rlctl.replaying.view import take_pictures
+    from rlctl.replaying.pictures import take_pictures
 
     for name, episode in content.choose_episodes(report):
         try:
