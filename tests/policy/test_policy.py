@@ -215,7 +215,7 @@ def test_a_wrong_shape_names_what_the_recipe_adds(tmp_path):
     info = describe()
     info = info.model_copy(update={"spec": dataclasses.replace(info.spec, frame_stack=4, time_feature=True)})
     PolicyFile(info, tensors_of(info)).write(tmp_path / "policy.safetensors")
-    with pytest.raises(ValueError, match=r"\(5,\), including the remaining fraction of the episode and 4 frames; policy"):
+    with pytest.raises(ValueError, match=r"\(5,\), including the remaining fraction of the episode and 4 frames; "):
         rlctl.load_policy(tmp_path / "policy.safetensors").predict(np.zeros(4))
 
 
