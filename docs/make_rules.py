@@ -27,13 +27,14 @@ FENCE = "```"
 
 INDEX = """# The rules of check-env
 
-`rlctl check-env TASK` builds an environment in child processes, plays a few dozen episodes, and judges what comes back
-by these {count} rules. An **error** makes training wrong or impossible (exit code 1), a **warning** is likely wrong
-(exit code 1 with `--strict`), an **info** is worth knowing. A finding may be milder than its rule, as the text says.
+`rlctl check-env TASK` builds an environment in child processes, plays a few dozen episodes, and checks the results with
+these {count} rules. An **error** makes training wrong or impossible (exit code 1), a **warning** is likely wrong
+(exit code 1 with `--strict`), an **info** is worth knowing. The text of a rule says when its findings are less severe.
 
-`--select RL3,RL501` judges only some, `--ignore RL107` all but some, `--explain RL304` shows one. What is meant can be
-waived on the environment's class, with the reason: `rlctl_ignore = {{"RL604": "the fall is the goal"}}`. In a pull
-request, `--baseline FILE` lets only new findings fail; `--json FILE` of an earlier check writes the file.
+`--select RL3,RL501` checks only these rules, `--ignore RL106` skips a rule, `--explain RL304` prints one. If a finding
+is intended, waive its rule in the environment's class, with the reason:
+`rlctl_ignore = {{"RL604": "the fall is the goal"}}`. In a pull request, `--baseline FILE` reports only new findings; an
+earlier check with `--json FILE` writes the file.
 
 This page is generated: `python docs/make_rules.py`.
 """

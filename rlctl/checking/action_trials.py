@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_actions
-from rlctl.checking.instance import Context, Instance
-from rlctl.checking.leaves import Leaf, flatten_action, flatten_numbers, name_element, pick
+from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rules import NotJudged, OutOfTime
+from rlctl.checking.values import Leaf, flatten, flatten_action, name_element, pick
 
 Frame = NDArray[np.float64]
 """What one call of reset or step returned: the observation's numbers, flat, the reward, and the two flags."""
@@ -58,7 +58,7 @@ def find_dimensions(leaves: list[Leaf]) -> list[ActionNumber]:
 class Trials:
     """Plays episodes of one instance, each with a seed and with changed actions; equal ones are played once."""
 
-    def __init__(self, context: Context, instance: Instance) -> None:
+    def __init__(self, instance: Instance) -> None:
         self.instance = instance
         self._plain: dict[tuple[int, int], list[Frame]] = {}
 
@@ -113,9 +113,9 @@ class Trials:
             if moment.step == 0:
                 after_reset()
         if episode.ended == "time":
-            raise OutOfTime("time ran out before all comparisons were made")
+            raise OutOfTime("time ran out before the last comparison")
         if episode.ended == "raised":
-            raise NotJudged("step returns no observation, reward and flags (RL201)")
+            raise NotJudged("step does not return observation, reward and flags (RL201)")
         return frames
 
     def copies(self, dimension: ActionNumber, seed: int, steps: int, longest_delay: int) -> list[int]:
@@ -138,14 +138,12 @@ def _to_frame(moment: Moment) -> Frame:
         reward = float(moment.reward)
     except Exception:  # its type is another rule's matter
         reward = float("nan")
-    return np.concatenate([flatten_numbers(moment.observation).astype(np.float64), [reward, *moment.flags]])
+    return np.concatenate([flatten(moment.observation).astype(np.float64), [reward, *moment.flags]])
 
 
 def find_differences(one: Sequence[Frame], two: Sequence[Frame]) -> dict[int, NDArray[np.intp]]:
-    """Return the columns that differ per step, as far as both go, for steps where any does; NaN equals NaN.
-
-    Columns are counted from the end: `REWARD`, -2 and -1 for the flags, the observation's elements before them.
-    """
+    """Return the columns that differ, by step; NaN equals NaN. Columns are counted from the end: -1 and -2 are the
+    flags, then `REWARD`, then the elements of the observation."""
     differences = {}
     for step, (a, b) in enumerate(zip(one, two, strict=False)):
         if a.shape != b.shape:

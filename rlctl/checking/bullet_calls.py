@@ -50,11 +50,9 @@ def is_library(frame: FrameType) -> bool:
 
 
 MOTORS = ("setJointMotorControl2", "setJointMotorControlArray", "resetJointState")
-"""Functions that set a joint's position, or the target of its motor."""
-RECORDED = (*MOTORS, "getContactPoints")
+RECORDED = (*MOTORS, "getContactPoints", "getLinkState")
 POSITION = 2  # PyBullet's POSITION_CONTROL
 FULL_TURN = 2 * math.pi
-MOST_FAR = 1_000
 
 
 class Target(NamedTuple):
@@ -103,9 +101,15 @@ class BulletCalls:
     def note_result(
         self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any], result: Any
     ) -> None:
-        """Note what a call set or returned, if it moves joints or asks for contacts."""
+        """Note what a call set or returned, if it moves joints or asks for contacts or the place of a link."""
         call = BulletCall(frame.f_code.co_filename, frame.f_lineno, name)
         client = int(keywords.get("physicsClientId", 0))
+        if name == "getLinkState":
+            if len(arguments) <= 3 and not keywords.get("computeForwardKinematics") and not is_library(frame):
+                again = sys.modules["pybullet"].getLinkState
+                present = again(*arguments, **{**keywords, "computeForwardKinematics": 1})[4]
+                self.late_links[call] = max(self.late_links.get(call, 0.0), math.dist(result[4], present))
+            return
         if name == "getContactPoints":
             names = ("bodyA", "bodyB", "linkIndexA", "linkIndexB")
             one, two, link, other = ({**dict(zip(names, arguments, strict=False)), **keywords}.get(n) for n in names)
@@ -118,15 +122,8 @@ class BulletCalls:
             target = Target(client, body, joint, value, force, call)
             if name != "resetJointState":
                 self.targets[client, body, joint] = target
-            if abs(value) > FULL_TURN and len(self.far_targets) < MOST_FAR:
+            if abs(value) > FULL_TURN and len(self.far_targets) < 1_000:
                 self.far_targets.append(target)
-
-    def note_link(self, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any], position: Any) -> None:
-        """Note how far a position that getLinkState returned is from the present one."""
-        if len(arguments) <= 3 and not keywords.get("computeForwardKinematics") and not is_library(frame):
-            call = BulletCall(frame.f_code.co_filename, frame.f_lineno, "getLinkState")
-            present = sys.modules["pybullet"].getLinkState(*arguments, **{**keywords, "computeForwardKinematics": 1})
-            self.late_links[call] = max(self.late_links.get(call, 0.0), math.dist(position, present[4]))
 
 
 def _read_positions(
@@ -162,16 +159,12 @@ def _read_arguments(frame: FrameType) -> str:
 
 
 class _Replacement:
-    """Something in the place of a function of PyBullet."""
-
     @property  # type: ignore[misc]
     def __class__(self) -> type:  # BulletClient adds the client to builtins only
         return types.BuiltinFunctionType
 
 
 class _RecordedFunction(_Replacement):
-    """A function of PyBullet whose calls are recorded."""
-
     def __init__(self, name: str, function: Any, calls: BulletCalls) -> None:
         self._name, self._function, self._calls = name, function, calls
 
@@ -181,8 +174,6 @@ class _RecordedFunction(_Replacement):
         result = self._function(*arguments, **keywords)
         if self._name in RECORDED:
             self._calls.note_result(self._name, frame, arguments, keywords, result)
-        elif self._name == "getLinkState":
-            self._calls.note_link(frame, arguments, keywords, result[4])
         return result
 
 

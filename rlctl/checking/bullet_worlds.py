@@ -1,6 +1,6 @@
-"""Reads PyBullet clients that somebody else made: their bodies, how these move, and which links touch.
+"""Reads PyBullet clients that an environment made: their bodies, how these move, and which links touch.
 
-`getCollisionShapeData` is left alone: it crashes on some models.
+It does not call `getCollisionShapeData`, which crashes on some models.
 """
 
 import contextlib
@@ -9,23 +9,19 @@ import functools
 import inspect
 import math
 import sys
-from collections import Counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 MOST_CLIENTS = 1024  # So many physics clients a process may have, in the wheels of PyBullet 3.2
-MOST_BODIES = 20  # So many bodies of a world are read, robots and free ones first
-MOST_JOINTS = 60
+MOST_BODIES, MOST_JOINTS = 20, 60  # So many of a world, and of a body, are read; robots and free bodies first
 MOST_LINKS = 30  # So many links of a robot are read for their orientation
 WIDEST_RANGE = 1e3  # wider limits are none: some models write 1e16
 
-GRAVITY = -9.81  # [m/s^2]
-WEIGHT_STEPS = 20
+GRAVITY, WEIGHT_STEPS = -9.81, 20  # [m/s^2]
 UNMOVED = 1e-6  # smaller differences are no effect of gravity [m, rad, m/s, rad/s]; stiff motors leave little
-LONGEST_S = 0.1  # simulated without the environment [s]: overlapping bodies are thrown out by then
-MOST_STEPS = 100
+LONGEST_S, MOST_STEPS = 0.1, 100  # simulated without the environment: overlapping bodies are thrown out by then
 
 Link = tuple[int, int]  # Body id and link index; the base is link -1
 Pair = tuple[Link, Link]
@@ -99,23 +95,24 @@ class World:
     def link_name(self, link: Link) -> str:
         """Return how to write a link: `tip of arm`."""
         for body in self.bodies:
-            if body.id == link[0] and len(body.links) == 1:
-                return body.name
             if body.id == link[0]:
-                return f"{body.links[link[1] + 1] or 'base'} of {body.name}"
+                part = f"{body.links[link[1] + 1] or 'base'} of " if len(body.links) > 1 else ""
+                return f"{part}{body.name}"
         return f"link {link[1]} of body {link[0]}"
 
 
 def read_world(client: int) -> World:
     """Return what a client holds now."""
-    p = ClientCalls(client)
-    ids = [p.getBodyUniqueId(i) for i in range(p.getNumBodies())]
-    bodies = []
-    for id in ids:
+    p, bodies = ClientCalls(client), []
+    for i in range(p.getNumBodies()):
         with contextlib.suppress(p.error):  # a soft body, which has neither links nor a mass
-            bodies.append(_body(client, id))
-    bodies.sort(key=lambda body: (not body.joints, not body.is_free))
-    return World(client, tuple(_number_names(bodies[:MOST_BODIES])))
+            bodies.append(_body(client, p.getBodyUniqueId(i)))
+    bodies = sorted(bodies, key=lambda body: (not body.joints, not body.is_free))[:MOST_BODIES]
+    names = [body.name for body in bodies]
+    for i, name in enumerate(names):
+        if count := names[:i].count(name):  # not their ids, which are others at every reset of some environments
+            bodies[i] = dataclasses.replace(bodies[i], name=f"{name} ({count + 1})")
+    return World(client, tuple(bodies))
 
 
 def _body(client: int, body: int) -> WorldBody:
@@ -125,21 +122,8 @@ def _body(client: int, body: int) -> WorldBody:
     joints = [_joint(info) for info in infos if info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)]
     links = [base, *(info[12].decode(errors="replace") for info in infos)]
     base_mass, *masses = (p.getDynamicsInfo(body, i)[0] for i in range(-1, len(infos)))
-    has_heavy_links = bool(joints) and any(mass > 0 for mass in masses)
-    return WorldBody(
-        body, name or base or "a body", tuple(links), tuple(joints[:MOST_JOINTS]), base_mass > 0, has_heavy_links
-    )
-
-
-def _number_names(bodies: list[WorldBody]) -> list[WorldBody]:
-    """Number bodies of one name; not by their ids, which are others at every reset of some environments."""
-    counts: Counter[str] = Counter()
-    numbered = []
-    for body in bodies:
-        counts[body.name] += 1
-        count = counts[body.name]
-        numbered.append(dataclasses.replace(body, name=f"{body.name} ({count})") if count > 1 else body)
-    return numbered
+    name, has_heavy_links = name or base or "a body", bool(joints) and any(mass > 0 for mass in masses)
+    return WorldBody(body, name, tuple(links), tuple(joints[:MOST_JOINTS]), base_mass > 0, has_heavy_links)
 
 
 def read_states(world: World) -> list[NDArray[np.float64]]:
@@ -150,8 +134,7 @@ def read_states(world: World) -> list[NDArray[np.float64]]:
         position, _ = p.getBasePositionAndOrientation(body.id)
         joints = p.getJointStates(body.id, [j.index for j in body.joints]) or ()
         numbers = np.ravel([joint[:2] for joint in joints], "F")  # all positions, then all speeds
-        parts = [position, *p.getBaseVelocity(body.id), numbers]
-        states.append(np.concatenate(parts))
+        states.append(np.concatenate([position, *p.getBaseVelocity(body.id), numbers]))
     return states
 
 
@@ -168,31 +151,15 @@ def read_orientations(world: World) -> dict[Link, list[float]]:
     return orientations
 
 
-def find_joint(client: int, body: int, index: int) -> Joint | None:
-    """Return a joint that a client holds now; None where there is none of one degree of freedom."""
-    p = ClientCalls(client)
-    try:
-        info = p.getJointInfo(body, index)
-    except p.error:
-        return None
-    is_single = info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)
-    return _joint(info) if is_single else None
-
-
 def _joint(info: Any) -> Joint:
     return Joint(info[0], info[1].decode(errors="replace"), info[2] == bullet().JOINT_REVOLUTE, info[8], info[9])
 
 
-def read_gravity(client: int) -> list[float]:
-    """Return the gravity of a client [m/s^2]."""
+def read_physics(client: int) -> tuple[list[float], float]:
+    """Return the gravity of a client [m/s^2], and how long one step of its physics is [s]."""
     parameters = ClientCalls(client).getPhysicsEngineParameters()
-    return [float(parameters[f"gravityAcceleration{axis}"]) for axis in "XYZ"]
-
-
-def read_time_step(client: int) -> float:
-    """Return how long one step of the physics of a client is [s]."""
-    parameters = ClientCalls(client).getPhysicsEngineParameters()
-    return float(parameters["fixedTimeStep"]) / max(1, int(parameters["numSubSteps"]))
+    gravity = [float(parameters[f"gravityAcceleration{axis}"]) for axis in "XYZ"]
+    return gravity, float(parameters["fixedTimeStep"]) / max(1, int(parameters["numSubSteps"]))
 
 
 def read_contacts(client: int) -> dict[Pair, float]:
@@ -202,12 +169,6 @@ def read_contacts(client: int) -> dict[Pair, float]:
         pair = (contact[1], contact[3]), (contact[2], contact[4])
         deepest[pair] = min(deepest.get(pair, math.inf), contact[8])
     return deepest
-
-
-def measure_thickness(client: int, link: Link) -> float:
-    """Return the smallest extent of the box around a link [m]."""
-    low, high = ClientCalls(client).getAABB(*link)
-    return float(min(b - a for a, b in zip(low, high, strict=True)))
 
 
 def weight_matters(world: World) -> bool:
@@ -229,7 +190,7 @@ def weight_matters(world: World) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Jump:
-    """How fast a free body became right after a reset, with nothing done to it."""
+    """How fast a free body became right after a reset, without any action."""
 
     body: str
     speed: float  # [m/s]
@@ -242,7 +203,7 @@ def find_jumps(world: World, seed: int) -> list[Jump]:
     """Simulate a world without its environment, and return how fast each free body became."""
     p = ClientCalls(world.client)
     dt = float(p.getPhysicsEngineParameters()["fixedTimeStep"])
-    gravity = float(np.linalg.norm(read_gravity(world.client)))
+    gravity = float(np.linalg.norm(read_physics(world.client)[0]))
     speeds = [_free_speeds(world)]
     for _ in range(min(MOST_STEPS, max(1, round(LONGEST_S / dt))) if dt > 0 else 0):
         p.stepSimulation()

@@ -7,22 +7,20 @@ import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from rlctl import output
 from rlctl.checking import families
 from rlctl.checking.children import Supervisor
-from rlctl.checking.leaves import name_leaf
-from rlctl.checking.progress import Position
-from rlctl.checking.records import ChildMessage, Mistake, Records
+from rlctl.checking.records import Records
 from rlctl.checking.rules import RULES, Experiment, NotApplicable, NotJudged, RuleFinding, Severity
+from rlctl.checking.values import name_leaf
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, did_you_mean
-from rlctl.output import format_count
 from rlctl.recipe import sources
 
 METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6": "step", "RL7": "step"}
 """The method that the findings of a family are about, where nothing more is known."""
 OF_SPACES = ("RL103", "RL106", "RL108", "RL109")  # rules about what a space declares
-SLOW_CALL_S = 5.0  # After so long a call is mentioned [s]
 LOADING = ("RL0", "RL216")  # judged even if no instance could be built
 
 
@@ -83,17 +81,17 @@ class CheckReport:
         """Return a line that says what was found."""
         verdict = self.verdict
         counts = [(sum(finding.severity is s for finding in verdict.findings), s) for s in Severity]
-        counted = ", ".join(format_count(count, severity) for count, severity in counts if count)
+        counted = ", ".join(output.format_count(count, severity) for count, severity in counts if count)
         waived = f", {len(verdict.waived)} waived" if verdict.waived else ""
         waived += f", {len(verdict.known)} known from the baseline" if verdict.known else ""
-        rules = format_count(len(verdict.judged), "rule")
+        rules = output.format_count(len(verdict.judged), "rule")
         return f"{self.task}: {counted or 'no findings'}{waived}; {rules} judged in {self.seconds:.1f} s"
 
     def subtract(self, baseline: Collection[str]) -> None:
         """Take out the findings whose fingerprints a baseline has: they are known, and fail nothing."""
-        verdict = self.verdict
-        verdict.known += [finding for finding in verdict.findings if self.fingerprint(finding) in baseline]
-        verdict.findings = [finding for finding in verdict.findings if self.fingerprint(finding) not in baseline]
+        findings = self.verdict.findings
+        self.verdict.known += [finding for finding in findings if self.fingerprint(finding) in baseline]
+        self.verdict.findings = [finding for finding in findings if self.fingerprint(finding) not in baseline]
 
 
 def check(
@@ -108,20 +106,15 @@ def check(
 ) -> CheckReport:
     """Check an environment with some rules, by id; with `only`, from some of their experiments.
 
-    Raises `UsageError` for a task or a parameter that does not exist. Whatever the environment itself does, a crash
-    or a hang of more than `env_timeout_s` seconds in a call included, is in the report.
+    Raises `UsageError` for a task or a parameter that does not exist. The report has every fault of the environment
+    itself, also crashes, and calls that take more than `env_timeout_s` seconds.
     """
     started = time.monotonic()
     records = Records(spec.task, normalizes=lambda what: _normalizes(spec.task, what))
 
-    def receive(message: ChildMessage) -> None:
-        if isinstance(message, Mistake):
-            raise UsageError(message.message)
-        records.add(message)
-
     needed = {"build"} | {name for name in families.find_needs(rules) if only is None or name in only}
     wanted = {process: [n for n in names if n in needed] for process, names in families.PROCESSES.items()}
-    supervisor = Supervisor(spec, budget_s, env_timeout_s, receive)
+    supervisor = Supervisor(spec, budget_s, env_timeout_s, records.add)
     with _status(spec.task, show_progress) as say:
         supervisor.run({process: names for process, names in wanted.items() if names}, say)
     records.printed_lines, records.printed_first = supervisor.children[0].printed, supervisor.children[0].first_line
@@ -131,26 +124,16 @@ def check(
 def _normalizes(task: str, what: str) -> bool:
     if registry.find_recipe_file(task) is None:
         return False
-
     normalize = sources.resolve(task, None, {}).normalize
     return normalize is not None and bool(getattr(normalize, what))
 
 
 @contextlib.contextmanager
-def _status(task: str, wanted: bool) -> Iterator[Callable[[Position, float, float], None]]:
-    from rlctl import output
-
-    console, noted = output.err(), set[str]()
-
-    def say(position: Position, waited_s: float, limit_s: float) -> None:
-        status.update(f"checking {task}: {position.phase}")
-        if waited_s > SLOW_CALL_S and position.call and position.call not in noted:
-            noted.add(position.call)
-            console.print(f"{position.call} takes long; the check waits for it up to {limit_s:g} s (--env-timeout)")
-
+def _status(task: str, wanted: bool) -> Iterator[Callable[[str], None]]:
+    console = output.err()
     status = console.status(f"checking {task}")
     with status if wanted and console.is_terminal else contextlib.nullcontext():
-        yield say if wanted else lambda *_: None
+        yield lambda phase: status.update(f"checking {task}: {phase}")
 
 
 def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> CheckVerdict:
@@ -159,13 +142,13 @@ def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> CheckVerdi
     for rule in rules:
         _apply(rule, records, verdict)
     if records.built is not None:
-        for finding in verdict.findings if records.built.is_task else ():
+        for finding in verdict.findings if records.built.names else ():
             if finding.fix == (general := RULES[finding.rule]).fix:
                 finding.fix = general.task_fix
         _waive(verdict, records.built.waivers)
         for leaf in records.built.leaves:
             if not leaf.supported:
-                verdict.not_judged[name_leaf(leaf)] = f"no rule can look into a {leaf.kind} space"
+                verdict.not_judged[name_leaf(leaf)] = f"rules cannot examine a {leaf.kind} space"
     verdict.findings.sort(key=lambda finding: (finding.severity.rank, finding.rule))
     return verdict
 
@@ -189,10 +172,10 @@ def _apply(rule: str, records: Records, verdict: CheckVerdict) -> None:
 def _findings(rule: str, records: Records) -> list[RuleFinding]:
     check, experiment = families.CHECKS.get(rule), families.DECIDED_BY.get(rule)
     findings = [finding for finding in records.findings if finding.rule == rule]
-    if findings and records.built is None:
+    if records.built is None and findings:
         return findings
-    if records.built is None and not rule.startswith(LOADING):
-        raise NotJudged("no instance could be built")
+    if not rule.startswith(LOADING):
+        records.require_built()
     if check is not None and not findings:
         findings += check.run(records)
     if experiment is not None and not findings:
@@ -216,11 +199,9 @@ def _require_complete(records: Records, experiment: Experiment, rule: str) -> No
 def _waive(verdict: CheckVerdict, waivers: Mapping[str, str]) -> None:
     for rule, reason in waivers.items():
         if rule not in RULES:
-            raise UsageError(
-                f"rlctl_ignore: no rule {rule!r}.{did_you_mean(rule, RULES)} "
-                'Write rlctl_ignore = {"RL604": "why this is meant"}.'
-            )
+            form = 'Write rlctl_ignore = {"RL604": "the reason"}.'
+            raise UsageError(f"rlctl_ignore: no rule {rule!r}.{did_you_mean(rule, RULES)} {form}")
         if not reason.strip():
-            raise UsageError(f"rlctl_ignore: {rule} is waived without a reason. Say why this is meant.")
+            raise UsageError(f"rlctl_ignore: {rule} is waived without a reason; write why it is intended")
     verdict.waived = [finding for finding in verdict.findings if finding.rule in waivers]
     verdict.findings = [finding for finding in verdict.findings if finding.rule not in waivers]

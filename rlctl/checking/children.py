@@ -1,7 +1,6 @@
 """The child processes of a check: what runs in one, and how the parent starts and watches them, two at a time.
 
-Deaths and hangs become failures. The experiments that a dead or hung process had left run in another one, so that most
-rules are judged even then.
+If one dies or hangs, that is a failure, and its other experiments run in a new process, to judge most rules even then.
 """
 
 import dataclasses
@@ -12,6 +11,8 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
+
+from gymnasium import spaces
 
 from rlctl.checking import families
 from rlctl.checking.instance import Budget, Context, EnvironmentRaised, describe_failure
@@ -55,16 +56,18 @@ def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> 
             if not context.is_built:
                 return
             end += read_clock() - started  # importing and building comes on top
-        elif context.is_built and not context.instance.can_act:
-            yield Skipped(experiment.name, "its action space is not a Gymnasium space")
+        elif context.is_built and not isinstance(context.instance.env.action_space, spaces.Space):
+            yield Skipped(experiment.name, "its action space is not a space of Gymnasium")
         elif started > end:
-            yield Skipped(experiment.name, f"the experiments before it took the {seconds:g} s there are")
+            yield Skipped(experiment.name, f"earlier experiments used all of the {seconds:g} s")
             yield Finished(experiment.name, 0.0, is_complete=False, is_cut=True)
         else:
             context.budget = Budget(started + (end - started) * experiment.share / shares)
             yield from _run(experiment, context)
         shares -= experiment.share
-    yield from context.close()
+    if context.is_built:
+        context.progress.phase("close")
+        yield from context.instance.close()
 
 
 def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
@@ -91,12 +94,9 @@ def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
     yield Finished(experiment.name, time.monotonic() - started, is_complete, context.budget.was_cut, crash)
 
 
-AT_ONCE = 2
 BUILD_TIMEOUT_S = 60.0  # How long importing and building may take, unless a step may take longer
 FIRST_CALLS = 3.0  # So many times longer than others the first reset or step may take: it may compile or load
 IDLE_TIMEOUT_S = 300.0  # outside of the environment: loading libraries [s]
-_POLL_S = 0.1
-_KEPT_LINES = 8
 _PYBULLETS = ("pybullet build time", "argv[")  # printed at import and connection
 
 
@@ -109,14 +109,14 @@ class Child:
         self.has_finished_one = False
         self.printed = 0  # Lines that were written to stdout
         self.first_line = ""
-        self.last_lines: deque[str] = deque(maxlen=_KEPT_LINES)
+        self.last_lines: deque[str] = deque(maxlen=8)
         self._memory = anonymous_file()
-        self._progress = CallProgress(self._memory)
+        self.progress = CallProgress(self._memory)
         self._readers = LineReader(functools.partial(self._keep, counts=True)), LineReader(self._keep)
-        arguments = {"process": name, "spec": spec, "seconds": seconds, "memory": self._memory}
+        arguments = {"process": name, "spec": spec, "experiments": self.experiments}
         self.process = ChildProcess(
             "rlctl.checking.children:main",
-            {**arguments, "experiments": self.experiments},
+            {**arguments, "seconds": seconds, "memory": self._memory},
             stdout=self._readers[0].descriptor,
             stderr=self._readers[1].descriptor,
             pass_fds=[self._memory],
@@ -125,7 +125,7 @@ class Child:
         for reader in self._readers:
             reader.close_descriptor()
         pid = self.process.process.pid
-        self._standstill = Standstill(lambda: self.position.counter, clock=lambda: read_clock_of(pid))
+        self.standstill = Standstill(lambda: self.progress.read().counter, clock=lambda: read_clock_of(pid))
 
     def _keep(self, line: str, *, counts: bool = False) -> None:
         if line and not line.startswith(_PYBULLETS):
@@ -133,18 +133,9 @@ class Child:
             self.first_line = self.first_line or (line if counts else "")
             self.last_lines.append(line)
 
-    @property
-    def position(self) -> Position:
-        """Where it is."""
-        return self._progress.read()
-
-    def wait_s(self) -> float:
-        """Return for how long it has been in the same call [s]."""
-        return self._standstill.seconds()
-
     def fail(self, kind: str, error: str) -> CallFailure:
         """Return the failure that ends it, with the last lines that it has printed."""
-        at, details = self.position, "\n".join(self.last_lines) or None
+        at, details = self.progress.read(), "\n".join(self.last_lines) or None
         call = at.call or "between calls"
         return CallFailure(kind, call, at.phase, at.episode, at.seed, at.step, error, details, process=self.name)
 
@@ -185,11 +176,8 @@ class Supervisor:
         self._started_again: set[str] = set()
         self.children: list[Child] = []  # Those that were started, the first process first
 
-    def run(self, experiments: Mapping[str, Sequence[str]], on_poll: Callable[[Position, float, float], None]) -> None:
-        """Run each process with some experiments, and come back when all are done, dead or ended.
-
-        `on_poll` is called with the position of each, for how long it has been there and how long it may be [s].
-        """
+    def run(self, experiments: Mapping[str, Sequence[str]], on_poll: Callable[[str], None]) -> None:
+        """Run each process with some experiments until all have ended; `on_poll` is called with their phases."""
         self._waiting = dict(experiments)
         self._start()
         try:
@@ -200,18 +188,18 @@ class Supervisor:
             for child in self._active.values():
                 child.close()
 
-    def _poll(self, on_poll: Callable[[Position, float, float], None]) -> None:
-        for ready in wait(list(self._active), timeout=_POLL_S):
+    def _poll(self, on_poll: Callable[[str], None]) -> None:
+        for ready in wait(list(self._active), timeout=0.1):
             self._read(self._active[ready])  # type: ignore[index]
         for child in list(self._active.values()):
-            position = child.position
+            position = child.progress.read()
             limit_s = _limit_s(position, self._env_timeout_s)  # first: if the call ends now, nothing stands still
-            on_poll(position, waited_s := child.wait_s(), limit_s)
-            if waited_s > limit_s:
-                self._end(child, child.fail("hung", f"did not come back in {limit_s:g} s"))
+            on_poll(position.phase)
+            if child.standstill.seconds() > limit_s:
+                self._end(child, child.fail("hung", f"did not return within {limit_s:g} s"))
 
     def _start(self) -> None:
-        while self._waiting and len(self._active) < (AT_ONCE if self._has_built else 1):
+        while self._waiting and len(self._active) < (2 if self._has_built else 1):
             name = next(iter(self._waiting))
             child = Child(name, self._spec, self._waiting.pop(name), self._budget_s)
             self.children.append(child)
@@ -239,7 +227,7 @@ class Supervisor:
         if failure is not None:
             self._receive(failure)
             rest = child.experiments[1:]
-            may_succeed = failure.kind == "died" or not child.position.is_first  # a first call would hang again
+            may_succeed = failure.kind == "died" or not child.progress.read().is_first  # a first call would hang again
             if may_succeed and rest and child.has_finished_one and child.name not in self._started_again:
                 self._started_again.add(child.name)
                 self._waiting = {child.name: rest, **self._waiting}

@@ -1,27 +1,19 @@
-"""Plays one episode of an environment that is not trusted: the only place that resets and steps in a loop.
-
-Its actions are a function of the action space, a kind and a seed.
-"""
-
-from __future__ import annotations
+"""Plays one episode of an untrusted environment. Only this module resets and steps in a loop."""
 
 import copy
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.checking.instance import Instance
-from rlctl.checking.leaves import Leaf, Path, find_leaves, name_type, read_flag
 from rlctl.checking.progress import read_clock
+from rlctl.checking.values import Leaf, Path, find_leaves, name_type, read_flag
 
-if TYPE_CHECKING:
-    from gymnasium import spaces
-
-HOLD_STEPS = 10  # How long an extreme action is held
-RARE = 0.1  # How often a rare action is not zero
+HOLD_STEPS, RARE = 10, 0.1  # How long an extreme action is held; how often a rare action is not zero
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,38 +36,26 @@ class Moment:
         return read_flag(self.terminated), read_flag(self.truncated)
 
 
+@dataclasses.dataclass(eq=False)
 class EpisodePlayer:
-    """One episode. Iterating over it resets, and steps until it ends or must end; each call is a `Moment`.
+    """One episode. Iterating over it resets, and steps until it ends or must end; each call is a `Moment`. If the
+    environment raises, iterating raises `EnvironmentRaised`. `reset` and `step` may be called directly too."""
 
-    Where the environment raises, iterating raises `EnvironmentRaised`. `reset` and `step` may be called directly too.
-    """
+    instance: Instance
+    seed: int
+    actions: str = "random"  # A kind (see `draw_actions`), or the name of the `sequence`
+    _: dataclasses.KW_ONLY
+    number: int = 0
+    action_seed: int | None = None  # `seed` by default
+    max_steps: int = 10_000
+    longest_s: float = float("inf")  # The episode also ends when the experiment's time is over
+    sequence: Iterable[Any] | None = None
 
-    def __init__(
-        self,
-        instance: Instance,
-        seed: int,
-        actions: str = "random",
-        *,
-        number: int = 0,
-        action_seed: int | None = None,
-        max_steps: int = 10_000,
-        longest_s: float = float("inf"),
-        sequence: Iterable[Any] | None = None,
-    ) -> None:
-        """`actions` is a kind (see `draw_actions`), drawn with `action_seed` (default `seed`), or the name of a
-        `sequence` of actions. The episode ends after `longest_s`, or when the experiment's time is over."""
-        self.instance = instance
-        self.seed = seed
-        self.number = number
-        self.max_steps = max_steps
-        self._deadline = min(instance.context.budget.deadline, read_clock() + longest_s)
+    def __post_init__(self) -> None:
+        self._deadline = min(self.instance.context.budget.deadline, read_clock() + self.longest_s)
         self.steps = 0
         self.ended = ""
         """`terminated`, `truncated`, `both`, or what cut it: `steps`, `time`, `raised` (a wrong return value)."""
-        self.actions = actions
-        self._sequence = sequence
-        self._action_seed = seed if action_seed is None else action_seed
-        self._next: Iterator[Any] = iter(())
 
     def __iter__(self) -> Iterator[Moment]:
         yield self.reset()
@@ -85,8 +65,9 @@ class EpisodePlayer:
     def reset(self) -> Moment:
         """Begin the episode."""
         self.steps, self.ended = 0, "" if self.max_steps else "steps"
-        space, given = self.instance.env.action_space, self._sequence
-        self._next = draw_actions(space, self.actions, self._action_seed) if given is None else iter(given)
+        space, seed = self.instance.env.action_space, self.seed if self.action_seed is None else self.action_seed
+        drawn = draw_actions(space, self.actions, seed) if self.sequence is None else self.sequence
+        self._next: Iterator[Any] = iter(drawn)
         returned = self.instance.reset(self.seed, self.number)
         if isinstance(returned, tuple) and len(returned) == 2:
             return Moment(0, None, returned[0], info=returned[1])
@@ -131,13 +112,11 @@ def draw_actions(space: spaces.Space[Any], kind: str, seed: int) -> Iterator[Any
     space = copy.deepcopy(space)
     space.seed(seed)
     rng = np.random.default_rng(seed)
-    while kind == "rare":
-        yield space.sample() if rng.random() < RARE else zero_action(space)
     repeated = space.sample() if kind == "repeated" else None
     while True:
-        if kind == "random":
+        if kind == "random" or (kind == "rare" and rng.random() < RARE):
             yield space.sample()
-        elif kind == "zero":
+        elif kind in ("zero", "rare"):
             yield zero_action(space)
         elif kind == "repeated":
             yield copy.deepcopy(repeated)
@@ -149,8 +128,6 @@ def draw_actions(space: spaces.Space[Any], kind: str, seed: int) -> Iterator[Any
 
 def build_action(space: spaces.Space[Any], value_of: Callable[[Leaf], Any], path: Path = ()) -> Any:
     """Return an action with what a function gives for each leaf of the space; a sample where that is None."""
-    from gymnasium import spaces
-
     if isinstance(space, spaces.Dict):
         return {key: build_action(part, value_of, (*path, key)) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
@@ -170,10 +147,7 @@ def zero_action(space: spaces.Space[Any]) -> Any:
 
 
 def action_at(space: spaces.Space[Any], numbers: NDArray[np.float64]) -> Any:
-    """Return the action at a point of the unit cube, of one number for each of the flat action.
-
-    The numbers are spread over the bounds; where there are none, over [-1, 1].
-    """
+    """Return an action whose numbers are given as fractions of their range, [-1, 1] for numbers without bounds."""
     rest = iter(numbers)
 
     def value_of(leaf: Leaf) -> NDArray[Any]:

@@ -1,28 +1,26 @@
 """Prints a report: the worst first with a block per rule, or in a format for programs; and the texts of the rules."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from rich.console import Console
+from rich.padding import Padding
+from rich.text import Text
 
 from rlctl import output
 from rlctl.checking.check import CheckReport
 from rlctl.checking.families.speed import format_speed
 from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, find_rule
 from rlctl.checking.tool_formats import Row, action_rows, observation_rows, to_annotations, to_json, to_sarif
+from rlctl.environments.info import describe_randomization
 from rlctl.storage import files
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.text import Text
-
 STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO: "cyan"}
-LONG = ("traceback", "last_output")  # Evidence that is text of several lines; JSON has it whole
 SHOWN_LINES = 3  # of what a dying process printed
 SHOWN_ITEMS = 4  # How much of a list in the evidence is shown; JSON has it whole
 SHOWN_ROWS = 16  # How many parts of the observation are shown
@@ -48,20 +46,13 @@ def show_crashes(report: CheckReport) -> None:
 
 def to_text(report: CheckReport) -> str:
     """Return a report as plain text, a line for each thing."""
-    from rich.console import Console
-
     stream = io.StringIO()
     plain: dict[str, Any] = {"markup": False, "highlight": False, "emoji": False, "soft_wrap": True}
     _print(Console(file=stream, width=1000, color_system=None, **plain), report)
     return stream.getvalue()
 
 
-FORMATS: dict[str, Callable[[CheckReport], str]] = {
-    "text": to_text,
-    "json": to_json,
-    "sarif": to_sarif,
-    "github": to_annotations,
-}
+FORMATS = {"text": to_text, "json": to_json, "sarif": to_sarif, "github": to_annotations}
 
 
 def _print(out: Console, report: CheckReport) -> None:
@@ -73,9 +64,6 @@ def _print(out: Console, report: CheckReport) -> None:
 
 
 def _print_rule(out: Console, findings: list[RuleFinding]) -> None:
-    from rich.padding import Padding
-    from rich.text import Text
-
     first = findings[0]
     out.print(Text(f"{first.severity} {first.rule}", STYLES[first.severity]).append(f"  {first.name}", "bold"))
     body = Text()
@@ -93,7 +81,8 @@ def _add(body: Text, finding: RuleFinding) -> None:
     body.append(f"{finding.message}\n")
     for line in str(finding.evidence.get("last_output", "")).splitlines()[-SHOWN_LINES:]:
         body.append(f"  {line}\n", "dim")
-    shown = {key: value for key, value in finding.evidence.items() if key not in LONG and value not in (None, [], "")}
+    texts = ("traceback", "last_output")
+    shown = {key: value for key, value in finding.evidence.items() if key not in texts and value not in (None, [], "")}
     if finding.where is not None:
         shown["at"] = f"{Path(finding.where[0]).name}:{finding.where[1]}"
     if shown:
@@ -127,16 +116,14 @@ def _facts(report: CheckReport) -> Iterator[str]:
             yield f"MuJoCo model {built.model}"
         yield f"speed {format_speed(report.records) or 'not measured'}"
         if built.events:
-            from rlctl.environments.info import describe_randomization
-
             yield f"events: {describe_randomization(built.events)}"
     if verdict.crashed:
-        yield f"crashed: {', '.join(verdict.crashed)}; what they would find is not known"
+        yield f"crashed: {', '.join(verdict.crashed)}; their findings are unknown"
     if built is None:
         yield "not judged: everything else, because no instance could be built"
         return
     if verdict.not_applicable:
-        yield f"does not apply: {_list_rules(list(verdict.not_applicable))} (--json FILE says why)"
+        yield f"does not apply: {_list_rules(list(verdict.not_applicable))} (reasons: --json FILE)"
     for reason in dict.fromkeys(verdict.not_judged.values()):
         names = [name for name, why in verdict.not_judged.items() if why == reason]
         yield f"not judged: {_list_rules(names)}: {reason}"
@@ -161,8 +148,6 @@ def _table(rows: list[Row]) -> Iterator[str]:
 
 def show_list() -> None:
     """Print every rule, by family."""
-    from rich.text import Text
-
     out = output.out()
     for family, title in FAMILIES.items():
         out.print(Text(f"{family} {title}", "bold"))
@@ -171,13 +156,11 @@ def show_list() -> None:
                 severity = Text(f"{rule.severity:<8}", STYLES[rule.severity])
                 out.print(Text(f"  {rule.id}  ").append_text(severity).append(rule.name))
     counts = [f"{sum(rule.severity is severity for rule in RULES.values())} {severity}s" for severity in Severity]
-    out.print(f"{len(RULES)} rules: {', '.join(counts)}. rlctl check-env --explain RL001 says more.")
+    out.print(f"{len(RULES)} rules: {', '.join(counts)}. rlctl check-env --explain RL001 explains a rule.")
 
 
 def explain(code: str) -> None:
     """Print what a rule means, and what to do about it."""
-    from rich.text import Text
-
     out, rule = output.out(), find_rule(code)
     out.print(Text(f"{rule.id}  {rule.name}", "bold"))
     out.print(Text(f"{rule.severity}, {FAMILIES[rule.id[:3]]}", STYLES[rule.severity]))

@@ -1,4 +1,4 @@
-"""Instances of an environment that is not trusted: how they are called, and what a call raised, as plain data."""
+"""Instances of an untrusted environment: how they are called, and what a call raised, as plain data."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
-from rlctl.checking.attributes import GeneratorWatch, find_author, is_task
 from rlctl.checking.bullet_calls import LIBRARIES
-from rlctl.checking.leaves import find_leaves
 from rlctl.checking.progress import CallProgress, read_clock
 from rlctl.checking.records import CallFailure
+from rlctl.checking.values import find_leaves, is_task
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
+from rlctl.environments.wrappers import find_time_limit
 from rlctl.errors import RlctlError, TaskError
 from rlctl.version import PACKAGE_FOLDER
 
@@ -38,10 +38,6 @@ _LIBRARY = re.compile(
     rf"(site|dist)-packages/({'|'.join(LIBRARIES)})(/|\\.)"
 )
 """Files of Python itself and of libraries: an exception there comes from a wrong call in the environment."""
-NO_OPENGL = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW", re.IGNORECASE)
-NO_OPENGL_FIX = (
-    "Where there is no display, set MUJOCO_GL=egl (or osmesa). Use OpenGL only to render or to observe images."
-)
 _MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
 
 
@@ -51,6 +47,9 @@ class EnvironmentRaised(Exception):
     def __init__(self, call: str, cause: BaseException) -> None:
         super().__init__(call)
         self.call, self.cause = call, cause
+
+    def __str__(self) -> str:
+        return describe(self.cause)
 
 
 def describe_failure(error: EnvironmentRaised, progress: CallProgress) -> CallFailure:
@@ -90,14 +89,22 @@ def is_own_file(file: str) -> bool:
     return PACKAGE_FOLDER not in Path(file).parents and _LIBRARY.search(file) is None
 
 
-def lacks_display(failure: CallFailure) -> bool:
-    """Say whether a process ended because it has no display."""
-    return failure.kind == "died" and NO_DISPLAY.search(failure.details or "") is not None
+def opengl_fix(error: str) -> str:
+    """Return what to do if an error says that OpenGL is missing; empty for other errors."""
+    is_missing = re.search(r"OpenGL|\bEGL\b|OSMesa|GLFW", error, re.IGNORECASE)
+    hint = "Where there is no display, set MUJOCO_GL=egl (or osmesa). Use OpenGL only to render or to observe images."
+    return hint if is_missing else ""
+
+
+def display_error(failure: CallFailure) -> str:
+    """Return the line that a process printed which ended because it has no display; empty for other failures."""
+    lines = (failure.details or "").splitlines() if failure.kind == "died" else []
+    return next((line.strip() for line in lines if NO_DISPLAY.search(line)), "")
 
 
 def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
     """Describe the file behind an exception, or behind what caused it; None if it is about something else."""
-    for cause in iterate_causes(error):
+    for cause in get_causes(error):
         name, folders = None, [str(Path.cwd())]
         if isinstance(cause, FileNotFoundError):
             path = re.search(r"[^\s'\"]*[/\\][^\s'\":]*", str(cause))
@@ -110,11 +117,9 @@ def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
     return None
 
 
-def iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield an exception and those behind it."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
+def get_causes(error: BaseException | None) -> list[BaseException]:
+    """Return an exception and those behind it."""
+    return [] if error is None else [error, *get_causes(error.__cause__ or error.__context__)]
 
 
 def _find_model(trace: TracebackType | None) -> str | None:
@@ -137,7 +142,7 @@ def _find_model(trace: TracebackType | None) -> str | None:
 
 Timer = Callable[..., Any]  # calls its first argument with the others
 
-MOST_FAILURES = 3  # After so many episodes that raise no other is played for the same purpose
+MOST_FAILURES = 3  # An experiment stops after so many episodes that raised
 
 
 @dataclasses.dataclass
@@ -147,15 +152,15 @@ class Budget:
     deadline: float  # On `read_clock`'s clock [s]
     bytes_left: int = 48 * 2**20
     failures: int = 0
-    was_cut: bool = False  # whether the clock stopped something before its number of steps or resets
+    was_cut: bool = False  # whether time ran out before all steps or resets were done
 
     @property
     def seconds_left(self) -> float:
-        """How much time there is [s]."""
+        """How much time is left [s]."""
         return max(0.0, self.deadline - read_clock())
 
     def is_over(self) -> bool:
-        """Say whether time is up, and note that this cut the experiment: the caller stops then."""
+        """Say whether time ran out, and note it: the caller then stops the experiment."""
         is_over = read_clock() > self.deadline
         self.was_cut |= is_over
         return is_over
@@ -164,7 +169,7 @@ class Budget:
         """Return which resource is used up; empty if none is."""
         if self.failures >= MOST_FAILURES:
             return f"{self.failures} of them raised"
-        return "memory was over" if self.bytes_left <= 0 else "time was over" if self.is_over() else ""
+        return "memory was used up" if self.bytes_left <= 0 else "time ran out" if self.is_over() else ""
 
 
 class Instance:
@@ -184,18 +189,9 @@ class Instance:
         self.timers: Mapping[str, Timer] = {}  # by the name of the call they time
 
     @property
-    def is_env(self) -> bool:
-        """Whether it inherits from `gymnasium.Env`."""
-        import gymnasium
-
-        return isinstance(self.env, gymnasium.Env)
-
-    @property
-    def can_act(self) -> bool:
-        """Whether its action space is one of Gymnasium's, from which actions can be drawn."""
-        from gymnasium import spaces
-
-        return isinstance(self.env.action_space, spaces.Space)
+    def max_steps(self) -> int | None:
+        """The longest episode that it declares [steps]; None where it declares none."""
+        return int(self.env.unwrapped.max_steps) if is_task(self.env) else find_time_limit(self.env)
 
     def call(self, name: str, function: Any, *arguments: Any, step: int = 0, **keywords: Any) -> Any:
         """Call into the environment; whatever it raises, `SystemExit` included, is an `EnvironmentRaised`."""
@@ -215,9 +211,13 @@ class Instance:
         keywords = {"seed": seed} if self.accepts_seed else {}
         return self.call("reset", self.env.reset, **keywords)
 
-    def close(self) -> None:
-        """Close the environment, where it can be."""
-        self.call("close", getattr(self.env, "close", lambda: None))
+    def close(self) -> list[CallFailure]:
+        """Close the environment, where it can be; return what that raised."""
+        try:
+            self.call("close", getattr(self.env, "close", lambda: None))
+        except EnvironmentRaised as error:
+            return [describe_failure(error, self.progress)]
+        return []
 
 
 class Context:
@@ -227,7 +227,8 @@ class Context:
         self.spec = spec
         self.progress = progress or CallProgress()
         self.budget = Budget(read_clock())  # What the experiment that is running may use
-        self.generators = GeneratorWatch()
+        self.unseeded_calls: set[tuple[str, int]] = set()  # file and line of default_rng() in reset or step
+        self.generators: dict[str, str] = {}  # State of each random generator after the first watched reset
         self._instance: Instance | None = None
 
     def build(self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None) -> Instance:
@@ -257,24 +258,12 @@ class Context:
 
     @contextlib.contextmanager
     def fresh(self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None) -> Iterator[Instance]:
-        """A new instance for one experiment, closed after it; what its close raises is not this experiment's matter."""
+        """A new instance for one experiment, closed after it; exceptions of its close are ignored."""
         instance = self.build(render_mode, spec)
         try:
             yield instance
         finally:
-            with contextlib.suppress(EnvironmentRaised):
-                instance.close()
-
-    def close(self, instance: Instance | None = None) -> Iterator[CallFailure]:
-        """Close an instance, by default the one that this process keeps; yield what it raised."""
-        if instance is None:
-            self.progress.phase("close")
-            instance = self._instance
-        try:
-            if instance is not None:
-                instance.close()
-        except EnvironmentRaised as error:
-            yield describe_failure(error, self.progress)
+            instance.close()
 
 
 def _accepts(env: Any, name: str) -> bool:
@@ -283,15 +272,3 @@ def _accepts(env: Any, name: str) -> bool:
     except ValueError:  # not written in Python
         return True
     return any(parameter.name == name or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
-
-
-def find_longest_episode(env: Any) -> int | None:
-    """Return after how many steps an environment says that its episodes end; None where it does not."""
-    from rlctl.environments.wrappers import find_time_limit
-
-    return int(env.unwrapped.max_steps) if is_task(env) else find_time_limit(env)
-
-
-def rebuilds_world(env: Any) -> bool:
-    """Say whether it is a task that declares that every reset loads the world anew."""
-    return is_task(env) and not find_author(env).fast_reset

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.checking import bullet_calls
-from rlctl.checking.attributes import find_author
 from rlctl.checking.progress import read_waited_s
+from rlctl.checking.values import find_author
 from rlctl.version import PACKAGE_FOLDER
 
 _BUILTIN = re.compile(
@@ -64,10 +64,8 @@ Function = tuple[str, int, str]  # file, line, name, as in cProfile
 
 
 class Profile:
-    """The functions that were called under a profiler, and by whom; `is_own` says whether a file is the environment's.
-
-    Run the profiler inside `bullet_calls.visible_to_profilers`.
-    """
+    """The functions that were called under a profiler, and their callers; `is_own` says whether a file is the
+    environment's. Run the profiler inside `bullet_calls.visible_to_profilers`."""
 
     def __init__(self, profile: cProfile.Profile, is_own: Callable[[str], bool]) -> None:
         profile.create_stats()
@@ -129,8 +127,7 @@ def _name_of(function: Function, modules: dict[Any, str]) -> str:
 
 
 def find_own_code(env: Any) -> Callable[[str], bool]:
-    """Return what decides of a file whether it is the environment's own code, and no library's."""
-
+    """Return the function that says whether a file is the environment's own code, not a library's."""
     paths = sysconfig.get_paths()
     libraries = [str(PACKAGE_FOLDER), *(paths[name] for name in ("stdlib", "purelib", "platlib"))]
     author = sys.modules.get(type(find_author(env)).__module__)

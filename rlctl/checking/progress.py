@@ -1,7 +1,7 @@
 """The position of a child process, in memory shared with its parent to locate hangs and crashes; and its clock.
 
-Time limits run on this clock, so a busy machine judges what an idle one does, and only takes longer: it stands still
-while a process waits for a processor. Linux counts that in `schedstat`; elsewhere it is the ordinary time.
+Time limits use this clock, so that a busy machine judges as much as an idle one: it stands still while a process waits
+for a processor. Linux counts that in `schedstat`; elsewhere it is the ordinary time.
 """
 
 import ctypes
@@ -10,18 +10,7 @@ import mmap
 import os
 import time
 from pathlib import Path
-
-
-class _Memory(ctypes.Structure):
-    _fields_ = (
-        ("counter", ctypes.c_int64),
-        ("call", ctypes.c_char * 16),
-        ("phase", ctypes.c_char * 64),
-        ("episode", ctypes.c_int64),
-        ("seed", ctypes.c_int64),
-        ("step", ctypes.c_int64),
-        ("is_first", ctypes.c_bool),
-    )
+from typing import Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +24,13 @@ class Position:
     seed: int
     step: int
     is_first: bool  # the process's first call of its kind, which may compile or load
+
+
+_KINDS: dict[Any, Any] = {int: ctypes.c_int64, str: ctypes.c_char * 64, bool: ctypes.c_bool}
+
+
+class _Memory(ctypes.Structure):
+    _fields_ = tuple((field.name, _KINDS[field.type]) for field in dataclasses.fields(Position))
 
 
 class CallProgress:

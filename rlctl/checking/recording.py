@@ -1,4 +1,4 @@
-"""Writes an episode down: everything that an environment that is not trusted returns."""
+"""Records an episode: everything that an untrusted environment returns."""
 
 from typing import Any
 
@@ -6,19 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, Moment
-from rlctl.checking.instance import Budget, EnvironmentRaised, describe_failure
-from rlctl.checking.leaves import Leaf, find_numbers, name_type, pick
+from rlctl.checking.instance import EnvironmentRaised, describe_failure
 from rlctl.checking.records import MOST_INFOS, CallFailure, CheckedEpisode, Form, Series
+from rlctl.checking.values import Leaf, find_numbers, name_type, pick
 
 
 class Recording:
-    """An episode that is written down while it is played: `advance` while `running`, or `run`."""
+    """An episode that is recorded while it is played: `advance` while `running`, or `run`."""
 
-    def __init__(self, role: str, episode: EpisodePlayer, budget: Budget) -> None:
-        """`role` is what it is recorded for; `budget` is charged with its memory."""
-        self.role = role
-        self.episode = episode
-        self.budget = budget
+    def __init__(self, role: str, episode: EpisodePlayer) -> None:
+        """`role` is what it is recorded for."""
+        self.role, self.episode = role, episode
+        self.budget = episode.instance.context.budget
         self.failure: CallFailure | None = None
         self._moments = iter(episode)
         self._ended = ""
@@ -53,11 +52,6 @@ class Recording:
     def running(self) -> bool:
         """Whether it has not begun, or there is another step to take."""
         return not self._ended
-
-    @property
-    def steps(self) -> int:
-        """How many steps were taken."""
-        return len(self._rewards)
 
     def _add(self, moment: Moment) -> None:
         self._step = moment.step
@@ -132,27 +126,25 @@ class Recording:
 
     @property
     def trajectory(self) -> CheckedEpisode:
-        """What was written down."""
+        """What was recorded."""
         return CheckedEpisode(
             role=self.role,
             episode=self.episode.number,
             seed=self.episode.seed,
             actions=self.episode.actions,
             ended=self._ended or "steps",
-            observations={
-                index: Series(np.array(steps, np.int64), np.stack(values))
-                for index, (steps, values) in self._values.items()
-            },
+            observations={index: _to_series(*recorded) for index, recorded in self._values.items()},
             rewards=np.array(self._rewards, np.float64),
             reward_is_number=np.array(self._is_number, np.bool_),
             terminated=np.array([flag for flag, _ in self._flags], np.bool_),
             truncated=np.array([flag for _, flag in self._flags], np.bool_),
-            infos={
-                name: Series(np.array(steps, np.int64), np.array(values, np.float64))
-                for name, (steps, values) in self._infos.items()
-            },
+            infos={name: _to_series(*recorded) for name, recorded in self._infos.items()},
             forms=[
                 Form(what, type_name, step, count, *more)
                 for (what, type_name, *more), (step, count) in self._forms.items()
             ],
         )
+
+
+def _to_series(steps: list[int], values: list[Any]) -> Series:
+    return Series(np.array(steps, np.int64), np.array(values))

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.leaves import Leaf, name_element
 from rlctl.checking.rules import NotJudged, RuleFinding
+from rlctl.checking.values import Leaf, name_element
+from rlctl.errors import UsageError
 
-FIRST_SEED = 1000
-SECOND_SEED = 1001
-
+FIRST_SEED, SECOND_SEED = 1000, 1001
 MOST_INFOS = 100  # So many numbers of info are recorded per episode, by name
 SUCCESS = "is_success"  # The name of success in info
 ENDS = ("terminated", "truncated", "both")
@@ -28,7 +27,7 @@ class Built:
     action_leaves: list[Leaf]
     observation_space: str
     action_space: str
-    names: Mapping[str, int] = dataclasses.field(default_factory=dict)  # observation name -> size
+    names: Mapping[str, int] = dataclasses.field(default_factory=dict)  # observation name -> size, of tasks only
     events: Mapping[str, bool] = dataclasses.field(default_factory=dict)  # event -> whether it acts
     max_steps: int | None = None  # The time limit it declares [steps]
     nondeterministic: bool = False  # its registration says that it is not repeatable
@@ -42,11 +41,6 @@ class Built:
     waivers: Mapping[str, str] = dataclasses.field(default_factory=dict)  # rule -> reason
     file: str | None = None  # Where its class is written
     line: int | None = None
-
-    @property
-    def is_task(self) -> bool:
-        """Whether it is a task of rlctl: those name what they observe."""
-        return bool(self.names)
 
     @property
     def parts(self) -> dict[str, slice]:
@@ -124,7 +118,7 @@ class CheckedEpisode:
 
 @dataclasses.dataclass(frozen=True)
 class CallFailure:
-    """A call into the environment that raised, never came back, or ended the process."""
+    """A call into the environment that raised, did not return, or ended the process."""
 
     kind: str  # `raised`, `hung` or `died`
     call: str  # `load`, `build`, `reset`, `step`, `close`, `sample`, `render` or `compute_reward`
@@ -156,7 +150,7 @@ class CallFailure:
 
 @dataclasses.dataclass(frozen=True)
 class Fact:
-    """What an experiment has found out for checks of the parent."""
+    """A result of an experiment, for checks of the parent."""
 
     experiment: str
     value: Any  # Plain data
@@ -178,7 +172,7 @@ class Finished:
     experiment: str
     seconds: float
     is_complete: bool
-    is_cut: bool = False  # by the clock: what happens later is not known
+    is_cut: bool = False  # time ran out: what would have happened later is unknown
     crash: str = ""  # The traceback of a bug of the experiment
 
 
@@ -195,8 +189,6 @@ class End:
 
 
 ChildMessage = Built | CheckedEpisode | CallFailure | RuleFinding | Fact | Skipped | Finished | Mistake | End
-
-
 OTHERS_MATTER = ("interleaved", "interleaved second", "after close")  # judged by RL401 and RL402
 
 
@@ -218,7 +210,7 @@ class Records:
     printed_first: str = ""
 
     def add(self, message: ChildMessage) -> None:
-        """Take in one message of a child process."""
+        """Add one message of a child process; raises `UsageError` for a `Mistake`."""
         match message:
             case Built():
                 self.built = message
@@ -234,15 +226,12 @@ class Records:
                 (self.skipped if message.applies else self.not_applicable)[message.name] = message.reason
             case Finished():
                 self.finished[message.experiment] = message
+            case Mistake():
+                raise UsageError(message.message)
 
     def role(self, role: str) -> list[CheckedEpisode]:
         """Return what was recorded for one purpose."""
         return [trajectory for trajectory in self.trajectories if trajectory.role == role]
-
-    @property
-    def episodes(self) -> list[CheckedEpisode]:
-        """Return the whole episodes of the first process."""
-        return self.role("episodes")
 
     def require_built(self) -> Built:
         """Return the environment that was built; raises `NotJudged` if there is none."""
@@ -252,7 +241,7 @@ class Records:
 
     @property
     def alone(self) -> list[CheckedEpisode]:
-        """Return all episodes of instances that were alone in their process and used as a learner uses them."""
+        """Return all episodes of instances that were alone in their process."""
         return [trajectory for trajectory in self.trajectories if trajectory.role not in OTHERS_MATTER]
 
     def require_alone(self) -> list[CheckedEpisode]:
@@ -285,13 +274,13 @@ class Records:
         return self.facts[experiment]
 
     def require_whole(self, *experiments: str) -> None:
-        """Raise `NotJudged` if the clock cut one of some experiments: what never happened may have happened later."""
+        """Raise `NotJudged` if time ran out in one of some experiments: what did not happen may have happened later."""
         cut = [name for name in experiments if name in self.finished and self.finished[name].is_cut]
         if cut:
             raise NotJudged(self.skipped.get(cut[0], f"time ran out in the experiment {cut[0]!r}"))
 
     def why_missing(self, experiment: str) -> str:
-        """Return why an experiment has not come to its end."""
+        """Return why an experiment was not completed."""
         if experiment in self.skipped:
             return self.skipped[experiment]
         failed = [failure for failure in self.failures if failure.phase == experiment]

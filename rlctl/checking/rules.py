@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,6 +17,9 @@ from rlctl.errors import UsageError, did_you_mean
 if TYPE_CHECKING:
     from rlctl.checking.instance import Context
     from rlctl.checking.records import ChildMessage, Records
+
+    RunExperiment = Callable[[Context], Iterator[ChildMessage]]
+    RunCheck = Callable[[Records], Iterable["RuleFinding"]]
 
 
 class Severity(enum.StrEnum):
@@ -97,35 +101,31 @@ def list_names(names: Sequence[str], most: int = 8) -> str:
 
 
 class NotJudged(Exception):
-    """Raised by a check or an experiment that has too little to go by; the text says why."""
+    """Raised by a check or an experiment that has too little data to judge; the text is the reason."""
 
 
 class OutOfTime(NotJudged):
-    """Raised where an experiment's time is over in the middle of a comparison."""
+    """Raised if an experiment's time ends before a comparison does."""
 
 
 class NotApplicable(Exception):
-    """Raised by a check or an experiment that has nothing to look at in this kind of environment; the text says why."""
+    """Raised by a check or an experiment that does not apply to this kind of environment; the text is the reason."""
 
 
 def choose_rules(select: Sequence[str] = (), ignore: Sequence[str] = ()) -> list[str]:
-    """Return the ids of the rules that begin with one of `select` (all, if it is empty) and with none of `ignore`.
-
-    Raises `UsageError` for what no rule's id begins with, and where nothing is left.
-    """
-    selected, ignored = _codes(select, "--select"), _codes(ignore, "--ignore")
-    rules = [rule for rule in RULES if rule.startswith(tuple(selected or FAMILIES))]
-    rules = [rule for rule in rules if not rule.startswith(tuple(ignored))]
+    """Return the ids of the rules that begin with one of `select` (all, if it is empty) and with none of `ignore`;
+    raises `UsageError` if no rule begins with one of these, and if no rule is left."""
+    selected, ignored = tuple(_codes(select, "--select") or FAMILIES), tuple(_codes(ignore, "--ignore"))
+    rules = [rule for rule in RULES if rule.startswith(selected) and not rule.startswith(ignored)]
     if not rules:
         raise UsageError("--select and --ignore leave no rule; rlctl check-env --list shows all")
     return rules
 
 
 def find_rule(code: str) -> Rule:
-    """Return the rule with an id or a name; raises `UsageError` with the closest."""
-    for rule in RULES.values():
-        if code.upper() == rule.id or code == rule.name:
-            return rule
+    """Return the rule with an id; raises `UsageError` with the closest."""
+    if code.upper() in RULES:
+        return RULES[code.upper()]
     family = [rule for rule in RULES if rule.startswith(code.upper())]
     hint = f" The family has: {', '.join(family)}." if family else did_you_mean(code.upper().replace("O", "0"), RULES)
     raise UsageError(f"no rule {code!r}.{hint} rlctl check-env --list shows all.")
@@ -149,9 +149,9 @@ class Experiment:
     """One thing to do with an environment in a child process."""
 
     name: str
-    run: Callable[[Context], Iterator[ChildMessage]]  # yields findings at once, so that a crash loses none
     rules: tuple[str, ...]  # those it decides if it completes; may be empty
     share: float  # of the time of its process, relative to the others
+    run: RunExperiment  # yields findings at once, so that a crash loses none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,30 +159,16 @@ class Check:
     """How the parent process judges a rule from what was recorded."""
 
     rule: str
-    run: Callable[[Records], Iterable[RuleFinding]]
     needs: tuple[str, ...]  # The experiments that record what it reads
-    of_absence: bool = False  # it judges what never happened, so its experiments must be complete
+    of_absence: bool  # it judges what never happened, so its experiments must be complete
+    run: RunCheck
 
 
-def experiment(
-    name: str, *rules: str, share: float = 1.0
-) -> Callable[[Callable[[Context], Iterator[ChildMessage]]], Experiment]:
+def experiment(name: str, *rules: str, share: float = 1.0) -> Callable[[RunExperiment], Experiment]:
     """Make an experiment of a function. It decides `rules`; see the package `families` for how."""
-
-    def decorate(run: Callable[[Context], Iterator[ChildMessage]]) -> Experiment:
-        assert all(rule in RULES for rule in rules)
-        return Experiment(name, run, rules, share)
-
-    return decorate
+    return functools.partial(Experiment, name, rules, share)
 
 
-def check(
-    rule: str, *needs: str, of_absence: bool = False
-) -> Callable[[Callable[[Records], Iterable[RuleFinding]]], Check]:
+def check(rule: str, *needs: str, of_absence: bool = False) -> Callable[[RunCheck], Check]:
     """Make the check of a rule of a function; by default it reads the recorded episodes."""
-
-    def decorate(run: Callable[[Records], Iterable[RuleFinding]]) -> Check:
-        assert rule in RULES
-        return Check(rule, run, needs or RECORDING, of_absence)
-
-    return decorate
+    return functools.partial(Check, rule, needs or RECORDING, of_absence)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from rlctl.checking.check import CheckReport
 from rlctl.checking.families.speed import Speed
-from rlctl.checking.leaves import Leaf, name_leaf
 from rlctl.checking.records import Built, Records
 from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity
+from rlctl.checking.values import Leaf, name_leaf
 from rlctl.errors import ArtifactError
 from rlctl.storage import files
 from rlctl.version import __version__
@@ -44,7 +44,7 @@ def describe(report: CheckReport) -> dict[str, Any]:
         "crashed": [{"what": name, "traceback": trace} for name, trace in verdict.crashed.items()],
         "environment": _describe_environment(records),
         "speed": _describe_speed(records.facts.get("speed")),
-        "episodes": len(records.episodes),
+        "episodes": len(records.role("episodes")),
         "steps": sum(trajectory.steps for trajectory in records.trajectories),
         "seconds": report.seconds,
         "budget_seconds": report.budget_s,
@@ -117,7 +117,7 @@ def read_baseline(file: Path) -> set[str]:
     except ArtifactError as error:
         raise ArtifactError(f"--baseline {error}; write one with rlctl check-env TASK --json {file}") from None
     except (KeyError, TypeError):
-        raise ArtifactError(f"--baseline {file} is no report of rlctl check-env --json") from None
+        raise ArtifactError(f"--baseline {file} is not a report of rlctl check-env --json") from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,15 +178,12 @@ def to_sarif(report: CheckReport) -> str:
         results.append({**_describe_result(report, finding, rules), "suppressions": [suppression]})
     notes = [("error", f"{name} crashed:\n{trace}") for name, trace in verdict.crashed.items()]
     notes += [("note", f"{name} not judged: {reason}") for name, reason in verdict.not_judged.items()]
-    invocation = {
-        "executionSuccessful": not verdict.crashed,
-        "exitCode": report.exit_code,
-        "toolExecutionNotifications": [{"level": level, "message": {"text": text}} for level, text in notes],
-    }
+    notifications = [{"level": level, "message": {"text": text}} for level, text in notes]
+    invocation = {"executionSuccessful": not verdict.crashed, "exitCode": report.exit_code}
     driver = {"name": "rlctl", "version": __version__, "rules": [_describe_rule(rule) for rule in rules]}
     run = {
         "tool": {"driver": driver},
-        "invocations": [invocation],
+        "invocations": [{**invocation, "toolExecutionNotifications": notifications}],
         "originalUriBaseIds": {"SRCROOT": {"uri": Path.cwd().as_uri() + "/"}},
         "results": results,
     }
@@ -231,15 +228,14 @@ def to_annotations(report: CheckReport) -> str:
     for finding in report.verdict.findings:
         title = _escape_property(f"{finding.rule} {finding.name}")
         message = _escape_data(f"{finding.message}\nfix: {finding.fix}")
-        lines.append(
-            f"::{GITHUB_COMMANDS[finding.severity]} {_annotate_place(report, finding)}title={title}::{message}"
-        )
+        command = f"::{GITHUB_COMMANDS[finding.severity]} {_annotate_place(report, finding)}"
+        lines.append(f"{command}title={title}::{message}")
     lines += [f"::error title={name} crashed::a bug in rlctl" for name in report.verdict.crashed]
     return "\n".join([*lines, report.summarize()]) + "\n"
 
 
 def _annotate_place(report: CheckReport, finding: RuleFinding) -> str:
-    """Return file and line as properties; empty for a file outside the repository, which cannot be annotated."""
+    # Only files of the repository can be annotated.
     root = Path(os.environ.get("GITHUB_WORKSPACE", Path.cwd())).resolve()
     place = report.locate(finding)
     if place is None or not place[0].resolve().is_relative_to(root):

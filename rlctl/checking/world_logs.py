@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import sys
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,9 @@ from rlctl.checking.bullet_calls import BulletCalls, Target
 from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Jump, Link, Pair, World, WorldBody
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Instance
-from rlctl.checking.leaves import flatten_numbers
 from rlctl.checking.records import FIRST_SEED
-from rlctl.checking.rules import NotApplicable
+from rlctl.checking.values import flatten
 
-MOST_WORLDS = 4
 DEEPEST_FINE = 0.02  # [m]; Bullet pushes links apart over several steps, heavy robots leave up to 2 cm
 LEAST_LIMIT = 0.005  # The same for the smallest things [m]: collision margins alone are 1 to 4 mm
 PART_OF_LINK = 0.25  # Between those two it is this part of the thinner link
@@ -30,6 +27,7 @@ class WorldLog:
     """One world in one episode: an entry per look."""
 
     world: World
+    actions: str  # The kind of the episode's actions
     places: list[Place] = dataclasses.field(default_factory=list)
     states: list[list[NDArray[np.float64]]] = dataclasses.field(default_factory=list)  # by look and body
     deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)  # depth and limit [m]
@@ -52,14 +50,9 @@ class WorldLog:
         self.states.append(states)
         self.touching.append(set(contacts))
         self.orientations.append(orientations)
-        self.observed.append(flatten_numbers(observation))
+        self.observed.append(flatten(observation))
         self.deep.append({pair: depth for pair, depth in deep.items() if depth[0] > depth[1]})
         return True
-
-    @property
-    def actions(self) -> str:
-        """The kind of the episode's actions."""
-        return str(self.places[0]["actions"]) if self.places else ""
 
     @property
     def bodies(self) -> list[tuple[WorldBody, NDArray[np.float64]]]:
@@ -77,7 +70,8 @@ class WorldLog:
 
 
 def _limit(client: int, pair: Pair) -> float:
-    thinner = min(bullet_worlds.measure_thickness(client, link) for link in pair)
+    boxes = [bullet_worlds.ClientCalls(client).getAABB(*link) for link in pair]
+    thinner = min(float(b - a) for low, high in boxes for a, b in zip(low, high, strict=True))  # smallest extent [m]
     return min(DEEPEST_FINE, max(LEAST_LIMIT, PART_OF_LINK * thinner))
 
 
@@ -93,18 +87,15 @@ class LoggedWorld:
     weight_matters: bool | None = None  # tested if gravity is zero
 
 
+@dataclasses.dataclass
 class WorldLogger:
-    """Logs the worlds of one instance. `older`: the clients that were connected before it was built; `calls` records
-    how it calls PyBullet."""
+    """Logs the worlds of one instance."""
 
-    def __init__(self, instance: Instance, older: set[int], calls: BulletCalls) -> None:
-        if "pybullet" not in sys.modules:
-            raise NotApplicable("no PyBullet world")
-        self.instance = instance
-        self.calls = calls
-        self.resets = 0
-        self._older = older
-        self._worlds: dict[int, LoggedWorld] = {}  # by index: ids of clients may change
+    instance: Instance
+    older: set[int]  # The clients that were connected before it was built
+    calls: BulletCalls  # Records how it calls PyBullet
+    resets: int = 0
+    _worlds: dict[int, LoggedWorld] = dataclasses.field(default_factory=dict)  # by index: ids of clients may change
 
     @property
     def worlds(self) -> list[LoggedWorld]:
@@ -118,7 +109,7 @@ class WorldLogger:
         logs: list[WorldLog] = []
         for moment in EpisodePlayer(self.instance, seed, kind, number=number, max_steps=steps):
             place = {"seed": seed, "episode": number, "actions": kind, "step": moment.step}
-            logs = logs if moment.step else self._begin()
+            logs = logs if moment.step else self._begin(kind)
             logs = [log for log in logs if log.look(place, moment.observation)]
             if moment.step == 0:
                 self.calls.targets.clear()
@@ -128,26 +119,26 @@ class WorldLogger:
             if not logs:
                 return
 
-    def _begin(self) -> list[WorldLog]:
+    def _begin(self, kind: str) -> list[WorldLog]:
         self.resets += 1
         logs = []
         for i, world in enumerate(self._read()):
-            gravity = bullet_worlds.read_gravity(world.client)
-            logged = self._worlds.setdefault(i, LoggedWorld(world, gravity, 0.0))
-            logged.time_step = bullet_worlds.read_time_step(world.client)
+            gravity, time_step = bullet_worlds.read_physics(world.client)
+            logged = self._worlds.setdefault(i, LoggedWorld(world, gravity, time_step))
+            logged.time_step = time_step
             logged.gravity = max(logged.gravity, gravity, key=np.linalg.norm)
             if world.key == logged.world.key:
                 logged.world = world
-            logs.append(WorldLog(world))
+            logs.append(WorldLog(world, kind))
             logged.logs.append(logs[-1])
         return logs
 
     def _read(self) -> list[World]:
         ids = bullet_worlds.find_clients()
-        own = [bullet_worlds.read_world(id) for id in ids if id not in self._older]
+        own = [bullet_worlds.read_world(id) for id in ids if id not in self.older]
         if not any(world.bodies for world in own):
             own = [bullet_worlds.read_world(id) for id in ids]
-        return [world for world in own if world.bodies][:MOST_WORLDS]
+        return [world for world in own if world.bodies][:4]
 
     def simulate_alone(self, number: int) -> None:
         """Reset, and simulate every world without the environment, which leaves them unusable."""

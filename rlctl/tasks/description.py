@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic_core import to_jsonable_python
 
-from rlctl.checking.leaves import Leaf, find_leaves
+from rlctl.checking.values import Leaf, find_leaves
 from rlctl.environments import installed, registry
 from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError

@@ -17,7 +17,7 @@ class GlobalRandom(Clean):
 
 class NoisyStep(Clean):
     def move(self, action):
-        super().move(action + np.float32(0.01 * random.random()))
+        super().move(action + np.float32(0.001 * random.randint(0, 9)))
 
 
 class LeakyReset(Clean):

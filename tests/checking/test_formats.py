@@ -16,9 +16,9 @@ from gymnasium import spaces
 from rlctl.checking import families, tool_formats
 from rlctl.checking.check import CheckReport, CheckVerdict, judge
 from rlctl.checking.formats import FORMATS, to_text
-from rlctl.checking.leaves import find_leaves
 from rlctl.checking.records import Built, Records
 from rlctl.checking.rules import FAMILIES, RULES, choose_rules, find_rule
+from rlctl.checking.values import find_leaves
 from rlctl.errors import UsageError
 from tests import fork_server
 from tests.checking.judging import records_of

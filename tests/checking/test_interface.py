@@ -43,7 +43,7 @@ def test_pictures_are_told():
         "shape (height, width, 3)"
     )
     (message,) = messages("TakesNoMode", "RL215")
-    assert message.startswith("metadata promises the render mode rgb_array, but ")
+    assert message.startswith("metadata lists the render mode rgb_array, but ")
     assert message.endswith("takes no render_mode")
     (message,) = messages("RenderNothing", "RL215")
     assert message.startswith("with render_mode='rgb_array' render returns a NoneType")

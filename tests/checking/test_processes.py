@@ -70,14 +70,14 @@ def test_segfault_is_a_finding(in_root):
 def test_hang_is_a_finding_after_the_timeout(in_root):
     report = check(EnvSpec(f"{BROKEN}:Hangs"), env_timeout_s=0.7)  # of its own clock; other calls take microseconds
     (finding,) = report.verdict.findings
-    assert (finding.rule, finding.message) == ("RL209", "step 7 did not come back in 0.7 s")
+    assert (finding.rule, finding.message) == ("RL209", "step 7 did not return within 0.7 s")
     assert report.exit_code == 1
 
 
 def test_a_first_call_that_hangs_ends_the_process_once(in_root):
     report = check(EnvSpec(f"{BROKEN}:HangsAtOnce"), env_timeout_s=0.2)
     (finding,) = report.verdict.findings
-    assert (finding.rule, finding.message) == ("RL209", "step 1 did not come back in 0.6 s")
+    assert (finding.rule, finding.message) == ("RL209", "step 1 did not return within 0.6 s")
     assert [failure.process for failure in report.records.failures] == ["probe", "instances"]
 
 
@@ -117,7 +117,7 @@ def test_the_tools_own_process_loads_neither_learner_nor_simulator(in_root):
 
 def test_a_rule_that_crashes_is_no_pass(monkeypatch):
     for rule in ("RL004", "RL306"):
-        monkeypatch.setitem(families.CHECKS, rule, Check(rule, lambda records: [1 / 0], ()))
+        monkeypatch.setitem(families.CHECKS, rule, Check(rule, (), False, lambda records: [1 / 0]))
     verdict = judge(Records("any"), ["RL004", "RL306"])
     assert verdict.not_judged["RL306"] == "no instance could be built"
     assert "ZeroDivisionError" in verdict.crashed["RL004"]

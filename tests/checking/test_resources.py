@@ -68,5 +68,5 @@ def test_memory_needs_resets_and_a_second_half():
 
 
 def test_too_few_resets_are_not_judged():
-    with pytest.raises(NotJudged, match="there was time for only 4 resets"):
+    with pytest.raises(NotJudged, match="time ran out after 4 resets"):
         found_in(4, [1, 2, 3, 4])

@@ -8,8 +8,8 @@ from importlib import import_module
 
 import pytest
 
-from rlctl.checking.leaves import find_numbers
 from rlctl.checking.rules import RULES
+from rlctl.checking.values import find_numbers
 from tests.checking.judging import FOLDER, IN_PROCESSES, case, check_case, findings, found, records_of, verdict_of
 
 CASES = [
@@ -176,7 +176,7 @@ def test_state_without_effect_is_not_named():
 
 def test_chance_that_reset_keeps_is_no_missing_seed():
     verdict = verdict_of("broken_repeats.py:KeptChance", "RL308")
-    assert verdict.not_judged["RL308"] == "an episode depends already on the one before it (RL301 to RL303)"
+    assert verdict.not_judged["RL308"] == "an episode already depends on the previous one (RL301 to RL303)"
 
 
 def test_what_a_nearer_rule_explains_is_not_judged():
@@ -189,7 +189,7 @@ def test_what_a_nearer_rule_explains_is_not_judged():
 def test_space_that_no_rule_can_look_into_is_said():
     verdict = verdict_of("broken_spaces.py:TextObservation", "RL101", "RL102", "RL103", "RL104")
     assert verdict.findings == []
-    assert verdict.not_judged["observation['say']"] == "no rule can look into a Text space"
+    assert verdict.not_judged["observation['say']"] == "rules cannot examine a Text space"
 
 
 def test_every_rule_has_an_environment_that_breaks_it():

@@ -1,4 +1,4 @@
-"""The families of rules. A family is a file (or two): its experiments and its rules side by side.
+"""The families of rules: their experiments and checks.
 
 **An experiment** does something with an environment in a child process and yields what it finds:
 
@@ -10,22 +10,20 @@
                 yield RuleFinding("RL215", "render returns no array", {"value": str(picture)})
 
 It decides the rules that it names, if it completes. `raise NotJudged(why)` or `NotApplicable(why)` ends it, and applies
-to all its rules without a finding; `yield Skipped("RL404", why)` applies to one. It calls the environment through
-`Instance.call`, `Instance.reset` and `EpisodePlayer` only: what the environment raises is then an `EnvironmentRaised`,
-which need not be caught, and hangs and crashes can be located. `context.budget` limits time and memory.
+to all its rules without a finding; `yield Skipped("RL404", why)` applies to one. It calls the environment only through
+`Instance.call`, `Instance.reset` and `EpisodePlayer`: its exceptions are then `EnvironmentRaised`, which need not be
+caught, and hangs and crashes can be located. `context.budget` limits time and memory.
 
 **A check** judges one rule in the parent process, from recorded episodes, which many rules share:
 
     @check("RL502", "episodes")
     def find_both_flags(records: Records) -> Iterator[RuleFinding]:
-        for episode in records.episodes: ...
+        for episode in records.role("episodes"): ...
 
 It names the experiments that it needs (by default `RECORDING`, which record the common episodes) and may raise
-`NotJudged` or `NotApplicable`. A rule may have an experiment and a check. A recording experiment yields what
-`Recording.run()` returns.
-
-**Texts** (name, severity, meaning, fix) are in `rules.yaml`. A finding has its own severity or fix only if they differ
-from the rule's. All checks of a module in `MODULES` count; `PROCESSES` orders the experiments.
+`NotJudged` or `NotApplicable`. A rule may have an experiment and a check. An experiment that records episodes yields
+what `Recording.run()` returns. Name, severity, meaning and fix of a rule are in `rules.yaml`; a finding has its own
+severity or fix only if they differ.
 """
 
 from collections.abc import Collection

@@ -15,10 +15,8 @@ from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFindin
 
 MOST_DIMENSIONS = 64
 STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows
-DELAY_STEPS = 4  # Over so many steps the effect of the first action is looked for
-NAN_STEPS = 4  # Of an episode whose first action is NaN
+DELAY_STEPS, NAN_STEPS = 4, 4  # Of episodes whose first action is changed, or NaN
 LONGEST_DELAY = 4  # steps; for earlier actions in observations and for penalties on changes
-MOST_NAMES = 8  # So many dimensions are named in a message
 Effect = Literal["lasting", "reward", "cost", "copy", "none"]
 """Of a number of the action: on what follows; only on its step's reward, up or, as a cost, down; only on its own copy
 in the observation; or nothing."""
@@ -30,8 +28,8 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
     with context.fresh() as instance:
         every = action_trials.find_dimensions(instance.action_leaves)
         if not every:
-            raise NotJudged("no number of the action can be varied")
-        trials = Trials(context, instance)
+            raise NotJudged("no element of the action can be varied")
+        trials = Trials(instance)
         trials.require_repeatable()
         effects: dict[str, Effect] = {}
         halves: list[str] = []
@@ -45,13 +43,13 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
                 costly = [dimension for dimension in every if effects.get(dimension.name) == "reward"]
                 effects |= {dimension.name: "cost" for dimension in costly if _only_costs(trials, dimension)}
         except OutOfTime:
-            why = "there was no time for more"
+            why = "time ran out"
             if not effects:
                 raise
     left_out = f" ({len(effects)} of {len(every)} dimensions: {why})" if why else ""
     yield from _without_effect(effects, len(every), left_out)
     if halves:
-        message = f"every value in one half of the range has the same effect: {list_names(halves, MOST_NAMES)}"
+        message = f"every value in one half of the range has the same effect: {list_names(halves)}"
         yield _finding(halves, message, Severity.INFO)
 
 
@@ -61,7 +59,7 @@ def give_nan(context: Context) -> Iterator[ChildMessage]:
     with context.fresh() as instance:
         if not any(leaf.kind == "Box" and leaf.dtype.startswith("float") for leaf in instance.action_leaves):
             raise NotApplicable("no continuous action")
-        trials = Trials(context, instance)
+        trials = Trials(instance)
         # A simulator may write a log about it to the working directory: MuJoCo does.
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.suppress(EnvironmentRaised):
             nan_in, lasts = _play_nan(trials)
@@ -77,11 +75,8 @@ def _play_nan(trials: Trials) -> tuple[str, bool]:
     dimensions = action_trials.find_dimensions(trials.instance.action_leaves)
     values = {dimension: np.nan for dimension in dimensions if "float" in dimension.leaf.dtype}
     frames = [~np.isfinite(frame) for frame in trials.with_values(FIRST_SEED, NAN_STEPS, values, at=0)[1:]]
-    parts = {
-        "observation": any(frame[:REWARD].any() for frame in frames),
-        "reward": any(frame[REWARD] for frame in frames),
-    }
-    names = [name for name, is_nan in parts.items() if is_nan]
+    names = ["observation"] if any(frame[:REWARD].any() for frame in frames) else []
+    names += ["reward"] if any(frame[REWARD] for frame in frames) else []
     if not names:
         return "", False
     later = trials.play(FIRST_SEED, trials.actions(FIRST_SEED, NAN_STEPS))
@@ -90,7 +85,6 @@ def _play_nan(trials: Trials) -> tuple[str, bool]:
 
 
 def _late_effects(trials: Trials, dimensions: Sequence[ActionNumber]) -> Iterator[RuleFinding]:
-    """Change the first action, and say whether observation or reward show that one step late, whatever the change."""
     pairs = []
     for seed in (FIRST_SEED, SECOND_SEED, SECOND_SEED + 1):
         plain = trials.plain(seed, DELAY_STEPS)
@@ -101,7 +95,7 @@ def _late_effects(trials: Trials, dimensions: Sequence[ActionNumber]) -> Iterato
     observed = [{step for step, columns in pair.items() if columns.min() < REWARD} for pair in pairs]
     evidence: dict[str, Any] = {"seed": FIRST_SEED, "value": 2, "expected": 1}
     if all(min(steps, default=0) == 2 for steps in observed):
-        message = "the first action changes the observation only at step 2: the observation is one step old"
+        message = "the first action does not change the observation before step 2: the observation is one step old"
         yield RuleFinding("RL115", message, {**evidence, "step": 1})
     elif all(min(steps, default=0) == 1 for steps in observed) and all(min(s, default=0) == 2 for s in rewarded):
         message = "the first action changes the observation at step 1, but the reward only from step 2 on"
@@ -173,7 +167,7 @@ def _without_effect(effects: Mapping[str, Effect], total: int, left_out: str) ->
     ):
         if names[kind]:
             is_all = len(names[kind]) == total
-            shown = "no element of the action" if is_all else list_names(names[kind], MOST_NAMES)
+            shown = "no element of the action" if is_all else list_names(names[kind])
             how = f"at its lowest and highest value, over {STAGES[-1][1]} steps from two seeds"
             message = f"{shown} changes {'anything' if is_all else 'nothing'}{what}: {how}{left_out}"
             yield _finding(names[kind], message, Severity.ERROR if is_useless and not left_out else severity)

@@ -1,10 +1,4 @@
-"""RL3: equal seeds and equal actions give equal episodes.
-
-The rules go from the simplest cause to the farthest; where a nearer one explains a difference, the farther ones are not
-judged.
-"""
-
-from __future__ import annotations
+"""RL3: equal seeds and actions give equal episodes. If a rule explains a difference, later ones are not judged."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -12,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.checking.attributes import find_unequal, read_attributes
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, SUCCESS, CheckedEpisode, ChildMessage, Fact, Records, Series
 from rlctl.checking.rules import Check, NotJudged, RuleFinding, Severity, check, experiment, list_names
+from rlctl.checking.values import find_unequal, read_attributes
 
 COMPARED_STEPS = 200  # How far comparisons go
 DIRTY_STEPS = 37  # longest unfinished episode before a repetition
@@ -25,121 +19,6 @@ KEPT_STEPS = 10  # So many steps are between two resets whose attributes are com
 LATE = 20  # a later difference is a residue, not the episode's start [steps]
 LAST_BITS = 1e-12  # largest difference that the order of additions explains
 NEARLY = 1e-5  # relative to the value or to 1: a smaller first difference is a numerical residue
-
-
-@experiment("comparisons", share=4.0)
-def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
-    """Play the first episode again: at once, after an unfinished other one, and with another seed."""
-    instance, budget = context.instance, context.budget
-    longest_s, steps = budget.seconds_left / 4, COMPARED_STEPS
-    for number, role in enumerate(("alone", "reused", "dirty", "seeds")):
-        instance.progress.phase(role)
-        if role == "dirty":
-            unfinished = min(DIRTY_STEPS, max(1, steps // 2))
-            other = EpisodePlayer(instance, SECOND_SEED, "extreme", max_steps=unfinished)
-            Recording(role, other, budget).run()
-        if budget.is_over():
-            return
-        seed, first = SECOND_SEED if role == "seeds" else FIRST_SEED, FIRST_SEED
-        episode = EpisodePlayer(
-            instance, seed, number=number, action_seed=first, max_steps=COMPARED_STEPS, longest_s=longest_s
-        )
-        recording = Recording(role, episode, budget)
-        yield from recording.run()
-        steps = min(steps, recording.steps)
-    yield Fact("kept", _find_kept(instance))
-
-
-def _find_kept(instance: Instance) -> list[str]:
-    read = []
-    for steps in (0, KEPT_STEPS, 0):
-        instance.reset(FIRST_SEED)
-        read.append(read_attributes(instance.env))
-        for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=steps):
-            pass
-    kept, every_time = find_unequal(*read[1:]), find_unequal(*read[:2])  # a clock differs every time
-    return [name for name in kept if name not in every_time] or kept
-
-
-def compare(records: Records, first: str, second: str) -> FirstDifference | None:
-    """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised."""
-    if not records.require_built().accepts_seed:
-        raise NotJudged("reset takes no seed (RL202)")
-    a, b = records.require_role(first), records.require_role(second)
-    if "raised" in (a.ended, b.ended):
-        raise NotJudged("the episode broke off (RL201, RL207)")
-    if not any(series.values.size for series in a.observations.values()):
-        raise NotJudged("no observation could be compared")
-    return find_difference(records, a, b)
-
-
-def require_independent(records: Records) -> None:
-    """Raise `NotJudged` if an episode depends on the one before it."""
-    if compare(records, "alone", "reused") is not None or compare(records, "alone", "dirty") is not None:
-        raise NotJudged("an episode depends already on the one before it (RL301 to RL303)")
-
-
-def report(
-    rule: str, records: Records, found: FirstDifference, what: str, cause: str = "", fix: str = "", mild: bool = False
-) -> RuleFinding:
-    """Return the finding that two recordings differ; an info if they are registered to, and no cause is known."""
-    severity = Severity.WARNING if found.is_small or mild else None
-    if (records.require_built().nondeterministic and not cause) or found.largest < LAST_BITS:
-        severity = Severity.INFO
-    return RuleFinding(rule, f"{what}: {found.text()}{cause}", found.evidence(), severity, fix)
-
-
-def _find_cause(records: Records) -> tuple[str, str]:
-    fresh = records.role("fresh process")
-    names: list[str] = records.facts.get("kept", [])
-    if not fresh or find_difference(records, records.require_role("alone"), fresh[0]) is not None:
-        return "", ""  # a new process differs too: chance
-    if find_difference(records, records.require_role("reused"), records.require_role("dirty")) is None:
-        first = "the first episode of an instance differs from all later ones"
-        return (
-            f"; {first}",
-            "Let every reset do what the first one does: restore a saved state before anything reads it.",
-        )
-    kept = list_names(names, most=3)
-    what = kept or "every attribute that step changes, and the whole simulation"
-    shown = f" ({kept})" if kept else ""
-    return f"; a new process repeats it, so reset keeps state{shown}", f"Set back in reset: {what}."
-
-
-def _compare_itself(rule: str, what: str, *, at_reset: bool) -> Check:
-    """Return the check that compares the resets, or the steps, of an episode and its repetition."""
-
-    @check(rule, "comparisons", "instances")
-    def compare_itself(records: Records) -> Iterator[RuleFinding]:
-        difference = compare(records, "alone", "reused")
-        if difference is not None and (difference.step == 0) is at_reset:
-            yield report(rule, records, difference, what, *_find_cause(records))
-
-    return compare_itself
-
-
-def _compare_other(rule: str, first: str, second: str, what: str, *needs: str) -> Check:
-    """Return the check that compares two recordings of an episode, if an instance repeats its own."""
-
-    @check(rule, "comparisons", *needs)
-    def compare_other(records: Records) -> Iterator[RuleFinding]:
-        difference = compare(records, first, second)
-        if difference is not None:
-            if compare(records, "alone", "reused") is not None:
-                raise NotJudged("the same instance already differs from itself (RL301, RL302)")
-            is_late = second == "dirty" and difference.step > LATE
-            yield report(rule, records, difference, what, mild=is_late)
-
-    return compare_other
-
-
-compare_resets = _compare_itself("RL301", "reset twice with one seed", at_reset=True)
-compare_repetition = _compare_itself("RL302", "played twice by one instance", at_reset=False)
-compare_after_other = _compare_other("RL303", "alone", "dirty", "played again after an unfinished other episode")
-compare_instances = _compare_other(
-    "RL304", "fresh process", "fresh instance", "played by a second instance in one process", "instances"
-)
-compare_processes = _compare_other("RL305", "alone", "fresh process", "played by a new process", "instances")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,6 +49,116 @@ class FirstDifference:
         place = {"seed": self.seed, "step": self.step, "element": self.element}
         sizes = {"relative_difference": self.size, "largest_relative_difference": self.largest}
         return {**place, "value": self.second, "expected": self.first, **sizes}
+
+
+@experiment("comparisons", share=4.0)
+def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
+    """Play the first episode again: at once, after an unfinished other one, and with another seed."""
+    instance, budget = context.instance, context.budget
+    longest_s, steps = budget.seconds_left / 4, COMPARED_STEPS
+    for number, role in enumerate(("alone", "reused", "dirty", "seeds")):
+        instance.progress.phase(role)
+        if role == "dirty":
+            unfinished = min(DIRTY_STEPS, max(1, steps // 2))
+            other = EpisodePlayer(instance, SECOND_SEED, "extreme", max_steps=unfinished)
+            Recording(role, other).run()
+        if budget.is_over():
+            return
+        seed, first = SECOND_SEED if role == "seeds" else FIRST_SEED, FIRST_SEED
+        episode = EpisodePlayer(
+            instance, seed, number=number, action_seed=first, max_steps=COMPARED_STEPS, longest_s=longest_s
+        )
+        yield from Recording(role, episode).run()
+        steps = min(steps, episode.steps)
+    yield Fact("kept", _find_kept(instance))
+
+
+def _find_kept(instance: Instance) -> list[str]:
+    read = []
+    for steps in (0, KEPT_STEPS, 0):
+        instance.reset(FIRST_SEED)
+        read.append(read_attributes(instance.env))
+        for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=steps):
+            pass
+    kept, every_time = find_unequal(*read[1:]), find_unequal(*read[:2])  # a clock differs every time
+    return [name for name in kept if name not in every_time] or kept
+
+
+def compare(records: Records, first: str, second: str) -> FirstDifference | None:
+    """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised."""
+    if not records.require_built().accepts_seed:
+        raise NotJudged("reset takes no seed (RL202)")
+    a, b = records.require_role(first), records.require_role(second)
+    if "raised" in (a.ended, b.ended):
+        raise NotJudged("the episode failed (RL201, RL207)")
+    if not any(series.values.size for series in a.observations.values()):
+        raise NotJudged("no observation could be compared")
+    return find_difference(records, a, b)
+
+
+def require_independent(records: Records) -> None:
+    """Raise `NotJudged` if an episode depends on the one before it."""
+    if compare(records, "alone", "reused") is not None or compare(records, "alone", "dirty") is not None:
+        raise NotJudged("an episode already depends on the previous one (RL301 to RL303)")
+
+
+def report(
+    rule: str, records: Records, found: FirstDifference, what: str, cause: str = "", fix: str = "", mild: bool = False
+) -> RuleFinding:
+    """Return the finding that two recordings differ; an info if they are registered to, and no cause is known."""
+    severity = Severity.WARNING if found.is_small or mild else None
+    if (records.require_built().nondeterministic and not cause) or found.largest < LAST_BITS:
+        severity = Severity.INFO
+    return RuleFinding(rule, f"{what}: {found.text()}{cause}", found.evidence(), severity, fix)
+
+
+def _find_cause(records: Records) -> tuple[str, str]:
+    fresh = records.role("fresh process")
+    names: list[str] = records.facts.get("kept", [])
+    if not fresh or find_difference(records, records.require_role("alone"), fresh[0]) is not None:
+        return "", ""  # a new process differs too: chance
+    if find_difference(records, records.require_role("reused"), records.require_role("dirty")) is None:
+        first = "the first episode of an instance differs from all later ones"
+        return (
+            f"; {first}",
+            "Let every reset do what the first one does: restore a saved state before anything reads it.",
+        )
+    kept = list_names(names, most=3)
+    what = kept or "every attribute that step changes, and the whole simulation"
+    shown = f" ({kept})" if kept else ""
+    return f"; a new process repeats it, so reset keeps state{shown}", f"Set back in reset: {what}."
+
+
+def _compare_itself(rule: str, what: str, *, at_reset: bool) -> Check:
+    @check(rule, "comparisons", "instances")
+    def compare_itself(records: Records) -> Iterator[RuleFinding]:
+        difference = compare(records, "alone", "reused")
+        if difference is not None and (difference.step == 0) is at_reset:
+            yield report(rule, records, difference, what, *_find_cause(records))
+
+    return compare_itself
+
+
+def _compare_other(rule: str, first: str, second: str, what: str, *needs: str) -> Check:
+    @check(rule, "comparisons", *needs)
+    def compare_other(records: Records) -> Iterator[RuleFinding]:
+        difference = compare(records, first, second)
+        if difference is not None:
+            if compare(records, "alone", "reused") is not None:
+                raise NotJudged("the same instance already differs from itself (RL301, RL302)")
+            is_late = second == "dirty" and difference.step > LATE
+            yield report(rule, records, difference, what, mild=is_late)
+
+    return compare_other
+
+
+compare_resets = _compare_itself("RL301", "reset twice with one seed", at_reset=True)
+compare_repetition = _compare_itself("RL302", "played twice by one instance", at_reset=False)
+compare_after_other = _compare_other("RL303", "alone", "dirty", "played again after an unfinished other episode")
+compare_instances = _compare_other(
+    "RL304", "fresh process", "fresh instance", "played by a second instance in one process", "instances"
+)
+compare_processes = _compare_other("RL305", "alone", "fresh process", "played by a new process", "instances")
 
 
 def find_difference(records: Records, one: CheckedEpisode, two: CheckedEpisode) -> FirstDifference | None:

@@ -3,12 +3,12 @@
 import contextlib
 from collections.abc import Iterator
 
-from rlctl.checking.attributes import find_assignment, read_generators
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.instance import Budget, Context, Instance
+from rlctl.checking.instance import Context
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import ENDS, FIRST_SEED, CheckedEpisode, ChildMessage, Records
 from rlctl.checking.rules import NotJudged, RuleFinding, Severity, check, experiment
+from rlctl.checking.values import find_assignment, read_generators, watch_unseeded
 
 EPISODES = (
     *("random", "zero", "extreme", "rare", "repeated", "random", "random", "random"),
@@ -18,63 +18,56 @@ EPISODES = (
 MOST_STEPS = 5_000  # in all; more episodes with other seeds show little more
 ENDLESS_STEPS = 3_000  # an episode without an end is stopped after so many steps
 LATER_ENDLESS_STEPS = 500  # The same, once one had no end
-FEWEST_EPISODES = 5
+FEWEST_EPISODES, FEWEST_TIES = 5, 4
 SHORTEST_LIMIT = 5  # shorter games with one length have no time limit [steps]
 LONGEST_AT_ONCE = 4  # so short episodes are no robot's [steps]
-FEWEST_TIES = 4
 FEWEST_LENGTHS = 2  # With fewer different lengths it may be one that is unlike the others
 SHORTEST_TIE = 20  # The same, where only some episodes end together [steps]
-ENOUGH_STEPS = 1_000  # shorter cut episodes tell nothing about an end
+ENOUGH_STEPS = 1_000  # shorter episodes without an end are too short to judge
 
 
 @experiment("episodes", share=6.0)
 def record_episodes(context: Context) -> Iterator[ChildMessage]:
     """Play whole episodes with actions of every kind."""
-    context.instance.reset(FIRST_SEED)
-    context.generators.before = read_generators(context.instance.env)
-    with context.generators.watch():
-        yield from _record_episodes(context.instance, context.budget)
-
-
-def _record_episodes(instance: Instance, budget: Budget) -> Iterator[ChildMessage]:
-    steps, is_endless = 0, False
-    for number, kind in enumerate(EPISODES):
-        if why := budget.why_spent():
-            raise NotJudged(f"{number} of {len(EPISODES)} episodes were played: {why}")
-        longest, longest_s = LATER_ENDLESS_STEPS if is_endless else ENDLESS_STEPS, budget.seconds_left / 2
-        seed = FIRST_SEED + number
-        episode = EpisodePlayer(instance, seed, kind, number=number, max_steps=longest, longest_s=longest_s)
-        recording = Recording("episodes", episode, budget)
-        yield from recording.run()
-        steps += recording.steps
-        is_endless |= episode.ended == "steps"
-        if steps >= MOST_STEPS:
-            return
+    instance, budget, steps, longest = context.instance, context.budget, 0, ENDLESS_STEPS
+    instance.reset(FIRST_SEED)
+    context.generators = read_generators(instance.env)
+    with watch_unseeded(context.unseeded_calls):
+        for number, kind in enumerate(EPISODES):
+            if why := budget.why_spent():
+                raise NotJudged(f"{number} of {len(EPISODES)} episodes were played: {why}")
+            seed, longest_s = FIRST_SEED + number, budget.seconds_left / 2
+            episode = EpisodePlayer(instance, seed, kind, number=number, max_steps=longest, longest_s=longest_s)
+            yield from Recording("episodes", episode).run()
+            steps += episode.steps
+            longest = LATER_ENDLESS_STEPS if episode.ended == "steps" else longest
+            if steps >= MOST_STEPS:
+                return
 
 
 @experiment("unseeded generators", "RL311", share=0.1)
 def find_unseeded(context: Context) -> Iterator[ChildMessage]:
-    """Reset with the first seed, and compare the state of all generators with the one that it had at the beginning."""
-    instance, watch = context.instance, context.generators
+    """Reset with the first seed, and compare the states of all generators with those after the first reset."""
+    instance = context.instance
     if not instance.accepts_seed:
         raise NotJudged("reset takes no seed (RL202)")
-    if watch.before is None:  # no other rule needs the episodes
+    if not context.generators:  # no other rule needs the episodes, or there are none
         with contextlib.suppress(NotJudged):
             yield from record_episodes.run(context)
-    for file, line in sorted(watch.calls)[:1]:
-        message = "a random generator without a seed is made in reset or step: default_rng()"
+    for file, line in sorted(context.unseeded_calls)[:1]:
+        message = "reset or step creates a random generator without a seed: default_rng()"
         yield RuleFinding("RL311", message, {"seed": FIRST_SEED}, where=(file, line))
     instance.reset(FIRST_SEED)
     after = read_generators(instance.env)
-    moved = [name for name, state in after.items() if (watch.before or {}).get(name, state) != state]
+    moved = [name for name, state in after.items() if context.generators.get(name, state) != state]
     for name in moved[:1]:
-        message = f"{name} is drawn from, and reset(seed={FIRST_SEED}) does not set it back"
+        message = f"{name} is used, and reset(seed={FIRST_SEED}) does not restore its state"
         where = find_assignment(instance.env, name)
         yield RuleFinding("RL311", message, {"element": name, "seed": FIRST_SEED}, where=where)
 
 
 def _require_episodes(records: Records) -> list[CheckedEpisode]:
-    episodes = [episode for episode in records.episodes if episode.ended != "raised"]
+    episodes = [episode for episode in records.role("episodes") if episode.ended != "raised"]
     if not episodes:
         raise NotJudged(records.skipped.get("episodes", "no episode could be played"))
     return episodes
@@ -93,8 +86,7 @@ def _find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
         return
     ended = [episode for episode in episodes if episode.ended == "terminated"]
     limit = max((episode.steps for episode in ended), default=0)
-    if records.require_built().counter:
-        counter = records.require_built().counter
+    if counter := records.require_built().counter:
         message = f"step sets terminated by a counter ({counter}), and truncated is always False"
         yield RuleFinding("RL501", message, {"value": "terminated", "expected": "truncated"})
         return
@@ -158,9 +150,10 @@ def _find_endless(records: Records) -> Iterator[RuleFinding]:
         return
     if max(longest.values()) < (limit or ENOUGH_STEPS):
         raise NotJudged(f"no end within {max(longest.values())} steps; longer episodes are not played")
-    declared = f", past its own limit of {limit}" if limit else " and no time limit is known"
+    declared = f"its own limit is {limit}" if limit else "no time limit is known"
     steps = ", ".join(f"{count:,} with {kind} actions" for kind, count in longest.items())
-    yield RuleFinding("RL503", f"no end within {steps}{declared}", {"steps": longest, "expected": limit})
+    message = f"no episode ended after so many steps: {steps}; {declared}"
+    yield RuleFinding("RL503", message, {"steps": longest, "expected": limit})
 
 
 @check("RL504", "episodes")

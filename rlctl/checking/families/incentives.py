@@ -14,15 +14,13 @@ from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
 
 LIKE_A_GOAL, LIKE_ANY = 0.9, 0.5  # of all rewards up to the last one: like a goal, like any; less: a failure
 NEARLY = 0.05  # How much better than doing nothing something has to be, to be better
-FEWEST_COMPARED = 10
 COMPARED_STEPS = 200  # How much of the episodes is compared at most: the search's are no longer
-SHORTEST_COMPARED = 10
+FEWEST_COMPARED, SHORTEST_COMPARED = 10, 10  # Episodes; steps of each
 MOST_OF = 0.5
-STARTS = 30
+STARTS, FEWEST_STARTS = 30, 10
 START_STEPS = 3  # More than one, to tell what belongs to the episode from chance in each step
 FIRST = FIRST_SEED + 100  # The first of their seeds; none of the whole episodes has them
 MANY_AT_START = 0.2  # part of the starts: a goal may be near the robot by chance
-FEWEST_STARTS = 10
 FEWEST_EPISODES = 20  # Fewer episodes say little about whether one can succeed
 FEWEST_STEPS = 500  # Steps of them: less is what raises, or ends, at once
 OTHER_NAMES = ("success", "succeeded", "goal_reached", "is_goal")
@@ -33,7 +31,7 @@ def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
     episodes = rewards.require_rewarded(records)
     if not any(episode.terminated.any() for episode in episodes):
         raise NotApplicable("nothing ended an episode early")
-    longest = rewards.longest_episode(records, episodes)
+    longest = records.require_built().max_steps or max(episode.steps for episode in episodes)
     inner = np.concatenate([episode.rewards[: episode.steps - episode.has_ended] for episode in episodes])
     early = [
         episode
@@ -43,25 +41,20 @@ def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
     if not early or not inner.size or inner.max() > 0 or inner.mean() == 0:
         return
     mean = float(inner.mean())
-    gains = [
-        float(episode.rewards[-1]) - mean - rewards.DISCOUNT * rewards.discounted_steps(mean, longest - episode.steps)
-        for episode in early
-    ]
+    saved = [-rewards.DISCOUNT * rewards.discounted_steps(mean, longest - episode.steps) for episode in early]
+    gains = [float(episode.rewards[-1]) - mean + much for episode, much in zip(early, saved, strict=True)]
     gain = float(np.median(gains))
     severity = _severity_of_end(episodes, early, inner)
     if gain <= 0 or severity is None:
         return
-    example = early[int(np.argsort(gains)[len(gains) // 2])]
-    last = float(example.rewards[-1])
-    saved = -rewards.DISCOUNT * rewards.discounted_steps(mean, longest - example.steps)
-    yield RuleFinding(
-        "RL604",
+    usual = int(np.argsort(gains)[len(gains) // 2])
+    example, last = early[usual], float(early[usual].rewards[-1])
+    message = (
         f"{len(early)} of {len(episodes)} episodes ended early without success. The mean reward is {mean:.3g} and none "
-        f"but the last is above 0, so ending at step {example.steps} with {last:.3g} saves {saved:.3g} (discounted by "
-        f"{rewards.DISCOUNT} up to step {longest})",
-        example.at(example.steps, value=last, mean_reward=mean, gain=gain),
-        severity,
+        f"but the last is above 0, so ending at step {example.steps} with {last:.3g} saves {saved[usual]:.3g} "
+        f"(discounted by {rewards.DISCOUNT} up to step {longest})"
     )
+    yield RuleFinding("RL604", message, example.at(example.steps, value=last, mean_reward=mean, gain=gain), severity)
 
 
 def _severity_of_end(
@@ -86,11 +79,8 @@ def _find_paid_idleness(records: Records) -> Iterator[RuleFinding]:
     if any(episode.terminated.any() or rewards.has_succeeded(episode) for episode in idle) or steps < SHORTEST_COMPARED:
         return
     nothing = [rewards.discounted_sum(episode.rewards[:steps]) for episode in idle]
-    something = [
-        rewards.discounted_sum(episode.rewards[:steps])
-        for episode in others
-        if episode.steps >= steps or episode.has_ended
-    ]
+    whole = [episode for episode in others if episode.steps >= steps or episode.has_ended]
+    something = [rewards.discounted_sum(episode.rewards[:steps]) for episode in whole]
     if not something or len({float(reward) for episode in compared for reward in episode.rewards[:steps]}) == 1:
         return  # a reward that never changes is RL602's
     mean, best = float(np.mean(nothing)), max(something)
@@ -98,13 +88,12 @@ def _find_paid_idleness(records: Records) -> Iterator[RuleFinding]:
         return
     bonus, share = _bonus(idle)
     because = f"; {100 * share:.0f} % of it is the term {bonus!r}, which never changes" if bonus else ""
-    yield RuleFinding(
-        "RL606",
+    message = (
         f"doing nothing earns {mean:.4g} over {steps} steps (discounted by {rewards.DISCOUNT}), the best of "
-        f"{len(something)} other episodes {best:.4g}{because}",
-        idle[0].at(steps, value=mean, best=best, term=bonus, share=share),
-        Severity.WARNING if bonus else Severity.INFO,
+        f"{len(something)} other episodes {best:.4g}{because}"
     )
+    evidence = idle[0].at(steps, value=mean, best=best, term=bonus, share=share)
+    yield RuleFinding("RL606", message, evidence, Severity.WARNING if bonus else Severity.INFO)
 
 
 def _bonus(idle: Sequence[CheckedEpisode]) -> tuple[str | None, float]:
@@ -125,7 +114,7 @@ def record_starts(context: Context) -> Iterator[ChildMessage]:
             yield Skipped("starts", f"only {number} of {STARTS} starts were made: {why}")
             return
         episode = EpisodePlayer(context.instance, FIRST + number, "zero", number=number, max_steps=START_STEPS)
-        yield from Recording("starts", episode, context.budget).run()
+        yield from Recording("starts", episode).run()
 
 
 @check("RL609", *rewards.WITH_SEARCH, of_absence=True)
@@ -136,7 +125,7 @@ def _find_unreported_success(records: Records) -> Iterator[RuleFinding]:
     if not any(episode.has_ended for episode in episodes):
         raise NotJudged("no episode ended, and success may be reported at the end only")
     names = dict.fromkeys(name for episode in episodes for name in episode.infos if name.split("/")[-1] in OTHER_NAMES)
-    instead = f"; {', '.join(map(repr, names))} in info is read by nobody" if names else ""
+    instead = f"; {', '.join(map(repr, names))} in info is not used by any tool" if names else ""
     message = f"is_success is not in info: rlctl eval cannot report a success rate{instead}"
     yield RuleFinding("RL609", message, {"value": list(names), "expected": SUCCESS})
 
@@ -170,8 +159,5 @@ def _find_no_success(records: Records) -> Iterator[RuleFinding]:
     best = max(episodes, key=lambda episode: float(np.nan_to_num(episode.rewards, nan=-np.inf).max()))
     step = int(np.nan_to_num(best.rewards, nan=-np.inf).argmax())
     reward = float(best.rewards[step])
-    yield RuleFinding(
-        "RL611",
-        f"is_success was never true in {rewards.summarize(episodes)}; best reward {reward:.4g} at step {step + 1}",
-        best.at(step + 1, value=reward, episodes=len(episodes)),
-    )
+    message = f"is_success was never true in {rewards.summarize(episodes)}; best reward {reward:.4g} at step {step + 1}"
+    yield RuleFinding("RL611", message, best.at(step + 1, value=reward, episodes=len(episodes)))

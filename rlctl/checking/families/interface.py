@@ -7,37 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.checking.instance import (
-    NO_DISPLAY,
-    NO_OPENGL,
-    NO_OPENGL_FIX,
-    Context,
-    EnvironmentRaised,
-    describe,
-    find_missing_file,
-    iterate_causes,
-    lacks_display,
-)
+from rlctl.checking.instance import Context, EnvironmentRaised, display_error, find_missing_file, get_causes, opengl_fix
 from rlctl.checking.records import FIRST_SEED, SUCCESS, CallFailure, CheckedEpisode, ChildMessage, Form, Records
 from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
 from rlctl.errors import RecipeError
 
 NUMBERS = ("float", "int", "numpy.float64")  # Reward types that both libraries accept
-MANY_LINES = 0.5  # lines per step; a few per reset are not slow
-FEWEST_STEPS = 20  # with fewer steps most lines come from the start
-MOST_FAILURES = 3
-RENDERING = "rendering"  # The experiment that renders
-OF_OTHER_RULES = ("interleaved", "after close", RENDERING)  # failures there are RL401's, RL402's and RL215's
+MANY_LINES, FEWEST_STEPS = 0.5, 20  # lines per step; with fewer steps most lines come from the start
+OF_OTHER_RULES = ("interleaved", "after close", "rendering")  # failures there are RL401's, RL402's and RL215's
 PICTURE = "a uint8 array of shape (height, width, 3)"  # What `render` returns in the mode rgb_array
 NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECASE)  # raised without graphics
 
 
 @check("RL201")
 def _find_other_number_of_values(records: Records) -> Iterator[RuleFinding]:
-    for trajectory, form in _first_forms(records, "reset"):
-        yield _of_form("RL201", f"reset returns {form.type}", trajectory, form, "tuple of 2")
-    for trajectory, form in _first_forms(records, "step"):
-        yield _of_form("RL201", f"step returns a {form.type}", trajectory, form, "tuple of 5")
+    for what, expected in (("reset", "tuple of 2"), ("step", "tuple of 5")):
+        for trajectory, form in _first_forms(records, what):
+            yield _of_form("RL201", f"{what} returns {_a(form.type)}", trajectory, form, expected)
 
 
 @check("RL202", "build")
@@ -71,8 +57,8 @@ def _find_wrong_types(records: Records) -> Iterator[RuleFinding]:
             at = int(np.isin(success.values, (0, 1)).argmin())
             value, step = float(success.values[at]), int(success.steps[at])
             evidence = trajectory.at(step, element=SUCCESS, value=value, expected="true or false")
-            message, fix = f"{SUCCESS} is {value:.4g} at step {step}", f"Report bool(...) as info['{SUCCESS}']."
-            yield RuleFinding("RL204", message, evidence, Severity.WARNING, fix)
+            fix = f"Report bool(...) as info['{SUCCESS}']."
+            yield RuleFinding("RL204", f"{SUCCESS} is {value:.4g} at step {step}", evidence, Severity.WARNING, fix)
             return
 
 
@@ -110,16 +96,16 @@ def select_failures(records: Records, kind: str) -> Iterator[CallFailure]:
 @check("RL207")
 def _find_exceptions(records: Records) -> Iterator[RuleFinding]:
     raised = (failure for failure in select_failures(records, "raised") if failure.file is None)  # the others: RL007
-    for failure in itertools.islice(raised, MOST_FAILURES):
-        fix = NO_OPENGL_FIX if NO_OPENGL.search(failure.error) else ""
+    for failure in itertools.islice(raised, 3):
+        fix = opengl_fix(failure.error)
         yield RuleFinding("RL207", failure.message, failure.place, fix=fix, where=failure.where)
 
 
 @check("RL208")
 def _find_ends_of_process(records: Records) -> Iterator[RuleFinding]:
-    without_opengl = any(NO_OPENGL.search(failure.error) for failure in select_failures(records, "raised"))
+    without_opengl = any(opengl_fix(failure.error) for failure in select_failures(records, "raised"))
     for failure in select_failures(records, "died"):
-        if not lacks_display(failure) and not without_opengl:  # RL216 or RL207 says why
+        if not display_error(failure) and not without_opengl:  # RL216 or RL207 says why
             yield RuleFinding("RL208", failure.message, failure.place)
 
 
@@ -131,22 +117,21 @@ def _find_hangs(records: Records) -> Iterator[RuleFinding]:
 
 @check("RL211", *RECORDING)
 def _find_prints(records: Records) -> Iterator[RuleFinding]:
-    lines = records.printed_lines
-    if lines:
+    if lines := records.printed_lines:
         steps = max(1, sum(trajectory.steps for trajectory in records.trajectories))
         message = f"{lines} lines on stdout in {steps} steps, the first: {records.printed_first[:80]!r}"
         severity = Severity.WARNING if steps >= FEWEST_STEPS and lines > max(20, MANY_LINES * steps) else None
         yield RuleFinding("RL211", message, {"value": lines, "expected": 0}, severity)
 
 
-@experiment(RENDERING, "RL215")
+@experiment("rendering", "RL215")
 def render(context: Context) -> Iterator[ChildMessage]:
     """Try the mode rgb_array, which opens no window, on an instance of its own, where it is promised."""
     with context.fresh() as instance:
         metadata = getattr(instance.env, "metadata", None)
     modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
     if not isinstance(modes, (list, tuple, set)) or "rgb_array" not in modes:
-        raise NotApplicable(f"metadata does not promise the render mode rgb_array (render_modes: {modes})")
+        raise NotApplicable(f"metadata does not list the render mode rgb_array (render_modes: {modes})")
     try:
         with context.fresh("rgb_array") as instance:
             instance.reset(FIRST_SEED)
@@ -154,26 +139,21 @@ def render(context: Context) -> Iterator[ChildMessage]:
     except EnvironmentRaised as error:
         if find_missing_file(error.cause) is not None:
             raise NotJudged("a file that the environment loads is missing (RL007)") from None
-        raised = describe(error.cause)
-        if _lacks_library(error.cause):
+        raised = str(error)
+        causes = get_causes(error.cause)
+        if any(isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in causes):
             raise NotJudged(f"a library that rendering needs is not installed: {raised}") from None
         call = "the constructor" if error.call == "build" else error.call
         message = f"with render_mode='rgb_array' {call} raises {raised}"
         if isinstance(error.cause, RecipeError):  # the constructor was not even called
-            message = f"metadata promises the render mode rgb_array, but {error.cause}"
+            message = f"metadata lists the render mode rgb_array, but {error.cause}"
         severity = Severity.INFO if NO_GRAPHICS.search(raised) else None
         yield RuleFinding("RL215", message, {"value": raised, "expected": PICTURE}, severity)
         return
     if wrong := _describe_wrong_picture(picture):
         message = f"with render_mode='rgb_array' render returns {wrong}, not {PICTURE}"
         is_rgba = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.shape[2:] == (4,)
-        severity = Severity.INFO if is_rgba else None
-        yield RuleFinding("RL215", message, {"value": wrong, "expected": PICTURE}, severity)
-
-
-def _lacks_library(error: BaseException) -> bool:
-    causes = list(iterate_causes(error))
-    return any(isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in causes)
+        yield RuleFinding("RL215", message, {"value": wrong, "expected": PICTURE}, Severity.INFO if is_rgba else None)
 
 
 def _describe_wrong_picture(picture: Any) -> str:
@@ -183,18 +163,17 @@ def _describe_wrong_picture(picture: Any) -> str:
     return "" if fine else f"an array of {picture.dtype} and shape {picture.shape}"
 
 
-@check("RL215", RENDERING)
+@check("RL215", "rendering")
 def _find_end_in_rendering(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
-        if failure.phase == RENDERING and failure.kind in ("died", "hung"):
+        if failure.phase == "rendering" and failure.kind in ("died", "hung"):
             yield RuleFinding("RL215", f"rendering without a window: {failure.message}", failure.place, Severity.ERROR)
 
 
 @check("RL216", *RECORDING)
 def _find_lost_display(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
-        if lacks_display(failure):
-            lines = [line.strip() for line in (failure.details or "").splitlines() if NO_DISPLAY.search(line)]
-            yield RuleFinding("RL216", f"{failure.message}, because there is no display: {lines[0]!r}", failure.place)
+        if line := display_error(failure):
+            yield RuleFinding("RL216", f"{failure.message}, because there is no display: {line!r}", failure.place)
             return
     records.require_built()

@@ -9,22 +9,23 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+
 from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.families.determinism import COMPARED_STEPS, compare, report, require_independent
 from rlctl.checking.families.interface import select_failures
-from rlctl.checking.instance import Context, EnvironmentRaised, Instance, describe_failure
+from rlctl.checking.instance import Context, Instance
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Records, Skipped
 from rlctl.checking.rules import RULES, NotJudged, RuleFinding, Severity, check, experiment
 
-IN_TURNS, AFTER_CLOSE = "two instances stepped in turns", "after another instance was closed"
+IN_TURNS, AFTER_CLOSE = "two instances stepped alternately", "after another instance was closed"
 MOST_RESETS = 100
 MEASURED_RESETS = 10  # between measurements of memory; the first ones fill caches
-FEWEST_RESETS = 8  # With fewer, growth cannot be distinguished from a slow start
+FEWEST_RESETS, FEWEST_MEASUREMENTS = 8, 3  # With fewer, growth cannot be distinguished from a slow start
 SETTLING_RESETS = 2  # The first resets load what later ones keep
 LEAST_GROWTH = 3  # In each half of the resets, so that one late object is not a leak
-FEWEST_MEASUREMENTS = 3
 MEMORY_GROWTH = 8 * 2**20  # after the warm-up [bytes]; allocators move by 1 to 2 MiB
 LATER_SHARE = 0.4  # of the growth in the second half: a leak does not slow down
 LEAKS = {
@@ -44,27 +45,26 @@ def compare_instances(context: Context) -> Iterator[ChildMessage]:
 
     def begin(instance: Instance, role: str, seed: int) -> Recording:
         progress.phase(role)
-        number = seed - FIRST_SEED
-        episode = EpisodePlayer(instance, seed, number=number, max_steps=COMPARED_STEPS, longest_s=longest_s)
-        return Recording(role, episode, budget)
+        number, steps = seed - FIRST_SEED, COMPARED_STEPS
+        return Recording(role, EpisodePlayer(instance, seed, number=number, max_steps=steps, longest_s=longest_s))
 
     progress.phase("alone")
     first = context.build()
     yield from begin(first, "fresh process", FIRST_SEED).run()
     yield from begin(first, "second alone", SECOND_SEED).run()
-    yield from context.close(first)
+    yield from first.close()
 
     progress.phase("fresh instance")
     neighbour = context.build()
     yield from begin(neighbour, "fresh instance", FIRST_SEED).run()
     if budget.is_over():
-        yield from context.close(neighbour)
+        yield from neighbour.close()
         return
 
     # From here on each instance has played the same episodes, in the same order, as `first` had.
     progress.phase("interleaved")
     survivor = context.build()
-    if survivor.is_env:
+    if isinstance(survivor.env, gymnasium.Env):
         yield from _shared_spaces(survivor.env, neighbour.env)
     else:
         yield Skipped("RL404", "it is not a gymnasium.Env (RL003)")
@@ -80,15 +80,15 @@ def compare_instances(context: Context) -> Iterator[ChildMessage]:
         if recording.running:
             recording.advance()
     progress.phase("close")
-    yield from context.close(neighbour)
+    yield from neighbour.close()
     progress.phase("after close")
     yield from recording.run()
-    yield from context.close(survivor)
+    yield from survivor.close()
 
 
 def _require_same_alone(records: Records) -> None:
     if compare(records, "fresh process", "fresh instance") is not None:
-        raise NotJudged("two instances differ already when they are alone (RL301 to RL304)")
+        raise NotJudged("two instances already differ when each is used alone (RL301 to RL304)")
     require_independent(records)
 
 
@@ -112,7 +112,7 @@ def _find_shared_world(records: Records) -> Iterator[RuleFinding]:
         if difference is not None:
             draws = any(finding.rule == "RL309" for finding in records.findings)
             because = ("; both draw from a global random generator (RL309)", RULES["RL309"].fix) if draws else ()
-            yield report("RL401", records, difference, f"{IN_TURNS}, against one alone", *because)
+            yield report("RL401", records, difference, f"{IN_TURNS}, compared with one alone", *because)
             return
 
 
@@ -123,10 +123,10 @@ def _find_effect_of_closing(records: Records) -> Iterator[RuleFinding]:
         yield finding
         return
     if list(_find_shared_world.run(records)):
-        raise NotJudged("the instances already disturb each other while both are open (RL401)")
+        raise NotJudged("the instances already affect each other before one is closed (RL401)")
     difference = compare(records, "second alone", "after close")
     if difference is not None:
-        yield report("RL402", records, difference, f"{AFTER_CLOSE}, against one alone")
+        yield report("RL402", records, difference, f"{AFTER_CLOSE}, compared with one alone")
 
 
 @check("RL403", "instances")
@@ -139,21 +139,18 @@ def _find_single_instance(records: Records) -> Iterator[RuleFinding]:
 
 
 def _shared_spaces(one: Any, other: Any) -> Iterator[RuleFinding]:
+    severities = {"action_space": Severity.WARNING, "observation_space": Severity.INFO}  # nobody samples observations
     shared = []
-    for name in ("action_space", "observation_space"):
+    for name, severity in severities.items():
         first, again, others = (getattr(env, name, None) for env in (one, one, other))
         if first is not again:
-            yield _of_spaces([name], f"{name} is a new object each time it is read, so that seeding it has no effect")
+            message = f"{name} is a new object each time it is read, so that seeding it has no effect"
+            yield RuleFinding("RL404", message, {"value": [name], "expected": []}, severity)
         elif first is others is not None:
             shared.append(name)
     if shared:
-        yield _of_spaces(shared, f"two instances have one object as {' and '.join(shared)}")
-
-
-def _of_spaces(names: list[str], message: str) -> RuleFinding:
-    # Nobody samples observations.
-    severity = Severity.WARNING if "action_space" in names else Severity.INFO
-    return RuleFinding("RL404", message, {"value": names, "expected": []}, severity)
+        message = f"two instances have one object as {' and '.join(shared)}"
+        yield RuleFinding("RL404", message, {"value": shared, "expected": []}, severities[shared[0]])
 
 
 @dataclasses.dataclass
@@ -200,8 +197,6 @@ def count_after_resets(context: Context) -> Iterator[ChildMessage]:
             counts.count()
             if counts.resets % MEASURED_RESETS == 0:
                 counts.measure_memory()
-    except EnvironmentRaised as error:
-        yield describe_failure(error, context.progress)
     finally:
         gc.unfreeze()
     yield from find_growth(counts)
@@ -211,7 +206,7 @@ def find_growth(counts: Counts) -> Iterator[RuleFinding]:
     """Yield what grows with every reset; raises `NotJudged` where there were too few of them."""
     resets = counts.resets
     if resets < FEWEST_RESETS:
-        raise NotJudged(f"there was time for only {resets} resets")
+        raise NotJudged(f"time ran out after {resets} resets")
     for what, series in counts.series.items():
         if growth := _growth(series):
             first, after = series[SETTLING_RESETS], resets - SETTLING_RESETS - 1

@@ -1,8 +1,7 @@
 """RL0: from the name on the command line to an environment, and to the variants of a task that a recipe switches on."""
 
-from __future__ import annotations
-
 import ast
+import contextlib
 import dataclasses
 import difflib
 import inspect
@@ -10,39 +9,33 @@ import re
 import textwrap
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.attributes import find_assignment, find_author, is_task
 from rlctl.checking.bullet_worlds import ClientCalls, find_clients
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import (
-    NO_OPENGL,
-    NO_OPENGL_FIX,
     Context,
     EnvironmentRaised,
     Instance,
-    describe,
+    display_error,
     find_line,
-    find_longest_episode,
     find_missing_file,
+    get_causes,
     is_own_file,
-    iterate_causes,
-    lacks_display,
+    opengl_fix,
 )
-from rlctl.checking.leaves import flatten_numbers
 from rlctl.checking.records import FIRST_SEED, Built, ChildMessage, Records, Skipped
 from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, check, experiment
-from rlctl.environments import info, registry
+from rlctl.checking.values import find_assignment, find_author, flatten, is_task
+from rlctl.environments import registry
 from rlctl.environments.dict_spaces import format_space
 from rlctl.environments.info import describe_mujoco_model
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import NoSuchClassError, OldGymError, RecipeError, RlctlError, TaskError, UsageError
-
-if TYPE_CHECKING:
-    from rlctl.environments.info import EnvInfo
 
 WAIVERS = "rlctl_ignore"  # The class attribute that waives rules: rule id -> reason
 
@@ -59,11 +52,12 @@ def build(context: Context) -> Iterator[ChildMessage]:
             raise error from None  # a name that does not exist, or a bug
         yield _explain(context, error)
         return
-    yield describe_built(instance)
+    yield _describe_built(instance)
     yield from _base_class(instance)
     if is_task(instance.env):
         yield from _find_misspelled(type(find_author(instance.env)))
-    if _opens_window():
+    clients = [ClientCalls(client) for client in find_clients()]
+    if any(client.getConnectionInfo()["connectionMethod"] == client.GUI for client in clients):
         evidence = {"value": "GUI", "expected": "DIRECT"}
         yield RuleFinding("RL216", "PyBullet was connected with a window (p.GUI)", evidence)
 
@@ -80,35 +74,27 @@ def _explain(context: Context, error: RlctlError) -> RuleFinding:
     where = find_line(cause) if cause is not None else None
     if context.progress.read().call == "load":
         return RuleFinding("RL001", str(error), details, where=where)
-    if isinstance(cause, TypeError) and (missing := _missing_arguments(str(cause))):
-        settings = " ".join(f"--set task.{name}=..." for name in missing)
+    missing = re.search(r"missing \d+ required .*?arguments?: (.*)", str(cause))
+    if isinstance(cause, TypeError) and missing:
+        settings = " ".join(f"--set task.{name}=..." for name in re.findall(r"'(\w+)'", missing[1]))
         fix = f"Give them ({settings}), or give them default values."
         return RuleFinding("RL006", str(error), details, fix=fix)
-    if isinstance(error, TaskError) and error.details is None and not _is_task(context.spec.task):
-        return RuleFinding("RL003", str(error))  # the registry's; what a constructor raises comes with its traceback
-    fix = NO_OPENGL_FIX if cause is not None and NO_OPENGL.search(str(cause)) else ""
-    return RuleFinding("RL002", str(error), details, fix=fix, where=where)
+    is_without_trace = isinstance(error, TaskError) and error.details is None  # a constructor's error has one
+    if is_without_trace and not registry.is_task(registry.load(context.spec.task)):
+        return RuleFinding("RL003", str(error))
+    return RuleFinding("RL002", str(error), details, fix=opengl_fix(str(cause)), where=where)
 
 
 def _imports_old_gym(error: BaseException | None) -> bool:
-    missing = [str(cause.name) for cause in iterate_causes(error) if isinstance(cause, ModuleNotFoundError)]
+    missing = [str(cause.name) for cause in get_causes(error) if isinstance(cause, ModuleNotFoundError)]
     return any(name.partition(".")[0] == "gym" for name in missing)
-
-
-def _is_task(name: str) -> bool:
-    return inspect.isclass(loaded := registry.load(name)) and registry.is_task(loaded)
-
-
-def _missing_arguments(message: str) -> list[str]:
-    match = re.search(r"missing \d+ required .*?arguments?: (.*)", message)
-    return re.findall(r"'(\w+)'", match.group(1)) if match else []
 
 
 def _base_class(instance: Instance) -> Iterator[RuleFinding]:
     bases = type(getattr(instance.env, "unwrapped", instance.env)).__mro__
     if any(base.__module__.partition(".")[0] == "gym" for base in bases):
         yield RuleFinding("RL008", "the class inherits from gym.Env, not from gymnasium.Env")
-    elif not instance.is_env:
+    elif not isinstance(instance.env, gymnasium.Env):
         yield RuleFinding("RL003", "the class does not inherit from gymnasium.Env")
     for name, leaves in (("observation", instance.leaves), ("action", instance.action_leaves)):
         if "NoneType" in {leaf.kind for leaf in leaves}:
@@ -131,16 +117,11 @@ def _find_misspelled(author: type) -> Iterator[RuleFinding]:
                 yield RuleFinding("RL013", message, {"value": name, "expected": close[0]})
 
 
-def _opens_window() -> bool:
-    clients = [ClientCalls(client) for client in find_clients()]
-    return any(client.getConnectionInfo()["connectionMethod"] == client.GUI for client in clients)
-
-
 @check("RL004", "build")
 def _find_end_while_loading(records: Records) -> Iterator[RuleFinding]:
     if records.built is None:
         for failure in records.failures:
-            if failure.process == "probe" and failure.call in ("load", "build") and not lacks_display(failure):
+            if failure.process == "probe" and failure.call in ("load", "build") and not display_error(failure):
                 evidence = {"last_output": failure.details} if failure.details else {}
                 yield RuleFinding("RL004", failure.message, evidence)
 
@@ -160,13 +141,15 @@ def _not_found(call: str, file: Mapping[str, Any], details: str | None) -> RuleF
     return RuleFinding("RL007", f"{call} does not find {file['file']!r}{where}", evidence)
 
 
-def describe_built(instance: Instance) -> Built:
-    """Return what is known of an environment before it is used."""
+def _describe_built(instance: Instance) -> Built:
     env = instance.env
     inner = getattr(env, "unwrapped", env)
     spec = getattr(env, "spec", None)
     author = type(find_author(env))
-    file, line = _place(author)
+    file: str | None = None
+    line: int | None = None
+    with contextlib.suppress(OSError, TypeError):
+        file, line = inspect.getsourcefile(author), inspect.getsourcelines(author)[1]
     return Built(
         leaves=instance.leaves,
         action_leaves=instance.action_leaves,
@@ -174,7 +157,7 @@ def describe_built(instance: Instance) -> Built:
         action_space=format_space(env.action_space),
         names=dict(inner.observation_sizes) if is_task(env) else {},
         events={name: name in inner.events for name in inner.task.events} if is_task(env) else {},
-        max_steps=find_longest_episode(env),
+        max_steps=instance.max_steps,
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
         **_read_flags(inner),
         places=_find_places(env, author, file),
@@ -195,13 +178,6 @@ def _waivers(author: type) -> Any:
     return {repr(waivers)[:40]: ""}
 
 
-def _place(author: type) -> tuple[str | None, int | None]:
-    try:
-        return inspect.getsourcefile(author), inspect.getsourcelines(author)[1]
-    except (OSError, TypeError):
-        return None, None
-
-
 def _find_places(env: Any, author: type, file: str | None) -> dict[str, tuple[str, int]]:
     places = {name: find_assignment(env, f"self.{name}") for name in ("observation_space", "action_space")}
     for name in ("__init__", "reset", "step"):
@@ -212,7 +188,6 @@ def _find_places(env: Any, author: type, file: str | None) -> dict[str, tuple[st
 
 
 def _read_flags(env: Any) -> dict[str, str]:
-    """Return what the code of `step` says of its flags, as `Built` has it."""
     try:
         nodes = list(ast.walk(ast.parse(textwrap.dedent(inspect.getsource(type(env).step)))))
     except (AttributeError, OSError, TypeError, SyntaxError):
@@ -249,7 +224,7 @@ def play_variants(context: Context) -> Iterator[ChildMessage]:
     try:
         repeats = _play(context, context.spec)
     except EnvironmentRaised:
-        raise NotJudged("the task raises whatever the events (RL2)") from None
+        raise NotJudged("the task raises with and without its events (RL2)") from None
     if task.events:
         yield from _play_events(context, repeats)
     else:
@@ -283,6 +258,7 @@ def _play_events(context: Context, repeats: bool) -> Iterator[RuleFinding]:
 
 
 def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[RuleFinding]:
+    from rlctl.environments.info import describe as describe_env  # both with pydantic's models, which load slowly
     from rlctl.recipe.recipe import validate
 
     spec, first = context.spec, None
@@ -294,12 +270,14 @@ def _play_stages(context: Context, stages: Sequence[Any]) -> Iterator[RuleFindin
         return
     for number, stage in enumerate(specs, start=1):
         try:
-            info = _describe(context, stage)
+            with context.fresh(spec=stage) as instance:
+                _record(instance)
+                description = describe_env(instance.env)
         except EnvironmentRaised as error:
             yield RuleFinding("RL012", f"stage {number} of {len(specs)}: {_describe_cause(error)}")
             continue
-        first = first or info
-        if difference := info.find_difference(first, "stage 1's"):
+        first = first or description
+        if difference := description.find_difference(first, "stage 1's"):
             yield RuleFinding("RL012", f"stage {number} of {len(specs)}: {difference}")
 
 
@@ -310,16 +288,10 @@ def _play(context: Context, spec: EnvSpec) -> bool:
     return bool(np.array_equal(episodes[0][:shortest], episodes[1][:shortest]))
 
 
-def _describe(context: Context, spec: EnvSpec) -> EnvInfo:
-    with context.fresh(spec=spec) as instance:
-        _record(instance)
-        return info.describe(instance.env)
-
-
 def _record(instance: Instance) -> NDArray[np.float64]:
     episode = EpisodePlayer(instance, FIRST_SEED, max_steps=STEPS)
-    return np.concatenate([flatten_numbers(moment.observation) for moment in episode])
+    return np.concatenate([flatten(moment.observation) for moment in episode])
 
 
 def _describe_cause(error: EnvironmentRaised) -> str:
-    return str(error.cause) if isinstance(error.cause, RlctlError) else describe(error.cause)
+    return str(error.cause) if isinstance(error.cause, RlctlError) else str(error)

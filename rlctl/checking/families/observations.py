@@ -6,17 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.families.rewards import WITH_SEARCH
-from rlctl.checking.leaves import Leaf, name_leaf
 from rlctl.checking.records import CheckedEpisode, Form, Records, Series
 from rlctl.checking.rules import RECORDING, NotJudged, RuleFinding, Severity, check, list_names
+from rlctl.checking.values import Leaf, name_leaf
 
 ROUNDING = 1e-6  # Excess over a bound, relative to the bound, up to which it is float rounding
 LARGE_SHARE, SMALL_SHARE = 0.1, 0.005  # of all observations but the last ones, for an error, or a warning
 OFF_CENTRE = 0.05  # part of the range that zero may be off its middle, for an info
 SMALLEST_SIDE = 36  # smaller images do not fit the default network's filters [pixels]
-FEWEST_ROWS, FEWEST_SEEDS = 50, 3
+FEWEST_ROWS, FEWEST_SEEDS, FEWEST_JUMPS = 50, 3, 2
 NEAR_TURN, SMALL_TURN = 1.0, 1.5  # a step of an angle is 2 pi +- NEAR_TURN, or small [rad]
-FEWEST_JUMPS = 2
 LARGE_SIZE = 100.0  # root mean square; networks expect inputs around 1
 
 
@@ -43,7 +42,7 @@ def _find_wrong_shape(records: Records) -> Iterator[RuleFinding]:
             evidence = trajectory.at(form.step, type=form.type, shape=shape, expected=list(leaf.shape))
             yield RuleFinding("RL101", message, evidence)
     for trajectory, form in records.forms("keys")[:1]:
-        message = f"observation has the keys {form.type}; the space has other ones"
+        message = f"observation has the keys {form.type}; the space has other keys"
         yield RuleFinding("RL101", message, trajectory.at(form.step))
 
 
@@ -63,8 +62,8 @@ def _find_wrong_dtype(records: Records) -> Iterator[RuleFinding]:
     for _, leaf, trajectory, form in wrong[:1]:
         more = f"; {parts - 1} other parts differ too" if parts > 1 else ""
         message = f"{name_leaf(leaf)} {_when(form.step)} is {form.dtype}; the space is {leaf.dtype}{more}"
-        is_number = np.dtype(form.dtype).kind in "biuf"
         evidence = trajectory.at(form.step, dtype=form.dtype, expected=leaf.dtype)
+        is_number = np.dtype(form.dtype).kind in "biuf"
         yield RuleFinding("RL102", message, evidence, Severity.WARNING if is_number else Severity.ERROR)
 
 
@@ -141,7 +140,7 @@ def _find_not_finite(records: Records) -> Iterator[RuleFinding]:
 def _find_shared_memory(records: Records) -> Iterator[RuleFinding]:
     for trajectory, form in records.forms("memory")[:1]:
         name = name_leaf(records.require_built().leaves[form.leaf or 0])
-        message = f"step {form.step} wrote into the memory of the {name} returned before it"
+        message = f"step {form.step} changed the {name} that the previous call had returned"
         yield RuleFinding("RL105", message, trajectory.at(form.step, steps=form.count))
 
 
@@ -189,8 +188,7 @@ def _find_unusual_images(records: Records) -> Iterator[RuleFinding]:
 
 
 def _is_in_image_format(leaf: Leaf) -> bool:
-    is_full_range = bool(np.all(leaf.low == 0) and np.all(leaf.high == 255))
-    return len(leaf.shape) == 3 and leaf.dtype == "uint8" and is_full_range
+    return len(leaf.shape) == 3 and leaf.dtype == "uint8" and bool(np.all(leaf.low == 0) and np.all(leaf.high == 255))
 
 
 def _image_problem(leaf: Leaf) -> str:
@@ -241,7 +239,6 @@ def _rows(records: Records, index: int) -> NDArray[np.float64]:
 
 
 def _leaves(records: Records, kinds: str = "f") -> Iterator[tuple[int, Leaf]]:
-    """Yield the arrays of the observation that are no images."""
     for index, leaf in enumerate(records.require_built().leaves):
         smallest = min(leaf.shape[0], leaf.shape[-1]) if leaf.shape else 0
         is_image = len(leaf.shape) == 3 and (leaf.dtype == "uint8" or smallest in (1, 3, 4))
@@ -284,9 +281,8 @@ def _find_wrapped_angles(records: Records) -> Iterator[RuleFinding]:
         jumps = np.abs(changes - 2 * np.pi) < NEAR_TURN
         is_angle = (np.abs(rows) <= 2 * np.pi).all(axis=0) & (jumps | (changes < SMALL_TURN)).all(axis=0)
         for column in np.flatnonzero(is_angle & (jumps.sum(axis=0) >= FEWEST_JUMPS))[:1]:
-            name = records.require_built().element(index, int(column))
-            count = f"{int(jumps[:, column].sum())} of {len(changes)} steps"
-            message = f"{name} jumps by 2 pi in {count}: an angle that wraps"
+            name, count = records.require_built().element(index, int(column)), int(jumps[:, column].sum())
+            message = f"{name} jumps by 2 pi in {count} of {len(changes)} steps: an angle that wraps"
             yield RuleFinding("RL117", message, {"element": name, "expected": "sin and cos"})
 
 

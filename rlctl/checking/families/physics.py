@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.attributes import is_task
 from rlctl.checking.bullet_calls import BulletCall, record_calls
 from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Joint, Jump, Pair, WorldBody, find_clients
 from rlctl.checking.families.robots import find_misuses
 from rlctl.checking.instance import Context, EnvironmentRaised, describe_failure
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, experiment, list_names
+from rlctl.checking.values import is_task
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
 
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))  # actions and logged steps
@@ -24,14 +24,10 @@ LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved
 PART_OF_RANGE, LEAST_ANGLE, LEAST_LENGTH = 0.1, 0.05, 0.01
 """How far outside its limits a joint may be: part of the range, and at least so much [rad], [m]."""
 FASTEST_BASE = 50.0  # [m/s]; PyBullet stops at 100 per axis, and no robot is faster than a car
-FASTEST_JOINT = 90.0  # [rad/s]; PyBullet stops at 100; arms and legs stay below 30
-FASTEST_SLIDE = 50.0  # [m/s]
-FASTEST_MEANT = 100.5  # the author raised the limit of 100, for example for wheels: only NONSENSE counts
-NONSENSE = 5_000.0
+FASTEST_JOINT, FASTEST_SLIDE = 90.0, 50.0  # [rad/s], [m/s]; PyBullet stops at 100; arms and legs stay below 30
+FASTEST_MEANT, NONSENSE = 100.5, 5_000.0  # between them the author raised the limit, for example for wheels
 FASTEST_JUMP = 1.0  # above falling, 0.1 s after a reset: ten times gravity [m/s]
 LONGEST_TIME_STEP = 0.02  # PyBullet's own is 1/240 [s]
-MOST_NAMES = 3
-MOST_CALLS = 20  # Calls that a finding's evidence has
 
 
 @experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 14, 15)), share=4.0)
@@ -71,14 +67,14 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
 def _left_out_clients(calls: Sequence[BulletCall]) -> Iterator[RuleFinding]:
     if calls:
         count = f"{len(calls)} calls" if len(calls) > 1 else "a call"
-        shown = list_names([f"{call.place} {call.name}" for call in calls], MOST_NAMES)
-        evidence = {"file": calls[0].file, "line": calls[0].line, "places": [call.place for call in calls[:MOST_CALLS]]}
+        shown = list_names([f"{call.place} {call.name}" for call in calls], most=3)
+        evidence = {"file": calls[0].file, "line": calls[0].line, "places": [call.place for call in calls[:20]]}
         yield RuleFinding("RL808", f"{count} of PyBullet without physicsClientId: {shown}", evidence)
 
 
 def _model_faults(env: Any) -> Iterator[ChildMessage]:
     if not is_task(env):
-        yield Skipped("RL809", "model files are known of tasks of rlctl only", applies=False)
+        yield Skipped("RL809", "only the model files of tasks of rlctl are known", applies=False)
         return
     from rlctl.task.inertia import find_inertia_faults
 
@@ -96,7 +92,7 @@ def _judge(world: LoggedWorld) -> Iterator[ChildMessage]:
     yield from explosions
     if explosions:
         for rule in ("RL803", "RL804"):
-            yield Skipped(rule, "the simulation explodes (RL805)")  # which explains what else is odd
+            yield Skipped(rule, "the simulation diverges (RL805)")  # which explains what else is odd
     else:
         yield from _penetration(world)
         yield from _joint_limits(world)
@@ -111,7 +107,7 @@ def _gravity(world: LoggedWorld) -> Iterator[RuleFinding]:
     heavy = [body.name for body in world.world.bodies if body.is_free or body.has_heavy_links]
     if heavy and not any(world.gravity) and world.weight_matters is not False:
         evidence = {"value": world.gravity, "expected": [0.0, 0.0, -9.81], "bodies": heavy}
-        yield RuleFinding("RL801", f"gravity is (0, 0, 0), and {list_names(heavy, MOST_NAMES)} can move", evidence)
+        yield RuleFinding("RL801", f"gravity is (0, 0, 0), and {list_names(heavy)} can move", evidence)
 
 
 def _penetration(world: LoggedWorld) -> Iterator[RuleFinding]:
@@ -131,12 +127,11 @@ def _penetration(world: LoggedWorld) -> Iterator[RuleFinding]:
         limit, place = log.deep[at][pair][1], log.places[at]
         names = [log.world.link_name(link) for link in pair]
         more = f"; so are {len(worst) - 1} other pairs of links" if len(worst) > 1 else ""
-        yield RuleFinding(
-            "RL803",
+        message = (
             f"{names[0]} is {100 * depth:.1f} cm inside {names[1]} {_when(place)}, and deeper than "
-            f"{100 * limit:.1f} cm for {len(row)} steps in a row{more}",
-            {**place, "value": depth, "expected": limit, "links": names},
+            f"{100 * limit:.1f} cm for {len(row)} steps in a row{more}"
         )
+        yield RuleFinding("RL803", message, {**place, "value": depth, "expected": limit, "links": names})
 
 
 def _longest_row(is_deep: Sequence[bool]) -> list[int]:
@@ -159,13 +154,13 @@ def _joint_limits(world: LoggedWorld) -> Iterator[RuleFinding]:
     names = list(dict.fromkeys(record[1] for record in joints))
     for _, name, joint, steps, place, value in joints[:1]:
         unit = "rad" if joint.is_angle else "m"
-        more = f"; outside of theirs are {list_names(names[1:], MOST_NAMES)}" if names[1:] else ""
-        yield RuleFinding(
-            "RL804",
+        more = f"; outside of theirs are {list_names(names[1:])}" if names[1:] else ""
+        message = (
             f"{name} is at {value:.3g} {unit} {_when(place)}; its limits are [{joint.low:.3g}, {joint.high:.3g}] "
-            f"{unit}; it is outside by much in {steps} steps{more}",
-            {**place, "joint": name, "value": value, "expected": [joint.low, joint.high], "other_joints": names[1:]},
+            f"{unit}; it is far outside them in {steps} steps{more}"
         )
+        evidence = {**place, "joint": name, "value": value, "expected": [joint.low, joint.high]}
+        yield RuleFinding("RL804", message, {**evidence, "other_joints": names[1:]})
 
 
 def _outside(joint: Joint, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -188,7 +183,6 @@ def _explosion(world: LoggedWorld) -> Iterator[RuleFinding]:
 
 
 def _fast(log: WorldLog, body: WorldBody, states: NDArray[np.float64]) -> Iterator[tuple[float, str, str, Place]]:
-    """Yield what of a body is too fast for several looks: speed, what it is, message, evidence."""
     for row, column in np.argwhere(~np.isfinite(states))[:1].tolist():
         value, place = str(states[row, column]), log.places[row]
         message = f"the state of {body.name} is {value} {_when(place)}"
@@ -214,9 +208,9 @@ def _thrown(world: LoggedWorld) -> dict[str, Jump]:
 
 def _unrest(world: LoggedWorld) -> Iterator[RuleFinding]:
     for jump in _thrown(world).values():
-        yield RuleFinding(
-            "RL807",
-            f"{jump.body} moves at {jump.speed:.2f} m/s {jump.after_s:.2g} s after reset, with nothing done to it; "
-            f"falling explains {jump.explained:.2f} m/s",
-            {"seed": jump.seed, "body": jump.body, "value": jump.speed, "expected": jump.explained},
+        message = (
+            f"{jump.body} moves at {jump.speed:.2f} m/s {jump.after_s:.2g} s after reset, without any action; "
+            f"falling explains {jump.explained:.2f} m/s"
         )
+        evidence = {"seed": jump.seed, "body": jump.body, "value": jump.speed, "expected": jump.explained}
+        yield RuleFinding("RL807", message, evidence)

@@ -9,32 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.action_trials import REWARD, Frame, Trials, find_differences
-from rlctl.checking.attributes import Attribute, find_assignment, find_unequal, read_attributes, read_generators
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.families.determinism import COMPARED_STEPS, LATE, compare, find_difference, report
 from rlctl.checking.families.rewards import has_succeeded
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
-from rlctl.checking.leaves import flatten_numbers
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Records
 from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFinding, check, experiment
+from rlctl.checking.values import Attribute, find_assignment, find_unequal, flatten, read_attributes, read_generators
 
-HIDDEN_STEPS = 20  # How many steps are compared with an attribute changed
-FEWEST_COMPARED = 5
+HIDDEN_STEPS, FEWEST_COMPARED = 20, 5  # How many steps are compared with an attribute changed
 MOST_CHANGED = 40  # So many attributes are changed
 MOST_OBSERVED = 1_000  # Larger observations are images or scans, in which a goal may be drawn
 REGRESSED_RESETS = 60  # Resets over which an attribute is predicted from the observation
 SHOWN = 0.9  # part of an attribute's variance that the observation has to explain
 MOST_SECOND_STEPS = 1_000  # most time limits are shorter
 FAINT = 0.01  # smaller late differences are a residue, no counter or flag
-AFTER_ENDS = ("after success", "after termination", "after truncation")
 
 
 @experiment("hidden state", "RL114", share=1.5)
 def change_attributes(context: Context) -> Iterator[ChildMessage]:
     """Play one episode again and again, each time with one attribute as reset drew it for another seed."""
     with context.fresh() as instance:
-        trials = Trials(context, instance)
+        trials = Trials(instance)
         trials.require_repeatable()
         plain = trials.plain(FIRST_SEED, HIDDEN_STEPS)  # known by now
         if plain[0].size > MOST_OBSERVED:
@@ -44,7 +41,7 @@ def change_attributes(context: Context) -> Iterator[ChildMessage]:
         for name, other in _find_drawn(instance, trials).items():
             frames = _play_changed(instance, trials, name, other)
             if frames is not None and _hides(plain, frames) and not _is_shown(instance, name):
-                yield _hidden(instance, name, other, plain, frames)
+                yield _hidden(instance, name, plain, frames)
                 return
 
 
@@ -80,7 +77,7 @@ def _is_shown(instance: Instance, name: str) -> bool:
     rows, values = [], []
     for number in range(REGRESSED_RESETS):
         start = EpisodePlayer(instance, FIRST_SEED + number, max_steps=0).reset()
-        rows.append(flatten_numbers(start.observation).astype(np.float64))
+        rows.append(flatten(start.observation).astype(np.float64))
         values.append(read_attributes(instance.env)[name].numbers)
     return explains(np.nan_to_num(np.stack(rows)), np.stack(values))
 
@@ -98,9 +95,7 @@ def explains(observed: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool
     return bool((rest**2).sum() <= (1 - SHOWN) * (wanted**2).sum())
 
 
-def _hidden(
-    instance: Instance, name: str, other: Attribute, plain: Sequence[Frame], changed: Sequence[Frame]
-) -> RuleFinding:
+def _hidden(instance: Instance, name: str, plain: Sequence[Frame], changed: Sequence[Frame]) -> RuleFinding:
     step = int(np.argmax([abs(a[REWARD] - b[REWARD]) for a, b in zip(plain, changed, strict=False)]))
     message = (
         f"reset draws {name}, the reward uses it, and the observation does not show it: with the value of another seed "
@@ -119,7 +114,7 @@ def play_after_ends(context: Context, success: Sequence[Any] | None) -> Iterator
     instance = context.build()  # not closed: closing may break the kept instance (RL402), which later experiments use
 
     def record(role: str, seed: int, most: int, sequence: Sequence[Any] | None = None) -> Recording:
-        recording = Recording(role, EpisodePlayer(instance, seed, max_steps=most, sequence=sequence), context.budget)
+        recording = Recording(role, EpisodePlayer(instance, seed, max_steps=most, sequence=sequence))
         recording.run()
         return recording
 
@@ -142,8 +137,8 @@ def play_after_ends(context: Context, success: Sequence[Any] | None) -> Iterator
 def _compare_after_ends(records: Records) -> Iterator[RuleFinding]:
     first, again = records.require_role("before ends"), records.require_role("before ends again")
     if not records.require_built().accepts_seed or find_difference(records, first, again) is not None:
-        raise NotJudged("an episode depends already on the one before it (RL301 to RL303)")
-    for role in AFTER_ENDS:
+        raise NotJudged("an episode already depends on the previous one (RL301 to RL303)")
+    for role in ("after success", "after termination", "after truncation"):
         for episode in records.role(role):
             difference = find_difference(records, again, episode)
             if difference is not None and "raised" not in (again.ended, episode.ended):
@@ -188,22 +183,21 @@ def compare_unseeded(context: Context) -> Iterator[ChildMessage]:
         values = _differing(*(_play(instance) for instance in (first, second)))
         agree = read_generators(first.env) == read_generators(second.env)
         if values and agree and _differing(*(_play(instance, seed=FIRST_SEED) for instance in (first, second))):
-            raise NotJudged("an episode depends already on the one before it (RL301 to RL303)")
+            raise NotJudged("an episode already depends on the previous one (RL301 to RL303)")
     if values:
-        message = f"reset with one seed, and then without: {values[0]:.6g} in an observation, in another instance "
+        numbers = f"an observation contains {values[0]:.6g}, in another instance {values[1]:.6g}"
         evidence = {"seed": FIRST_SEED, "value": values[1], "expected": values[0]}
-        yield RuleFinding("RL308", f"{message}{values[1]:.6g}", evidence)
+        yield RuleFinding("RL308", f"reset first with a seed, then without: {numbers}", evidence)
 
 
 def _play(instance: Instance, **seed: int) -> NDArray[np.float64]:
-    """Reset with a seed and then a few times as given; return the numbers of these and of some more observations."""
     episode = EpisodePlayer(instance, FIRST_SEED, max_steps=UNSEEDED_STEPS)
     episode.reset()
     starts = [instance.call("reset", instance.env.reset, **seed) for _ in range(UNSEEDED_RESETS)]
     observations = [start[0] if isinstance(start, tuple) else start for start in starts]
     while not episode.ended:
         observations.append(episode.step().observation)
-    numbers = np.concatenate([flatten_numbers(observation) for observation in observations])
+    numbers = np.concatenate([flatten(observation) for observation in observations])
     return np.nan_to_num(numbers.astype(np.float64))
 
 

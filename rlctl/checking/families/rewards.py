@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.instance import Context, EnvironmentRaised, describe
+from rlctl.checking.instance import Context, EnvironmentRaised
 from rlctl.checking.records import FIRST_SEED, SUCCESS, CheckedEpisode, ChildMessage, Records
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
 
@@ -34,9 +34,7 @@ def require_readable(records: Records) -> list[CheckedEpisode]:
         raise NotJudged("step does not return five values (RL201)")
     if any(form.type != "dict" for _, form in records.forms("info")):
         raise NotJudged("info is not a dict (RL204)")
-    episodes = [episode for episode in records.require_alone() if episode.steps]
-    _require_enough(episodes)
-    return episodes
+    return _require_enough([episode for episode in records.require_alone() if episode.steps])
 
 
 def require_rewarded(records: Records) -> list[CheckedEpisode]:
@@ -49,9 +47,17 @@ def require_rewarded(records: Records) -> list[CheckedEpisode]:
     return episodes
 
 
-def _require_enough(episodes: list[CheckedEpisode]) -> None:
+def _require_enough(episodes: list[CheckedEpisode]) -> list[CheckedEpisode]:
     if sum(episode.steps for episode in episodes) < ENOUGH_STEPS:
         raise NotJudged(f"fewer than {ENOUGH_STEPS} steps were recorded")
+    return episodes
+
+
+def _require_terms(records: Records) -> list[CheckedEpisode]:
+    episodes = [episode for episode in require_rewarded(records) if has_terms(episode)]
+    if not episodes:
+        raise NotApplicable("no reward_terms in info")
+    return episodes
 
 
 def has_terms(episode: CheckedEpisode) -> bool:
@@ -110,11 +116,6 @@ def discounted_steps(reward: float, steps: int) -> float:
     return float(reward * (1 - DISCOUNT**steps) / (1 - DISCOUNT))
 
 
-def longest_episode(records: Records, episodes: Sequence[CheckedEpisode]) -> int:
-    """Return how long an episode may last: the declared limit, or the longest that was recorded [steps]."""
-    return records.require_built().max_steps or max(episode.steps for episode in episodes)
-
-
 def summarize(episodes: Sequence[CheckedEpisode]) -> str:
     """Return how much was recorded: `80 episodes with random, zero and searched actions (6,100 steps)`."""
     kinds = list(dict.fromkeys(episode.actions for episode in episodes))
@@ -123,8 +124,7 @@ def summarize(episodes: Sequence[CheckedEpisode]) -> str:
 
 
 @check("RL601")
-def find_not_finite(records: Records) -> Iterator[RuleFinding]:
-    """Find the first reward that is NaN or infinite."""
+def _find_not_finite(records: Records) -> Iterator[RuleFinding]:
     for episode in records.require_alone():
         wrong = np.flatnonzero(~np.isfinite(episode.rewards) & episode.reward_is_number)
         if wrong.size:
@@ -142,18 +142,16 @@ def _find_constant_reward(records: Records) -> Iterator[RuleFinding]:
         return
     at_success = any(has_succeeded(episode) for episode in episodes)
     also = ", also where is_success is true" if at_success else ""
-    yield RuleFinding(
-        "RL602",
-        f"the reward is {constant:g} at every step of {summarize(episodes)}{also}, and nothing ends an episode early",
-        {"value": constant, "episodes": len(episodes), "steps": sum(episode.steps for episode in episodes)},
-        Severity.WARNING if constant > 0 or at_success else Severity.INFO,
-    )
+    message = f"the reward is {constant:g} at every step of {summarize(episodes)}{also}; nothing ends an episode early"
+    evidence = {"value": constant, "episodes": len(episodes), "steps": sum(episode.steps for episode in episodes)}
+    severity = Severity.WARNING if constant > 0 or at_success else Severity.INFO
+    yield RuleFinding("RL602", message, evidence, severity)
 
 
 @check("RL603")
 def _find_badly_scaled(records: Records) -> Iterator[RuleFinding]:
     require_rewarded(records)
-    episodes = [episode for episode in records.episodes if episode.steps]
+    episodes = [episode for episode in records.role("episodes") if episode.steps]
     if not episodes:
         return
     inner = np.concatenate([episode.rewards[: episode.steps - episode.has_ended] for episode in episodes])
@@ -173,10 +171,7 @@ def _find_badly_scaled(records: Records) -> Iterator[RuleFinding]:
 
 @check("RL612", *WITH_SEARCH, of_absence=True)
 def _find_constant_penalty(records: Records) -> Iterator[RuleFinding]:
-    episodes = [episode for episode in require_rewarded(records) if has_terms(episode)]
-    if not episodes:
-        raise NotApplicable("no reward_terms in info")
-    _require_enough(episodes)
+    episodes = _require_enough(_require_terms(records))
     for name, value in find_constant_terms(episodes).items():
         if value < 0 and not MEANT_CONSTANT.search(name):
             message = f"reward term {name!r} is {value:.6g} at every step of {summarize(episodes)}"
@@ -185,31 +180,26 @@ def _find_constant_penalty(records: Records) -> Iterator[RuleFinding]:
 
 @check("RL607", *WITH_SEARCH)
 def _find_wrong_sum(records: Records) -> Iterator[RuleFinding]:
-    episodes = [episode for episode in require_rewarded(records) if has_terms(episode)]
-    if not episodes:
-        raise NotApplicable("no reward_terms in info")
-    wrong, steps, worst = 0, 0, (0.0, episodes[0], 0, 0.0)
-    for episode in episodes:
-        total = np.sum(list(find_terms(episode).values()), axis=0)
-        off = np.abs(total - episode.rewards) / np.maximum(1.0, np.abs(episode.rewards))
-        off = np.nan_to_num(off)  # a step without terms
-        wrong, steps = wrong + int((off > SUM_TOLERANCE).sum()), steps + episode.steps
-        at = int(off.argmax())
-        worst = max(worst, (float(off[at]), episode, at, float(total[at])), key=lambda candidate: candidate[0])
-    if wrong > FEW_WRONG * steps:
-        _, episode, at, total_at = worst
-        reward = float(episode.rewards[at])
+    episodes = _require_terms(records)
+    totals = [np.sum(list(find_terms(episode).values()), axis=0) for episode in episodes]
+    rewards = np.concatenate([episode.rewards for episode in episodes])
+    off = np.abs(np.concatenate(totals) - rewards) / np.maximum(1.0, np.abs(rewards))
+    off = np.nan_to_num(off)  # a step without terms
+    wrong, worst = int((off > SUM_TOLERANCE).sum()), int(off.argmax())
+    if wrong > FEW_WRONG * len(off):
+        episode, step = [(episode, step) for episode in episodes for step in range(1, episode.steps + 1)][worst]
+        total, reward = float(np.concatenate(totals)[worst]), float(rewards[worst])
         message = (
-            f"reward_terms do not add up to the reward in {wrong} of {steps} steps: at step {at + 1} their sum is "
-            f"{total_at:.6g} and the reward {reward:.6g}"
+            f"reward_terms do not add up to the reward in {wrong} of {len(off)} steps: at step {step} their sum is "
+            f"{total:.6g} and the reward {reward:.6g}"
         )
-        yield RuleFinding("RL607", message, episode.at(at + 1, value=total_at, expected=reward))
+        yield RuleFinding("RL607", message, episode.at(step, value=total, expected=reward))
 
 
 @check("RL615", "episodes", "search")
 def _find_jump_at_rest(records: Records) -> Iterator[RuleFinding]:
     require_rewarded(records)
-    for episode in records.episodes + records.role("search"):
+    for episode in records.role("episodes") + records.role("search"):
         size = episode.steps - episode.has_ended
         if episode.actions != "zero" or size < 2 * REST_STEPS or not episode.observations:
             continue
@@ -218,8 +208,7 @@ def _find_jump_at_rest(records: Records) -> Iterator[RuleFinding]:
         for series in episode.observations.values():
             if len(series.values) != episode.steps + 1:
                 return
-            values = series.values.reshape(len(series.values), -1).astype(np.float64)
-            still &= np.abs(np.diff(values, axis=0)).max(axis=1, initial=0.0)[:size] <= STILL
+            still &= np.abs(np.diff(series.rows, axis=0)).max(axis=1, initial=0.0)[:size] <= STILL
         level = np.asarray(np.abs(np.diff(rewards)) <= STILL * np.maximum(1.0, np.abs(rewards[1:])))
         for at in np.flatnonzero(~level).tolist():
             before, after = slice(max(0, at - REST_STEPS), at), slice(at + 1, at + 1 + REST_STEPS)
@@ -227,7 +216,7 @@ def _find_jump_at_rest(records: Records) -> Iterator[RuleFinding]:
             if len(rewards[before]) == REST_STEPS == len(level[after]) and calm:
                 jump = f"from {rewards[at]:.4g} to {rewards[at + 1]:.4g} at step {at + 2}"
                 evidence = episode.at(at + 2, value=float(rewards[at + 1]), expected=float(rewards[at]))
-                yield RuleFinding("RL615", f"the reward jumps {jump}, and no observed number changes", evidence)
+                yield RuleFinding("RL615", f"the reward jumps {jump}, but the observation does not change", evidence)
                 return
 
 
@@ -252,18 +241,19 @@ def recompute_rewards(context: Context) -> Iterator[ChildMessage]:
     try:
         computed = instance.call("compute_reward", lambda: np.asarray(compute(*goals, infos), np.float64))
     except EnvironmentRaised as error:
-        message = f"compute_reward, of many goals at once, raises {describe(error.cause)}"
+        message = f"compute_reward, of many goals at once, raises {error}"
         yield RuleFinding("RL614", message, {"steps": len(taken)})
         return
     if computed.shape != rewards.shape:
-        shapes = f"of {len(taken)} goals at once it returns shape {computed.shape}, not {rewards.shape}"
-        yield RuleFinding("RL614", f"compute_reward: {shapes}", {"steps": len(taken)})
+        message = f"compute_reward of {len(taken)} goals at once returns shape {computed.shape}, not {rewards.shape}"
+        yield RuleFinding("RL614", message, {"steps": len(taken)})
         return
     off = np.abs(computed - rewards)
     # Written so that NaN is another reward; where the environment itself gives one, RL601 says so.
     is_other = np.isfinite(rewards) & ~(off <= TOLERANCE * np.maximum(1.0, np.abs(rewards)))
     if is_other.any():
         step = int(np.where(is_other, off, 0.0).argmax())
-        message = f"the reward of step {step + 1} is {rewards[step]:.6g}, and compute_reward says {computed[step]:.6g}"
+        returned = f"compute_reward returns {computed[step]:.6g}"
+        message = f"the reward of step {step + 1} is {rewards[step]:.6g}, and {returned}"
         evidence = {"step": step + 1, "value": float(computed[step]), "expected": float(rewards[step])}
         yield RuleFinding("RL614", message, evidence)

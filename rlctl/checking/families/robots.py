@@ -7,27 +7,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.bullet_calls import FULL_TURN, BulletCalls, ContactQuery
-from rlctl.checking.bullet_worlds import JOINTS, ClientCalls, find_joint
+from rlctl.checking.bullet_worlds import JOINTS, ClientCalls
 from rlctl.checking.rules import RuleFinding, Severity
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 
 FAR_RANGES = 3.0  # a target farther outside the limits is not just out of reach
-FEWEST_JOINTS = 3
+FEWEST_JOINTS, FEWEST_QUERIES, FEWEST_LOOKS = 3, 50, 30
 LATE_LINK = 0.001  # [m]
-NEAR = 0.05  # of sorted targets and positions that are equal [rad], [m]
-APART = 0.2  # of a target and its own joint's position [rad], [m]
-FEWEST_QUERIES = 50
+NEAR, APART = 0.05, 0.2  # of sorted targets and positions; of a target and its own joint's position [rad], [m]
 MOSTLY = 0.3  # Part of all looks in which bodies have to touch, so that a query should have seen it
 SAME = 2e-4  # An element of the observation is an angle if it differs by no more in any look [rad]
 LEAST_MOTION = 0.02  # standard deviation; calmer angles may be equal by chance [rad]
-FEWEST_LOOKS = 30
 ORDERS = {"w, x, y, z": (1, 2, 3, 0), "w first, passed on as x, y, z, w": (3, 0, 1, 2)}  # where x, y, z, w come from
 ANGLES = (*("roll", "pitch", "yaw") * 3, "", "", "")
 
 
-def _find_far_targets(calls: BulletCalls) -> Iterator[RuleFinding]:
+def _find_far_targets(worlds: Sequence[LoggedWorld], calls: BulletCalls) -> Iterator[RuleFinding]:
+    bodies = [(world.world.client, body) for world in worlds for body in world.world.bodies]
+    joints = {(client, body.id, joint.index): joint for client, body in bodies for joint in body.joints}
     for target in calls.far_targets:
-        joint = find_joint(target.client, target.body, target.joint)
+        joint = joints.get((target.client, target.body, target.joint))
         if joint is None or not joint.is_angle or not joint.has_limits:
             continue
         outside = max(joint.low - target.value, target.value - joint.high)
@@ -44,11 +43,8 @@ def _find_far_targets(calls: BulletCalls) -> Iterator[RuleFinding]:
 def _find_wrong_order(world: LoggedWorld) -> Iterator[RuleFinding]:
     for log in world.logs:
         for body, states in log.bodies if log.first_targets else ():
-            targets = {
-                j: log.first_targets.get((world.world.client, body.id, joint.index))
-                for j, joint in enumerate(body.joints)
-            }
-            driven = {j: target for j, target in targets.items() if target is not None}
+            keys = [(world.world.client, body.id, joint.index) for joint in body.joints]
+            driven = {j: log.first_targets[key] for j, key in enumerate(keys) if key in log.first_targets}
             if len(driven) < FEWEST_JOINTS:
                 continue
             positions = states[0, [JOINTS + j for j in driven]]
@@ -115,12 +111,12 @@ def _find_empty_queries(world: LoggedWorld, calls: BulletCalls) -> Iterator[Rule
 
 
 def _explain_empty(world: LoggedWorld, query: ContactQuery) -> tuple[str, Severity] | None:
-    """Return why a query is empty, and how sure that is; None where the bodies hardly touched."""
-    names = {body.id: body for body in world.world.bodies}
+    p, known = ClientCalls(query.client), {body.id for body in world.world.bodies}
+    existing = {-1, *(p.getBodyUniqueId(i) for i in range(p.getNumBodies()))}
     for body, link in zip(query.bodies, query.links, strict=True):
-        if body >= 0 and not _exists(query.client, body):
+        if body not in existing:
             return f"there is no body {body}", Severity.WARNING
-        if body in names and link is not None and not _has_shape(world, body, link):
+        if body in known and link is not None and not _has_shape(world, body, link):
             name = world.world.link_name((body, link))
             return f"{name} (link {link}) has no collision shape", Severity.WARNING
     touched = [_find_touching(log, query) for log in world.logs]
@@ -133,11 +129,6 @@ def _explain_empty(world: LoggedWorld, query: ContactQuery) -> tuple[str, Severi
     text = f"{world.world.link_name(asked)} (link {asked[1]}) never touched, but {world.world.link_name(other)} did"
     is_next = any(_are_joined(query.client, asked, link) for link in others)
     return f"{text} (link {other[1]})", Severity.WARNING if is_next else Severity.INFO
-
-
-def _exists(client: int, body: int) -> bool:
-    p = ClientCalls(client)
-    return body in {p.getBodyUniqueId(i) for i in range(p.getNumBodies())}
 
 
 def _has_shape(world: LoggedWorld, body: int, link: int) -> bool:
@@ -190,10 +181,8 @@ def _find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
 
 
 def find_angles(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return roll, pitch and yaw, their sines and cosines, and the direction of gravity in the body's frame.
-
-    `quaternions` are x, y, z, w. Shape (n, 4); of the result (n, 12).
-    """
+    """Return roll, pitch and yaw, their sines and cosines, and the direction of gravity in the body's frame, shape
+    (n, 12), of quaternions x, y, z, w, shape (n, 4)."""
     x, y, z, w = quaternions.T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
@@ -205,7 +194,7 @@ def find_angles(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def find_misuses(worlds: Sequence[LoggedWorld], calls: BulletCalls) -> Iterator[RuleFinding]:
     """Yield what is wrong with how the robots of some worlds are driven and read; the worlds have to be there still."""
-    yield from _find_far_targets(calls)
+    yield from _find_far_targets(worlds, calls)
     yield from _find_late_links(calls)
     for world in worlds:
         yield from _find_wrong_order(world)

@@ -16,19 +16,16 @@ from numpy.typing import NDArray
 from rlctl.checking.episode import EpisodePlayer, action_at, zero_action
 from rlctl.checking.families import rewards
 from rlctl.checking.families.reset import play_after_ends
-from rlctl.checking.instance import Context, find_longest_episode
+from rlctl.checking.instance import Context
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Skipped
 from rlctl.checking.rules import NotJudged, RuleFinding, experiment
 
-MOST_STEPS = 4_500  # in all: they find the goal of the bundled `reach` from most seeds
-MOST_EPISODES = 60
+MOST_STEPS, MOST_EPISODES = 4_500, 60  # in all: they find the goal of the bundled `reach` from most seeds
 LONGEST = 150  # episodes are stopped after so many steps; a reward that leads to a goal shows before
 SEGMENTS = 3  # Of a sequence, each one action that is held: few numbers to search among
-GENERATION = 10
-ELITE = 3
-WIDTH = 0.3  # Of the first generation, as a standard deviation; the range of an action is 1
-LEAST_WIDTH = 0.025
+GENERATION, ELITE = 10, 3  # Sequences; the best of them
+WIDTH, LEAST_WIDTH = 0.3, 0.025  # Standard deviation, first and least; the range of an action is 1
 STRETCH = 1.5  # How long a sequence's actions reach, against the longest episode so far
 CEM_FRACTION = 0.7  # part of the steps that is for generations
 CONTINUED = 12  # Episodes that follow the best and then go on otherwise
@@ -40,8 +37,6 @@ LATE = 10  # steps after the recorded ones are assumed to earn the mean of the l
 
 @dataclasses.dataclass
 class _Attempt:
-    """One episode of the search."""
-
     sequence: list[Any]
     played: CheckedEpisode
 
@@ -82,11 +77,9 @@ class _Search:
 
     @property
     def succeeded(self) -> list[_Attempt]:
-        """The attempts with a success."""
         return [attempt for attempt in self.attempts if rewards.has_succeeded(attempt.played)]
 
     def cross_entropy_search(self) -> Iterator[ChildMessage]:
-        """Play generations of held actions, each around the best of the one before."""
         shape = (SEGMENTS, self._size)
         mean, width = np.full(shape, 0.5), np.full(shape, WIDTH)
         best, best_score = mean, -np.inf
@@ -106,7 +99,6 @@ class _Search:
             mean, width = elite.mean(axis=0), np.maximum(elite.std(axis=0), LEAST_WIDTH)
 
     def perturb_best(self) -> Iterator[ChildMessage]:
-        """Follow the best sequence and hold another action from some step on."""
         for _ in range(CONTINUED):
             if not self._goes_on():
                 return
@@ -116,11 +108,10 @@ class _Search:
             yield from self.play([*best.sequence[:at], *[action] * (self._length - at)])
 
     def stop_early(self) -> Iterator[ChildMessage]:
-        """Follow a sequence that finished, do nothing from shortly before its end on, and compare what both earn."""
         is_reported = rewards.reports_success([attempt.played for attempt in self.attempts])
         finished = [attempt for attempt in self.attempts if _finishes(attempt.played, is_reported)]
         if not finished:
-            yield Skipped("RL605", "the search for high returns ended no episode at a goal", applies=False)
+            yield Skipped("RL605", "no searched episode ended in success", applies=False)
             return
         best = max(finished, key=lambda attempt: attempt.played.rewards[-1])
         one, nothing = best.played, zero_action(self._space)
@@ -132,7 +123,7 @@ class _Search:
                 two = self.attempts[-1].played
                 is_same = np.array_equal(one.rewards[:at], two.rewards[:at]) and two.ended != "raised"
                 if is_same and two.steps > one.steps and not _finishes(two, is_reported):
-                    limit = find_longest_episode(self.instance.env)
+                    limit = self.instance.max_steps
                     longest = limit or max(attempt.played.steps for attempt in self.attempts)
                     stops.append(compare_returns(one, two, at, longest))
         if not is_reported:
@@ -140,11 +131,10 @@ class _Search:
         yield from _judge_stops(one, stops)
 
     def play(self, sequence: list[Any], kind: str = "searched") -> Iterator[ChildMessage]:
-        """Play one sequence of actions."""
         copies = (copy.deepcopy(action) for action in sequence)
         number, steps = len(self.attempts), len(sequence)
         episode = EpisodePlayer(self.instance, FIRST_SEED, kind, number=number, max_steps=steps, sequence=copies)
-        recording = Recording("search", episode, self.budget)
+        recording = Recording("search", episode)
         yield from recording.run()
         played = recording.trajectory
         self.attempts.append(_Attempt(sequence, played))
@@ -199,9 +189,9 @@ def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[Ch
         return
     best = max(stops, key=lambda stop: stop.stopping - stop.finishing)
     if best.per_step > 0 and best.stopping > best.finishing + CLEARLY * abs(best.finishing):
-        yield RuleFinding(
-            "RL605",
+        message = (
             f"finishing at step {finished.steps} earns {best.finishing:.4g} from step {best.step} on; stopping there "
-            f"earns {best.per_step:.3g} per step instead, {best.stopping:.4g} in all (discount {rewards.DISCOUNT})",
-            finished.at(best.step, value=best.stopping, expected=f"below {best.finishing:.6g}", per_step=best.per_step),
+            f"earns {best.per_step:.3g} per step instead, {best.stopping:.4g} in all (discount {rewards.DISCOUNT})"
         )
+        earned = {"value": best.stopping, "expected": f"below {best.finishing:.6g}", "per_step": best.per_step}
+        yield RuleFinding("RL605", message, finished.at(best.step, **earned))

@@ -2,27 +2,25 @@
 
 import cProfile
 import dataclasses
-import statistics
 from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
 
 from rlctl.checking.bullet_calls import visible_to_profilers
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.instance import Context, Instance, Timer, rebuilds_world
+from rlctl.checking.instance import Context, Instance, Timer
 from rlctl.checking.profiling import Profile, Stopwatch, TimedCall, find_own_code
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import ChildMessage, Fact, Records
 from rlctl.checking.rules import NotJudged, RuleFinding, Severity, check, experiment, list_names
+from rlctl.checking.values import find_author, is_task
 from rlctl.output import format_duration
 
 FIRST_SPEED_SEED = 5000
-TIMED_STEPS = 200
-TIMED_RESETS = 5
-PROFILED_S = 0.15  # How long steps are profiled, and resets [s]
-MOST_STEPS = 20_000  # So many steps, or resets, are enough
+TIMED_STEPS, TIMED_RESETS = 200, 5
+PROFILED_S, MOST_STEPS = 0.15, 20_000  # How long steps are profiled, and resets [s]; so many are enough
 BATCH = 25  # steps per mean; the median of the means ignores disturbances
 LONGEST_S = 2.0  # enough, however much there is [s]
-MOST_CALLS = 5
-
 MILLION = 1_000_000
 SLOW_STEPS_PER_S = 100.0  # a million steps then take about three hours [steps/s]
 CLEARLY_SLOW = 1.25  # So many times slower than that is a warning; less may be a busy machine
@@ -66,19 +64,17 @@ def measure_speed(context: Context) -> Iterator[ChildMessage]:
     context.budget.was_cut = False  # it lasts as long as it should
     is_own = find_own_code(instance.env)
     in_step, in_reset = (Profile(profiler, is_own) for profiler in profilers.values())
-    yield Fact(
-        "speed",
-        Speed(
-            step_s=typical(steps.seconds, BATCH),
-            reset_s=typical(resets.seconds, 1),
-            steps=len(steps.seconds),
-            resets=len(resets.seconds),
-            slowest_in_step=in_step.slowest()[:MOST_CALLS],
-            suspicious_in_step=in_step.suspicious(),
-            suspicious_in_reset=in_reset.suspicious(),
-            rebuilds=rebuilds_world(instance.env),
-        ),
+    speed = Speed(
+        step_s=typical(steps.seconds, BATCH),
+        reset_s=typical(resets.seconds, 1),
+        steps=len(steps.seconds),
+        resets=len(resets.seconds),
+        slowest_in_step=in_step.slowest()[:5],
+        suspicious_in_step=in_step.suspicious(),
+        suspicious_in_reset=in_reset.suspicious(),
+        rebuilds=is_task(instance.env) and not find_author(instance.env).fast_reset,
     )
+    yield Fact("speed", speed)
 
 
 def _play(
@@ -104,42 +100,37 @@ def typical(seconds: Sequence[float], batch: int) -> float | None:
     if not seconds:
         return None
     batch = min(batch, len(seconds))
-    starts = range(0, len(seconds) - batch + 1, batch)
-    return statistics.median(statistics.fmean(seconds[start : start + batch]) for start in starts)
+    whole = np.reshape(seconds[: len(seconds) // batch * batch], (-1, batch))
+    return float(np.median(whole.mean(axis=1)))
 
 
 @check("RL901", "speed")
 def _find_slow_step(records: Records) -> Iterator[RuleFinding]:
-    speed = _require_speed(records)
+    speed: Speed = records.require_fact("speed")
     if speed.step_s is None:
         raise NotJudged("no step could be timed")
     named_elsewhere = _idle(records, speed, "step") + _loading(speed, "step")
     left = speed.step_s * (1 - _share(named_elsewhere))
     if left * SLOW_STEPS_PER_S <= 1:
         return
-    per_s, hours = 1 / speed.step_s, MILLION * speed.step_s / 3600
-    calls = _list(speed.slowest_in_step)
+    per_s, hours, slowest = 1 / speed.step_s, MILLION * speed.step_s / 3600, _list(speed.slowest_in_step)
+    time = f"a million steps take {hours:,.3g} hours per process on this machine"
+    evidence = {"value": per_s, "expected": SLOW_STEPS_PER_S, "step_ms": 1e3 * speed.step_s, "steps": speed.steps}
     is_clear = left * SLOW_STEPS_PER_S > CLEARLY_SLOW
     has_large_call = any(call.share >= LARGE_CALL for call in speed.slowest_in_step)
-    yield RuleFinding(
-        "RL901",
-        f"{per_s:,.3g} steps/s: a million steps take {hours:,.3g} hours per process on this machine; slowest: {calls}",
-        {"value": per_s, "expected": SLOW_STEPS_PER_S, "step_ms": 1e3 * speed.step_s, "steps": speed.steps},
-        Severity.WARNING if is_clear and has_large_call else Severity.INFO,
-    )
+    severity = Severity.WARNING if is_clear and has_large_call else Severity.INFO
+    yield RuleFinding("RL901", f"{per_s:,.3g} steps/s: {time}; slowest: {slowest}", evidence, severity)
 
 
 @check("RL903", "speed")
 def _find_drawing_and_waiting(records: Records) -> Iterator[RuleFinding]:
-    speed = _require_speed(records)
+    speed: Speed = records.require_fact("speed")
     for call, seconds in (("step", speed.step_s), ("reset", speed.reset_s)):
-        for episode in _idle(records, speed, call):
-            lost = _time(episode.share * seconds) if seconds else "?"
-            yield RuleFinding(
-                "RL903",
-                f"{call} calls {episode.name}{_at(episode)}: {lost} per {call}, {episode.share:.0%} of its time",
-                {"call": call, "value": episode.name, "place": episode.place, "share": episode.share},
-            )
+        for timed in _idle(records, speed, call):
+            lost = _time(timed.share * seconds) if seconds else "?"
+            message = f"{call} calls {timed.name}{_at(timed)}: {lost} per {call}, {timed.share:.0%} of its time"
+            evidence = {"call": call, "value": timed.name, "place": timed.place, "share": timed.share}
+            yield RuleFinding("RL903", message, evidence)
 
 
 @check("RL904", "speed", "episodes")
@@ -156,12 +147,10 @@ def _find_loading(records: Records) -> Iterator[RuleFinding]:
         if calls and (connects or call == "step" or share >= LITTLE_LOADING):
             named = sorted(calls, key=lambda call: (call.kind != "connecting", -call.share))
             names = list_names([f"{timed.name}{_at(timed)}" for timed in named], NAMED_CALLS)
-            yield RuleFinding(
-                "RL904",
-                f"{call} calls {names}: {_time(seconds)} per {call}, {share:.0%} of {part}",
-                {"call": call, "value": [timed.name for timed in named], "ms": 1e3 * seconds, "share": share},
-                Severity.WARNING if share >= LITTLE_LOADING else Severity.INFO,
-            )
+            message = f"{call} calls {names}: {_time(seconds)} per {call}, {share:.0%} of {part}"
+            evidence = {"call": call, "value": [timed.name for timed in named], "ms": 1e3 * seconds, "share": share}
+            severity = Severity.WARNING if share >= LITTLE_LOADING else Severity.INFO
+            yield RuleFinding("RL904", message, evidence, severity)
 
 
 def format_speed(records: Records) -> str:
@@ -179,24 +168,15 @@ def format_speed(records: Records) -> str:
     )
 
 
-def _episode_steps(records: Records) -> float | None:
-    episodes = [episode for episode in records.episodes if episode.steps]
-    whole = [episode for episode in episodes if episode.has_ended] or episodes
-    random = [episode for episode in whole if episode.actions == "random"] or whole
-    return statistics.fmean(episode.steps for episode in random) if random else None
-
-
-def _require_speed(records: Records) -> Speed:
-    speed: Speed = records.require_fact("speed")
-    return speed
-
-
 def _require_times(records: Records) -> tuple[Speed, float, float, float]:
     """Return the speed, the time of a step and of a reset [s], and the steps of an episode."""
-    speed, steps = _require_speed(records), _episode_steps(records)
-    if not speed.step_s or speed.reset_s is None or steps is None:
-        raise NotJudged("no step or no reset could be timed")
-    return speed, speed.step_s, speed.reset_s, steps
+    speed: Speed = records.require_fact("speed")
+    episodes = [episode for episode in records.role("episodes") if episode.steps]
+    whole = [episode for episode in episodes if episode.has_ended] or episodes
+    random = [episode for episode in whole if episode.actions == "random"] or whole
+    if not speed.step_s or speed.reset_s is None or not random:
+        raise NotJudged("too few steps or resets to measure their time")
+    return speed, speed.step_s, speed.reset_s, float(np.mean([episode.steps for episode in random]))
 
 
 def _suspicious(speed: Speed, call: str, kinds: Sequence[str]) -> list[TimedCall]:
@@ -226,9 +206,8 @@ def _share(calls: Sequence[TimedCall]) -> float:
 
 
 def _list(calls: Sequence[TimedCall]) -> str:
-    return ", ".join(
-        f"{call.name} {call.share:.0%}{_at(call)}" for call in calls[:NAMED_CALLS] if call.share >= LEAST_SHARE
-    )
+    named = [call for call in calls[:NAMED_CALLS] if call.share >= LEAST_SHARE]
+    return ", ".join(f"{call.name} {call.share:.0%}{_at(call)}" for call in named)
 
 
 def _at(call: TimedCall) -> str:

@@ -1,0 +1,273 @@
+"""Values taken apart: spaces and observations into arrays (leaves), and the attributes that an environment holds."""
+
+import collections
+import contextlib
+import copy
+import dataclasses
+import inspect
+import random
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.checking.bullet_calls import LIBRARIES, is_library
+
+Path = tuple[str | int, ...]
+NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)
+
+
+@dataclasses.dataclass(frozen=True)
+class Leaf:
+    """One array of a space. Every supported kind has bounds: Discrete(n) is the integers from 0 to n - 1."""
+
+    path: Path  # Keys and places from the whole value to this array
+    kind: str  # `Box`, `Discrete`, `MultiDiscrete`, `MultiBinary`, or another class
+    shape: tuple[int, ...] = ()
+    dtype: str = ""
+    low: NDArray[Any] | None = None  # Shape `shape`; None for a kind that cannot be judged
+    high: NDArray[Any] | None = None
+
+    @property
+    def supported(self) -> bool:
+        """Whether rules can look into it."""
+        return self.low is not None
+
+    @property
+    def flat_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest value of each number. Shape (elements,)."""
+        low, high = (np.ravel(np.asarray(bound, np.float64)) for bound in (self.low, self.high))
+        return low, high
+
+
+def name_leaf(leaf: Leaf, of: str = "observation") -> str:
+    """Return how to write the leaf of an observation or an action: `observation['camera'][0]`."""
+    return of + "".join(f"[{key!r}]" for key in leaf.path)
+
+
+def name_element(leaf: Leaf, index: int, of: str = "observation") -> str:
+    """Return how to write one number of a leaf, given by its flat index: `observation['camera'][3, 0, 2]`."""
+    where = name_leaf(leaf, of)
+    if not leaf.shape:
+        return where
+    position = np.unravel_index(index, leaf.shape)
+    return f"{where}[{', '.join(str(int(i)) for i in position)}]"
+
+
+def find_leaves(space: Any, path: Path = ()) -> list[Leaf]:
+    """Take a space apart; what is not a known space becomes a leaf that is not supported."""
+    if isinstance(space, spaces.Dict):
+        return [leaf for key, value in space.spaces.items() for leaf in find_leaves(value, (*path, key))]
+    if isinstance(space, spaces.Tuple):
+        return [leaf for i, value in enumerate(space.spaces) for leaf in find_leaves(value, (*path, i))]
+    bounds = _bounds(space)
+    kind = type(space).__name__
+    if bounds is None:
+        return [Leaf(path, kind)]
+    low, high = bounds
+    return [Leaf(path, kind, tuple(space.shape), str(space.dtype), low, high)]
+
+
+def _bounds(space: spaces.Space[Any]) -> tuple[NDArray[Any], NDArray[Any]] | None:
+    if isinstance(space, spaces.Box):
+        return space.low, space.high
+    if isinstance(space, spaces.Discrete):
+        return np.array(space.start), np.array(space.start + space.n - 1)
+    if isinstance(space, spaces.MultiDiscrete):
+        start = np.asarray(getattr(space, "start", np.zeros_like(space.nvec)))
+        return start, start + space.nvec - 1
+    if isinstance(space, spaces.MultiBinary):
+        return np.zeros(space.shape, np.int8), np.ones(space.shape, np.int8)
+    return None
+
+
+def pick(value: Any, path: Path) -> Any:
+    """Return the part of an observation that a leaf stands for; raises `LookupError` or `TypeError`."""
+    for key in path:
+        value = value[key]
+    return value
+
+
+def flatten_action(leaves: list[Leaf], action: Any) -> NDArray[np.float64]:
+    """Return an action's numbers in the order of the action space's leaves; those of unknown kinds are left out."""
+    parts = [np.ravel(pick(action, leaf.path)).astype(np.float64) for leaf in leaves if leaf.supported]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def flatten(observation: Any) -> NDArray[Any]:
+    """Return a copy of all numbers of an observation; those that are in no array of numbers are left out."""
+    if isinstance(observation, dict):
+        observation = tuple(observation.values())
+    if isinstance(observation, (tuple, list)) and any(isinstance(part, (np.ndarray, dict)) for part in observation):
+        parts = [flatten(value) for value in observation]
+        return np.concatenate(parts) if parts else np.zeros(0)
+    try:
+        array = np.array(observation)
+    except Exception:  # a ragged list, or an object of its own kind
+        array = np.zeros(0)
+    return array.ravel() if array.dtype.kind in "biuf" else np.zeros(0)
+
+
+def find_numbers(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:
+    """Yield the numbers of an info by name; those in a dictionary of it as `reward_terms/distance`."""
+    for key, value in info.items():
+        inner = value.items() if isinstance(value, dict) else [("", value)]
+        for name, number in inner:
+            # Some libraries make an array without axes of a comparison.
+            is_scalar = isinstance(number, np.ndarray) and number.shape == () and number.dtype.kind in "biuf"
+            if isinstance(number, NUMBERS) or is_scalar:
+                with contextlib.suppress(OverflowError):  # a whole number of hundreds of digits
+                    yield f"{key}/{name}" if isinstance(value, dict) else str(key), float(number)
+
+
+def name_type(value: Any) -> str:
+    """Return a type as a user would write it: `numpy.bool`, `list`."""
+    kind = type(value)
+    return kind.__qualname__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__qualname__}"
+
+
+def read_flag(flag: Any) -> bool:
+    """Return what a flag means, whatever its type; False for what has no truth, and any of a flag per agent."""
+    if isinstance(flag, bool):  # nearly always; asking numpy takes a tenth of a robot's step
+        return flag
+    try:
+        return bool(np.any(list(flag.values()) if isinstance(flag, dict) else flag))
+    except Exception:  # its type is noted, and is a finding
+        return False
+
+
+MOST_NUMBERS = 64  # larger arrays are buffers, images or tables, no single quantity
+MOST_ATTRIBUTES, DEEPEST = 500, 2  # Attributes of attributes are read, but no deeper
+Generator = np.random.Generator | np.random.RandomState | random.Random
+NO_GENERATORS = {id(np.random.mtrand._rand), id(random._inst)}  # of the whole process: RL309 watches them
+
+
+def find_author(env: Any) -> Any:
+    """Return the object whose class the environment's author wrote: not rlctl's environment of a task, but the task."""
+    inner = getattr(env, "unwrapped", env)
+    return inner.task if is_task(env) else inner
+
+
+def is_task(env: Any) -> bool:
+    """Say whether it is an environment of a task of rlctl."""
+    task_env = sys.modules.get("rlctl.task.env")
+    return task_env is not None and isinstance(getattr(env, "unwrapped", env), task_env.TaskEnv)
+
+
+@dataclasses.dataclass(frozen=True)
+class Attribute:
+    """A number, an array of numbers, or a random generator that an object of the environment holds."""
+
+    name: str  # `self.goal`
+    owner: Any  # The object, or the dictionary, that holds it
+    key: str
+    value: Any  # A copy; of a generator the generator itself
+
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """The numbers, flat; empty for a generator."""
+        return np.zeros(0) if isinstance(self.value, Generator) else np.ravel(np.asarray(self.value, np.float64))
+
+    def assign(self, value: Any) -> None:
+        """Replace the value in the environment."""
+        if isinstance(self.owner, dict):
+            self.owner[self.key] = copy.deepcopy(value)
+        else:
+            setattr(self.owner, self.key, copy.deepcopy(value))
+
+
+def read_attributes(env: Any) -> dict[str, Attribute]:
+    """Return the attributes of the object that the environment's author wrote, by name; runs none of its code."""
+    attributes: dict[str, Attribute] = {}
+    seen: set[int] = set()
+
+    def visit(owner: Any, name: str, depth: int) -> None:
+        seen.add(id(owner))
+        items = owner if isinstance(owner, dict) else getattr(owner, "__dict__", {})
+        for key, value in list(items.items()):
+            if len(attributes) >= MOST_ATTRIBUTES or not isinstance(key, str):
+                continue
+            path = f"{name}[{key!r}]" if isinstance(owner, dict) else f"{name}.{key}"
+            if _is_quantity(value) or (isinstance(value, Generator) and id(value) not in NO_GENERATORS):
+                value = value if isinstance(value, Generator) else copy.deepcopy(value)
+                attributes[path] = Attribute(path, owner, key, value)
+            elif depth < DEEPEST and id(value) not in seen and _is_own(value):
+                visit(value, path, depth + 1)
+
+    visit(find_author(env), "self", 0)
+    return attributes
+
+
+def _is_quantity(value: Any) -> bool:
+    if isinstance(value, NUMBERS):
+        return True
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "biuf" and 0 < value.size <= MOST_NUMBERS
+    if not isinstance(value, list | tuple | collections.deque) or not 0 < len(value) <= MOST_NUMBERS:
+        return False
+    sizes = [np.size(item) for item in value if isinstance(item, (*NUMBERS, np.ndarray))]
+    return len(sizes) == len(value) and len(set(sizes)) == 1 and sum(sizes) <= MOST_NUMBERS
+
+
+def _is_own(value: Any) -> bool:
+    if isinstance(value, dict):
+        return True
+    is_object = hasattr(value, "__dict__") and not inspect.isroutine(value) and not inspect.isclass(value)
+    return is_object and not inspect.ismodule(value) and type(value).__module__.partition(".")[0] not in LIBRARIES
+
+
+def find_unequal(one: Mapping[str, Attribute], two: Mapping[str, Attribute]) -> list[str]:
+    """Return the names whose numbers differ, of those that both have with the same shape."""
+    shared = [name for name in one.keys() & two.keys() if one[name].numbers.shape == two[name].numbers.shape]
+    return sorted(n for n in shared if not np.array_equal(one[n].numbers, two[n].numbers, equal_nan=True))
+
+
+def read_generators(env: Any) -> dict[str, str]:
+    """Return the state of each random generator, as text, by name."""
+    values = {name: attribute.value for name, attribute in read_attributes(env).items()}
+    return {name: _state(value) for name, value in values.items() if isinstance(value, Generator)}
+
+
+def _state(generator: Any) -> str:
+    if isinstance(generator, np.random.Generator):
+        return str(generator.bit_generator.state)
+    if isinstance(generator, np.random.RandomState):
+        kind, keys, *rest = generator.get_state()
+        return str((kind, np.asarray(keys).tobytes(), rest))
+    return str(generator.getstate())
+
+
+def find_assignment(env: Any, name: str) -> tuple[str, int] | None:
+    """Return file and line of the first assignment to an attribute, given as `self.rng`; None if there is none."""
+    with contextlib.suppress(OSError, TypeError):
+        author = type(find_author(env))
+        for cls in author.__mro__:
+            if cls is not author and cls.__module__.partition(".")[0] in LIBRARIES:
+                continue
+            lines, first = inspect.getsourcelines(cls)
+            for number, line in enumerate(lines):
+                if re.match(rf"\s*{re.escape(name)}\s*(:[^=]+)?=[^=]", line):
+                    return str(inspect.getsourcefile(cls)), first + number
+    return None
+
+
+@contextlib.contextmanager
+def watch_unseeded(calls: set[tuple[str, int]]) -> Iterator[None]:
+    """Add file and line of each call of `default_rng()` without a seed inside the `with` block, except in libraries."""
+    original = np.random.default_rng
+
+    def default_rng(seed: Any = None) -> np.random.Generator:
+        frame = sys._getframe(1)
+        if seed is None and not is_library(frame):
+            calls.add((frame.f_code.co_filename, frame.f_lineno))
+        return original(seed)
+
+    np.random.default_rng = default_rng
+    try:
+        yield
+    finally:
+        np.random.default_rng = original
