@@ -51,7 +51,7 @@ def test_pictures_are_told():
 
 def test_gymnasiums_own_generator_has_no_place():
     (finding,) = findings(f"{FILE}:ForgetsSeed", "RL311")
-    assert finding.message.startswith("self._np_random is drawn from")
+    assert finding.message.startswith("self._np_random is used")
     assert finding.where is None
 
 
