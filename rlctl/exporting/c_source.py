@@ -227,7 +227,10 @@ def build_library(code: CSource, info: PolicyInfo, folder: Path, compiler: list[
     library = folder / f"{code.name}{LIBRARY_SUFFIX}"
     library.with_suffix(".json").write_text(info.model_dump_json())
     command = [*compiler, *FLAGS, "-fPIC", "-shared", "-o", str(library), f"{code.name}.c", "harness.c", "-lm"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise AnswerIsNo(f"{compiler[0]} cannot be started: {error.strerror or error}") from None
     if done.returncode != 0:
         raise AnswerIsNo(f"{compiler[0]} cannot compile the policy: {short_repr(done.stderr, 300)}")
     return library

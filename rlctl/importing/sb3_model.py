@@ -210,6 +210,8 @@ def read_tensors(content: bytes) -> dict[str, NDArray[Any]]:
     """Return the tensors, by name, of a state dict that `torch.save` wrote as a zip archive (torch 1.6 or newer)."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         prefix = next((name[: -len("data.pkl")] for name in archive.namelist() if name.endswith("/data.pkl")), "")
+        if f"{prefix}byteorder" in archive.namelist() and _read_member(archive, f"{prefix}byteorder") != b"little":
+            raise NotPlainData("tensors of a big-endian machine")
         state = pickle_data.read(_read_member(archive, f"{prefix}data.pkl"))
         tensors: dict[str, NDArray[Any]] = {}
         for name, value in dict(state.items if isinstance(state, Call) else state).items():

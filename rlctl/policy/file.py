@@ -16,7 +16,7 @@ from pydantic import Field
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.named_task import POLICY
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec, PolicySpec
-from rlctl.errors import ArtifactError
+from rlctl.errors import ArtifactError, short_repr
 from rlctl.policy.shipped import Provenance
 from rlctl.storage import files, untrusted
 
@@ -84,6 +84,9 @@ class PolicyFile:
         metadata, info, tensors = _read(path)
         if metadata.get("sha256") != compute_digest(metadata["rlctl"], tensors):
             raise ArtifactError(f"{path}: damaged: its content does not match its sha256")
+        for name, values in tensors.items():
+            if not np.isfinite(values).all():
+                raise ArtifactError(f"{path}: damaged: {short_repr(name)} is not finite")
         return cls(info, tensors, path)
 
     @staticmethod

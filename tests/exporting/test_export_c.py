@@ -9,7 +9,7 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import UsageError
+from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.exporting.c_source import FLAGS, build_library, find_compiler, write_c
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.request import ExportRequest
@@ -231,3 +231,13 @@ def test_header_is_for_c_plus_plus_too(small, train, write, tmp_path):
         ["./main"],
     ):
         subprocess.run(command, cwd=tmp_path, check=True)
+
+
+def test_a_compiler_that_cannot_be_started(small, train, write, tmp_path, monkeypatch):
+    broken = tmp_path / "cc"
+    broken.write_bytes(b"\x7fELF")
+    broken.chmod(0o755)
+    monkeypatch.setenv("CC", str(broken))
+    path = write(train("ppo", small(), steps=0), "ppo", small())
+    with pytest.raises(AnswerIsNo, match="cc cannot be started: Exec format error"):
+        export_policy(ExportRequest(str(path), ("c",), "best", tmp_path / "policy.c"))

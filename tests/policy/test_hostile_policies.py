@@ -142,7 +142,8 @@ def test_a_description_that_is_none(text, message, changed):
 @pytest.mark.parametrize(
     ("tensors", "message"),
     [
-        ({"policy/log_std": np.full(2, np.nan, np.float32)}, "the policy's action is not finite: [nan, nan]"),
+        ({"policy/log_std": np.full(2, np.nan, np.float32)}, "damaged: policy/log_std is not finite"),
+        ({"normalize//var": np.full(5, np.inf)}, "damaged: normalize//var is not finite"),
         ({"normalize//mean": np.zeros(1)}, "normalize//mean has shape (1,), the observation (5,)"),
         ({"normalize//var": np.full(5, -1.0)}, "its tensors do not fit its description: "),
         ({"policy/log_std": np.zeros(3, np.float32)}, "its tensors do not fit its description: "),
