@@ -32,9 +32,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
     tasks = [entry.name for entry in installed.list_installed() if entry.distribution in names]
     if not tasks:
-        raise pytest.UsageError(
-            f"rlctl_tasks: {', '.join(map(str, names))} installs no tasks; `rlctl tasks` lists the installed ones"
-        )
+        listed = ", ".join(map(str, names))
+        pytest.fail(f"rlctl_tasks: {listed} installs no tasks; `rlctl tasks` lists the installed ones", pytrace=False)
     metafunc.parametrize("task", tasks)
 
 
@@ -53,7 +52,7 @@ def check_env() -> CheckEnv:
         try:
             findings = run_check(task, select=select, **options)
         except RlctlError as error:
-            pytest.fail(str(error), pytrace=False)
+            raise pytest.fail.Exception(str(error), pytrace=False) from None
         failures = [finding for finding in findings if finding.severity in wrong]
         if failures:
             lines = [f"{finding}\n  fix: {finding.fix}" for finding in failures]

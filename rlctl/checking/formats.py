@@ -120,7 +120,8 @@ def _facts(report: CheckReport) -> Iterator[str]:
     if verdict.crashed:
         yield f"crashed: {', '.join(verdict.crashed)}; their findings are unknown"
     if built is None:
-        yield "not judged: everything else, because no instance could be built"
+        reason = "" if verdict.findings else f"; the reason: rlctl check-env {report.task} --select RL0"
+        yield f"not judged: the other rules, because no instance could be built{reason}"
         return
     if verdict.not_applicable:
         yield f"does not apply: {_list_rules(list(verdict.not_applicable))} (reasons: --json FILE)"

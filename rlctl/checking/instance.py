@@ -109,11 +109,15 @@ def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
         if isinstance(cause, FileNotFoundError):
             path = re.search(r"[^\s'\"]*[/\\][^\s'\":]*", str(cause))
             name = str(cause.filename or (path[0] if path else cause))
+        elif match := re.search(r"Error opening file '([^']+)'", str(cause)):  # MuJoCo's ValueError
+            name = match[1]
         elif type(cause).__module__ == "pybullet" and "load" in str(cause).lower():
             name, data = _find_model(cause.__traceback__), sys.modules.get("pybullet_data")
             folders += [data.getDataPath()] if data else []
         if name is not None:
-            return {"file": name, "searched": [] if Path(name).is_absolute() else folders}
+            searched = [] if Path(name).is_absolute() else folders
+            found = next((folder for folder in searched[1:] if Path(folder, name).is_file()), "")
+            return {"file": name, "searched": searched, "found": found}
     return None
 
 

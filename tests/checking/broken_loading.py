@@ -48,3 +48,18 @@ class NoModelAtReset(Clean):
     def start(self):
         super().start()
         pybullet.loadURDF("robot.urdf", physicsClientId=self.client)
+
+
+class NoSearchPath(Clean):
+    def __init__(self):
+        super().__init__()
+        self.client = pybullet.connect(pybullet.DIRECT)
+        self.floor = pybullet.loadURDF("plane.urdf", physicsClientId=self.client)
+
+
+class NoMujocoModel(Clean):
+    def __init__(self):
+        super().__init__()
+        import mujoco  # optional
+
+        self.model = mujoco.MjModel.from_xml_path("finger.xml")

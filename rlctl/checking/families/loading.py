@@ -137,6 +137,7 @@ def _find_missing_files(records: Records) -> Iterator[RuleFinding]:
 
 def _not_found(call: str, file: Mapping[str, Any], details: str | None) -> RuleFinding:
     where = f", looked for in {' and '.join(file['searched'])}" if file["searched"] else ""
+    where = f": it is in {file['found']}; call setAdditionalSearchPath first" if file["found"] else where
     evidence = {**file, "traceback": details} if details else dict(file)
     return RuleFinding("RL007", f"{call} does not find {file['file']!r}{where}", evidence)
 
