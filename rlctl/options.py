@@ -15,7 +15,7 @@ class Option:
 
     help: str
     flags: tuple[str, ...] = ()
-    """`("--from",)`; empty: the field's name. `(" /--no-check",)` is a flag that makes the field False."""
+    """`("--from",)`; empty: the field's name. `("/--no-check",)` is a flag that makes the field False."""
     metavar: str | None = None
     min: float | None = None
     max: float | None = None

@@ -228,5 +228,5 @@ def present(content: Any, json_target: str | None) -> bool:
         return True
     from rlctl.storage import files
 
-    files.write_json(Path(json_target), content)
+    files.write_result(Path(json_target), f"{json.dumps(content, indent=2)}\n".encode())
     return False

@@ -29,7 +29,7 @@ SHOWN_ROWS = 16  # How many parts of the observation are shown
 def show(report: CheckReport, form: str, target: str | None) -> None:
     """Print a report in one of `FORMATS`, or write it to a file (`-`: stdout) and say so on stderr."""
     if target not in (None, "-"):
-        files.write_text(Path(str(target)), FORMATS[form](report))
+        files.write_result(Path(str(target)), FORMATS[form](report).encode())
         print(f"{report.summarize()}; written to {target}", file=sys.stderr)
     elif form == "text":
         _print(output.out(), report)

@@ -65,9 +65,11 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         fields = [field for field in dataclasses.fields(request) if _find_option(hints[field.name])]
         parameters += [_make_parameter(field.name, hints[field.name], _find_default(field)) for field in fields]
         requests[parameter.name] = (request, [field.name for field in fields])
+    turned_off = [parameter.name for parameter in parameters if _turns_off(parameter.annotation)]
 
     def run(**values: Any) -> None:
         output.results()  # reserves stdout for the result: plugins print to stderr from now on
+        values |= {name: not values[name] for name in turned_off}
         for name, (request, fields) in requests.items():
             values[name] = request(**{field: values.pop(field) for field in fields})
         return function(**values)
@@ -82,6 +84,12 @@ def _find_option(annotation: Any) -> Option | None:
     return next((data for data in getattr(annotation, "__metadata__", ()) if isinstance(data, Option)), None)
 
 
+def _turns_off(annotation: Any) -> bool:
+    """Return whether an option is a flag such as `--no-check`, which makes its field False."""
+    option = _find_option(annotation)
+    return option is not None and any(flag.startswith("/") for flag in option.flags)
+
+
 def _find_default(field: dataclasses.Field[Any]) -> Any:
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
@@ -89,9 +97,10 @@ def _find_default(field: dataclasses.Field[Any]) -> Any:
 def _make_parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
     if (option := _find_option(annotation)) is not None:
         kind = annotation.__origin__
+        default = False if _turns_off(annotation) else default
         make = typer.Argument if isinstance(option, Argument) else typer.Option
         made: Any = make(
-            *option.flags,
+            *(flag.removeprefix("/") for flag in option.flags),
             help=option.help,
             metavar=option.metavar,
             min=option.min,
@@ -99,7 +108,7 @@ def _make_parameter(name: str, annotation: Any, default: Any) -> inspect.Paramet
             autocompletion=None if option.completes is None else _COMPLETIONS[option.completes],
             show_default=option.default_text or kind is not bool,
         )
-        annotation = Annotated[kind, made]
+        annotation = Annotated[kind, made, option]
     default = inspect.Parameter.empty if default is dataclasses.MISSING else default
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 

@@ -59,7 +59,7 @@ def report_runs(
         Path | None, Option("Default: report.html; md goes to stdout.", ("--output", "-o"), metavar="FILE")
     ] = None,
     format: Annotated[Literal["html", "md"], Option("A page, or text for pull requests.")] = "html",
-    pictures: Annotated[bool, Option("Do not replay episodes to draw pictures.", (" /--no-pictures",))] = True,
+    pictures: Annotated[bool, Option("Do not replay episodes to draw pictures.", ("/--no-pictures",))] = True,
     episodes: Annotated[
         int, Option("Episodes that each run plays to compare recipes; 0: do not compare.", min=0, max=1_000_000)
     ] = 100,

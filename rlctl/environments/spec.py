@@ -53,9 +53,7 @@ class EnvSpec:
     def make(self, render_mode: Literal["human", "rgb_array", "ansi"] | None = None) -> gymnasium.Env[Any, Any]:
         """Build the environment; raises `UsageError` for wrong names or parameters, `TaskError` if it fails."""
         if render_mode == "rgb_array" and not os.environ.get("DISPLAY"):
-            os.environ.setdefault(
-                "MUJOCO_GL", "egl"
-            )  # MuJoCo reads it at import; its default needs a display
+            os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it at import; its default needs a display
         constructor = self.constructor()
         if is_task(constructor):
             env = self._make_task_env(constructor, render_mode)

@@ -27,13 +27,13 @@ class EvalOptions:
         Option(
             "Play on a TASK: zero, random, MODULE:FUNCTION, PATH.py:FUNCTION, or a policy server.",
             ("--policy",),
-            metavar="zero|random|FUNCTION|ws://HOST:PORT",
+            metavar="POLICY",
         ),
     ] = None
     episodes: Annotated[int, Option("Episodes, each with its own seed.", min=1, max=1_000_000)] = 100
     seed: EpisodeSeed = 0
     stage: Annotated[int | None, Option("Stage of the policy's curriculum.", min=1, default_text="the last")] = None
-    deterministic: Annotated[bool, Option("Sample actions instead of taking the mean.", (" /--stochastic",))] = True
+    deterministic: Annotated[bool, Option("Sample actions instead of taking the mean.", ("/--stochastic",))] = True
     n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1)] = None
     limits: Annotated[Path | None, Option("Compare with and without safety limits (YAML).", metavar="FILE")] = None
     record: Annotated[Path | None, Option("New folder for the episodes (.npz), for --demos.", metavar="FOLDER")] = None

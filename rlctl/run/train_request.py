@@ -40,7 +40,7 @@ class TrainRequest:
     """Keys of the recipe and their values, nested as in a recipe; they override `config`."""
     device: Annotated[str, Option("cpu, cuda, or auto.")] = "cpu"
     record: Annotated[int, Option("Write the last N evaluation episodes as .rrd.", metavar="N", min=0)] = 0
-    check: Annotated[bool, Option("Train without checking the environment first.", (" /--no-check",))] = True
+    check: Annotated[bool, Option("Train without checking the environment first.", ("/--no-check",))] = True
     force: Annotated[bool, Option("Resume a run even if its task has changed.", ("--force",))] = False
     env_timeout_s: EnvTimeout = 60.0
     root: RunsFolder = Path("runs")

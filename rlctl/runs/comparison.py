@@ -143,6 +143,12 @@ def compare_runs(
                 f"{run.path}: {change}\nit was trained on another version of the task, so the comparison is not fair; "
                 "--force compares anyway"
             )
+    seeds = [run for group in groups if len(group) > 1 for run in group]
+    if unfinished := next((run for run in seeds if run.status().get("status") != "finished" and not force), None):
+        raise UsageError(
+            f"{unfinished.path}: this seed has not finished its training, so the comparison is not fair; --force "
+            "compares anyway"
+        )
     recipes = [[run.recipe() for run in group] for group in groups]
     first = _evaluate(groups[0][0], request, threshold)
     # All play in the same environment: an easier tolerance does not make a policy better.

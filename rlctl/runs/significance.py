@@ -85,14 +85,19 @@ def compare_seeds(
 ) -> dict[Quantity, SeedDifference]:
     """Compare two recipes by the final scores of their training seeds, each of shape (seeds,); see `compare_episodes`.
 
-    Two seeds or more each. The interval of the difference of means is a bootstrap over seeds.
+    Two seeds or more each. The interval of the difference of means is Welch's, because a bootstrap of few seeds is
+    too narrow.
     """
+    from scipy.stats import ttest_ind
+
     p_values = exchange_seeds(np.array(list(baseline.values())), np.array(list(candidate.values())))
     differences = {}
     for quantity, p in zip(baseline, p_values, strict=True):
         one, two = baseline[quantity], candidate[quantity]
         mean, std = float(two.mean() - one.mean()), math.sqrt(float(two.var(ddof=1) + one.var(ddof=1)))
-        low, high = _interval((two, one), lambda new, old, axis=-1: np.mean(new, axis=axis) - np.mean(old, axis=axis))
+        low = high = mean
+        if std > 0:
+            low, high = map(float, ttest_ind(two, one, equal_var=False).confidence_interval(1 - ALPHA))
         differences[quantity] = SeedDifference(
             mean,
             low,
@@ -100,7 +105,8 @@ def compare_seeds(
             min(1.0, comparisons * float(p)),
             _sample_size(mean, std, _LEAST_SEEDS),
             probability_of_improvement=float((np.sign(two[:, None] - one[None, :]) + 1).mean() / 2),
-            smallest_p=min(1.0, comparisons * 2 / math.comb(one.size + two.size, one.size)),
+            # Of equal numbers of seeds, the opposite order is as extreme.
+            smallest_p=comparisons * (1 + (one.size == two.size)) / math.comb(one.size + two.size, one.size),
         )
     return differences
 

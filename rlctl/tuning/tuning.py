@@ -65,6 +65,11 @@ class Tuning:
         return self.path / "best.yaml"
 
     @property
+    def unchanged_file(self) -> Path:
+        """Where the recipe of trial 0 is, to compare the best one with."""
+        return self.path / "unchanged.yaml"
+
+    @property
     def best(self) -> Trial | None:
         """Return the trial with the highest score among those that were trained to the end."""
         return find_best(self.trials)
@@ -92,6 +97,7 @@ class Tuning:
         files.write_json(self.path / TUNE_FILE, content)
         if (best := self.best) is not None:
             files.write_text(self.best_file, yaml_text.dump(self._make_recipe(best.values)))
+            files.write_text(self.unchanged_file, yaml_text.dump(self._make_recipe({})))
 
     def _make_recipe(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the changes to the task's recipe, without seed, length and evaluations."""
@@ -149,7 +155,7 @@ def show(tuning: Tuning, json: str | None) -> None:
     )
     best = tuning.best
     assert best is not None
-    task, file = shlex.quote(tuning.task), shlex.quote(str(tuning.best_file))
+    task, file, unchanged = map(shlex.quote, (tuning.task, str(tuning.best_file), str(tuning.unchanged_file)))
     if best.number == 0:
         out.print("no trial was better than the unchanged recipe")
         return
@@ -158,7 +164,7 @@ def show(tuning: Tuning, json: str | None) -> None:
         f"best: trial {best.number}, in {tuning.best_file}\n"
         f"Each trial had one seed, so the best of {len(tuning.trials)} looks better than it is. Compare on new seeds:\n"
         f"  rlctl train {task} --config {file} --seeds {seeds}\n"
-        f"  rlctl train {task} --seeds {seeds}\n"
+        f"  rlctl train {task} --config {unchanged} --seeds {seeds}\n"
         "then give both groups to rlctl runs compare"
     )
 

@@ -47,14 +47,6 @@ def test_a_missing_model_is_named_with_the_search_path():
     assert finding.message.startswith("the constructor does not find 'kuka_iiwa/modell.urdf', looked for in ")
 
 
-def test_a_model_outside_the_search_path_is_named_with_its_folder():
-    (finding,) = findings("broken_loading.py:NoSearchPath", "RL007")
-    folder = pybullet_data.getDataPath()
-    assert finding.message == (
-        f"the constructor does not find 'plane.urdf': it is in {folder}; call setAdditionalSearchPath first"
-    )
-
-
 def test_a_missing_model_of_mujoco_is_named():
     pytest.importorskip("mujoco")
     (finding,) = findings("broken_loading.py:NoMujocoModel", "RL007")

@@ -37,6 +37,7 @@ def in_root(monkeypatch):
     [
         ("tests/checking/broken_import.py:Anything", "RL001", "ZeroDivisionError: at import", "Repair the line"),
         (f"{BROKEN}:RaisingConstructor", "RL007", "does not find 'robot.urdf', looked for in", "__file__"),
+        ("tests/checking/broken_loading.py:NoSearchPath", "RL007", "call setAdditionalSearchPath first", "__file__"),
         (f"{BROKEN}:NeedsArgument", "RL006", "missing 1 required", "(--set task.gain=...)"),
         (f"{BROKEN}:NUMBER", "RL005", "NUMBER is a int, not a class", "case-sensitive"),
         (
@@ -176,7 +177,7 @@ def test_command_shows_the_worst_first_with_numbers_and_fix():
     assert run.stdout.splitlines()[:4] == [
         "error RL204  types of what step returns",
         "  the reward is a numpy.ndarray at step 1",
-        "  seed 1000, episode 0, actions random, step 1, type numpy.ndarray, expected float",
+        "  seed 1000, episode 0, actions random, step 1, call step, type numpy.ndarray, expected float",
         "  fix: Return bool(...) for both flags (a comparison of numpy numbers gives numpy.bool), float(reward), and a "
         "dict, which may be empty.",
     ]

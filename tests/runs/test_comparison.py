@@ -10,6 +10,7 @@ from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.players import choose_spec, load_player
 from rlctl.evaluation.request import EvalRequest
 from rlctl.recipe.sources import resolve
+from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
 from rlctl.runs.comparison import Candidate, RunComparison, Side, compare, find_recipe_changes
 from rlctl.runs.comparison_report import as_json, format_needed
@@ -113,6 +114,17 @@ def test_refusals(root, write_run):
     other = write_run("ant/2026-01-01_00-00-00_s0")
     with pytest.raises(UsageError, match=r"different tasks.*--task"):
         compare([str(one), str(other)], EvalRequest(None))
+
+
+def test_seeds_that_have_not_finished_are_not_compared(root, monkeypatch):
+    unfinished = sorted((root / "0.99/Line").iterdir())[1]
+    status = RunDirectory.status
+    change = lambda run: status(run) | ({"status": "running"} if run.path == unfinished else {})  # noqa: E731
+    monkeypatch.setattr(RunDirectory, "status", change)
+    texts = [str(root / "0.9/Line"), str(root / "0.99/Line")]
+    with pytest.raises(UsageError, match="this seed has not finished its training"):
+        compare(texts, EvalRequest(None, episodes=1))
+    assert len(compare(texts, EvalRequest(None, episodes=1), force=True).candidates[0].side.runs) == 2
 
 
 def test_gate(root):

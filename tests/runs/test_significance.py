@@ -87,6 +87,18 @@ def test_returns_are_paired():
     assert 0.8 < difference.low < difference.mean < difference.high < 1.2
 
 
+def test_unequal_groups_reach_half_the_p_value():
+    difference = seed_difference(np.arange(4.0), np.arange(3.0) + 100.0)
+    assert difference.p == pytest.approx(1 / 35)
+    assert difference.smallest_p == pytest.approx(1 / 35)
+
+
+def test_the_interval_of_few_seeds_is_welchs():
+    # Means 2 and 12, variances 1 of 3 seeds each: 10 +- t(0.975, 4) * sqrt(1/3 + 1/3) = 10 +- 2.776 * 0.8165
+    difference = seed_difference(np.array([1.0, 2.0, 3.0]), np.array([11.0, 12.0, 13.0]))
+    assert (difference.low, difference.high) == pytest.approx((10 - 2.267, 10 + 2.267), abs=1e-3)
+
+
 @pytest.mark.parametrize(("seeds", "smallest"), [(3, 0.1), (4, 2 / 70), (5, 2 / 252)])
 def test_smallest_p_of_so_many_seeds(seeds, smallest):
     difference = seed_difference(np.arange(seeds, dtype=float), np.arange(seeds) + 100.0)

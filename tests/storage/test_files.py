@@ -203,3 +203,17 @@ def test_changes_to_a_sealed_file_are_noticed(tmp_path):
 def test_the_root_of_all_folders_is_no_file():
     with pytest.raises(IsADirectoryError):
         files.write_bytes(Path("/"), b"")
+
+
+def test_a_result_goes_into_a_pipe_and_through_a_link(tmp_path):
+    pipe, link, target = tmp_path / "pipe", tmp_path / "link.json", tmp_path / "target.json"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    files.write_result(pipe, b"into the pipe")
+    assert os.read(reader, 100) == b"into the pipe"
+    os.close(reader)
+    target.write_text("")
+    link.symlink_to(target)
+    files.write_result(link, b"behind the link")
+    assert link.is_symlink()
+    assert target.read_bytes() == b"behind the link"

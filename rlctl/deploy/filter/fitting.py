@@ -118,6 +118,8 @@ def _make_bounds(
         raise RecipeError(f"limits: {name}: the smallest whole action is faster than the limits allow")
     if not (np.isfinite([low, high]).all() and min(factor.min(), speed.min(), change.min()) > _SMALLEST):
         raise RecipeError("limits: scale, offset, a limit or control_dt is too large or too small to calculate with")
+    if (factor < np.abs(offset) * 2e-9).any():  # next to the offset, float64 rounds it to less than float32's precision
+        raise RecipeError("limits: scale is too small next to offset: the actions of the robot would be rounded")
     return Bounds(
         names,
         dt,

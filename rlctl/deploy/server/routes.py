@@ -142,6 +142,8 @@ class Routes:
     @web.middleware
     async def _check_access(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse requests without the key (`Authorization: Api-Key KEY`) and requests from other sites' pages."""
+        if "Content-Encoding" in request.headers:
+            return _refuse(415, "compressed bodies are refused")
         problem = _find_problem(request, self.server.request.host in LOOPBACK, self.server.api_key)
         if problem is None:
             try:

@@ -79,7 +79,9 @@ async def serve_until(
     request = server.request
     logging.getLogger("aiohttp.server").addFilter(_is_worth_a_traceback)
     connections = Connections(count_allowed_connections(request.max_clients))
-    runner = web.AppRunner(Routes(server, connections).make_app(), access_log=None, shutdown_timeout=1.0)
+    app = Routes(server, connections).make_app()
+    # A small body could decompress to gigabytes, and stops would wait: `Routes` refuses compressed ones.
+    runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0, auto_decompress=False)
     await runner.setup()
     web_server = runner.server
     assert web_server is not None

@@ -150,3 +150,8 @@ def test_without_a_control_dt(write):
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(ArtifactError, match="no such file"):
         read_limits(tmp_path / "none.yaml")
+
+
+def test_a_scale_that_rounding_would_swallow(write, arm):
+    with pytest.raises(RecipeError, match="scale is too small next to offset"):
+        SafetyFilter(arm, write("{command: position, scale: 1.0e-10, offset: 100}"))

@@ -1,12 +1,14 @@
 """Clients that flood the server, send gigabytes or half a frame, or die do not disturb the other clients."""
 
 import contextlib
+import gzip
 import os
 import socket
 import struct
 import subprocess
 import sys
 import threading
+import time
 import urllib.request
 
 import hypothesis.strategies as st
@@ -166,6 +168,13 @@ def test_too_few_file_descriptors(tmp_path):
 def test_addresses_that_are_none(server, headers, capfd):
     assert server.get("/metadata", headers=headers)[0] in (400, 403)
     assert capfd.readouterr().err == ""
+
+
+def test_a_compressed_body_is_refused_before_it_is_unpacked(server):
+    body = gzip.compress(bytes(200_000_000))
+    began = time.process_time()
+    assert server.post("/act", body, headers={"Content-Encoding": "gzip"})[0] == 415
+    assert time.process_time() - began < 0.1
 
 
 def test_numbers_of_401_digits(server, capfd):
