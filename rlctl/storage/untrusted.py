@@ -24,6 +24,7 @@ Model = TypeVar("Model", bound="BaseModel")
 
 _CGROUPS = Path("/sys/fs/cgroup")
 JSON_LIMIT = 16 * 2**20  # [bytes]
+_DEEPEST = 100  # levels of JSON; writing or printing more may exceed a recursion limit
 _ALWAYS_READ = 1_000_000  # [bytes]
 _MEMBERS = 1000  # maximum number of arrays in a file
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -77,9 +78,16 @@ def check_safetensors(path: Path) -> None:
 def parse_json(text: str | bytes) -> Any:
     """Parse JSON; raises `ValueError` if it is damaged, nested too deeply, or contains a number that is too large."""
     try:
-        return json.loads(text)
+        content = json.loads(text)
     except RecursionError:
         raise ValueError("nested too deeply") from None
+    level = [content]
+    for _ in range(_DEEPEST):
+        parts = [part.values() if isinstance(part, dict) else part for part in level if isinstance(part, dict | list)]
+        level = [value for part in parts for value in part]
+        if not level:
+            return content
+    raise ValueError("nested too deeply")
 
 
 def parse_model(text: str | bytes, model: type[Model], path: Path, what: str) -> Model:
@@ -88,6 +96,7 @@ def parse_model(text: str | bytes, model: type[Model], path: Path, what: str) ->
     content = None
     try:
         content = parse_json(text)
+        json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair is no text: nothing could write it
         file_format = content.get("format") if isinstance(content, dict) else None
         if isinstance(file_format, int) and file_format > newest:
             known = f"this rlctl {__version__} can read ({newest}); upgrade rlctl"

@@ -117,7 +117,7 @@ def test_a_network_of_another_size(kwargs, message, changed, described):
         ({"type": "Dict", "spaces": []}, "not a space: "),
         ({"type": ["Box"]}, "not a space: "),
         (nested(30), "its tensors do not fit its description: "),
-        (nested(400), "its tensors do not fit its description: "),
+        (nested(400), "damaged: nested too deeply"),
     ],
 )
 def test_a_space_that_cannot_be(space, message, changed, described):
@@ -132,6 +132,8 @@ def test_a_space_that_cannot_be(space, message, changed, described):
         ('{"format": ' + "9" * 10_000 + "}", "damaged: Exceeds the limit"),
         ("", "damaged: Expecting value"),
         ("null", "damaged: expected a mapping of "),
+        ('{"\\ud800": 0}', "damaged: 'utf-8' codec can't encode"),
+        ('{"format": 1, "algo": ["\\udfff"]}', "damaged: 'utf-8' codec can't encode"),
         ('{"format": "x"}', "damaged: format: expected a whole number, got 'x'"),
     ],
 )
