@@ -176,7 +176,8 @@ def refuse_links_out(folder: Path, kind: str = "run") -> None:
     """Raise `ArtifactError` for a folder with a link out of it: what is written or uploaded must be in the folder."""
     own = folder.resolve()
     for path in folder.rglob("*"):
-        if path.is_symlink() and not path.resolve().is_relative_to(own):
+        # Unlike `resolve`, `realpath` accepts a link to itself.
+        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(own):
             raise ArtifactError(f"{path}: a symbolic link out of the {kind}'s folder; remove it")
 
 

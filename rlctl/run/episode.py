@@ -98,4 +98,6 @@ def _find_mismatch(episode: RecordedEpisode) -> str | None:
     ):
         if values.shape != shape or values.dtype.kind not in "biuf":
             return f"{name}: {values.dtype} of shape {values.shape}, not numbers of shape {shape}"
+    if not (steps or only_actions):
+        return "it has no steps"
     return None if np.isfinite(actions).all() else "actions are not all finite"

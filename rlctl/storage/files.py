@@ -143,7 +143,7 @@ def _take_place(new: Path, path: Path) -> None:
 def recover(folder: Path) -> None:
     """Restore folders that a killed `whole_folder` had renamed, and remove incomplete files and folders."""
     for place in folder.glob(".*.part*"):
-        original = place.with_name(place.name[1:].removesuffix(_OLD))
+        original = folder / place.name[1:].removesuffix(_OLD)
         if place.name.endswith(_OLD) and not original.exists():
             os.rename(place, original)
         elif place.is_dir() and not place.is_symlink():

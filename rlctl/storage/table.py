@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rlctl.storage import files
+from rlctl.storage import files, untrusted
 
 
 class Table:
@@ -17,6 +17,10 @@ class Table:
     """
 
     def __init__(self, path: Path) -> None:
+        """Open a table; raises `ArtifactError` if the path is not a regular file, which reading could wait for."""
+        if path.exists():
+            with untrusted.open_file(path):
+                pass
         self.path = path
         self.size = _read_size(path)
         self._pending: list[dict[str, Any]] = []

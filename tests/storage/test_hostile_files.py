@@ -15,6 +15,7 @@ from rlctl.run.directory import RunDirectory, RunLock, is_being_written
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.run.lookup import FoundPolicy, find_policy
 from rlctl.storage import files
+from rlctl.storage.table import Table
 
 INFO = EpisodeInfo(spec=EnvSpec("reach"), seed=1, total_reward=0.0, term_names=["distance"])
 
@@ -153,6 +154,14 @@ def test_an_episode_whose_parts_do_not_fit(changes, message, episode):
     assert len(str(caught.value).splitlines()) == 1
 
 
+def test_an_episode_without_steps(episode):
+    arrays = files.read_npz(episode)
+    nothing = {name: arrays[name][:0] for name in ("actions", "rewards", "terms")}
+    files.write_npz(episode, {**arrays, **nothing, "observations": arrays["observations"][:1]})
+    with pytest.raises(ArtifactError, match=r"000000.npz: damaged: it has no steps$"):
+        load_episode(episode)
+
+
 @pytest.mark.parametrize("value", [None, -1, "x", [], {}, 10**30, 1e308])
 def test_any_value_at_any_place_of_an_episode(value, episode):
     arrays, lines = files.read_npz(episode), []
@@ -174,6 +183,7 @@ def test_any_value_at_any_place_of_an_episode(value, episode):
     [
         (b"[" * 100_000, "nested too deeply"),
         (b'{"a": ' * 100_000 + b"1" + b"}" * 100_000, "nested too deeply"),
+        (b"[" * 101 + b"]" * 101, "nested too deeply"),
         (b'{"a": ' + b"9" * 10_000 + b"}", "Exceeds the limit"),
         (b"", "Expecting value"),
         (b"\xff\xfe{\x00}\x00", "'utf-8' codec can't decode byte 0xff"),
@@ -269,7 +279,23 @@ def test_a_checkpoint_that_is_no_step(step, tmp_path):
         run.policy_file(step)
 
 
+@pytest.mark.parametrize("name", ["..old.part", "...old.part"])
+@pytest.mark.parametrize("make", [os.mkdir, lambda path: path.write_text("x")])
+def test_an_old_part_of_nothing_is_removed(make, name, tmp_path):
+    make(tmp_path / name)
+    files.recover(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder"])
+def test_a_table_that_is_no_file(kind, tmp_path):
+    {"pipe": os.mkfifo, "folder": os.mkdir}[kind](tmp_path / "evals.csv")
+    with pytest.raises(ArtifactError, match=r"evals.csv: a (pipe or a device|folder), not a file$"):
+        Table(tmp_path / "evals.csv")
+
+
 def test_a_run_with_a_link_within_is_written(tmp_path):
     (tmp_path / "best").write_text("x")
     (tmp_path / "latest").symlink_to("best")
+    (tmp_path / "itself").symlink_to("itself")
     RunDirectory(tmp_path).lock().release()
