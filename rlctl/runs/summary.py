@@ -3,9 +3,10 @@
 import contextlib
 import csv
 import dataclasses
+import io
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from rlctl.errors import ArtifactError
 from rlctl.policy.file import Score
 from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
 from rlctl.run.group import find_run_of_seed, list_jobs, read_job
+from rlctl.storage import untrusted
 
 Rows = list[dict[str, float | None]]  # of a table, oldest first; an empty field is None
 _LARGEST = 1e100  # larger numbers are ignored: plots and sums would overflow
@@ -159,19 +161,27 @@ def list_waiting(root: Path = ROOT) -> Iterator[RunSummary]:
 def read_table(path: Path) -> Rows:
     """Return a table's rows with numbers; rows cut short by a killed process or without numbers are left out.
 
-    Infinite and absurdly large values are None.
+    Infinite and absurdly large values are None. Raises `ArtifactError` for what is not a table.
     """
-    try:
-        with path.open(newline="", encoding="utf-8", errors="replace") as file:
-            rows = list(csv.DictReader(file))
-    except FileNotFoundError:
+    names, *rows = _parse(path, _read_lines(path)) or [[]]
+    tables = (dict(zip(names, row, strict=True)) for row in rows if len(row) == len(names))
+    return [numbers for row in tables if (numbers := _numbers(row)) is not None and numbers.get("steps") is not None]
+
+
+def _read_lines(path: Path) -> list[str]:
+    if not path.exists():
         return []
-    return [numbers for row in rows if (numbers := _numbers(row)) is not None]
+    return list(io.StringIO(untrusted.read_bytes(path).decode(errors="replace"), newline=""))
 
 
-def _numbers(row: dict[str, Any]) -> dict[str, float | None] | None:
-    if None in row or None in row.values():
-        return None
+def _parse(path: Path, lines: Iterable[str]) -> list[list[str]]:
+    try:
+        return list(csv.reader(lines))
+    except csv.Error as error:  # a field that is too long
+        raise ArtifactError(f"{path}: damaged: {error}") from None
+
+
+def _numbers(row: dict[str, str]) -> dict[str, float | None] | None:
     try:
         numbers = {name: float(value) if value else None for name, value in row.items()}
     except ValueError:
@@ -225,13 +235,9 @@ def find_best_row(rows: Rows) -> dict[str, float | None] | None:
 
 
 def last_row(path: Path) -> dict[str, str] | None:
-    """Return the last whole row of a table without parsing the others."""
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
-    except OSError:
-        return None
-    whole = [line for line in lines if line.endswith("\n")]
+    """Return the last whole row of a table without parsing the others; raises `ArtifactError` as `read_table`."""
+    whole = [line for line in _read_lines(path) if line.endswith("\n")]
     if len(whole) < 2:
         return None
-    names, values = csv.reader((whole[0], whole[-1]))
+    names, values = _parse(path, (whole[0], whole[-1]))
     return dict(zip(names, values, strict=True)) if len(names) == len(values) else None

@@ -1,14 +1,16 @@
 """What stands in a run folder, and its name, is text: no terminal obeys it, and nothing in it is a traceback."""
 
 import json
+import os
 import random
 
 import pytest
 
-from rlctl.errors import RlctlError
+from rlctl.errors import ArtifactError, RlctlError
 from rlctl.run.directory import RunDirectory
 from rlctl.runs import listing, show
 from rlctl.runs.report.write import write_report
+from rlctl.runs.summary import summarize
 
 RED = "\x1b[31mred\x1b]0;title\x07\x9b2J"
 
@@ -62,6 +64,54 @@ def scramble(folder, random):
             for step in range(random.choice((0, 1, 5, 14)))
         ]
         (folder / file).write_text("\n".join(",".join(row) for row in [COLUMNS, *rows]) + "\n")
+
+
+def describe(folder):
+    show.show(show.RunDescription(RunDirectory(folder)), None)
+
+
+@pytest.mark.parametrize("name", ["metrics.csv", "evals.csv"])
+@pytest.mark.parametrize("content", ["a pipe or a device, not a file", "damaged: field larger than field limit"])
+def test_a_table_that_cannot_be_read(content, name, write_run):
+    folder = write_run("reach/2026-11-21_10-00-00_s0")
+    (folder / name).unlink()
+    if "pipe" in content:
+        os.mkfifo(folder / name)
+    else:
+        (folder / name).write_text("steps,return\n1," + "y" * 200_000 + "\n")
+    summary = summarize(folder)
+    assert (summary.state, summary.reason.startswith(f"{name}: {content}")) == ("damaged", True)
+    with pytest.raises(ArtifactError, match=f"{name}: {content}"):
+        describe(folder)
+
+
+@pytest.mark.parametrize("depth", [101, 300, 500])
+def test_a_status_that_is_nested_deeply(depth, write_run):
+    folder = write_run("reach/2026-11-21_10-00-00_s0", versions={"a": "DEEP"})
+    file = folder / "run.json"
+    file.write_text(file.read_text().replace('"DEEP"', "[" * depth + "]" * depth))
+    assert summarize(folder).reason == "run.json: damaged: nested too deeply"
+
+
+@pytest.mark.parametrize("recipe", ["algo: [ppo]", "algo_kwargs: 5", "stages: {a: 1}", "algo: {ppo: 1}"])
+def test_a_recipe_of_other_types_is_not_diagnosed(recipe, write_run, capsys):
+    folder = write_run("reach/2026-11-21_10-00-00_s0", metrics=[(step, 0.5, 1.0) for step in range(12)])
+    (folder / "recipe.yaml").write_text(f"{recipe}\n")
+    describe(folder)
+    write_report([str(folder)], target=folder / "report.html", pictures=False)
+
+
+def test_an_evaluation_at_no_step_is_left_out(write_run, capsys):
+    folder = write_run("reach/2026-11-21_10-00-00_s0")
+    (folder / "evals.csv").write_text("steps,success,return\nnan,0.9,9\n500,0.5,2\n1e999,0.9,9\n")
+    describe(folder)
+    assert summarize(folder).best_step == 500
+
+
+def test_half_a_surrogate_pair_is_reported(write_run, tmp_path):
+    folder = write_run("reach/2026-11-21_10-00-00_s0", status="failed", error="\ud800")
+    write_report([str(folder)], target=tmp_path / "report.html", pictures=False)
+    assert r"\ud800" in (tmp_path / "report.html").read_text()
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RlctlError
 from rlctl.policy.file import PolicyFile
-from rlctl.recipe import sources
+from rlctl.recipe import recipe, sources
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import RecordedEpisode, load_episode
@@ -62,7 +62,7 @@ class History:
     def __init__(self, run: RunDirectory) -> None:
         self.run = run
         self.status: Mapping[str, Any] = _read(run.status) or {}
-        self.recipe: Mapping[str, Any] = _read(sources.read, run.recipe_file) or {}
+        self.recipe: Mapping[str, Any] = _read(_read_recipe, run.recipe_file) or {}
         self.metrics, self.evaluations = read_table(run.metrics_file), read_table(run.evals_file)
 
     def curve(self, name: str) -> Curve:
@@ -120,6 +120,12 @@ class History:
         files = sorted((file for file in self.run.episodes.glob("*.npz") if file.stem.isdecimal()), reverse=True)
         episodes = [_read(load_episode, file) for file in files[:EPISODES]]
         return [episode for episode in episodes if episode is not None and len(episode.rewards)]
+
+
+def _read_recipe(path: Path) -> dict[str, Any]:
+    content = sources.read(path)
+    recipe.validate(content, str(path))
+    return content
 
 
 def _read(function: Callable[..., _Record], *arguments: Path) -> _Record | None:

@@ -47,7 +47,7 @@ def write_report(
         output.results().write(output.escape_controls(text))
         return None
     path = target or DEFAULT_FILE
-    files.write_result(path, text.encode())
+    files.write_result(path, text.encode(errors="backslashreplace"))
     return path
 
 
