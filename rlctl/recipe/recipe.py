@@ -57,6 +57,8 @@ class EvalSettings(Section):
     """Steps between evaluations."""
     episodes: Whole = Field(20, ge=1, le=1_000_000)
     """Episodes per evaluation, the same seeds each time."""
+    seed: Whole | None = Field(None, ge=0, lt=2**32, json_schema_extra=decide_by("the seed of the training"))
+    """Seed of these episodes. Trainings with different seeds and equal episodes can be compared."""
     deterministic: Switch = True
     """Whether the policy takes its mean action instead of a random sample."""
 

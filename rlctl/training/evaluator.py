@@ -45,7 +45,8 @@ class EvaluationEpisodes:
         settings = self._recipe.eval
         workers = self._workers = self._workers or self._make_workers()
         usual = settings.episodes
-        seeds = episode_seeds(self._recipe.seed, Stream.EVAL_IN_TRAINING, usual + (unseen or 0))
+        seed = self._recipe.seed if self._recipe.eval.seed is None else self._recipe.eval.seed
+        seeds = episode_seeds(seed, Stream.EVAL_IN_TRAINING, usual + (unseen or 0))
         seeds = seeds[:usual] if unseen is None else seeds[usual:]
         try:
             workers.set_policy(policy)

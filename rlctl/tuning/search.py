@@ -224,10 +224,12 @@ def _make_request(tuning: Tuning, trial: Trial) -> TrainRequest:
     run = tuning.find_run(trial)
     if run is not None and run.checkpoints():
         return TrainRequest(resume=str(run.path), check=trial.number == 0)
+    same_episodes = {"eval": {"seed": tuning.seed}}
     return TrainRequest(
         tuning.task,
         config=tuning.config,
-        settings=merge(tuning.settings, nest(trial.values)) | {"seed": tuning.seed + trial.number},
+        settings=merge(same_episodes, merge(tuning.settings, nest(trial.values)))
+        | {"seed": tuning.seed + trial.number},
         check=trial.number == 0,  # the first trial has checked the environment
         root=tuning.path,
     )

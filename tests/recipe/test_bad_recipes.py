@@ -110,7 +110,7 @@ def test_what_looks_wrong_and_is_right(tmp_path):
         ("randomize=1", "randomize: expected true or false, got 1"),
         ("stop_success=.inf", "stop_success: expected a number in (0, 1] or null, got inf"),
         ("stop_success='1'", "stop_success: expected a number in (0, 1] or null, got '1'"),
-        ("eval=null", "eval: expected a mapping of every_steps, episodes, deterministic, got None"),
+        ("eval=null", "eval: expected a mapping of every_steps, episodes, seed, deterministic, got None"),
         ("eval.episodes=0", "eval.episodes: expected a whole number in [1, 1e6], got 0"),
         ("eval.every_steps=0", "eval.every_steps: expected a whole number in [1, 1e12] or null, got 0"),
         ("checkpoint.keep=0", "checkpoint.keep: expected a whole number in [1, 1e6], got 0"),

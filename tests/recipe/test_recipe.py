@@ -103,7 +103,7 @@ def test_a_resolved_recipe_is_a_config(packaged, config):
         ({"gamma": 0.9}, "no key 'gamma'. Did you mean 'algo_kwargs.gamma'? Keys here: task, "),
         (
             {"eval": {"episode": 3}},
-            "no key 'eval.episode'. Did you mean 'episodes'? Keys here: every_steps, episodes, deterministic.",
+            "no key 'eval.episode'. Did you mean 'episodes'? Keys here: every_steps, episodes, seed, deterministic.",
         ),
         ({"checkpoint": {"kep": 3}}, "no key 'checkpoint.kep'. Did you mean 'keep'? Keys here: keep."),
         (

@@ -18,6 +18,7 @@ import yaml
 from rlctl.errors import ArtifactError, Interrupted, RecipeError, TaskError, UsageError
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory, is_being_written
+from rlctl.run.episode import load_episode
 from rlctl.run.group import read_group
 from rlctl.run.lookup import find_run
 from rlctl.runs.listing import list_runs, plan_removal
@@ -375,7 +376,7 @@ def wait_for(condition, timeout_s=120.0):
         time.sleep(0.05)
 
 
-def test_trainings_that_are_real(rlctl):
+def test_trainings_that_are_real(rlctl, tmp_path):
     settings = ["-n", "128", "--n-envs", "2", "--set", "algo_kwargs.n_steps=16", "--set", "eval.episodes=1"]
     search = ["--search", "algo_kwargs.gamma=0.5,0.99", "--trials", "2", "--jobs", "2"]
     result = rlctl("tune", LINE, *settings, *search, "--json", "-")
@@ -387,6 +388,9 @@ def test_trainings_that_are_real(rlctl):
     ]
     scores = [each["score"] for each in content["trials"]]
     assert content["best"] == scores.index(max(scores))
+    episodes = sorted(tmp_path.glob("runs/Line/*_tune/*/episodes/000000.npz"))
+    assert len({load_episode(file).info.seed for file in episodes}) == 1  # trials are compared in the same episodes
+    assert len(episodes) == 2
 
 
 @pytest.mark.parametrize(
