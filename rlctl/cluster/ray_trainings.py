@@ -68,6 +68,9 @@ def connect(address: str, task: str, cpus: int) -> Any:
     if is_copied(task):
         options["runtime_env"] = {"working_dir": os.getcwd(), "excludes": ["/runs"]}
     try:
+        if address not in ("", "auto"):
+            host, _, port = address.rpartition(":")
+            socket.create_connection((host, int(port)), timeout=10).close()  # Ray itself tries for ten minutes
         ray.init(**options)
     except Exception as error:  # ConnectionError, ValueError or RuntimeError
         reason = str(error).partition("\n")[0]

@@ -244,9 +244,8 @@ def test_a_cluster_that_is_gone(cluster, tmp_path):
     wait_for(lambda: has_ended(pid), 30)
 
 
-@slow
 def test_a_cluster_that_is_not_there(tmp_path):
-    with pytest.raises(TaskError, match="cannot be reached"):
+    with pytest.raises(TaskError, match=r"cannot be reached: .*refused"):
         choose_executor("ray:127.0.0.1:1")(tmp_path, LINE, 1, None)
 
 
