@@ -16,7 +16,6 @@ import pytest
 
 from rlctl.cluster.executors import choose_cell_player, choose_executor
 from rlctl.cluster.ray_trainings import connect
-from rlctl.errors import TaskError
 from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.vary import measure_robustness
 from rlctl.run.group import read_job
@@ -244,9 +243,12 @@ def test_a_cluster_that_is_gone(cluster, tmp_path):
     wait_for(lambda: has_ended(pid), 30)
 
 
-def test_a_cluster_that_is_not_there(tmp_path):
-    with pytest.raises(TaskError, match=r"cannot be reached: .*refused"):
-        choose_executor("ray:127.0.0.1:1")(tmp_path, LINE, 1, None)
+def test_a_cluster_that_is_not_there(rlctl):
+    """In a process of its own: one that is connected to another cluster keeps its connection."""
+    done = rlctl("train", LINE, "--seeds", "0-1", "--on", "ray:127.0.0.1:1", "--no-check")
+    assert done.returncode == 3
+    assert "error: --on ray:127.0.0.1:1: cannot be reached: " in done.stderr
+    assert "refused" in done.stderr
 
 
 @slow
