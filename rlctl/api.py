@@ -25,8 +25,10 @@ def check_env(
 ) -> list[RuleFinding]:
     """Check an environment as `rlctl check-env` does, in child processes, and return the findings, worst first.
 
-    Keywords are parameters of the task. `select` and `ignore` are prefixes of rule ids: `ignore=["RL5"]`. Raises
-    `UsageError` for an unknown task or parameter, and `TaskError` if no instance can be built and no finding says why.
+    Keywords are parameters of the task. `select` and `ignore` are prefixes of rule ids: `ignore=["RL5"]`. A finding
+    has `rule`, `severity` ("error", "warning", "info"), `message`, `fix` and `evidence`; `str(finding)` is one line.
+    Raises `UsageError` for an unknown task or parameter, and `TaskError` if no instance can be built and no finding
+    says why.
     """
     from rlctl.checking.check import check
     from rlctl.checking.rules import choose_rules

@@ -86,7 +86,9 @@ def read_numbers(values: Any) -> NDArray[np.float64]:
 def _read_array(values: Any, name: str) -> Array:
     try:
         array = np.asarray(values)
-    except ValueError:  # lists of different lengths
+    except Exception:  # lists of different lengths; an object's own conversion, such as a tensor's on a GPU
+        array = np.array(None)
+    if hasattr(values, "mask") and np.ma.is_masked(values):  # a missing measurement
         array = np.array(None)
     if array.dtype.kind not in "biuf":
         raise ObservationError(f"{name} is not an array of numbers")

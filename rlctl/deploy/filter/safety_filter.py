@@ -159,11 +159,11 @@ class SafetyFilter:
         if observation is None:
             return self.fail("missing")
         try:
-            values = self.layout.flatten(observation)
-        except ValueError as error:
+            values, (age,) = self.layout.flatten(observation), read_numbers(age_s)
+        except ValueError as error:  # no numbers, or an age that is not one number
             return self.fail("invalid observation", short_repr(str(error), 200))
         self._observed = True
-        if (fault := self._sensors.check(values, age_s)) is not None:
+        if (fault := self._sensors.check(values, float(age))) is not None:
             return self.fail(*fault)
         if self._measured is not None and self._command is not None:
             self._command.measure(values[self._measured])

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.deploy.server.request import KEY_VARIABLE, LOOPBACK, ServeRequest
 from rlctl.deploy.server.session import load_served_policy
-from rlctl.errors import RlctlError, UsageError, explain_missing_package
+from rlctl.errors import ArtifactError, RlctlError, UsageError, explain_missing_package
 from rlctl.storage import untrusted
 
 if TYPE_CHECKING:
@@ -48,7 +48,10 @@ def _read_key(file: Path | None) -> str | None:
     if file is None:
         key = os.environ.get(KEY_VARIABLE)
         return key.strip() if key else None
-    key = untrusted.read_bytes(file, _LONGEST_KEY).decode(errors="replace").strip()
+    try:
+        key = untrusted.read_bytes(file, _LONGEST_KEY).decode().strip()
+    except UnicodeDecodeError:
+        raise ArtifactError(f"{file}: not a key: it is no text") from None
     if not key or not key.isprintable() or not key.isascii():
         raise UsageError(f"--key-file {file}: the file contains no key; write the key as one line of ASCII text")
     return key

@@ -62,6 +62,11 @@ def test_pictures_of_another_scale_or_on_their_side(picture, message):
         assert camera.read({"camera": same})["camera"].tolist() == np.full((4, 6, 3), 7).tolist()
 
 
+class Hostile:
+    def __array__(self, *args, **kwargs):
+        raise ZeroDivisionError
+
+
 @pytest.mark.parametrize(
     "value",
     [
@@ -75,7 +80,7 @@ def test_pictures_of_another_scale_or_on_their_side(picture, message):
             {1, 2},
             {"positions": [0, 0]},
         ),
-        *([], np.zeros(4), np.zeros(6), np.zeros(5, "datetime64[s]")),
+        *(Hostile(), [], np.zeros(4), np.zeros(6), np.ma.array(np.zeros(5), mask=True), np.zeros(5, "datetime64[s]")),
     ],
     ids=lambda value: type(value).__name__,
 )
@@ -88,8 +93,8 @@ def test_what_is_not_an_observation_is_a_fault(arm, value):
     assert safety.state == "holding"
 
 
-@pytest.mark.parametrize("age", [np.nan, 1e9, -1e9], ids=repr)
-def test_an_unknown_age_is_a_fault(arm, age):
+@pytest.mark.parametrize("age", [None, "1", [], [0, 0], 1j, np.nan, 1e9, -1e9], ids=repr)
+def test_what_is_not_an_age_is_a_fault(arm, age):
     safety = make_filter(arm)
     assert not safety.observe(observe_at(0, 0), age)
     assert safety.limit([1, 1]) == pytest.approx([0, 0])
@@ -97,7 +102,7 @@ def test_an_unknown_age_is_a_fault(arm, age):
 
 @pytest.mark.parametrize(
     "action",
-    [np.array([1j, 0]), ["1", "2"], np.zeros(2, "datetime64[s]")],
+    [np.array([1j, 0]), ["1", "2"], Hostile(), np.ma.array([1, 2], mask=[True, False]), np.zeros(2, "datetime64[s]")],
     ids=lambda value: type(value).__name__,
 )
 def test_what_is_not_an_action_is_a_fault(arm, action):

@@ -289,3 +289,9 @@ def test_a_file_that_is_not_a_policy(tmp_path):
     (tmp_path / "policy.onnx").write_bytes(b"onnx")
     with pytest.raises(ArtifactError, match="damaged, or not an ONNX file"):
         make_server(tmp_path / "policy.onnx", ServeRequest())
+
+
+def test_a_key_file_that_is_no_text(tmp_path):
+    (tmp_path / "key").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ArtifactError, match="not a key: it is no text"):
+        make_server(write_policy(tmp_path / "policy.safetensors"), ServeRequest(key_file=tmp_path / "key"))
