@@ -21,7 +21,6 @@ from rlctl.checking.records import CallFailure
 from rlctl.checking.values import find_leaves, is_task
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
-from rlctl.environments.wrappers import find_time_limit
 from rlctl.errors import RlctlError, TaskError
 from rlctl.version import PACKAGE_FOLDER
 
@@ -195,6 +194,8 @@ class Instance:
     @property
     def max_steps(self) -> int | None:
         """The longest episode that it declares [steps]; None where it declares none."""
+        from rlctl.environments.wrappers import find_time_limit
+
         return int(self.env.unwrapped.max_steps) if is_task(self.env) else find_time_limit(self.env)
 
     def call(self, name: str, function: Any, *arguments: Any, step: int = 0, **keywords: Any) -> Any:
@@ -232,7 +233,7 @@ class Context:
         self.progress = progress or CallProgress()
         self.budget = Budget(read_clock())  # What the experiment that is running may use
         self.unseeded_calls: set[tuple[str, int]] = set()  # file and line of default_rng() in reset or step
-        self.generators: dict[str, str] = {}  # State of each random generator after the first watched reset
+        self.generators: dict[str, str] | None = None  # State of each after the first watched reset; None before
         self._instance: Instance | None = None
 
     def build(self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None) -> Instance:

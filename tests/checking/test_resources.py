@@ -4,7 +4,11 @@ import pytest
 
 from rlctl.checking.check import judge
 from rlctl.checking.families import isolation
+from rlctl.checking.families.episodes import find_unseeded, record_episodes
+from rlctl.checking.instance import Context
+from rlctl.checking.progress import read_clock
 from rlctl.checking.rules import NotJudged
+from rlctl.environments.spec import EnvSpec
 from tests.checking.judging import case, check_case, findings, records_of
 
 FILE = "broken_resources.py"
@@ -70,3 +74,11 @@ def test_memory_needs_resets_and_a_second_half():
 def test_too_few_resets_are_not_judged():
     with pytest.raises(NotJudged, match="time ran out after 4 resets"):
         found_in(4, [1, 2, 3, 4])
+
+
+def test_a_task_without_generators_plays_its_episodes_once():
+    context = Context(EnvSpec("reach"))
+    context.budget.deadline = read_clock() + 60
+    assert len(list(record_episodes.run(context))) >= 5
+    assert context.generators == {}
+    assert not list(find_unseeded.run(context))

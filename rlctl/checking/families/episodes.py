@@ -51,7 +51,7 @@ def find_unseeded(context: Context) -> Iterator[ChildMessage]:
     instance = context.instance
     if not instance.accepts_seed:
         raise NotJudged("reset takes no seed (RL202)")
-    if not context.generators:  # no other rule needs the episodes, or there are none
+    if context.generators is None:  # no other rule needs the episodes
         with contextlib.suppress(NotJudged):
             yield from record_episodes.run(context)
     for file, line in sorted(context.unseeded_calls)[:1]:
@@ -59,7 +59,7 @@ def find_unseeded(context: Context) -> Iterator[ChildMessage]:
         yield RuleFinding("RL311", message, {"seed": FIRST_SEED}, where=(file, line))
     instance.reset(FIRST_SEED)
     after = read_generators(instance.env)
-    moved = [name for name, state in after.items() if context.generators.get(name, state) != state]
+    moved = [name for name, state in after.items() if (context.generators or {}).get(name, state) != state]
     for name in moved[:1]:
         message = f"{name} is used, and reset(seed={FIRST_SEED}) does not restore its state"
         where = find_assignment(instance.env, name)

@@ -15,7 +15,7 @@ from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.families.determinism import COMPARED_STEPS, compare, report, require_independent
 from rlctl.checking.families.interface import select_failures
-from rlctl.checking.instance import Context, Instance
+from rlctl.checking.instance import Context, EnvironmentRaised, Instance, describe_failure
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Records, Skipped
 from rlctl.checking.rules import RULES, NotJudged, RuleFinding, Severity, check, experiment
@@ -197,6 +197,10 @@ def count_after_resets(context: Context) -> Iterator[ChildMessage]:
             counts.count()
             if counts.resets % MEASURED_RESETS == 0:
                 counts.measure_memory()
+    except EnvironmentRaised as error:
+        if counts.resets < FEWEST_RESETS:
+            raise
+        yield describe_failure(error, context.progress)
     finally:
         gc.unfreeze()
     yield from find_growth(counts)
