@@ -85,7 +85,9 @@ def compare_runs(
     threshold: Annotated[
         float | None, Option("Report the steps until this success rate (or return); default for success: 0.9.")
     ] = None,
-    force: Annotated[bool, Option("Compare even if the task has changed.", ("--force",))] = False,
+    force: Annotated[
+        bool, Option("Compare although the task has changed or a seed is unfinished.", ("--force",))
+    ] = False,
     gate: Annotated[Literal["not-worse"] | None, Option("Exit 1 if any is worse than the first.")] = None,
     json: Json = None,
 ) -> None:

@@ -112,7 +112,8 @@ def compare(
 
     `texts` are runs, groups, globs, or folders of runs; the first is the baseline. `threshold` is a success rate, or a
     return if the task reports no success; the result has the steps until an evaluation reached it. `force` compares
-    even if the task has changed since a training. Raises `UsageError` for sides that cannot be compared.
+    even if the task has changed since a training or a seed has not finished its own. Raises `UsageError` for sides
+    that cannot be compared.
     """
     if len(texts) < 2:
         raise UsageError("give two or more to compare, the baseline first: rlctl runs compare A B")
@@ -146,8 +147,8 @@ def compare_runs(
     seeds = [run for group in groups if len(group) > 1 for run in group]
     if unfinished := next((run for run in seeds if run.status().get("status") != "finished" and not force), None):
         raise UsageError(
-            f"{unfinished.path}: this seed has not finished its training, so the comparison is not fair; --force "
-            "compares anyway"
+            f"{unfinished.path}: this seed has not finished its training\n"
+            "the comparison is not fair; --force compares anyway"
         )
     recipes = [[run.recipe() for run in group] for group in groups]
     first = _evaluate(groups[0][0], request, threshold)

@@ -88,27 +88,34 @@ def compare_seeds(
     Two seeds or more each. The interval of the difference of means is Welch's, because a bootstrap of few seeds is
     too narrow.
     """
-    from scipy.stats import ttest_ind
-
     p_values = exchange_seeds(np.array(list(baseline.values())), np.array(list(candidate.values())))
     differences = {}
     for quantity, p in zip(baseline, p_values, strict=True):
         one, two = baseline[quantity], candidate[quantity]
         mean, std = float(two.mean() - one.mean()), math.sqrt(float(two.var(ddof=1) + one.var(ddof=1)))
-        low = high = mean
-        if std > 0:
-            low, high = map(float, ttest_ind(two, one, equal_var=False).confidence_interval(1 - ALPHA))
+        half = _welch_half_width(one, two)
         differences[quantity] = SeedDifference(
             mean,
-            low,
-            high,
+            mean - half,
+            mean + half,
             min(1.0, comparisons * float(p)),
             _sample_size(mean, std, _LEAST_SEEDS),
             probability_of_improvement=float((np.sign(two[:, None] - one[None, :]) + 1).mean() / 2),
             # Of equal numbers of seeds, the opposite order is as extreme.
-            smallest_p=comparisons * (1 + (one.size == two.size)) / math.comb(one.size + two.size, one.size),
+            smallest_p=min(1.0, comparisons * (1 + (one.size == two.size)) / math.comb(one.size + two.size, one.size)),
         )
     return differences
+
+
+def _welch_half_width(one: Array, two: Array) -> float:
+    """Return half the width of Welch's interval of a difference of means; 0 where neither side varies."""
+    from scipy.special import stdtrit
+
+    errors = [float(side.var(ddof=1)) / side.size for side in (one, two)]  # squared standard errors
+    if sum(errors) == 0:
+        return 0.0
+    freedom = sum(errors) ** 2 / sum(error**2 / (side.size - 1) for error, side in zip(errors, (one, two), strict=True))
+    return float(stdtrit(freedom, 1 - ALPHA / 2)) * math.sqrt(sum(errors))
 
 
 def flip_signs(differences: Array) -> Array:

@@ -236,8 +236,11 @@ def find_best_row(rows: Rows) -> dict[str, float | None] | None:
 
 def last_row(path: Path) -> dict[str, str] | None:
     """Return the last whole row of a table without parsing the others; raises `ArtifactError` as `read_table`."""
-    whole = [line for line in _read_lines(path) if line.endswith("\n")]
-    if len(whole) < 2:
+    if not path.exists():
         return None
-    names, values = _parse(path, (whole[0], whole[-1]))
+    header, _, rows = untrusted.read_bytes(path).partition(b"\n")
+    whole, _, _ = rows.rpartition(b"\n")
+    if not whole.strip():
+        return None
+    names, values = _parse(path, (line.decode(errors="replace") for line in (header, whole.rpartition(b"\n")[2])))
     return dict(zip(names, values, strict=True)) if len(names) == len(values) else None

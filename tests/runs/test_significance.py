@@ -1,6 +1,7 @@
 """The figures of a comparison, each with numbers from a formula or a published table."""
 
 import statistics
+import warnings
 
 import numpy as np
 import pytest
@@ -99,6 +100,14 @@ def test_the_interval_of_few_seeds_is_welchs():
     assert (difference.low, difference.high) == pytest.approx((10 - 2.267, 10 + 2.267), abs=1e-3)
 
 
+def test_one_side_that_does_not_vary():
+    # Means 2 and 12, variances 1 and 0 of 3 seeds: 10 +- t(0.975, 2) * sqrt(1/3) = 10 +- 4.303 * 0.5774
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        difference = seed_difference(np.array([1.0, 2.0, 3.0]), np.full(3, 12.0))
+    assert (difference.low, difference.high) == pytest.approx((10 - 2.484, 10 + 2.484), abs=1e-3)
+
+
 @pytest.mark.parametrize(("seeds", "smallest"), [(3, 0.1), (4, 2 / 70), (5, 2 / 252)])
 def test_smallest_p_of_so_many_seeds(seeds, smallest):
     difference = seed_difference(np.arange(seeds, dtype=float), np.arange(seeds) + 100.0)
@@ -165,6 +174,8 @@ def test_seeds_of_two_quantities_are_exchanged_together():
     both = compare_seeds({"success": low, "return": low}, {"success": high, "return": high})
     assert [difference.p for difference in both.values()] == pytest.approx([2 / 70, 2 / 70])
     assert compare_seeds({"return": low}, {"return": high}, comparisons=2)["return"].smallest_p == pytest.approx(4 / 70)
+    two_seeds = {"return": np.arange(2.0)}, {"return": np.arange(2.0) + 10}
+    assert compare_seeds(*two_seeds, comparisons=4)["return"].smallest_p == 1.0
     assert find_least_seeds(1) == (4, pytest.approx(2 / 70))
     assert find_least_seeds(2) == (5, pytest.approx(4 / 252))
 

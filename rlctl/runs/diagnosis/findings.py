@@ -76,7 +76,7 @@ def list_signs() -> dict[str, signs.Sign]:
 
 
 def diagnose(run: RunDirectory | History) -> list[Finding]:
-    """Return what the records of a run show, warnings first; never raises for what is in the folder."""
+    """Return what the records of a run show, warnings first; raises `ArtifactError` for a table that is not CSV."""
     history = run if isinstance(run, History) else History(run)
     functions = list_signs()
     read_sign = functools.cache(lambda name: functions[name](history))

@@ -57,7 +57,7 @@ class Curve:
 
 
 class History:
-    """Reads the records of a run; a missing or damaged record is empty."""
+    """Reads the records of a run; a missing record is empty, a table that is not CSV is an `ArtifactError`."""
 
     def __init__(self, run: RunDirectory) -> None:
         self.run = run
