@@ -121,28 +121,30 @@ class StepSearch:
                 trial = Trial(len(self._tuning.trials), self._number, values)
                 self._tuning.trials.append(trial)
                 self._tuning.save()
-                asked.set_user_attr(_LABEL, f"{self._tuning.path.name}/{trial.number}")
+                asked.set_user_attr(_LABEL, self._label(trial))
                 return trial, asked
             # Do not train equal values twice: report the first result to Optuna.
             state = _STATES.get(known.state, TrialState.FAIL)
             self._study.tell(asked, known.score if state == TrialState.COMPLETE else None, state)
         return None
 
+    def _label(self, trial: Trial) -> str:
+        return f"{self._tuning.path.name}/{trial.number}"
+
     def _add(self, trial: Trial) -> None:
         """Add a finished trial to Optuna's study if its values are within the distributions."""
         content, state = merge(self._recipe, nest(trial.values)), _STATES[trial.state]
-        label = f"{self._tuning.path.name}/{trial.number}"
         values = ((dimension, get_value(content, dimension.key)) for dimension in self._dimensions)
         drawn = {dimension.key: dimension.from_value(value) for dimension, value in values}
         known = (asked.user_attrs.get(_LABEL) for asked in self._study.get_trials(deepcopy=False, states=(state,)))
-        if None in drawn.values() or label in known:
+        if None in drawn.values() or self._label(trial) in known:
             return
         finished = optuna.trial.create_trial(
             state=state,
             value=trial.score if state == TrialState.COMPLETE else None,
             params=drawn,
             distributions=self._distributions,
-            user_attrs={_LABEL: label},
+            user_attrs={_LABEL: self._label(trial)},
             intermediate_values=dict(enumerate(self._tuning.list_scores(trial))),
         )
         self._study.add_trial(finished)
@@ -224,12 +226,10 @@ def _make_request(tuning: Tuning, trial: Trial) -> TrainRequest:
     run = tuning.find_run(trial)
     if run is not None and run.checkpoints():
         return TrainRequest(resume=str(run.path), check=trial.number == 0)
-    same_episodes = {"eval": {"seed": tuning.seed}}
     return TrainRequest(
         tuning.task,
         config=tuning.config,
-        settings=merge(same_episodes, merge(tuning.settings, nest(trial.values)))
-        | {"seed": tuning.seed + trial.number},
+        settings=merge(tuning.settings, nest(trial.values)) | {"seed": tuning.seed + trial.number},
         check=trial.number == 0,  # the first trial has checked the environment
         root=tuning.path,
     )

@@ -62,11 +62,12 @@ def _begin(request: TuneRequest, task: str) -> Tuning:
     steps = [parse_search(request.search)] if request.search else list_usual_steps(recipe)
     for dimension in (dimension for step in steps for dimension in step):
         _check(dimension, task, request)
+    same_episodes = {"eval": {"seed": recipe.seed if recipe.eval.seed is None else recipe.eval.seed}}
     tuning = Tuning(
         path=create_group_folder(task, "tune", request.root),
         task=task,
         config=None if request.config is None else find_config(request.config).absolute(),
-        settings=_evaluate_often_enough(recipe, request.settings),
+        settings=merge(same_episodes, _evaluate_often_enough(recipe, request.settings)),
         metric=request.metric,
         trials_per_step=request.trials,
         seed=recipe.seed,
@@ -80,9 +81,19 @@ def _begin(request: TuneRequest, task: str) -> Tuning:
 def _check_resumed(tuning: Tuning) -> None:
     """Raise `ArtifactError` for a tuning, perhaps somebody else's, that would run a program or create a database."""
     named_task.check_source(tuning.task, named_task.TUNING)
-    kind, _, file = (tuning.storage or "").partition(":///")
-    if kind == "sqlite" and not os.path.isfile(file):
-        raise ArtifactError(f"{tuning.path}: {file}, the database of its trials, does not exist in the current folder")
+    if tuning.storage is None:
+        return
+    from sqlalchemy.engine import make_url  # with Optuna
+    from sqlalchemy.exc import ArgumentError
+
+    try:
+        url = make_url(tuning.storage)
+    except ArgumentError:
+        raise ArtifactError(f"{tuning.path}: its storage {tuning.storage!r} is not the URL of a database") from None
+    if url.get_backend_name() == "sqlite" and not os.path.isfile(url.database or ""):
+        raise ArtifactError(
+            f"{tuning.path}: {url.database}, the database of its trials, does not exist in the current folder"
+        )
 
 
 def _check_storage(url: str) -> None:

@@ -316,6 +316,8 @@ SOUND = {"task": LINE, "config": None, "settings": {}, "metric": "return", "tria
             r"tune\.json names 'stranger\.py:main' as its task, but stranger\.py does not",
         ),
         ({"storage": "sqlite:///new.db"}, r"new\.db, the database of its trials, does not exist"),
+        ({"storage": "sqlite+pysqlite:///new.db?timeout=20"}, r": new\.db, the database of its trials, does not exist"),
+        ({"storage": "new.db"}, "its storage 'new.db' is not the URL of a database"),
     ],
 )
 def test_a_tuning_of_somebody_else_runs_no_script_and_creates_no_database(tmp_path, monkeypatch, change, message):
