@@ -42,6 +42,11 @@ class ClusterSettings(pydantic.BaseModel, extra="forbid"):
     sbatch: list[str] = []  # options for `sbatch`, such as `--time=04:00:00`
     setup: list[str] = []  # shell commands that a SLURM node runs first, such as `source .venv/bin/activate`
 
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _accept_comments_alone(cls, content: Any) -> Any:
+        return {} if content is None else content
+
 
 def read_settings(path: Path | None) -> ClusterSettings:
     """Read a file, by default `cluster.yaml` if it exists; raises `RecipeError` if it is invalid."""

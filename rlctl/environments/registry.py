@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.environments import installed
-from rlctl.environments.installed import find_module_file
 from rlctl.errors import (
     NoSuchClassError,
     OldGymError,
@@ -45,14 +44,14 @@ def load(task: str) -> Callable[..., Any]:
         return _load_target(task, entry.target)
     if _GYMNASIUM_ID.match(task):
         package = task.rpartition(":")[0]
-        if package and find_module_file(package, in_current_folder=True) is not None:
+        if package and installed.find_module_file(package, in_current_folder=True) is not None:
             append_to_path(os.getcwd())
             import_module(task, package)  # separately, so that an exception is reported as one of the import
         return _load_gymnasium(task)
     if ":" in task:
         append_to_path(os.getcwd())
         return _load_target(task, task)
-    for file in (Path(task).expanduser(), Path(f"{task}.py"), Path(f"{task.lower()}.py")):
+    for file in (Path(os.path.expanduser(task)), Path(f"{task}.py"), Path(f"{task.lower()}.py")):
         if file.suffix == ".py" and file.is_file():
             forms = " or ".join(f"{file}:{name}" for name in _list_classes(file)) or f"{file}:CLASS"
             raise UsageError(f"no task {task!r} is installed; to name a class in {file}: {forms}")
@@ -101,7 +100,7 @@ def find_source_file(task: str) -> Path | None:
     if _GYMNASIUM_ID.match(task) or ":" not in task:
         return None
     place = task.rpartition(":")[0]
-    return Path(place) if place.endswith(".py") else find_module_file(place, in_current_folder=True)
+    return Path(place) if place.endswith(".py") else installed.find_module_file(place, in_current_folder=True)
 
 
 def find_origin(task: str) -> dict[str, str]:
@@ -185,7 +184,7 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
     spec = gymnasium.registry.get(task.rpartition(":")[2])
     if spec is not None and isinstance(spec.entry_point, str):
         module = spec.entry_point.partition(":")[0]
-        if find_module_file(module) is not None:
+        if installed.find_module_file(module) is not None:
             import_module(task, module)  # as in `load`: report exceptions of the import separately
 
     def constructor(**parameters: Any) -> Any:
@@ -231,8 +230,8 @@ def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
 
 def import_module(task: str, name: str) -> Any:
     """Import a module that is installed or in the current folder; raises `TaskError` for any exception in it."""
-    is_installed = name in sys.modules or find_module_file(name) is not None
-    if not is_installed and find_module_file(name, in_current_folder=True) is None:
+    is_installed = name in sys.modules or installed.find_module_file(name) is not None
+    if not is_installed and installed.find_module_file(name, in_current_folder=True) is None:
         raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
     return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
 

@@ -15,6 +15,7 @@ from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.layers import Normalize, OneHot
 from rlctl.policy.network import Network
 from rlctl.policy.onnx_policy import OwnGraph
+from rlctl.task.motors import Joints
 
 _TAKEN = (onnx_policy.ACTION, *onnx_policy.STATE_INPUTS, *onnx_policy.STATE_OUTPUTS)
 _STATE_MEANING = "LSTM state; zeros when an episode begins, then the output of the step before"
@@ -128,7 +129,7 @@ def make_metadata(info: PolicyInfo) -> dict[str, str]:
     The key `rlctl` has the whole description as JSON. The other keys are for programs without rlctl; lists are
     separated by commas, in the order of the elements of the observation or the action.
     """
-    env = info.env
+    env, action_space = info.env, info.env.spaces()[1]
     plain = {
         "task": info.spec.task,
         "algorithm": info.algo,
@@ -138,9 +139,12 @@ def make_metadata(info: PolicyInfo) -> dict[str, str]:
         "observation_units": ",".join(env.observation_units.get(name, "") for name in env.observation_sizes),
         "frame_stack": str(info.spec.frame_stack),
         "action_meaning": env.action_meaning,
-        "action_space": "" if isinstance(action_space := env.spaces()[1], spaces.Box) else str(action_space),
+        "action_space": "" if isinstance(action_space, spaces.Box) else str(action_space),
         "joint_names": ",".join(env.joints.names) if env.joints else "",
-        **{key: ",".join(f"{value:.9g}" for value in values) for key, values in _list_numbers(info).items()},
+        **{
+            key: ",".join(f"{value:.9g}" for value in values)
+            for key, values in _list_numbers(action_space, env.joints).items()
+        },
         "control_dt": "" if env.control_dt is None else f"{env.control_dt!r} s",
         "robot": env.robot,
         "state": "state_h and state_c: zeros when an episode begins" if info.algo == "recurrent_ppo" else "",
@@ -150,9 +154,8 @@ def make_metadata(info: PolicyInfo) -> dict[str, str]:
     return {onnx_policy.METADATA_KEY: info.model_dump_json(), **used}
 
 
-def _list_numbers(info: PolicyInfo) -> dict[str, Sequence[float]]:
+def _list_numbers(space: spaces.Space[Any], joints: Joints | None) -> dict[str, Sequence[float]]:
     """Return bounds of the action, and numbers of the joints by the keys that mjlab and BeyondMimic read."""
-    space, joints = info.env.spaces()[1], info.env.joints
     numbers: dict[str, Sequence[float]] = {}
     if isinstance(space, spaces.Box):
         numbers = {"action_low": space.low.ravel().tolist(), "action_high": space.high.ravel().tolist()}

@@ -94,11 +94,8 @@ class Layout:
 
     def describe_action(self) -> list[str]:
         """Return lines on the meaning of the action and its bounds."""
-        meaning, space, actions = (
-            self.info.env.action_meaning or "action of the environment",
-            self.action_space,
-            self.actions,
-        )
+        meaning = self.info.env.action_meaning or "action of the environment"
+        space, actions = self.action_space, self.actions
         if not isinstance(space, spaces.Box):
             return [f"  {meaning}: {' '.join(str(space).split())}, counted from 0"]
         bounds = zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True)

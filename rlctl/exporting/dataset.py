@@ -95,8 +95,10 @@ def _write_lerobot(folder: Path, task: str, env: EnvInfo, episodes: list[Episode
     ends, zeros = np.cumsum(lengths), np.zeros(len(lengths), np.int64)
     columns |= {"index": np.arange(ends[-1]), "task_index": np.zeros(ends[-1], np.int64)}
     columns |= {"timestamp": (columns["frame_index"] * dt).astype(np.float32)}
-    types = {name: {"dtype": str(values.dtype), "names": None} for name, values in columns.items()}
-    features = {name: types[name] | {"shape": values.shape[1:] or [1]} for name, values in columns.items()}
+    features = {
+        name: {"dtype": str(values.dtype), "shape": values.shape[1:] or [1], "names": None}
+        for name, values in columns.items()
+    }
     totals = {"total_episodes": len(ends), "total_frames": len(columns["index"]), "total_tasks": 1}
     described = {"codebase_version": "v3.0", "robot_type": env.robot, "fps": 1 / dt}
     described |= {"splits": {"train": f"0:{len(ends)}"}, "features": features}

@@ -120,7 +120,7 @@ def _describe_shape(space: spaces.Space[Any]) -> Any:
     return str(space) if counts else f"{type(space).__name__}{space.shape}"
 
 
-def _write_checked(output: Path, source: str, policy: PolicyFile) -> None:
+def _write_checked(target: Path, source: str, policy: PolicyFile) -> None:
     """Write the file under a temporary name, and rename it if it loads and acts; errors name `source`."""
     from rlctl.policy.torch_policy import TorchPolicy
 
@@ -132,7 +132,7 @@ def _write_checked(output: Path, source: str, policy: PolicyFile) -> None:
         except ArtifactError as error:
             raise ArtifactError(str(error).replace(str(part), source)) from None
 
-    files.write_with(output, write)
+    files.write_with(target, write)
 
 
 def show(policy: PolicyFile, json: str | None) -> None:

@@ -214,9 +214,11 @@ def read_tensors(content: bytes) -> dict[str, NDArray[Any]]:
             raise NotPlainData("tensors of a big-endian machine")
         state = pickle_data.read(_read_member(archive, f"{prefix}data.pkl"))
         tensors: dict[str, NDArray[Any]] = {}
+        size = 0
         for name, value in dict(state.items if isinstance(state, Call) else state).items():
             tensors[str(name)] = _read_tensor(value, archive, prefix)
-            if sum(tensor.nbytes for tensor in tensors.values()) > LARGEST_MEMBER:  # many names may share one storage
+            size += tensors[str(name)].nbytes
+            if size > LARGEST_MEMBER:  # many names may share one storage
                 raise NotPlainData(f"tensors of more than {LARGEST_MEMBER:,} bytes")
         return tensors
 

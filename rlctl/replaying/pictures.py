@@ -134,7 +134,7 @@ def take_pictures(episode: RecordedEpisode, count: int) -> PictureStrip:
             if step in chosen:
                 pictures.append((step, encode_jpeg(view.draw())))
 
-        choose = recorded_actions(episode, env)
+        choose = recorded_actions(episode, env.action_space)
         rollout = play_episode(env, spec, episode.info.seed, choose, policy=episode.info.policy, watch=watch)
     finally:
         env.close()

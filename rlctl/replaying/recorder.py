@@ -196,9 +196,9 @@ def find_dt(env: Env) -> float | None:
     return describe(env).control_dt or (1.0 / fps if fps else None)
 
 
-def recorded_actions(episode: RecordedEpisode, env: Env, path: Path | None = None) -> Choose:
+def recorded_actions(episode: RecordedEpisode, space: spaces.Space[Any], path: Path | None = None) -> Choose:
     """Return a function that chooses the recorded actions; raises `ArtifactError` if they cannot be replayed."""
-    recorded, shape, task = episode.actions.shape[1:], env.action_space.shape or (), episode.info.spec.task
+    recorded, shape, task = episode.actions.shape[1:], space.shape or (), episode.info.spec.task
     if recorded != shape:
         name = path or f"episode of {task}"
         raise ArtifactError(f"{name}: its actions have shape {recorded}, but those of {task} have {shape}")

@@ -113,7 +113,8 @@ def _check_request(request: ReplayRequest) -> None:
     if request.verify is not None and source is not None:
         raise UsageError(f"--verify replays only {request.verify}: leave out {source}")
     recorded = request.verify or (source if _is_episode(source) else None)
-    if recorded and (given := [name for name in _OF_POLICIES if getattr(request, name) != getattr(_DEFAULTS, name)]):
+    asked = dataclasses.replace(request, episodes=None) if request.episodes == 1 else request  # it is one episode
+    if recorded and (given := [name for name in _OF_POLICIES if getattr(asked, name) != getattr(_DEFAULTS, name)]):
         raise UsageError(
             f"{recorded} is a recorded episode and is replayed unchanged: leave out {_OF_POLICIES[given[0]]}"
         )
@@ -144,7 +145,7 @@ class _RecordedSource:
         self.spec, self.seeds, self.name = info.spec, [info.seed], info.policy
 
     def begin(self, env: Env, seed: int) -> Choose:
-        return recorded_actions(self._episode, env, self._path)
+        return recorded_actions(self._episode, env.action_space, self._path)
 
     def record(self) -> list[ReplayedEpisode]:
         """Write the recording next to the episode, or to `--output`."""
@@ -176,7 +177,6 @@ class _PolicySource:
             self.spec = dataclasses.replace(self.spec, sim=request.sim)
         self.name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
         self._described = f"{self._file} ({info.algo}, step {info.training_steps:,})"
-        self.seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes or 1)
         self._chosen: dict[int, float] = {}  # returns of the chosen episodes, by seed
         self._choice = ""
         if request.choice is not None:
@@ -185,6 +185,8 @@ class _PolicySource:
             results, self._choice = choose_episodes(player, self.spec, episodes, request.seed, request.choice)
             self._chosen = {result.seed: result.total_reward for result in results}
             self.seeds = list(self._chosen)
+        else:
+            self.seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes or 1)
 
     def record(self) -> list[ReplayedEpisode]:
         """Write each episode and its recording."""

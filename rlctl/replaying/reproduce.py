@@ -66,7 +66,7 @@ def record_episode(
     if info.failure:
         _replay_failed(episode)
     with closing(make_drawable(spec, warn)) as env:
-        choose = recorded_actions(episode, env)
+        choose = recorded_actions(episode, env.action_space)
         rollout = play_episode(env, spec, info.seed, choose, policy=info.policy, draw=warn)
     if info.failure:
         warn(f"warning: {title}: it failed when it was recorded ({info.failure}), but not when it was replayed")
@@ -79,6 +79,7 @@ def record_episode(
 def _replay_failed(episode: RecordedEpisode) -> None:
     """Replay a failed episode in a worker, because it may hang or end its process; raises `TaskError` as it does."""
     with Workers(episode.info.spec, 1) as workers:
+        recorded_actions(episode, workers.info.spaces()[1])
         workers.replay_actions({0: (episode.info.seed, episode.actions)})
 
 
@@ -94,7 +95,9 @@ def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Rollout, Verif
             f"to see it fail again: rlctl replay {path}"
         )
     with closing(spec.make()) as env:
-        rollout = play_episode(env, spec, info.seed, recorded_actions(episode, env, path), policy=info.policy)
+        rollout = play_episode(
+            env, spec, info.seed, recorded_actions(episode, env.action_space, path), policy=info.policy
+        )
     now = current_versions(spec.task)
     relevant = {name: version for name, version in info.versions.items() if name not in _ONLY_OF_POLICIES}
     other = {name: (version, now.get(name)) for name, version in relevant.items() if now.get(name) != version}

@@ -88,13 +88,14 @@ class SceneReader:
 
     def read(self, step: int) -> None:
         """Read the world after a step; 0 is the reset."""
+        positions = self._env.task.markers()
         if step == 0:  # only now: a reset may load the bodies again
             self._bodies = [_BodyReader(body) for body in self._env.sim.bodies.values()]
-            self._markers: dict[str, list[Array]] = {}
+            self._markers: dict[str, list[Array]] = {name: [] for name in positions}
         for reader in self._bodies:
             reader.read()
-        for name, position in self._env.task.markers().items():
-            self._markers.setdefault(name, []).append(np.array(position, np.float64))
+        for name, history in self._markers.items():
+            history.append(np.array(positions[name], np.float64))
 
     def scene(self) -> Scene:
         """Return what was read since the last reset."""

@@ -48,11 +48,13 @@ def _find_faults(body: Body, root: ElementTree.Element) -> Iterator[tuple[str, s
 
 
 def _find_bad_number(inertial: ElementTree.Element, inertia_used: bool) -> str:
-    """Return what is wrong with the first value that is not a number: PyBullet reads part of it, or 0."""
+    """Return what is wrong with the first value that is not a number, or with a negative mass."""
     for element in inertial.findall("mass") + inertial.findall("inertia") * inertia_used:
         for name, value in element.items():
             if not re.fullmatch(_NUMBER, value.strip()):
                 return f"{element.tag} {name}={value!r} is not a number; PyBullet reads its first digits, or 0."
+            if element.tag == "mass" and float(value) < 0:
+                return f"a mass of {float(value):g} kg."
     return ""
 
 

@@ -212,7 +212,7 @@ class Sim(Constraints):
     def add_height_field(
         self, name: str, heights: Array, *, cell: float, color: Sequence[float] = (0.55, 0.6, 0.5)
     ) -> Body:
-        """Add rough ground, centred at 0, 0: `heights` [m] above z = 0, `cell` [m] apart, as of `rough_heights`."""
+        """Add rough ground, centred at 0, 0: `heights` [m] above z = 0, such as `rough_heights`, `cell` [m] apart."""
         self._check_new(name)
         rows, columns = heights.shape
         shape = pybullet.createCollisionShape(

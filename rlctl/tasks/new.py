@@ -60,7 +60,7 @@ def create(name: str) -> NewPlugin:
     with storage_files.whole_folder(folder) as temporary:
         for path, text in content.items():
             (temporary / path).parent.mkdir(parents=True, exist_ok=True)
-            (temporary / path).write_text(text, encoding="utf-8")
+            storage_files.write_new(temporary / path, text.encode())
     return NewPlugin(name, folder, package, cls, list(content))
 
 

@@ -79,11 +79,11 @@ def _list_facts(content: Json) -> list[Row]:
         "origin": f"{content['distribution']} {content['version']}" if content["distribution"] else None,
         "file": content["file"],
         "mass": f"{content['mass']:.4g} kg" if content["mass"] is not None else None,
+        "robot": definition["robot"] if definition is not None else None,
         "control": f"{control_dt:.6g} s per action" if control_dt else None,
         "episode": f"truncated after {steps:,} steps" if steps else "no known time limit",
     }
     if definition is not None:
-        facts["robot"] = definition["robot"]
         facts["control"] = f"{control_dt:.6g} s per action, {definition['substeps']} physics steps each"
         facts["episode"] = f"{definition['episode_s']:.6g} s, {steps:,} steps"
         facts["success"] = "is_success, at the end of an episode" if definition["has_success"] else "not defined"

@@ -158,7 +158,7 @@ class Callbacks:
         for name, callback in self._callbacks.items():
             self.running = f"callback {name}, {moment}"
             try:
-                method = functools.partial(getattr(callback, moment), self._training)
+                method = functools.partial(_call_method, callback, moment, self._training)
                 call_callback(name, method, f"{moment} at step {self._training.steps:,}: ")
             finally:
                 self.running = ""
@@ -189,9 +189,14 @@ class Callbacks:
 
         for (name, callback), entry in zip(self._callbacks.items(), entries, strict=False):
             state = {key: unflatten(structure, tensors) for key, structure in entry["state"].items()}
-            call_callback(name, functools.partial(callback.load_state_dict, state), "load_state_dict: ")
+            load = functools.partial(_call_method, callback, "load_state_dict", state)
+            call_callback(name, load, "load_state_dict: ")
         self._training.apply_parameters()
         return [entry["inexact"] for entry in entries if entry.get("inexact")]
+
+
+def _call_method(callback: Callback, method: str, argument: Any) -> None:
+    getattr(callback, method)(argument)  # looked up here, where errors of the user's class are caught
 
 
 class Sb3Callback(Callback):

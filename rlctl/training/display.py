@@ -103,7 +103,7 @@ class Display:
     def stage(self, title: str, why: str = "") -> None:
         """A stage of the curriculum begins or is resumed."""
         self._stage = title.partition(":")[0]
-        self.message(f"{title}  ({why})" if why else title)
+        self.message(_format_stage(title, why))
 
     def evaluation(self, steps: int, success: float | None, mean_return: float, best: bool) -> None:
         """An evaluation is done."""
@@ -118,6 +118,10 @@ class Display:
                 os.dup2(nowhere.fileno(), sys.stderr.fileno())
             if callable(stop := signal.getsignal(signal.SIGTERM)):
                 stop(signal.SIGPIPE, None)
+
+
+def _format_stage(title: str, why: str) -> str:
+    return f"{title}  ({why})" if why else title
 
 
 def _format_evaluation(steps: int, success: float | None, mean_return: float, best: bool) -> str:
@@ -184,7 +188,7 @@ class LiveDisplay(Display):
 
     def stage(self, title: str, why: str = "") -> None:
         """Show the stage of the curriculum."""
-        self._stage = f"{title}  ({why})" if why else title
+        self._stage = _format_stage(title, why)
 
     def evaluation(self, steps: int, success: float | None, mean_return: float, best: bool) -> None:
         """Add an evaluation to the list, of which the last five are shown."""

@@ -184,6 +184,8 @@ def _begin_check(spec: EnvSpec, env_timeout_s: float) -> Future[CheckReport]:
 def _refuse_errors(report: CheckReport, display: Display) -> None:
     if report.records.built is None:
         return  # the workers build it too, and report the error
+    for name in report.verdict.crashed:
+        display.message(f"check before training: {name} crashed because of a bug in rlctl; this rule was not checked")
     task, findings = shlex.quote(report.task), report.verdict.findings
     errors = [finding for finding in findings if finding.severity is Severity.ERROR]
     if errors:

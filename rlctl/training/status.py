@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from rlctl.environments.registry import find_git_commit, identify_task
 from rlctl.errors import DivergedError, Interrupted, RlctlError, RunTaken
-from rlctl.policy.file import PolicyInfo
 from rlctl.recipe.recipe import Recipe, find_difference
 from rlctl.recipe.sources import resolve_with_stages
 from rlctl.rollout.messages import EpisodeResult
@@ -20,6 +19,7 @@ from rlctl.run.directory import RunDirectory
 from rlctl.version import collect_versions
 
 if TYPE_CHECKING:
+    from rlctl.policy.file import PolicyInfo
     from rlctl.training.start import Start
 
 

@@ -12,13 +12,11 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from rlctl.errors import Interrupted
-from rlctl.processes import error_boundary, messages
 from rlctl.processes.child_process import ChildEndedError, ChildProcess, LineReader
 from rlctl.rollout.workers import available_cores
 from rlctl.run.train_request import TrainRequest
@@ -125,7 +123,7 @@ def train_in_child(
     """Train in a child process that ends with this one; return its exit code, 128 + N after signal N."""
     reader = LineReader(receive)
     child = ChildProcess(
-        "rlctl.training.trainings:main",
+        "rlctl.training.child:main",
         {"request": request.to_json(), "command": list(sys.argv if command is None else command)},
         one_thread=False,
         stdout=reader.descriptor,
@@ -147,30 +145,3 @@ def train_in_child(
         child.close()
     reader.wait()
     return code if code >= 0 else 128 - code
-
-
-def main(connection: Connection, request: dict[str, Any], command: Sequence[str]) -> None:
-    """Train; send a message when signals can stop the training. `command` is the parent's command line."""
-    sys.argv[:] = command
-    error_boundary.prepare_streams()
-    code = error_boundary.run(lambda: _train(connection, request))
-    error_boundary.limit_exit_handlers(code)
-    sys.exit(code)
-
-
-def _train(connection: Connection, content: dict[str, Any]) -> int:
-    from rlctl.run.train_request import TrainRequest
-    from rlctl.training.signals import HandledSignals
-
-    with HandledSignals(_interrupt):
-        messages.send(connection, "ready")
-        from rlctl.training.request import run_training
-
-        run_training(TrainRequest.from_json(content))
-    return 0
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    from rlctl.errors import Interrupted
-
-    raise Interrupted("interrupted before the training began", number)

@@ -3,6 +3,7 @@
 import pytest
 
 from rlctl.cluster.executors import choose_cell_player, choose_executor
+from rlctl.cluster.work import ClusterSettings, read_settings
 from rlctl.errors import RecipeError, UsageError
 from rlctl.training.trainings import make_local_trainings
 
@@ -49,3 +50,8 @@ def test_on_without_cells_or_seeds_is_an_error(rlctl):
         done = rlctl("eval", "reach", "--on", "ray", *push)
         assert (done.returncode, done.stderr) == (2, "error: --on needs a robustness map: give --vary or --sim too\n")
     assert "--jobs, --on and --detach need several seeds" in rlctl("train", "reach", "--on", "ray").stderr
+
+
+def test_settings_that_are_comments_alone(tmp_path):
+    (tmp_path / "cluster.yaml").write_text("# cpus: 4\n")
+    assert read_settings(tmp_path / "cluster.yaml") == ClusterSettings()

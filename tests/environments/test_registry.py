@@ -138,6 +138,7 @@ def test_python_api_takes_parameters():
 
 def test_an_unknown_name_gives_the_closest():
     assert error(UsageError, "reech").startswith("no task 'reech'. Did you mean 'reach'? Installed: ")
+    assert error(UsageError, "~reach").startswith("no task '~reach'. Did you mean 'reach'? Installed: ")
     assert error(UsageError, "reech").endswith("Other forms: package.module:Class, path/to/file.py:Class, Pendulum-v1.")
     assert UsageError("").exit_code == 2
 

@@ -66,6 +66,7 @@ def test_the_inertia_of_the_file(sim, tmp_path):
         ),
         (inertial(1, 1, 1, mass="${m}"), "mass value='${m}' is not a number; PyBullet reads its first digits, or 0."),
         (inertial(0.0003, 0.0076, 0.0076), None),
+        (inertial(0.0003, 0.0076, 0.0076, mass=-1), "a mass of -1 kg."),
     ],
 )
 def test_faults(sim, tmp_path, inertial, fault):

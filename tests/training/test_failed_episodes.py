@@ -81,3 +81,15 @@ def test_it_is_of_the_stage_it_was_in(fail):
     assert load_episode(run.episode_file(0)).info.spec.parameters["last"] is True
     assert "the gripper fell off" in lived_again(run.episode_file(0))
     assert error.exit_code == 3
+
+
+def test_actions_for_another_space(fail):
+    from rlctl.errors import ArtifactError
+    from rlctl.run.episode import save_episode
+
+    _, run = fail(fault="raise")
+    file = run.episode_file(0)
+    episode = load_episode(file)
+    save_episode(file, type(episode)(**{**vars(episode), "actions": episode.actions.repeat(2, axis=1)}))
+    with pytest.raises(ArtifactError, match=r"its actions have shape \(2,\), but those of .* have \(1,\)"):
+        run_replay(ReplayRequest(str(file)))

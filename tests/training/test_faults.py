@@ -44,7 +44,7 @@ def whole(tmp_path_factory):
         ).run
 
 
-# The same faults without a training, and many more, are in tests/rollout/test_returned.py.
+# The same faults without a training, and many more, are in tests/rollout/test_returned_values.py.
 ENDS = {
     "raise": "RuntimeError: the gripper fell off",
     "unprintable": "Unprintable: (message unavailable: ZeroDivisionError)",

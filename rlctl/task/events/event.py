@@ -211,7 +211,11 @@ class Event:
 
     @cached_property
     def _hints(self) -> dict[str, Any]:
-        return typing.get_type_hints(self.function, include_extras=True)
+        try:
+            return typing.get_type_hints(self.function, include_extras=True)
+        except NameError as error:
+            name = getattr(self.function, "__name__", str(self.function))
+            raise TaskError(f"event function {name}: {error}; import it outside of `if TYPE_CHECKING:`") from None
 
     def _read(self, where: str, key: str, value: Any, error: type[RlctlError]) -> Any:
         hint = self._hints.get(key)

@@ -30,6 +30,7 @@ from rlctl.training.updates.mlp import (
 )
 
 _LOSS_EVERY = 8  # every so many updates the losses are computed, for the log only
+_LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0  # SB3's limits, without gSDE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -292,6 +293,3 @@ def _quantile_shares(outputs: Floats) -> Floats:
     """Return the share of returns below each quantile, shape (quantiles,)."""
     count = outputs.shape[-1]
     return (np.arange(count, dtype=np.float32) + np.float32(0.5)) / np.float32(count)
-
-
-_LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0  # SB3's limits, without gSDE

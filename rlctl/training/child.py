@@ -1,0 +1,36 @@
+"""Child process of a training: receives a request as JSON, exits with the exit code of `rlctl train`."""
+
+import sys
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
+from types import FrameType
+from typing import Any
+
+from rlctl.processes import error_boundary, messages
+
+
+def main(connection: Connection, request: dict[str, Any], command: Sequence[str]) -> None:
+    """Train; send a message when signals can stop the training. `command` is the parent's command line."""
+    sys.argv[:] = command
+    error_boundary.prepare_streams()
+    code = error_boundary.run(lambda: _train(connection, request))
+    error_boundary.limit_exit_handlers(code)
+    sys.exit(code)
+
+
+def _train(connection: Connection, content: dict[str, Any]) -> int:
+    from rlctl.run.train_request import TrainRequest
+    from rlctl.training.signals import HandledSignals
+
+    with HandledSignals(_interrupt):
+        messages.send(connection, "ready")
+        from rlctl.training.request import run_training
+
+        run_training(TrainRequest.from_json(content))
+    return 0
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    from rlctl.errors import Interrupted
+
+    raise Interrupted("interrupted before the training began", number)
