@@ -288,7 +288,8 @@ def main() -> int:
                 if not file.exists():
                     print(f"{task} {tool} seed {seed}", file=sys.stderr, flush=True)
                     files.write_json(file, dataclasses.asdict(measure(task, tool, seed, options.minutes)))
-    curves = [Curve(**json.loads(file.read_text())) for file in sorted(FOLDER.glob("*.json"))]
+    curves = [Curve(**json.loads(file.read_text())) for file in FOLDER.glob("*.json")]
+    curves.sort(key=lambda curve: (list(PUBLISHED).index(curve.task), list(TOOLS).index(curve.tool), curve.seed))
     write_page(curves, 30.0)
     draw(curves, Path("docs/pictures/compare.png"))
     return 0

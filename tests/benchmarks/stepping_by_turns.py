@@ -6,6 +6,7 @@ how many segments to play, a line each, and writes environment steps per second.
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import sys
 import time
@@ -14,8 +15,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from rlctl.environments.spec import EnvSpec
 from rlctl.rollout.workers import Workers
+
+EnvSpec: Any = importlib.import_module("rlctl.env_spec").EnvSpec  # where it was in that commit
 
 
 def main(task: str, n_envs: int, steps: int, hidden: int) -> None:
