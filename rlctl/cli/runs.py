@@ -7,7 +7,7 @@ import typer
 from typer.core import TyperGroup
 
 from rlctl.cli.arguments import command, parse_changes
-from rlctl.options import TASK_FORMS, Argument, EpisodeSeed, Json, Option, RunName, Settings, Yes
+from rlctl.options import TASK_FORMS, Argument, EpisodeSeed, Json, Option, RunName, RunsFolder, Settings, Yes
 
 
 class _RunsGroup(TyperGroup):
@@ -29,13 +29,14 @@ app = typer.Typer(cls=_RunsGroup, help="List runs, show one, report and compare 
 def list_runs(
     task: Annotated[str | None, Argument("Only the runs of this task.", metavar="[TASK]")] = None,
     sort: Annotated[Literal["newest", "score", "steps", "minutes"], Option("Order.")] = "newest",
+    output: RunsFolder = Path("runs"),
     json: Json = None,
 ) -> None:
-    """List every run below ./runs. `rlctl runs` alone does the same."""
+    """List every run below a folder. `rlctl runs` alone does the same."""
     from rlctl.runs.listing import list_runs, show
 
     commands = [command.name for command in app.registered_commands if command.name]
-    show(list_runs(task, sort=sort, commands=commands, waiting=True), json)
+    show(list_runs(task, sort=sort, root=output, commands=commands, waiting=True), json, output)
 
 
 @app.command("show")
@@ -56,9 +57,11 @@ def report_runs(
         Argument("Runs, groups, globs or folders of runs, all of one task.", metavar="RUN", default_text="latest"),
     ] = [],
     output: Annotated[
-        Path | None, Option("Default: report.html; md goes to stdout.", ("--output", "-o"), metavar="FILE")
+        Path | None, Option("Default: report.FORMAT; md goes to stdout.", ("--output", "-o"), metavar="FILE")
     ] = None,
-    format: Annotated[Literal["html", "md"], Option("A page, or text for pull requests.")] = "html",
+    format: Annotated[
+        Literal["html", "md", "svg", "pdf"], Option("A page, text for pull requests, or the learning curves alone.")
+    ] = "html",
     pictures: Annotated[bool, Option("Do not replay episodes to draw pictures.", ("/--no-pictures",))] = True,
     episodes: Annotated[
         int, Option("Episodes that each run plays to compare recipes; 0: do not compare.", min=0, max=1_000_000)

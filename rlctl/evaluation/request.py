@@ -34,7 +34,7 @@ class EvalOptions:
     seed: EpisodeSeed = 0
     stage: Annotated[int | None, Option("Stage of the policy's curriculum.", min=1, default_text="the last")] = None
     deterministic: Annotated[bool, Option("Sample actions instead of taking the mean.", ("/--stochastic",))] = True
-    n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1)] = None
+    n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1, max=10_000)] = None
     limits: Annotated[Path | None, Option("Compare with and without safety limits (YAML).", metavar="FILE")] = None
     record: Annotated[Path | None, Option("New folder for the episodes (.npz), for --demos.", metavar="FOLDER")] = None
     env_timeout_s: EnvTimeout = 60.0

@@ -18,6 +18,8 @@ from rlctl.evaluation.evaluate import Evaluation, run_evaluation
 from rlctl.evaluation.request import EvalRequest
 from rlctl.rollout.workers import available_cores
 
+_LATE_SHARE = 0.001  # so many late answers are the computer's: 99.9 % are in time
+
 
 @dataclasses.dataclass(frozen=True)
 class SelfTest:
@@ -46,7 +48,7 @@ class SelfTest:
             problems.append(f"{self.not_running:,} answers came while the server was holding or stopped")
         if self.control_dt is not None and self.round_trip_p99_s >= self.control_dt:
             problems.append(f"p99 {self.round_trip_p99_s * 1e3:.3g} ms is not below control_dt, {self.control_dt:g} s")
-        if self.misses:
+        if self.misses > _LATE_SHARE * self.requests:
             busy = self.load > available_cores()
             hint = f"; other programs were running (load {self.load:.1f}): repeat without them" if busy else ""
             problems.append(f"{self.misses:,} of {self.requests:,} answers took longer than control_dt{hint}")

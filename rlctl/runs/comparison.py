@@ -5,6 +5,7 @@ are compared as recipes: each run's best policy is evaluated, and the score of a
 """
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -151,6 +152,9 @@ def compare_runs(
             "the comparison is not fair; --force compares anyway"
         )
     recipes = [[run.recipe() for run in group] for group in groups]
+    for name, own in zip(names, recipes, strict=True):
+        if any(one == two for one, two in itertools.combinations(own, 2)):
+            raise UsageError(f"{name}: two of its runs have the same recipe and seed, which count as one training")
     first = _evaluate(groups[0][0], request, threshold)
     # All play in the same environment: an easier tolerance does not make a policy better.
     request = dataclasses.replace(request, spec=first.evaluation.spec)

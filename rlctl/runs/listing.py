@@ -75,13 +75,13 @@ def find_runs_of(text: str) -> list[RunDirectory]:
     return runs
 
 
-def show(runs: list[RunSummary], json: str | None) -> None:
+def show(runs: list[RunSummary], json: str | None, root: Path = ROOT) -> None:
     """Print the table, or JSON alone for `-`."""
     if output.present({"runs": [as_json(run) for run in runs]}, json):
         return
     out = output.out()
     if not runs:
-        out.print(f"no runs yet under {ROOT.resolve()}; train one: rlctl train reach")
+        out.print(f"no runs yet under {root.resolve()}; train one: rlctl train reach")
         return
     output.print_table(_COLUMNS, map(_cells, runs), left=_LEFT, drop=_DROP)
     for change, names in _find_source_changes(runs).items():

@@ -195,7 +195,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def _read_flag(self, method: str) -> bool:
         flag = getattr(self.task, method)()
         try:
-            is_flag = flag in (None, False, True)
+            is_flag = flag in (False, True)
         except ValueError:  # an array
             is_flag = False
         if not is_flag:

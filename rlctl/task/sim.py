@@ -94,8 +94,8 @@ class Sim(Constraints):
 
         `position` [m], `orientation` and `fixed` are for URDF files; the other formats contain them. `flags` are
         PyBullet's URDF_* flags. With `self_collision` links collide, except with their ancestors. `inertia="shape"`
-        is for a URDF whose inertias are wrong (see `rlctl.task.inertia`): PyBullet computes them from the collision
-        shapes and the file's masses.
+        is for a URDF whose inertias are wrong (see `rlctl.task.model_faults`): PyBullet computes them from the
+        collision shapes and the file's masses.
         """
         self._check_new(name)
         path = find_model_file(file)

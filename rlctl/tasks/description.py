@@ -108,7 +108,7 @@ def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> 
 
 
 def _describe_definition(env: TaskEnv) -> dict[str, Any]:
-    from rlctl.task.inertia import find_inertia_faults
+    from rlctl.task.model_faults import find_model_faults
 
     task = env.task
     return {
@@ -127,7 +127,7 @@ def _describe_definition(env: TaskEnv) -> dict[str, Any]:
             _describe_event(name, event, env.events[name].event if name in env.events else None)
             for name, event in task.events.items()
         ],
-        "model_faults": [fault for body in env.sim.bodies.values() for fault in find_inertia_faults(body)],
+        "model_faults": [fault for body in env.sim.bodies.values() for fault in find_model_faults(body)],
     }
 
 

@@ -97,9 +97,9 @@ def test_no_arguments_show_the_help(rlctl):
             "Invalid value for '--sort': Value error, 'stepz' is not one of 'newest', 'score', 'steps', 'minutes'",
         ),
         (
-            ["runs", "report", "latest", "--format", "pdf"],
+            ["runs", "report", "latest", "--format", "txt"],
             2,
-            "Invalid value for '--format': Value error, 'pdf' is not one of 'html', 'md'",
+            "Invalid value for '--format': Value error, 'txt' is not one of 'html', 'md', 'svg'",
         ),
         (
             ["runs", "compare", "a", "b", "--gate", "better"],

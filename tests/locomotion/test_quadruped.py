@@ -6,7 +6,7 @@ import pytest
 from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
-from rlctl.task.inertia import find_inertia_faults
+from rlctl.task.model_faults import find_model_faults
 from rlctl_locomotion.quadruped import FEET, Quadruped
 
 
@@ -118,4 +118,4 @@ def test_mistakes(parameters, message):
 
 
 def test_nothing_is_wrong_with_the_model(env):
-    assert find_inertia_faults(env.task.body) == []
+    assert find_model_faults(env.task.body) == []

@@ -8,7 +8,7 @@ import pytest
 from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
-from rlctl.task.inertia import find_inertia_faults
+from rlctl.task.model_faults import find_model_faults
 from rlctl_manipulation.gear_arm import (
     ELBOW,
     GEAR,
@@ -273,5 +273,5 @@ def test_mistakes(parameters, message):
 
 
 def test_nothing_is_wrong_with_the_models(env):
-    assert [fault for body in env.sim.bodies.values() for fault in find_inertia_faults(body)] == []
+    assert [fault for body in env.sim.bodies.values() for fault in find_model_faults(body)] == []
     assert env.task.arm.joint_positions[env.task.joints] == pytest.approx(HOME, abs=0.1)

@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
-from rlctl.task.inertia import find_inertia_faults
+from rlctl.task.model_faults import find_model_faults
 from rlctl_manipulation.peg_insert import HOME, TOP_SPEED, PegInsert
 from tests.manipulation.scripted import assert_episodes_repeat, play
 
@@ -121,4 +121,4 @@ def test_a_hole_that_is_not_so_deep():
 
 
 def test_nothing_is_wrong_with_the_models(env):
-    assert [fault for body in env.sim.bodies.values() for fault in find_inertia_faults(body)] == []
+    assert [fault for body in env.sim.bodies.values() for fault in find_model_faults(body)] == []

@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
-from rlctl.task.inertia import find_inertia_faults
+from rlctl.task.model_faults import find_model_faults
 from rlctl_manipulation.screw_drive import HOME, LEAD, TOP_SPEED, TRAVEL, ScrewDrive
 from tests.manipulation.scripted import assert_episodes_repeat, play
 
@@ -134,4 +134,4 @@ def test_friction_that_the_spindle_cannot_turn():
 
 
 def test_nothing_is_wrong_with_the_models(env):
-    assert [fault for body in env.sim.bodies.values() for fault in find_inertia_faults(body)] == []
+    assert [fault for body in env.sim.bodies.values() for fault in find_model_faults(body)] == []

@@ -1,6 +1,7 @@
 """Comparing runs: real policies on a small task, and what is refused."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -114,6 +115,15 @@ def test_refusals(root, write_run):
     other = write_run("ant/2026-01-01_00-00-00_s0")
     with pytest.raises(UsageError, match=r"different tasks.*--task"):
         compare([str(one), str(other)], EvalRequest(None))
+
+
+def test_a_copy_of_a_run_is_no_second_seed(root, tmp_path):
+    first, second = root / "0.9/Line", tmp_path / "copied"
+    run = sorted((root / "0.99/Line").iterdir())[0]
+    for name in ("one", "two"):
+        shutil.copytree(run, second / name)
+    with pytest.raises(UsageError, match="copied: two of its runs have the same recipe and seed"):
+        compare([str(first), str(second)], EvalRequest(None, episodes=1))
 
 
 def test_seeds_that_have_not_finished_are_not_compared(root, monkeypatch):

@@ -6,6 +6,7 @@ import re
 import shlex
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -107,6 +108,16 @@ def test_a_band_per_recipe(group):
     assert page.count(">learning_rate 0.001</text>") == 3  # legends of return and success, title of its terms
     assert "learning_rate 0.002: In the evaluation that selected it" in page
     assert "not compared: learning_rate 0.002: a single run cannot be compared" in write(*group)
+
+
+@pytest.mark.parametrize(("form", "begins"), [("svg", b"<?xml"), ("pdf", b"%PDF-")])
+def test_curves_for_a_paper(group, rlctl, form, begins):
+    write_recipes(group, a={"learning_rate": 0.001}, b={"learning_rate": 0.001}, c={"learning_rate": 0.002})
+    done = rlctl("runs", "report", *group, "--format", form)
+    assert (done.returncode, done.stdout) == (0, f"report: report.{form}\n")
+    content = Path(f"report.{form}").read_bytes()
+    assert content.startswith(begins)
+    assert form == "pdf" or content.count(b">learning_rate 0.001</text>") == 2  # legends of return and success
 
 
 def test_a_bad_result_is_not_called_usual(write_run):

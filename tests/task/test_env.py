@@ -149,6 +149,14 @@ def test_a_changed_shape_in_a_dict_layout(make):
         env.step(np.zeros(2))
 
 
+def test_a_forgotten_return(make):
+    env = make(Slider())
+    env.task.is_success = lambda: None
+    env.reset(seed=0)
+    with pytest.raises(TaskError, match=r"Slider: is_success\(\) returned None, not True or False"):
+        env.step(np.zeros(2))
+
+
 def test_an_unknown_weight_names_the_closest():
     with pytest.raises(RecipeError) as caught:
         TaskEnv(Slider(), reward_weights={"distence": 1.0})

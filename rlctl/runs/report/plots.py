@@ -1,8 +1,8 @@
-"""The plots of a report, as SVG texts for an HTML page."""
+"""The plots of a report, as SVG texts for an HTML page or as a file of their own."""
 
 import io
 import re
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
@@ -32,6 +32,21 @@ _UNITS = {"return": "return of an episode", "success": "success rate"}
 def plot_learning(report: RunReport, column: str) -> str | None:
     """Return the curve of a quantity over training steps, with evaluations; None where there is none."""
     figure, axes = _make_figure()
+    return _finish(figure, axes) if _draw_learning(axes, report, column) else None
+
+
+def draw_learning(report: RunReport, form: Literal["svg", "pdf"]) -> bytes:
+    """Return the learning curves as a file for a paper; a quantity without values has no panel."""
+    with matplotlib.rc_context(_STYLE):
+        figure, file = Figure(figsize=(2 * _SIZE[0], _SIZE[1]), layout="constrained"), io.BytesIO()
+        for axes, column in zip(figure.subplots(1, 2), _TITLES, strict=True):
+            if not _draw_learning(axes, report, column):
+                axes.remove()
+        figure.savefig(file, format=form)
+    return file.getvalue()
+
+
+def _draw_learning(axes: Axes, report: RunReport, column: str) -> bool:
     for number, recipe in enumerate(report.recipes):
         training = mean_curve([run.metrics for run in recipe.runs], column)
         evaluated = mean_curve([run.evaluations for run in recipe.runs], column)
@@ -41,12 +56,11 @@ def plot_learning(report: RunReport, column: str) -> str | None:
         if evaluated is not None:
             line = {"linestyle": "none", **color} if recipe.name else {}
             _draw_curve(axes, evaluated, "" if recipe.name else "evaluations", {"marker": "o", "ms": 3, **line})
-    if not axes.lines:
-        return None
     if column == "success":
         _scale_rates(axes)
-    axes.legend(loc="best", **_LEGEND)
-    return _finish(figure, axes, "training steps", _UNITS[column], f"{_TITLES[column]} over training steps")
+    axes.legend(loc="best", **_LEGEND) if axes.lines else None
+    _label(axes, "training steps", _UNITS[column], f"{_TITLES[column]} over training steps")
+    return bool(axes.lines)
 
 
 def plot_terms(recipe: RecipeRuns) -> str | None:
@@ -131,18 +145,23 @@ def _make_figure() -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _finish(figure: Figure, axes: Axes, x: str, y: str, title: str) -> str:
+def _label(axes: Axes, x: str, y: str, title: str) -> None:
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.set_title(title, loc="left", fontsize=9, fontweight="bold")
     if x == "training steps":
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+
+
+def _finish(figure: Figure, axes: Axes, *labels: str) -> str:
+    if labels:
+        _label(axes, *labels)
     file = io.StringIO()
     with matplotlib.rc_context(_STYLE):
         figure.savefig(file, format="svg", transparent=True, metadata=_NO_METADATA)
     svg = file.getvalue()[file.getvalue().index("<svg") :].replace("#000000", "currentColor")  # the page's text colour
     # The page scales the plot; screen readers read its name.
-    name = title.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    name = axes.get_title(loc="left").replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     return re.sub(
         r'^<svg ([^>]*?)width="[^"]*"',
         rf'<svg role="img" aria-label="{name}" \1',

@@ -1,4 +1,4 @@
-"""Writes a report as one HTML file that needs nothing else, or as Markdown for pull requests."""
+"""Writes a report as one HTML file that needs nothing else, as Markdown, or its curves alone as a picture."""
 
 import base64
 from collections.abc import Iterator, Sequence
@@ -18,24 +18,28 @@ from rlctl.runs.show import describe_robustness, tabulate
 from rlctl.runs.summary import Rows
 from rlctl.storage import files
 
-DEFAULT_FILE = Path("report.html")
-
 _PICTURES = 6  # of an episode
 
 
 def write_report(
     runs: Sequence[str],
-    form: Literal["html", "md"] = "html",
+    form: Literal["html", "md", "svg", "pdf"] = "html",
     target: Path | None = None,
     *,
     pictures: bool = True,
     episodes: int = 100,
 ) -> Path | None:
-    """Write a report and return its file, by default report.html; None for Markdown that was printed.
+    """Write a report, or its learning curves alone (svg, pdf), and return its file; None for Markdown that was printed.
 
     Runs of several recipes are compared first, each plays `episodes` for it; 0 leaves it out.
     """
     report = content.collect(runs)
+    path = target or Path(f"report.{form}")
+    if form in ("svg", "pdf"):
+        from rlctl.runs.report import plots
+
+        files.write_result(path, plots.draw_learning(report, form))
+        return path
     is_html = form == "html"
     finalize = None if is_html else _escape_html
     environment = jinja2.Environment(
@@ -46,7 +50,6 @@ def write_report(
     if target is None and not is_html:
         output.results().write(output.escape_controls(text))
         return None
-    path = target or DEFAULT_FILE
     files.write_result(path, text.encode(errors="backslashreplace"))
     return path
 

@@ -1,11 +1,11 @@
-"""What a URDF says of masses and inertias: used, and judged."""
+"""What a URDF says of masses, inertias and joints: used, and judged."""
 
 import numpy as np
 import pytest
 
 from rlctl.task import Sim
 from rlctl.task.bullet import pybullet
-from rlctl.task.inertia import find_inertia_faults
+from rlctl.task.model_faults import find_model_faults
 from tests.task import models
 
 BOX = '<collision><geometry><box size="0.3 0.04 0.04"/></geometry></collision>'
@@ -70,8 +70,28 @@ def test_the_inertia_of_the_file(sim, tmp_path):
     ],
 )
 def test_faults(sim, tmp_path, inertial, fault):
-    found = find_inertia_faults(load(sim, tmp_path, inertial))
+    found = find_model_faults(load(sim, tmp_path, inertial))
     assert found == ([f"model.urdf, link 'rod': {fault}"] if fault else [])
+
+
+@pytest.mark.parametrize(
+    ("of_joint", "fault"),
+    [
+        (
+            '<limit lower="-3" upper="3"/><origin xyz="0,1 0 0"/>',
+            "origin xyz='0,1 0 0' is not a number; PyBullet reads its first digits, or 0.",
+        ),
+        ('<limit lower="-90" upper="90"/>', "limits of -90 and 90 rad. Are these degrees?"),
+        ('<limit lower="-1.57" upper="1.57"/><origin xyz="0, 1, 0" rpy=" 0 0 1.5e-3"/>', None),
+    ],
+)
+def test_joints(sim, tmp_path, of_joint, fault):
+    joint = models.joint("joint", "base", "rod").replace(
+        '<limit lower="-3" upper="3" effort="50" velocity="5"/>', of_joint
+    )
+    rod = f'<link name="rod">{inertial(0.0003, 0.0076, 0.0076)}{BOX}</link>'
+    body = sim.load("body", models.urdf(tmp_path, models.link("base", 1.0), rod, joint), fixed=True)
+    assert find_model_faults(body) == ([f"model.urdf, joint 'joint': {fault}"] if fault else [])
 
 
 @pytest.mark.parametrize(("encoding", "faults"), [("ISO-8859-1", 1), ("UTF-8", 0), ("none", 0)])
@@ -79,11 +99,11 @@ def test_a_file_that_is_not_utf_8(sim, tmp_path, encoding, faults):
     rod = f'<!-- Stoß --><link name="rod">{BOX}</link>'
     file = models.urdf(tmp_path, models.link("base", 1.0), rod, models.joint("joint", "base", "rod"))
     file.write_bytes(f'<?xml version="1.0" encoding="{encoding}"?>\n{file.read_text()}'.encode("latin-1"))
-    assert len(find_inertia_faults(sim.load("body", file, fixed=True))) == faults
+    assert len(find_model_faults(sim.load("body", file, fixed=True))) == faults
 
 
 def test_what_is_not_used_is_no_fault(sim, tmp_path):
-    assert find_inertia_faults(load(sim, tmp_path, inertial(1, 1, 1), inertia="shape")) == []
-    assert find_inertia_faults(sim.load("plane", "plane.urdf", fixed=True)) == []
-    assert find_inertia_faults(sim.load("hopper", "mjcf/hopper.xml")) == []
-    assert find_inertia_faults(sim.add_height_field("ground", np.zeros((3, 3)), cell=0.1)) == []
+    assert find_model_faults(load(sim, tmp_path, inertial(1, 1, 1), inertia="shape")) == []
+    assert find_model_faults(sim.load("plane", "plane.urdf", fixed=True)) == []
+    assert find_model_faults(sim.load("hopper", "mjcf/hopper.xml")) == []
+    assert find_model_faults(sim.add_height_field("ground", np.zeros((3, 3)), cell=0.1)) == []

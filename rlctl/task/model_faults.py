@@ -1,4 +1,4 @@
-"""Finds masses and inertias in a URDF that are physically impossible."""
+"""Finds what a URDF gets wrong without an error: impossible masses and inertias, texts for numbers, degrees."""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -11,10 +11,12 @@ from rlctl.task.bullet import pybullet
 
 _ROUNDING = 1.01  # of values written with a few digits
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
+_NUMERIC = ("mass", "inertia", "origin", "axis", "limit", "box", "cylinder", "sphere")  # elements, all attributes
+_DEGREES = (30.0, 360.0)  # a motor before a gear may turn 30 rad; more than 360 stands for no limit
 
 
-def find_inertia_faults(body: Body) -> list[str]:
-    """Return a line for every link of a URDF body whose mass or inertia is missing or impossible.
+def find_model_faults(body: Body) -> list[str]:
+    """Return a line for every link and joint of a URDF body that PyBullet reads without an error, but wrongly.
 
     A link without `<inertial>` weighs 1 kg in PyBullet. Principal moments [kg m^2] are positive, none exceeds the sum
     of the others, and none exceeds mass x size^2, where size [m] is the diagonal of the link's collision shape.
@@ -25,36 +27,51 @@ def find_inertia_faults(body: Body) -> list[str]:
         root = ElementTree.fromstring(body.file.read_bytes().strip())
     except (ElementTree.ParseError, LookupError, ValueError):  # LookupError and ValueError: an unknown encoding
         return []  # PyBullet reads more than XML allows
-    return [f"{body.file.name}, link {name!r}: {fault}" for name, fault in _find_faults(body, root)]
+    faults = [*_find_faults(body, root), *_find_joint_faults(root)]
+    return [f"{body.file.name}, {place}: {fault}" for place, fault in faults]
 
 
 def _find_faults(body: Body, root: ElementTree.Element) -> Iterator[tuple[str, str]]:
     for link in root.findall("link"):
         name = link.get("name", "")
+        place = f"link {name!r}"
+        if fault := _find_text(link, body.inertia_from_file):
+            yield place, fault
+            continue
         index = -1 if name == body.base_name else body._links.get(name)
         if index is None or (index == -1 and body.fixed):
             continue  # merged with its parent, or held by the world: its mass is not used
         inertial = link.find("inertial")
-        if inertial is not None and (fault := _find_bad_number(inertial, body.inertia_from_file)):
-            yield name, fault
-            continue
+        mass = None if inertial is None else inertial.find("mass")
+        if mass is not None and float(mass.get("value", 0)) < 0:
+            yield place, f"a mass of {mass.get('value')} kg."
         # Frames of a gram with a rounded-up inertia are common and harmless: they keep the solver stable.
         if body._dynamics[index].mass <= 0.01 * body.total_mass():
             continue
-        if inertial is None or inertial.find("mass") is None:
-            yield name, "no <inertial>, so PyBullet gives it a mass of 1 kg. Write its mass and inertia."
+        if inertial is None or mass is None:
+            yield place, "no <inertial>, so PyBullet gives it a mass of 1 kg. Write its mass and inertia."
         elif body.inertia_from_file and (fault := _judge_inertia(body, index, inertial)):
-            yield name, fault
+            yield place, fault
 
 
-def _find_bad_number(inertial: ElementTree.Element, inertia_used: bool) -> str:
-    """Return what is wrong with the first value that is not a number, or with a negative mass."""
-    for element in inertial.findall("mass") + inertial.findall("inertia") * inertia_used:
-        for name, value in element.items():
-            if not re.fullmatch(_NUMBER, value.strip()):
+def _find_joint_faults(root: ElementTree.Element) -> Iterator[tuple[str, str]]:
+    for joint in root.findall("joint"):
+        limit, fault = joint.find("limit"), _find_text(joint)
+        if not fault and limit is not None and joint.get("type") == "revolute":
+            lower, upper = (float(limit.get(name, 0)) for name in ("lower", "upper"))
+            if _DEGREES[0] <= max(-lower, upper) <= _DEGREES[1]:
+                fault = f"limits of {lower:g} and {upper:g} rad. Are these degrees?"
+        if fault:
+            yield f"joint {joint.get('name', '')!r}", fault
+
+
+def _find_text(owner: ElementTree.Element, inertia_used: bool = True) -> str:
+    """Return what is wrong with the first value that is not a number, or numbers separated by spaces."""
+    for element in owner.iter():
+        for name, value in element.items() if element.tag in _NUMERIC else ():
+            is_used = inertia_used or element.tag != "inertia"
+            if is_used and not all(re.fullmatch(_NUMBER, number) for number in value.replace(", ", " ").split()):
                 return f"{element.tag} {name}={value!r} is not a number; PyBullet reads its first digits, or 0."
-            if element.tag == "mass" and float(value) < 0:
-                return f"a mass of {float(value):g} kg."
     return ""
 
 
