@@ -249,7 +249,7 @@ class Body(Properties):
         return self._base_state()[1]
 
     def set_base(self, position: Sequence[float], orientation: Sequence[float] = (0, 0, 0, 1)) -> None:
-        """Place the base at rest."""
+        """Place the base at rest, its centre of mass at `position` [m]; `Sim.load` places its origin."""
         pybullet.resetBasePositionAndOrientation(self.id, position, orientation, physicsClientId=self.client)
         self._cache.clear()
 

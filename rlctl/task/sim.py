@@ -92,10 +92,10 @@ class Sim(Constraints):
     ) -> Body:
         """Load the body of a URDF, MJCF (`.xml`) or SDF file: a path, or a name in `pybullet_data`.
 
-        `position` [m], `orientation` and `fixed` are for URDF files; the other formats contain them. `flags` are
-        PyBullet's URDF_* flags. With `self_collision` links collide, except with their ancestors. `inertia="shape"`
-        is for a URDF whose inertias are wrong (see `rlctl.task.model_faults`): PyBullet computes them from the
-        collision shapes and the file's masses.
+        `position` [m] and `orientation` of the base's origin, and `fixed`, are for URDF files; other formats contain
+        them. `flags` are PyBullet's URDF_* flags. With `self_collision` links collide, except with their ancestors.
+        `inertia="shape"` is for a URDF whose inertias are wrong (see `rlctl.task.model_faults`): PyBullet computes them
+        from the collision shapes and the file's masses.
         """
         self._check_new(name)
         path = find_model_file(file)
