@@ -224,11 +224,13 @@ def write_page(curves: list[Curve], limit_minutes: float) -> None:
     """Write the table of all curves."""
     lines = [
         "# How long a training takes, next to RL Baselines3 Zoo and sbx\n",
-        f"Written by `make compare`. {_describe_machine()}. One training at a time; minutes from the start of the",
-        "process, evaluations included. rl-zoo3 has its own tuned hyperparameters (TQC), for `reach` those of an",
-        "earlier recipe of rlctl (PPO). sbx has TQC [256, 256] with the zoo's learning rate, batch, gamma and tau.",
-        f"Peers are evaluated on {EPISODES} episodes, rlctl as its recipes say.\n",
-        f"| task | score to reach | tool | seed | minutes to it | best score after {limit_minutes:g} minutes |",
+        f"Written by `make compare` on {_describe_machine()}.",
+        "One training at a time; minutes from the start of the process, evaluations included.",
+        "rl-zoo3 has its own tuned hyperparameters (TQC), for `reach` those of an earlier recipe of rlctl (PPO). sbx has TQC [256, 256] with the zoo's learning rate, batch, gamma and tau.",
+        f"Peers are evaluated on {EPISODES} episodes, rlctl as its recipes say. Where a training ended earlier, its best",
+        "score counts. `make compare TASKS=ant` adds a task.\n",
+        "![score over minutes](pictures/compare.png)\n",
+        f"| task | score to reach | tool | seed | minutes to it | best score within {limit_minutes:g} minutes |",
         "|---|---|---|---|---|---|",
     ]
     for curve in curves:
@@ -268,6 +270,7 @@ def draw(curves: list[Curve], target: Path) -> None:
             if curve.task == task:
                 color = f"C{list(TOOLS).index(curve.tool)}"
                 axes.plot(curve.minutes, curve.scores, color=color, label=curve.tool if curve.seed == 0 else None)
+        axes.set_ylabel("success rate" if task in BY_SUCCESS else "return")
         axes.legend(frameon=False)
     figure.savefig(target, dpi=110)
 
