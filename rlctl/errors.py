@@ -1,7 +1,5 @@
 """The exceptions of rlctl, with their exit codes, and helpers for their messages."""
 
-from __future__ import annotations
-
 import difflib
 import importlib
 import re
@@ -80,7 +78,7 @@ class EpisodeFailed(TaskError):
         self.actions: Any = None
         """The actions of the episode up to the failed step, shape (step, ...); None if they are unknown."""
 
-    def with_hint(self, hint: str) -> EpisodeFailed:
+    def with_hint(self, hint: str) -> "EpisodeFailed":
         """Return the same error with another hint."""
         return EpisodeFailed(self.what, self.env, self.seed, self.step, hint=hint, details=self.details)
 

@@ -3,8 +3,6 @@
 Short formulas are written out: importing scipy.stats takes longer than many evaluations.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -27,7 +25,7 @@ class Spread:
     max: float
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Spread:
+    def of(cls, values: Sequence[float]) -> "Spread":
         """Describe values, one per episode."""
         array = np.asarray(values, np.float64)
         quarter = array.size // 4

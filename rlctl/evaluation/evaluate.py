@@ -1,7 +1,5 @@
 """`rlctl eval`: play many episodes, each with its own seed, and return their statistics; also of a group of seeds."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
@@ -48,7 +46,7 @@ class Evaluation:
     final_distance: Spread | None
     max_steps: int | None
     limited_by: Path | None = None
-    unlimited: Evaluation | None = None  # the same episodes without limits
+    unlimited: "Evaluation | None" = None  # the same episodes without limits
     action_change: float | None = None  # mean of |action - previous action|; None if it was not measured
 
     @property

@@ -1,11 +1,9 @@
 """Policies exported as C, compiled and called through ctypes; `rlctl export --c` verifies its files with them."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from gymnasium import spaces
@@ -52,7 +50,7 @@ class CPolicy(Policy):
         self._dtype = self._action.dtype if isinstance(self.action_space, spaces.Box) else np.dtype(np.int64)
 
     @classmethod
-    def load(cls, path: Path) -> CPolicy:
+    def load(cls, path: Path) -> Self:
         """Load a library with the JSON description next to it; raises `ArtifactError` if it does not load."""
         try:
             info = PolicyInfo.model_validate(files.read_json(path.with_suffix(".json")))

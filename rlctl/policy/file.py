@@ -1,12 +1,10 @@
 """Policy files: `.safetensors`, without pickle, with the network, the normalisation, and JSON that describes them."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pydantic
@@ -79,7 +77,7 @@ class PolicyFile:
     path: Path | None = None  # the file that was read
 
     @classmethod
-    def read(cls, path: Path) -> PolicyFile:
+    def read(cls, path: Path) -> Self:
         """Read a policy file; raises `ArtifactError` if it is missing, damaged, not from rlctl or of a newer format."""
         metadata, info, tensors = _read(path)
         if metadata.get("sha256") != compute_digest(metadata["rlctl"], tensors):
@@ -100,12 +98,12 @@ class PolicyFile:
         prefix = "policy/"
         return {name.removeprefix(prefix): values for name, values in self.tensors.items() if name.startswith(prefix)}
 
-    def actor_only(self) -> PolicyFile:
+    def actor_only(self) -> Self:
         """Return the policy with only the tensors of the actor and of the normalisation."""
         names = list_actor_tensors(self.info.algo, self.tensors)
         return dataclasses.replace(self, tensors={name: self.tensors[name] for name in names})
 
-    def with_info(self, **changes: Any) -> PolicyFile:
+    def with_info(self, **changes: Any) -> Self:
         """Return the policy with some fields of its description changed."""
         return dataclasses.replace(self, info=self.info.model_copy(update=changes))
 

@@ -3,8 +3,6 @@
 Arrays are not copied: new weights in shared memory take effect when `prepare` is called.
 """
 
-from __future__ import annotations
-
 import abc
 import dataclasses
 from collections.abc import Callable, Iterable
@@ -170,6 +168,15 @@ class Activation(Layer):
         return ACTIVATIONS[self.name](value)
 
 
+@dataclasses.dataclass(slots=True)
+class LstmLayer:
+    """Weights of torch's LSTM, shape (4 x hidden, ...): the gates input, forget, cell and output, stacked."""
+
+    of_input: Array
+    of_hidden: Array
+    biases: list[Array]  # two, shape (4 x hidden,); or none
+
+
 class Lstm:
     """The layers of an LSTM, and their state: hidden and cell, shape (2, layers, hidden)."""
 
@@ -189,15 +196,6 @@ class Lstm:
             state[1, number] = _sigmoid(f) * state[1, number] + _sigmoid(i) * np.tanh(g)
             value = state[0, number] = _sigmoid(o) * np.tanh(state[1, number])
         return value
-
-
-@dataclasses.dataclass(slots=True)
-class LstmLayer:
-    """Weights of torch's LSTM, shape (4 x hidden, ...): the gates input, forget, cell and output, stacked."""
-
-    of_input: Array
-    of_hidden: Array
-    biases: list[Array]  # two, shape (4 x hidden,); or none
 
 
 def _sigmoid(value: Array) -> Array:

@@ -1,9 +1,7 @@
 """SB3's networks, and policies that act with them, for comparison with exports. Imports torch."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import sb3_contrib
@@ -144,7 +142,7 @@ class TorchPolicy(Policy):
         network.set_training_mode(False)
 
     @classmethod
-    def load(cls, path: Path) -> TorchPolicy:
+    def load(cls, path: Path) -> Self:
         """Read a policy file; raises `ArtifactError` if it is not one, or its tensors do not fit its description."""
         policy = PolicyFile.read(path)
         try:
@@ -156,7 +154,7 @@ class TorchPolicy(Policy):
             raise ArtifactError(f"{path}: its tensors do not fit its description: {problem}") from None
 
     @classmethod
-    def _build(cls, policy: PolicyFile) -> TorchPolicy:
+    def _build(cls, policy: PolicyFile) -> Self:
         """Build the network, load its weights and act once."""
         network = build_network(policy.info)
         state = {name: torch.from_numpy(value.copy()) for name, value in policy.weights.items()}

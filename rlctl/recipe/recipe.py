@@ -1,12 +1,10 @@
 """Recipes: how to train a task. Typed YAML, every key is checked; `rlctl.recipe.sources` merges their sources."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 
 import pydantic
 from pydantic import Field
@@ -138,7 +136,7 @@ class Recipe(Section):
         return checked.model_dump(mode="json", exclude_unset=True)
 
     @pydantic.model_validator(mode="after")
-    def _fit_together(self) -> Recipe:
+    def _fit_together(self) -> Self:
         dropped = self.algo_kwargs.get("top_quantiles_to_drop_per_net", 0)
         if dropped >= (quantiles := self.policy_kwargs.get("n_quantiles", _QUANTILES)):
             raise ValueError(

@@ -1,9 +1,7 @@
 """Curricula: the stages of a recipe, from an easy task to the full task."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import pydantic
 from pydantic import Field
@@ -24,7 +22,7 @@ class Promotion(Section):
     """Minimum length of the stage in environment steps, all environments together."""
 
     @pydantic.model_validator(mode="after")
-    def _check_measure(self) -> Promotion:
+    def _check_measure(self) -> Self:
         if (self.success is None) == (self.mean_return is None):
             raise ValueError("give one of success and return: promote: {success: 0.8, window: 100}")
         return self

@@ -3,8 +3,6 @@
 A task is drawn by PyBullet's software renderer, any other environment by its own `render()`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import fractions
 import os
@@ -39,15 +37,6 @@ _STRIP_SIZE = (240, 180)  # [pixels], of a report's pictures
 _EYE_DIRECTION = np.array([1.0, -0.9, 0.55])  # from the right of a robot that looks along x, from above
 _FIELD_OF_VIEW = 45.0  # [degrees]
 _CLOSEST, _FARTHEST = 0.8, 8.0  # [m]; the renderer draws nothing beyond 10 m
-
-
-def look_at(env: Env, width: int, height: int) -> _World | _Pictures:
-    """Return the view of an environment: a camera in a task's world, or the environment's own pictures.
-
-    Pictures of a task have `width` and `height` [pixels].
-    """
-    inner = env.unwrapped
-    return _World(inner, width, height) if isinstance(inner, TaskEnv) else _Pictures(env)
 
 
 class _Pictures:
@@ -100,6 +89,15 @@ class _World:
         eye = self._target + self._offset
         target = self._target.tolist()
         return self._env.sim.render(*self._size, eye=eye.tolist(), target=target, field_of_view=_FIELD_OF_VIEW)
+
+
+def look_at(env: Env, width: int, height: int) -> _World | _Pictures:
+    """Return the view of an environment: a camera in a task's world, or the environment's own pictures.
+
+    Pictures of a task have `width` and `height` [pixels].
+    """
+    inner = env.unwrapped
+    return _World(inner, width, height) if isinstance(inner, TaskEnv) else _Pictures(env)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Arrays that the main process shares with its workers, in one anonymous file."""
 
-from __future__ import annotations
-
 import dataclasses
 import mmap
 import os
@@ -110,15 +108,15 @@ class SegmentArrays:
         """Where an episode ended."""
         return self.terminated | self.truncated
 
-    def first(self, steps: int, ended: Sequence[EpisodeResult]) -> SegmentArrays:
+    def first(self, steps: int, ended: Sequence[EpisodeResult]) -> "SegmentArrays":
         """Return the first steps, with the episodes that `ended` in them; the arrays share memory."""
         return self._select(np.s_[:, :steps], np.s_[:, : steps + 1], ended)
 
-    def of(self, env: int) -> SegmentArrays:
+    def of(self, env: int) -> "SegmentArrays":
         """Return the segment of one environment: arrays of shape (steps, ...) that share memory."""
         return self._select(env, env, ())
 
-    def _select(self, index: Any, observed: Any, ended: Sequence[EpisodeResult]) -> SegmentArrays:
+    def _select(self, index: Any, observed: Any, ended: Sequence[EpisodeResult]) -> "SegmentArrays":
         return SegmentArrays(
             {key: rows[observed] for key, rows in self.observation.items()},
             {key: rows[index] for key, rows in self.final.items()},

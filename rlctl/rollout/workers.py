@@ -4,13 +4,11 @@ Observations, actions, rewards, flags and a policy's parameters are in shared me
 and answers list the episodes that ended. Workers are new interpreters, never forks, with one thread each.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import os
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -267,7 +265,7 @@ class Workers:
         while self._memories:
             os.close(self._memories.pop())
 
-    def __enter__(self) -> Workers:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,12 +1,10 @@
 """The arguments of `rlctl train` as data. Imports nothing heavy."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 from rlctl.options import Config, EnvTimeout, Option, OptionalTask, RunsFolder
 
@@ -45,7 +43,7 @@ class TrainRequest:
     env_timeout_s: EnvTimeout = 60.0
     root: RunsFolder = Path("runs")
 
-    def to_resume(self, run: Path, settings: Mapping[str, Any]) -> TrainRequest:
+    def to_resume(self, run: Path, settings: Mapping[str, Any]) -> Self:
         """Return the request that resumes a run of this one."""
         return dataclasses.replace(
             self, task=None, config=None, initial_policy=None, demos=None, resume=str(run), settings=settings
@@ -59,7 +57,7 @@ class TrainRequest:
         return content
 
     @classmethod
-    def from_json(cls, content: Any) -> TrainRequest:
+    def from_json(cls, content: Any) -> "TrainRequest":
         """Return the request of `to_json`; raises `ValueError` for invalid data."""
         import pydantic
 

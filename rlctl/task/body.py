@@ -1,7 +1,5 @@
 """A body of the world: joints and links by name, state as numpy, motors with limits."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -199,7 +197,7 @@ class Body(Properties):
         states = pybullet.getLinkStates(self.id, numbers, physicsClientId=self.client) or ()
         return [state[0] for state in states]
 
-    def links_touching(self, other: Body) -> set[str]:
+    def links_touching(self, other: "Body") -> set[str]:
         """Return the links, or the base, that touched `other` in the last step; `other` may be the body itself."""
         points = self._contact_points()
         # Each point lists this body first; a contact of the body with itself is listed once for both links.
@@ -208,7 +206,7 @@ class Body(Properties):
             numbers |= {point[4] for point in points if point[2] == self.id}
         return {self._all_names[number] for number in numbers}  # the base, -1, is the last name
 
-    def contacts_with(self, other: Body) -> Contacts:
+    def contacts_with(self, other: "Body") -> Contacts:
         """Return the points where this body touches `other`, at the last physics step."""
         points = [point for point in self._contact_points() if point[2] == other.id]
         names = [self._all_names[point[3]] for point in points]
@@ -216,7 +214,7 @@ class Body(Properties):
         forces = np.array([point[9] for point in points]) * self._substeps
         return Contacts(names, forces, np.array([point[8] for point in points]))
 
-    def distance_to(self, other: Body, link: str | None = None) -> float:
+    def distance_to(self, other: "Body", link: str | None = None) -> float:
         """Return the shortest distance [m] between the collision shapes of two bodies, negative where they overlap.
 
         If `link` is given, only that link of this body is measured.

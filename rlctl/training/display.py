@@ -1,14 +1,12 @@
 """What training shows: a live display on a terminal, plain lines elsewhere. Everything goes to stderr."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
 import time
 from collections import deque
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 from rlctl import output
 from rlctl.run.directory import RunDirectory
@@ -59,7 +57,7 @@ class Display:
         self._first: tuple[float, int] | None = None  # time and steps of the first segment
         self._steps, self._stage, self._last_line = 0, "", 0.0
 
-    def __enter__(self) -> Display:
+    def __enter__(self) -> Self:
         self.message(self.title)
         return self
 
@@ -144,7 +142,7 @@ class LiveDisplay(Display):
         self._evaluations: list[tuple[int, float | None, float, bool]] = []
         self._live = Live(self, console=output.err(), refresh_per_second=8, transient=False)
 
-    def __enter__(self) -> Display:
+    def __enter__(self) -> Self:
         self._live.__enter__()
         return self
 

@@ -5,8 +5,6 @@ sent is stored in the run folder: what is missing is sent later, also after a re
 The trackers' own environment variables name the address and the key: rlctl neither asks for a key nor stores one.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import importlib
@@ -102,7 +100,7 @@ class _Sender:
             self._loaders.clear()  # what could not be sent is read again
             self._warn(str(error) or repr(error))
 
-    def send(self) -> Tracker:
+    def send(self) -> "Tracker":
         """Send new metrics, and files that have changed."""
         tracker = self._tracker = self._tracker or self._connect()
         sent = self._sent["steps"]
@@ -125,7 +123,7 @@ class _Sender:
                     self._send_file(tracker, file, status["steps"])
         tracker.finish(status["status"])
 
-    def _connect(self) -> Tracker:
+    def _connect(self) -> "Tracker":
         run, group = self._run, self._run.path.parent
         if run.tracking_file.exists():
             self._sent = files.read_json(run.tracking_file)
@@ -157,7 +155,7 @@ class _Sender:
                 values = [value for value in event.summary.value if value.HasField("simple_value")]
                 yield event.step, event.wall_time, {value.tag: value.simple_value for value in values}
 
-    def _send_file(self, tracker: Tracker, file: Path, version: int) -> None:
+    def _send_file(self, tracker: "Tracker", file: Path, version: int) -> None:
         if self._sent["files"].get(file.name) != version:
             tracker.save(file)
             self._sent["files"][file.name] = version

@@ -3,11 +3,9 @@
 Events are stored as arrays until somebody reads them: this keeps each step fast.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -180,7 +178,7 @@ class SafetyEvent:
         """The event's name alone; an `Intervention` has several."""
         return (self.name,)
 
-    def list_events(self) -> list[SafetyEvent]:
+    def list_events(self) -> list[Self]:
         """Return the event alone; an `Intervention` makes several."""
         return [self]
 

@@ -1,7 +1,5 @@
 """Searches in worker processes for the values with which the simulation follows a log: trials, then least squares."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
