@@ -36,8 +36,7 @@ def check_env(
     from rlctl.errors import RlctlError, TaskError
 
     rules = choose_rules(select, ignore)
-    spec = EnvSpec(task, parameters)
-    report = check(spec, rules=rules, env_timeout_s=env_timeout_s, show_progress=False)
+    report = check(EnvSpec(task, parameters), rules=rules, env_timeout_s=env_timeout_s, show_progress=False)
     if report.verdict.crashed:
         names, details = ", ".join(report.verdict.crashed), "\n".join(report.verdict.crashed.values())
         raise RlctlError(f"check_env: a bug in rlctl: {names} crashed on {task}; please report it", details=details)

@@ -137,8 +137,7 @@ class SlurmTrainings(Trainings):
             works=shlex.quote(os.path.abspath(works)),
         )
         files.write_text(script, content)
-        command = ["sbatch", "--parsable", *self._settings.sbatch, str(script)]
-        number = _call(command).strip().partition(";")[0]
+        number = _call(["sbatch", "--parsable", *self._settings.sbatch, str(script)]).strip().partition(";")[0]
         for index, work in enumerate(self._works):
             write_job(folder, Job(work.seed, work.task, "queued", f"slurm {number}_{index}"))
         with self._queue_lock:
@@ -191,8 +190,7 @@ class SlurmTrainings(Trainings):
             return job.place.partition(" ")[2] in self._queue.split()
 
     def _ask_queue(self) -> str:
-        command = ["squeue", "--noheader", "--array", "--format=%i", "--user", str(os.getuid())]
-        return _call(command) or "-"
+        return _call(["squeue", "--noheader", "--array", "--format=%i", "--user", str(os.getuid())]) or "-"
 
 
 def _forward_lines(log: Path, position: int, receive: Callable[[str], None]) -> int:

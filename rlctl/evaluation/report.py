@@ -137,8 +137,7 @@ def show_group(result: GroupScore, json: str | None) -> None:
     out = output.out()
     scores = [seed.score for seed in result.seeds if seed.score is not None]
     episodes = f", {output.format_count(scores[0].episodes, 'episode')} each, seed {scores[0].seed}" if scores else ""
-    seeds = output.format_count(len(result.seeds), "seed")
-    out.print(f"{result.group.task}: {result.group.path}, {seeds}{episodes}")
+    out.print(f"{result.group.task}: {result.group.path}, {output.format_count(len(result.seeds), 'seed')}{episodes}")
     success, returns = result.spread("success"), result.spread("mean_return")
     rows = [_list_cells(seed) for seed in result.seeds]
     for label in ("mean", "IQM", "std"):
@@ -189,8 +188,7 @@ def _show_map(varied: RobustnessMap, worst: Cell | None) -> None:
 
 
 def _show_list(varied: RobustnessMap, worst: Cell | None) -> None:
-    has_success = varied.cells[0].success_rate is not None
-    successes = ("success", "95 % interval") if has_success else ()
+    successes = ("success", "95 % interval") if varied.cells[0].success_rate is not None else ()
     rows = []
     for cell in varied.cells:
         cells = [f"{cell.values[0]:g}"]

@@ -120,8 +120,7 @@ def _list_margins(
 ) -> list[tuple[float, float]]:
     """Return per choice how much larger the logit of the expected choice is, and the size of that logit."""
     if isinstance(space, spaces.MultiBinary):  # compared with a logit of 0, a probability of 0.5
-        wrong = np.flatnonzero(expected != action)
-        return [(abs(float(logits[index])), 0.0) for index in wrong]
+        return [(abs(float(logits[index])), 0.0) for index in np.flatnonzero(expected != action)]
     sizes = space.nvec if isinstance(space, spaces.MultiDiscrete) else [len(logits)]
     groups = np.split(logits, np.cumsum(sizes)[:-1])
     choices = zip(groups, np.atleast_1d(expected), np.atleast_1d(action), strict=True)

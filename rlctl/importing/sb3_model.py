@@ -241,5 +241,4 @@ def _read_tensor(value: Any, archive: zipfile.ZipFile, prefix: str) -> NDArray[A
         return np.zeros(shape, dtype)
     if math.prod(shape) > numbers.size:  # strides of 0 would repeat numbers
         raise NotPlainData("a tensor larger than its storage")
-    steps = [stride * dtype.itemsize for stride in strides]
-    return as_strided(numbers[offset:], shape, steps).copy()
+    return as_strided(numbers[offset:], shape, [stride * dtype.itemsize for stride in strides]).copy()

@@ -53,8 +53,7 @@ class CPolicy(Policy):
     def load(cls, path: Path) -> Self:
         """Load a library with the JSON description next to it; raises `ArtifactError` if it does not load."""
         try:
-            info = PolicyInfo.model_validate(files.read_json(path.with_suffix(".json")))
-            return cls(info, ctypes.CDLL(str(path)))
+            return cls(PolicyInfo.model_validate(files.read_json(path.with_suffix(".json"))), ctypes.CDLL(str(path)))
         except OSError as error:
             raise ArtifactError(f"{path}: the compiled policy does not load: {error}") from None
 

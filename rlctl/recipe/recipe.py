@@ -132,8 +132,7 @@ class Recipe(Section):
         model = models.get(info.data.get("algo", ""))  # not there if it is wrong itself, which is then reported
         if model is None:
             return values
-        checked = model.model_validate(values)
-        return checked.model_dump(mode="json", exclude_unset=True)
+        return model.model_validate(values).model_dump(mode="json", exclude_unset=True)
 
     @pydantic.model_validator(mode="after")
     def _fit_together(self) -> Self:

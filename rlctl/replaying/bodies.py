@@ -44,8 +44,7 @@ def _draw_marker(name: str, positions: NDArray[np.float64], color: tuple[int, in
     entity, steps = rr.new_entity_path(["world", "markers", name]), range(len(positions))
     stream = timelines.stream
     # Positions are not static: static data would hide the moving ones.
-    point = rr.Points3D.from_fields(radii=0.03, colors=color, labels=name, show_labels=True)
-    stream.log(entity, point, static=True)
+    stream.log(entity, rr.Points3D.from_fields(radii=0.03, colors=color, labels=name, show_labels=True), static=True)
     timelines.send(entity, steps, rr.Points3D.columns(positions=positions))
     wireframe = rr.components.FillMode.MajorWireframe
     halo = rr.Ellipsoids3D.from_fields(

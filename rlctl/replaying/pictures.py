@@ -235,8 +235,7 @@ class _Mp4:
     def add(self, picture: Picture) -> None:
         if self._stream.width != picture.shape[1]:
             self._stream.height, self._stream.width = picture.shape[:2]
-        frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
-        self._container.mux(self._stream.encode(frame))
+        self._container.mux(self._stream.encode(self._av.VideoFrame.from_ndarray(picture, format="rgb24")))
 
     def close(self) -> None:
         self._container.mux(self._stream.encode())

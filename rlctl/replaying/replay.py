@@ -195,8 +195,7 @@ class _PolicySource:
         spec, episodes = self.spec, []
         with closing(make_drawable(spec, print_warning)) as env:
             for seed in self.seeds:
-                choose = self.begin(env, seed)
-                rollout = play_episode(env, spec, seed, choose, policy=self.name, draw=print_warning)
+                rollout = play_episode(env, spec, seed, self.begin(env, seed), policy=self.name, draw=print_warning)
                 recording = self._next_recording()
                 episode = recording.with_suffix(".npz")
                 save_episode(episode, rollout.episode)

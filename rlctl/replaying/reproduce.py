@@ -160,8 +160,7 @@ def _list_columns(recorded: RecordedEpisode, rollout: Rollout) -> list[_Column]:
     ]
     columns.append(_Column(["reward"], 1, recorded.rewards[:, None], rollout.episode.rewards[:, None]))
     if (term_names := recorded.info.term_names) == rollout.episode.info.term_names and term_names:
-        names = [f"term {name}" for name in term_names]
-        columns.append(_Column(names, 1, recorded.terms, rollout.episode.terms))
+        columns.append(_Column([f"term {name}" for name in term_names], 1, recorded.terms, rollout.episode.terms))
     return columns
 
 

@@ -34,8 +34,7 @@ def write_rrd(path: Path, rollout: Rollout, *, title: str, warn: Warn, several: 
     Step 0 is the reset; an action, its reward and the state after it have the same step. `warn` receives messages about
     what cannot be drawn. If `several` recordings are opened together, the viewer shows a list of them.
     """
-    info = rollout.episode.info
-    application = f"rlctl_{registry.make_slug(info.spec.task)}"
+    application = f"rlctl_{registry.make_slug(rollout.episode.info.spec.task)}"
     stream = rr.RecordingStream(application, recording_id=_make_id(rollout.episode), send_properties=False)
     stream.set_log_time_enabled(False)
     with stream:

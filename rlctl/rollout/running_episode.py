@@ -86,14 +86,13 @@ class RunningEpisode:
         distance = (metrics if isinstance(metrics, dict) else info).get("distance")
         if not isinstance(distance, int | float | np.number) or not math.isfinite(distance):
             distance = None
-        terms = {str(name): _to_float(value, f"reward term {name}") for name, value in self._sums.items()}
         return EpisodeResult(
             self.index,
             self.seed,
             self._return,
             self.step,
             None if success is None else _to_bool(success, "info['is_success']"),
-            terms,
+            {str(name): _to_float(value, f"reward term {name}") for name, value in self._sums.items()},
             None if distance is None else float(distance),
             row,
             report,

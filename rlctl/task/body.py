@@ -127,8 +127,7 @@ class Body(Properties):
         """
         if joint not in self._force_sensors:
             raise TaskError(f"joint {joint!r} has no force sensor: call add_force_sensor({joint!r}) in build")
-        state = pybullet.getJointState(self.id, self._joint_number(joint), physicsClientId=self.client)
-        return np.array(state[2])
+        return np.array(pybullet.getJointState(self.id, self._joint_number(joint), physicsClientId=self.client)[2])
 
     def _joint_number(self, joint: str) -> int:
         check_name(joint, self.all_joint_names, f"{self.file.name} has no joint", TaskError)

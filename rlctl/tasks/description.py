@@ -46,8 +46,7 @@ def describe(task: str) -> Description:
     constructor: Any = registry.load(task)
     recipe = sources.resolve_with_stages(task)
     # The last stage is the full task. Parts of stacked observations have no names.
-    spec = dataclasses.replace(recipe.env_specs(task)[-1], frame_stack=1, time_feature=False)
-    env = spec.make()
+    env = dataclasses.replace(recipe.env_specs(task)[-1], frame_stack=1, time_feature=False).make()
     # Reading attributes of an environment also runs the plugin's code.
     try:
         about = call_plugin(task, lambda: _describe_env(task, constructor, env))

@@ -90,8 +90,7 @@ def keep_compiler_out() -> None:
 
 def _use_fused_adam(model: BaseAlgorithm) -> None:
     """Let Adam update all weights in one call: with small networks most time is spent on calls. Same results."""
-    parts = [model, *(getattr(model.policy, name, None) for name in ("actor", "critic")), model.policy]
-    for part in parts:
+    for part in (model, *(getattr(model.policy, name, None) for name in ("actor", "critic")), model.policy):
         for name in ("optimizer", "ent_coef_optimizer"):
             optimizer = getattr(part, name, None)
             if isinstance(optimizer, torch.optim.Adam):

@@ -196,8 +196,7 @@ class Cloning:
             moments.count = float(self._total_timesteps)  # the actor depends on them, so they must change slowly
         named = {f"policy/{name}": parameter for name, parameter in model.policy.named_parameters()}
         optimizer = torch.optim.Adam([named[name] for name in list_actor_tensors(algo, named)], _RATE)
-        schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.01, _UPDATES)
-        self._imitate(optimizer, _UPDATES, 1.0, schedule)
+        self._imitate(optimizer, _UPDATES, 1.0, torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.01, _UPDATES))
         model.policy.set_training_mode(False)
         with torch.no_grad():
             loss = float(self._compute_loss(slice(None)))

@@ -51,8 +51,7 @@ class Metrics:
 
     def is_due(self) -> bool:
         """Return whether to write a row: after every rollout of an on-policy algorithm, else at intervals."""
-        steps = self._learner.steps
-        return self._learner.recipe.algo in ON_POLICY or steps >= self._learner.progress.next_row
+        return self._learner.recipe.algo in ON_POLICY or self._learner.steps >= self._learner.progress.next_row
 
     def measure(self) -> dict[str, Any]:
         """Return the row about the steps since the last one; empty if there were none."""

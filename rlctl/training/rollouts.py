@@ -224,8 +224,7 @@ class Rollouts(abc.ABC):
         tensors |= write_graph(model, self._algo, workers.info.spaces()[0])
         workers.set_policy(PolicyFile(self._policy_info, tensors))
         if (state := workers.recurrent_state) is not None:
-            last = model._last_lstm_states.pi
-            state[:, 0], state[:, 1] = (part.cpu().numpy().transpose(1, 0, 2) for part in last)
+            state[:, 0], state[:, 1] = (part.cpu().numpy().transpose(1, 0, 2) for part in model._last_lstm_states.pi)
             state[np.asarray(model._last_episode_starts)] = 0.0
 
     def update_reward_statistics(self, segment: SegmentArrays) -> NDArray[np.float32]:

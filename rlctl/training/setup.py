@@ -190,8 +190,7 @@ def _refuse_errors(report: CheckReport, display: Display) -> None:
     errors = [finding for finding in findings if finding.severity is Severity.ERROR]
     if errors:
         text = "; ".join(f"{finding.rule} {finding.name} ({finding.message})" for finding in errors)
-        failed = any(finding.rule in _FAILURES for finding in errors)
-        raise (TaskError if failed else AnswerIsNo)(
+        raise (TaskError if any(finding.rule in _FAILURES for finding in errors) else AnswerIsNo)(
             f"the check before training found {format_count(len(errors), 'error')}: {text}\n"
             f"rlctl check-env {task} shows details; --no-check trains anyway."
         )

@@ -74,8 +74,7 @@ def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
 def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
     """Restore the state that `take` returned; raises `ArtifactError` if it does not fit the model."""
     try:
-        parameters = unflatten(plain["parameters"], tensors)
-        model.set_parameters(parameters, exact_match=True, device=model.device)
+        model.set_parameters(unflatten(plain["parameters"], tensors), exact_match=True, device=model.device)
         for name, variable in _variables(model).items():
             variable.copy_(torch.from_numpy(tensors[name].copy()))  # in place: the optimiser holds the same tensor
         _restore_normalizer(model, tensors)

@@ -131,8 +131,7 @@ class Bounds:
         """Return whether there is clearly room to brake after a motion."""
         end = x if self.change is None else x * (np.abs(x) * self._per_square + self._per_step)
         end = end + reference
-        inside = np.minimum(np.maximum(end, self._quick_low), self._quick_high)
-        return bool(inside.tobytes() == end.tobytes())
+        return bool(np.minimum(np.maximum(end, self._quick_low), self._quick_high).tobytes() == end.tobytes())
 
     def _find_room(self, reference: Array) -> Array:
         """Return how far a step may go up and down, shape (2, count).

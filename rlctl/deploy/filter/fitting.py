@@ -70,8 +70,7 @@ def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
         raise RecipeError(_NO_CONTROL_DT)
     _check_home(limits, bounds, home)
     _check_measured(limits, bounds, measured, layout)
-    safe = _make_safe_command(limits, bounds, count)
-    return FittedLimits(layout, space, control_dt, bounds, measured, home, safe)
+    return FittedLimits(layout, space, control_dt, bounds, measured, home, _make_safe_command(limits, bounds, count))
 
 
 def _make_bounds(

@@ -84,8 +84,7 @@ def _draw_sines(env: TaskEnv, steps: int, seed: int) -> Array:
         hertz = np.exp(rng.uniform(np.log(_LOWEST_HZ), np.log(_HIGHEST_HZ), count))
         total += np.sin(2 * np.pi * hertz * time + rng.uniform(0, 2 * np.pi, count))
     fade = max(1, round(_FADE_S / env.task.control_dt))
-    ramp = np.minimum(1.0, np.minimum(np.arange(steps), np.arange(steps)[::-1])[:, None] / fade)
-    total *= ramp
+    total *= np.minimum(1.0, np.minimum(np.arange(steps), np.arange(steps)[::-1])[:, None] / fade)
     result: Array = total / np.abs(total).max(axis=0)
     return result
 
@@ -130,8 +129,7 @@ def _find_danger(env: TaskEnv, joints: dict[str, tuple[Any, int]]) -> tuple[str,
             return f"joint {name} is faster than its top speed, {limit:.3g} rad/s", largest
     if env.task.is_terminated():
         return "the episode ends", largest
-    bodies = {id(body): body for body, _ in joints.values() if body.fixed}.values()
-    for body in bodies:
+    for body in {id(body): body for body, _ in joints.values() if body.fixed}.values():
         for other in env.sim.bodies.values():
             if other is not body and (touching := body.links_touching(other)):
                 return f"{sorted(touching)[0]} touches {other.name}", largest

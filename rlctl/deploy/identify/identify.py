@@ -94,8 +94,7 @@ def identify(
     env = open_world(spec)
     try:
         unknowns = find_unknowns(env.task.events, events, spec.task)
-        expected = describe_expected(env, spec.task)
-        log = read_log(log_file, expected)
+        log = read_log(log_file, describe_expected(env, spec.task))
         space: Any = env.action_space
         check_actions(log, log_file, np.ravel(space.low), np.ravel(space.high))
         if log.positions.std(axis=0).max() < _MIN_MOTION:

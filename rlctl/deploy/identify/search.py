@@ -103,8 +103,7 @@ def search(ask: Ask, unknowns: Unknowns, weights: Array, seed: int, report: Call
     trials = _make_trials(unknowns, seed)
     report(f"{len(trials)} trials")
     costs = ask([FindFit(trial, weights) for trial in trials])
-    ranked = [trials[index] for index in np.argsort(costs, kind="stable")]
-    starts = _choose_starts(trials[0], ranked)
+    starts = _choose_starts(trials[0], [trials[index] for index in np.argsort(costs, kind="stable")])
     report(f"least squares from {len(starts)} starts")
     fit_all([FindFit(start, weights, _EVALUATIONS) for start in starts])
     best = _best(fits)

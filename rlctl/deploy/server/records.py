@@ -166,8 +166,7 @@ class _Handler(logging.handlers.RotatingFileHandler):
         # On a full disk the server continues and warns once.
         if not self._warned:
             self._warned = True
-            error = sys.exception()
-            print(f"warning: {self.baseFilename}: cannot write to the log: {error}", file=sys.stderr)
+            print(f"warning: {self.baseFilename}: cannot write to the log: {sys.exception()}", file=sys.stderr)
 
 
 class RerunLog:

@@ -45,8 +45,7 @@ class PolicyServer:
         self._order: str | None = None  # the operator's last order, which later clients get too; None: no order
         self._limits = limits
         shapes = ObservationLayout(policy.info.env).shapes
-        numbers = sum(map(math.prod, shapes.values()))
-        self.largest_message = 64 * numbers + 64 * 1024  # text with names
+        self.largest_message = 64 * sum(map(math.prod, shapes.values())) + 64 * 1024  # text with names
         """Largest size of a request [bytes]."""
         # The first answer of a process is slow, because libraries load modules for it: no robot shall wait for that.
         Session(0, lambda: policy, limits).answer({name: np.zeros(shape) for name, shape in shapes.items()})
@@ -57,7 +56,6 @@ class PolicyServer:
     def metadata(self) -> dict[str, Any]:
         """The first message to a client: names, sizes, units and bounds of observations and actions, timing."""
         info = self.policy.info
-        layout = self.posting.safety.layout
         return {
             "server": f"rlctl {__version__}",
             "task": info.spec.task,
@@ -65,7 +63,7 @@ class PolicyServer:
             "policy": self.policy.file.name,
             "training_steps": info.training_steps,
             "control_dt": self.posting.safety.control_dt,
-            "observation": {name: list(shape) for name, shape in layout.shapes.items()},
+            "observation": {name: list(shape) for name, shape in self.posting.safety.layout.shapes.items()},
             "observation_units": dict(info.env.observation_units),
             "action_meaning": info.env.action_meaning,
             "env": info.env.model_dump(mode="json"),

@@ -157,8 +157,7 @@ class PpoUpdate:
         log_std: Floats = policy.log_std.numpy()
         if not policy.use_sde:
             return np.exp(log_std)
-        variance = np.square(actor[-2][0]) @ np.exp(2 * log_std) + float(policy.action_dist.epsilon)
-        std: Floats = np.sqrt(variance)
+        std: Floats = np.sqrt(np.square(actor[-2][0]) @ np.exp(2 * log_std) + float(policy.action_dist.epsilon))
         return std
 
     def _set_std_gradient(self, actor: list[Floats], std: Floats, to_log_std: Floats) -> None:

@@ -248,8 +248,7 @@ class SacUpdate:
 
     def _value(self, outputs: Floats) -> tuple[Floats, Floats]:
         """Return the value from the critics' outputs, shape (batch, 1), and its gradient with respect to them."""
-        lowest = outputs.argmin(0)
-        to_outputs = (np.arange(len(outputs))[:, None, None] == lowest).astype(np.float32)
+        to_outputs = (np.arange(len(outputs))[:, None, None] == outputs.argmin(0)).astype(np.float32)
         return outputs.min(0), to_outputs
 
 
