@@ -27,12 +27,8 @@ def sample_batches(model: Any, network: Any, count: int, size: int) -> list[Batc
     """Return `count` minibatches of `size` transitions, as SB3 would draw them; `network` extracts the features."""
     parts = _gather(model, count, size)
     features, next_features = (_extract(network, parts[name]) for name in ("observations", "next_observations"))
-    batches = []
-    for index in range(count):
-        rows = slice(index * size, (index + 1) * size)
-        names = ("actions", "rewards", "discounts")
-        batches.append(Batch(features[rows], next_features[rows], *(parts[name][rows] for name in names)))
-    return batches
+    arrays = (features, next_features, parts["actions"], parts["rewards"], parts["discounts"])
+    return [Batch(*(array[first : first + size] for array in arrays)) for first in range(0, count * size, size)]
 
 
 def _extract(network: Any, observations: Any) -> Floats:

@@ -70,8 +70,11 @@ class MlpStack:
             output = values[index + 1]
             np.matmul(values[index], layer.weight.swapaxes(1, 2), out=output)
             output += layer.bias
-            if index + 1 < len(self._layers):
-                self._activate(output)
+            is_hidden = index + 1 < len(self._layers)
+            if is_hidden and self._uses_tanh:
+                np.tanh(output, out=output)
+            elif is_hidden:
+                torch.from_numpy(output).relu_()  # a tenth of NumPy's time
         return values
 
     def _get_buffers(self, use: str, batch: int) -> list[Floats]:
@@ -79,12 +82,6 @@ class MlpStack:
             shapes = [(self.count, batch, layer.bias.shape[2]) for layer in self._layers]
             self._buffers[use, batch] = [np.empty(shape, np.float32) for shape in shapes]
         return self._buffers[use, batch]
-
-    def _activate(self, values: Floats) -> None:
-        if self._uses_tanh:
-            np.tanh(values, out=values)
-        else:
-            torch.from_numpy(values).relu_()  # a tenth of NumPy's time
 
     def backpropagate(self, values: list[Floats], gradient: Floats, *, latent: Floats | None = None) -> None:
         """Set the weights' gradients from the outputs' gradient, and from `latent`, of the last hidden layer."""

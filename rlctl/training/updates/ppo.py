@@ -56,9 +56,7 @@ class PpoUpdate:
         model, policy = self._model, self._policy
         model._update_learning_rate(policy.optimizer)
         clip_range = model.clip_range(model._current_progress_remaining)
-        clip_range_vf = None
-        if model.clip_range_vf is not None:
-            clip_range_vf = model.clip_range_vf(model._current_progress_remaining)
+        clip_range_vf = model.clip_range_vf and model.clip_range_vf(model._current_progress_remaining)
         data = self._read_buffer()
         logged: dict[str, list[float]] = collections.defaultdict(list)
         for _ in range(model.n_epochs):
@@ -170,12 +168,11 @@ class PpoUpdate:
         np.multiply(of_variance, np.exp(2 * self._policy.log_std.numpy()), out=self._log_std_gradient)
 
     def _log(self, logged: dict[str, list[float]], clip_range: float, clip_range_vf: float | None) -> None:
-        model, logger = self._model, self._model.logger
-        buffer = model.rollout_buffer
+        model, logger, buffer = self._model, self._model.logger, self._model.rollout_buffer
         for name, values in logged.items():
             logger.record(f"train/{name}", np.mean(values))
-        variance = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
-        logger.record("train/explained_variance", variance)
+        explained = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
+        logger.record("train/explained_variance", explained)
         logger.record("train/std", self._policy.log_std.exp().mean().item())
         logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
         logger.record("train/clip_range", clip_range)
