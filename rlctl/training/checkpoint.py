@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import pydantic
 import torch
-from numpy.typing import NDArray
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -193,8 +192,7 @@ def restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
     if len(steps) != env.num_envs:
         raise ArtifactError(f"it was saved with {len(steps)} environments, not {env.num_envs}")
     started = tensors["environments/episodes_started"].tolist()
-    actions: list[NDArray[Any]] = np.split(tensors["environments/actions"], np.cumsum(steps)[:-1])
-    mismatch = set(env.replay_actions(started, actions))
+    mismatch = set(env.replay_actions(started, np.split(tensors["environments/actions"], np.cumsum(steps)[:-1])))
     for key, observation in env.workers.arrays.observation.items():
         before = tensors[f"environments/observation/{key}"]
         mismatch.update(index for index in range(env.num_envs) if not np.array_equal(before[index], observation[index]))
@@ -273,11 +271,7 @@ class ReplaySegments:
 
 
 def _arrays(buffer: ReplayBuffer) -> Tensors:
-    arrays: Tensors = {}
-    for name in _FIELDS:
-        value: Any = getattr(buffer, name)
-        arrays |= {f"{name}/{key}": part for key, part in split(value).items()}
-    return arrays
+    return {f"{name}/{key}": part for name in _FIELDS for key, part in split(getattr(buffer, name)).items()}
 
 
 def hindsight_tensors(buffer: ReplayBuffer) -> Tensors:
@@ -293,6 +287,5 @@ def hindsight_tensors(buffer: ReplayBuffer) -> Tensors:
 
 def restore_hindsight(buffer: ReplayBuffer, tensors: Tensors) -> None:
     """Restore the positions of episodes that `hindsight_tensors` returned."""
-    if isinstance(buffer, HerReplayBuffer):
-        for name, array in hindsight_tensors(buffer).items():
-            array[...] = tensors[name]
+    for name, array in hindsight_tensors(buffer).items():
+        array[...] = tensors[name]

@@ -1,5 +1,6 @@
 """What a training writes into its run folder, and what a resume restores; a failing disk stops no training."""
 
+import functools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -89,8 +90,7 @@ class Checkpoints:
         check_finite(self._learner.model, self.run.path)
         self._learner.progress.seconds = self._learner.seconds
         began = time.monotonic()
-        policy = self._learner.pack()
-        is_saved = self.attempt("checkpoint", lambda: self._write(policy))
+        is_saved = self.attempt("checkpoint", functools.partial(self._write, self._learner.pack()))
         if is_saved:
             if self._reported:
                 self._warn(f"saved again, at step {self.saved_step:,}")
