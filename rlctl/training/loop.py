@@ -67,7 +67,7 @@ class TrainingLoop:
         self._stop_if_requested()
         if self.evaluator.is_due():
             self.evaluate()
-        if learner.is_at_end or self._success_holds():
+        if learner.is_at_end or learner.progress.good_in_a_row >= 2:
             if learner.progress.stop_reason:
                 self._display.message(f"stopped by a callback: {learner.progress.stop_reason}")
             self.evaluator.compare_best_with_last(self._stop_if_requested)
@@ -92,9 +92,6 @@ class TrainingLoop:
         if row := self.evaluator.evaluate(self._stop_if_requested):
             self.callbacks.finish_evaluation(row)
         self._metrics.exclude(time.monotonic() - began)
-
-    def _success_holds(self) -> bool:
-        return self.learner.recipe.stop_success is not None and self.learner.progress.good_in_a_row >= 2
 
     def _announce_stop(self) -> None:
         if self.stop_signal is not None and not self._stop_announced:

@@ -116,7 +116,10 @@ def summarize_steps(
             if not ended[:, :-1].all():  # the change from one action to the next of the same episode, in half ranges
                 row["action_change"] = float(np.abs(np.diff(actions, axis=1))[~ended[:, :-1]].mean())
     row["exploration"] = _measure_exploration(space, log.get("train/entropy_loss"))
-    return row | {"value": _read_value(last, log)}
+    if last is not None and last.values is not None:
+        return row | {"value": float(last.values.mean())}
+    loss = log.get("train/actor_loss")  # minus the critic's mean value, with SAC's entropy bonus
+    return row | {"value": None if loss is None else -float(loss)}
 
 
 def _measure_exploration(space: spaces.Space[Any], entropy_loss: Any) -> float | None:
@@ -133,14 +136,6 @@ def _measure_exploration(space: spaces.Space[Any], entropy_loss: Any) -> float |
         return None
     per_element = -entropy_loss / half.size
     return math.exp(min(per_element - 0.5 * math.log(2 * math.pi * math.e), 50.0)) / float(np.exp(np.log(half).mean()))
-
-
-def _read_value(last: LastSteps | None, log: Mapping[str, Any]) -> float | None:
-    """Return the critic's mean value: off-policy minus the actor's loss, which includes SAC's entropy bonus."""
-    if last is not None and last.values is not None:
-        return float(last.values.mean())
-    loss = log.get("train/actor_loss")
-    return None if loss is None else -float(loss)
 
 
 def _gradient_norm(model: BaseAlgorithm) -> float | None:
