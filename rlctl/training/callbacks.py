@@ -212,8 +212,7 @@ class Sb3Callback(Callback):
         """Call `on_training_start`."""
         self._model = training.model
         self._callback.init_callback(self._model)
-        total = training.recipe.total_timesteps
-        self._callback.on_training_start({"self": self._model, "total_timesteps": total}, {})
+        self._callback.on_training_start({"self": self._model, "total_timesteps": training.recipe.total_timesteps}, {})
 
     def on_segment(self, training: Training) -> None:
         """Call `on_rollout_start`, `on_step` for each step, and `on_rollout_end`."""

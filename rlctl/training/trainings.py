@@ -62,11 +62,10 @@ class Trainings:
 
     def _prepare_thread(self) -> None:
         """Give this thread's trainings their share of the cores, which also sets their number of workers."""
-        thread_number = next(self._thread_numbers)
         if self._jobs > 1 and hasattr(os, "sched_setaffinity"):
             cores = sorted(os.sched_getaffinity(0))
             share = max(1, len(cores) // self._jobs)
-            first = thread_number * share % len(cores)
+            first = next(self._thread_numbers) * share % len(cores)
             os.sched_setaffinity(0, cores[first : first + share])
 
     def train(

@@ -65,11 +65,10 @@ def _check_network(file: Path, info: PolicyInfo, model: Any, weights: Mapping[st
     wrong = [name for name, shape in given.items() if network.get(name) != shape]
     wrong += [name for name in list_actor_tensors(info.algo, list(network)) if name not in given]
     keys = dict.fromkeys([*info.policy_kwargs, *ours]) if wrong else _SAME_FUNCTION
-    values = {key: (info.policy_kwargs.get(key), ours.get(key)) for key in keys}
     parts = [
-        f"policy_kwargs.{key} is {theirs} in the policy and {own} in the recipe"
-        for key, (theirs, own) in values.items()
-        if to_jsonable_python(theirs) != to_jsonable_python(own)  # tuples are lists
+        f"policy_kwargs.{key} is {info.policy_kwargs.get(key)} in the policy and {ours.get(key)} in the recipe"
+        for key in keys
+        if to_jsonable_python(info.policy_kwargs.get(key)) != to_jsonable_python(ours.get(key))  # tuples are lists
     ]
     if wrong or parts:
         raise UsageError(f"--from {file}: its network differs: {'; '.join(parts) or f'tensor {wrong[0]} differs'}")
