@@ -181,7 +181,7 @@ def refuse_links_out(folder: Path, kind: str = "run") -> None:
             raise ArtifactError(f"{path}: a symbolic link out of the {kind}'s folder; remove it")
 
 
-class RunLock:
+class RunLock(contextlib.AbstractContextManager["RunLock"]):
     """Prevents two processes from writing the same run, or another `kind` of folder with runs.
 
     The operating system releases it when the process ends, even after a crash.
@@ -219,9 +219,6 @@ class RunLock:
         if self._descriptor >= 0:
             os.close(self._descriptor)
         self._descriptor = -1
-
-    def __enter__(self) -> RunLock:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.release()

@@ -40,7 +40,7 @@ _DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
 
 
 @dataclasses.dataclass(frozen=True)
-class Start:
+class Start(contextlib.AbstractContextManager["Start"]):
     """Start of a training; while entered it holds the lock of a resumed run."""
 
     request: TrainRequest
@@ -55,9 +55,6 @@ class Start:
     demos: Mapping[str, str] | None = None  # the demonstrations of `--demos`; see `describe_demonstrations`
     inexact: tuple[str, ...] = ()  # reasons, known before the start, why the resume cannot be bit-exact
     began: float = dataclasses.field(default_factory=time.monotonic)
-
-    def __enter__(self) -> Start:
-        return self
 
     def __exit__(self, *_: object) -> None:
         if self.lock is not None:
