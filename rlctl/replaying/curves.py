@@ -29,11 +29,7 @@ class Timelines:
     def __init__(self, stream: rr.RecordingStream, dt: float | None) -> None:
         self.stream = stream
         self.dt = dt
-
-    @property
-    def default(self) -> str:
-        """The timeline that the viewer opens with."""
-        return "step" if self.dt is None else "sim_time"
+        self.default = "step" if dt is None else "sim_time"  # the timeline that the viewer opens with
 
     def send(
         self, entity: str, steps: Sequence[int] | NDArray[np.int64], columns: Iterable[rr.ComponentColumn]

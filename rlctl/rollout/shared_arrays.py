@@ -131,17 +131,12 @@ class PolicyNumbers:
     def __init__(self, descriptor: int, n_envs: int) -> None:
         self._descriptor = descriptor
         self._n_envs = n_envs
-        self._arrays: dict[str, NDArray[Any]] = {}
+        self.arrays: dict[str, NDArray[Any]] = {}  # by name; a recurrent policy has also `state`
         self._structure: tuple[Any, ...] = ()
-
-    @property
-    def state(self) -> NDArray[np.float32] | None:
-        """Hidden and cell state of each environment's episode, shape (n_envs, 2, layers, hidden); None without."""
-        return self._arrays.get("state")
 
     def forget(self) -> None:
         """Note that the workers use another policy."""
-        self._arrays, self._structure = {}, ()
+        self.arrays, self._structure = {}, ()
 
     def write(self, policy: PolicyFile) -> list[tuple[str, tuple[int, ...], str]]:
         """Write a policy's parameters; return name, shape and dtype of each if workers must load it, else nothing.
@@ -156,10 +151,10 @@ class PolicyNumbers:
         structure = (info.algo, info.policy_kwargs, info.clip_observation, layout)
         is_new = structure != self._structure
         if is_new:
-            self._arrays = map_arrays(self._descriptor, {name: (v.shape, v.dtype) for name, v in numbers.items()})
+            self.arrays = map_arrays(self._descriptor, {name: (v.shape, v.dtype) for name, v in numbers.items()})
             self._structure = structure
         else:
             numbers.pop("state", None)
         for name, values in numbers.items():
-            self._arrays[name][...] = values
+            self.arrays[name][...] = values
         return layout if is_new else []

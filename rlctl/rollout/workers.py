@@ -4,11 +4,12 @@ Observations, actions, rewards, flags and a policy's parameters are in shared me
 and answers list the episodes that ended. Workers are new interpreters, never forks, with one thread each.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import os
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NoReturn, Self
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ DEFAULT_TIMEOUT_S = 60.0
 RecordedActions = tuple[int, NDArray[Any]]  # seed and actions so far of an episode
 
 
-class Workers:
+class Workers(contextlib.AbstractContextManager["Workers"]):
     """`n_envs` environments of one kind on `n_workers` processes (default: the cores).
 
     Building starts at once and the first use waits for it, so that a caller can do its own slow imports in the
@@ -55,6 +56,7 @@ class Workers:
         bounds = np.linspace(0, n_envs, n_workers + 1).round().astype(int).tolist()
         self._ranges = list(itertools.pairwise(bounds))
         self._owner = [worker for worker, (low, high) in enumerate(self._ranges) for _ in range(low, high)]
+        self.first_envs = [low for low, _ in self._ranges]  # the first environment of each worker
         self._memories = [anonymous_file(), anonymous_file()]
         arrays, numbers = self._memories
         self._numbers = PolicyNumbers(numbers, n_envs)
@@ -82,11 +84,6 @@ class Workers:
         """The shared arrays, a row per environment; waits until the environments are built."""
         self._wait_until_built()
         return self._arrays
-
-    @property
-    def first_envs(self) -> list[int]:
-        """The first environment of each worker."""
-        return [low for low, _ in self._ranges]
 
     @property
     def playing(self) -> set[int]:
@@ -176,7 +173,7 @@ class Workers:
     @property
     def recurrent_state(self) -> NDArray[np.float32] | None:
         """Hidden and cell state of each environment's episode, shape (n_envs, 2, layers, hidden); None without."""
-        return self._numbers.state
+        return self._numbers.arrays.get("state")
 
     def start_playing(self, play: messages.Play) -> None:
         """Begin to play a segment into `arrays.segment`; a longer segment than before replaces these arrays.
@@ -264,9 +261,6 @@ class Workers:
     def _close_memory(self) -> None:
         while self._memories:
             os.close(self._memories.pop())
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -60,6 +60,7 @@ class Body(Properties):
         ]
         self.all_joint_names = [info[1].decode() for info in infos]
         self._links = {info[12].decode(): index for index, info in enumerate(infos)}
+        self.link_names = list(self._links)  # names of all links but the base
         self.base_name: str = pybullet.getBodyInfo(body_id, physicsClientId=client)[0].decode()
         self._all_names = [*self._links, self.base_name]
         movable = [info for info in infos if info[2] in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)]
@@ -73,11 +74,6 @@ class Body(Properties):
         """Torque or force limit in the model file [N m or N], shape (joints,)."""
         self.joint_max_speed: Array = np.array([info[11] for info in movable])
         """Velocity limit in the model file [rad/s or m/s], shape (joints,)."""
-
-    @property
-    def link_names(self) -> list[str]:
-        """Names of all links but the base."""
-        return list(self._links)
 
     def _joint_states(self) -> tuple[Array, Array, Any]:
         # Positions, velocities, and motor torques in a tuple: few tasks need them as an array.

@@ -40,23 +40,18 @@ class Curriculum:
             progress.stage = 1
 
     @property
-    def number(self) -> int:
-        """The current stage, from 1; 0 without stages."""
-        return self._progress.stage
-
-    @property
     def _rule(self) -> Promotion | None:
         """Promotion rule of the current stage; None for the last."""
-        return self.stages[self.number - 1].promote if self.stages else None
+        return self.stages[self._progress.stage - 1].promote if self.stages else None
 
     @property
     def title(self) -> str:
         """The current stage as text: `stage 2 of 3: tolerance 0.1`."""
-        return format_title(self.number, self.stages)
+        return format_title(self._progress.stage, self.stages)
 
     def columns(self) -> dict[str, int]:
         """Return the table column `stage`; empty without stages."""
-        return {"stage": self.number} if self.stages else {}
+        return {"stage": self._progress.stage} if self.stages else {}
 
     def count(self, ended: Sequence[EpisodeResult]) -> None:
         """Count finished training episodes of the current stage, in the order in which they ended."""
@@ -134,7 +129,7 @@ class Learner:
 
     def begin_next_stage(self) -> tuple[str, str]:
         """Cut the running episodes short and begin the next stage; return its title and the reason."""
-        self.env.workers.rebuild(self.curriculum.specs[self.curriculum.number])
+        self.env.workers.rebuild(self.curriculum.specs[self.progress.stage])
         begin_next_episodes(self.model)
         return self.curriculum.enter_next_stage(self.steps)
 

@@ -30,6 +30,7 @@ class TrainingLoop:
         self._metrics = Metrics(learner, checkpoints, display)
         self._display = display
         self._stop_announced = False
+        self._resume_command = shlex.join(["rlctl", "train", "--resume", str(checkpoints.run.path)])
         learner.start_clock()
 
     def run(self) -> None:
@@ -106,10 +107,6 @@ class TrainingLoop:
             f"interrupted at step {self.learner.steps:,}; {state}. Resume with: {self._resume_command}",
             self.stop_signal,
         )
-
-    @property
-    def _resume_command(self) -> str:
-        return shlex.join(["rlctl", "train", "--resume", str(self.checkpoints.run.path)])
 
     def _save_the_end(self) -> None:
         self.learner.progress.done = True

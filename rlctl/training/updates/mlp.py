@@ -47,21 +47,12 @@ class MlpStack:
         linears = [[module for module in network if isinstance(module, nn.Linear)] for network in modules]
         self._layers = [_Layer(row) for row in zip(*linears, strict=True)]
         self._buffers: dict[tuple[str, int], list[Floats]] = {}
-
-    @property
-    def count(self) -> int:
-        """Number of networks."""
-        return len(self._layers[0].weight)
-
-    @property
-    def parameters(self) -> list[Tensor]:
+        self.count = len(modules)  # number of networks
+        self.parameters = [values for layer in self._layers for values in layer.parameters]
         """Weights and biases, of all networks together."""
-        return [values for layer in self._layers for values in layer.parameters]
-
-    @property
-    def gradients(self) -> list[Floats]:
+        self.gradients = [layer.weight_gradient for layer in self._layers]
+        self.gradients += [layer.bias_gradient for layer in self._layers]
         """Gradients of the parameters; the order differs from `parameters`."""
-        return [*(layer.weight_gradient for layer in self._layers), *(layer.bias_gradient for layer in self._layers)]
 
     def run(self, inputs: Floats, use: str) -> list[Floats]:
         """Return the inputs and the output of each layer. The next run with the same `use` overwrites these arrays."""
