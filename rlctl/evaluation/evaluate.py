@@ -95,8 +95,7 @@ def run_evaluation(
 
 def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:
     """Start the workers of a request: by default an environment per core, but no more than episodes."""
-    n_envs = min(request.n_envs or available_cores(), request.episodes)
-    return Workers(spec, n_envs, timeout_s=request.env_timeout_s)
+    return Workers(spec, min(request.n_envs or available_cores(), request.episodes), timeout_s=request.env_timeout_s)
 
 
 def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
@@ -212,10 +211,8 @@ class GroupScore:
     def as_json(self) -> dict[str, Any]:
         """Return the scores as plain data."""
         spreads = {"success": self.spread("success"), "return": self.spread("mean_return")}
-        plain: dict[str, Any] = to_jsonable_python(
-            {"group": self.group.path, "task": self.group.task, "seeds": self.seeds, **spreads}
-        )
-        return plain
+        scores = {"group": self.group.path, "task": self.group.task, "seeds": self.seeds, **spreads}
+        return dict(to_jsonable_python(scores))
 
     def check(self, gates: Gates) -> None:
         """Raise `ArtifactError` if a seed has no score, and `AnswerIsNo` if one misses a gate."""

@@ -110,8 +110,7 @@ def as_json(result: Evaluation) -> dict[str, Any]:
             "return_without": unlimited.returns,
             "interventions": count_interventions(result),
         }
-    plain: dict[str, Any] = to_jsonable_python(content)
-    return plain
+    return dict(to_jsonable_python(content))
 
 
 def describe_score(score: MeasuredScore) -> str:

@@ -182,12 +182,11 @@ def _vary_event(
     check_name(parameter, ranges, f"--vary {name}: event {key!r} has no random parameter", UsageError)
     limits = ranges[parameter]
     read_range(f"--vary {name}", list(span[:2]), RangeLimits(limits.low, limits.high, limits.above), UsageError)
-    acts = spec.randomize or event.enabled or key in spec.events
     return Axis(
         name=name,
         setting=f"events.{key}.{parameter}",
         values=_spread(span, limits.whole),
-        nominal=None if acts else event.nominal(parameter),
+        nominal=None if spec.randomize or event.enabled or key in spec.events else event.nominal(parameter),
         whole=limits.whole,
     )
 

@@ -148,8 +148,7 @@ def _ask(cells: int, seconds: float, yes: bool) -> None:
     total = cells * seconds
     if yes or total <= ASK_ABOVE_S:
         return
-    duration = output.format_duration(total)
-    expected = f"{cells:,} cells will take about {duration}: the nominal one took {seconds:.1f} s"
+    expected = f"{cells:,} cells will take about {output.format_duration(total)}: the nominal one took {seconds:.1f} s"
     refusal = f"--vary: {expected}; use fewer values or --episodes, or start anyway with --yes"
     if not output.confirm(f"{expected}; start?", refusal):
         raise UsageError("--vary: not started")

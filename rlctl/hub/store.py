@@ -98,8 +98,7 @@ def push(contents: Mapping[str, Path | bytes], address: str) -> Manifest:
 def _open_store(address: str) -> Iterator[tuple[Any, str]]:
     scheme = address.partition("://")[0]
     try:
-        fsspec: Any = importlib.import_module("fsspec")
-        store, path = fsspec.core.url_to_fs(address)
+        store, path = importlib.import_module("fsspec").core.url_to_fs(address)
     except ImportError as error:
         raise UsageError(f"{address}: {scheme}:// needs packages: pip install 'rlctl[hub]' ({error})") from None
     except ValueError as error:

@@ -197,7 +197,6 @@ class _Reader:
 
 
 def _is_image(space: spaces.Space[object]) -> bool:
-    """Return whether SB3 treats a space as an image."""
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) != 3:
         return False
     return bool((space.low == 0).all() and (space.high == 255).all())

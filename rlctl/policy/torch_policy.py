@@ -155,7 +155,6 @@ class TorchPolicy(Policy):
 
     @classmethod
     def _build(cls, policy: PolicyFile) -> Self:
-        """Build the network, load its weights and act once."""
         network = build_network(policy.info)
         state = {name: torch.from_numpy(value.copy()) for name, value in policy.weights.items()}
         mismatch = network.load_state_dict(state, strict=False)

@@ -111,9 +111,8 @@ def _path_points(body: BodyMotion) -> NDArray[np.float64]:
 
 def shape_centers(body: BodyMotion, link: int) -> NDArray[np.float64]:
     """Return the positions of the shapes of a link [m], world frame, shape (shapes, T + 1, 3)."""
-    offsets = [shape.position for shape in body.shapes if shape.link == body.links[link]]
     turns, position = Rotation.from_quat(body.orientations[:, link]), body.positions[:, link]
-    centers = [position + turns.apply(offset) for offset in offsets]
+    centers = [position + turns.apply(shape.position) for shape in body.shapes if shape.link == body.links[link]]
     return np.array(centers, np.float64).reshape(-1, *position.shape)
 
 

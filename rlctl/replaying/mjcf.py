@@ -84,8 +84,7 @@ def _defaults(group: ElementTree.Element | None, outer: Mapping[str, str]) -> It
 def _of_body(body: ElementTree.Element, defaults: _Defaults, around: str) -> Iterator[Shape]:
     inherited = body.get("childclass", around)
     for geom in body.iterfind("geom"):
-        chosen = defaults.get(geom.get("class", inherited), {})
-        yield _shape(body.get("name", ""), {**chosen, **geom.attrib})
+        yield _shape(body.get("name", ""), {**defaults.get(geom.get("class", inherited), {}), **geom.attrib})
     for child in body.iterfind("body"):
         yield from _of_body(child, defaults, inherited)
 

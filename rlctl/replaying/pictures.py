@@ -182,8 +182,6 @@ def film_episodes(
 
 
 class _Film:
-    """Takes the pictures of one film."""
-
     def __init__(self, env: Env, path: Path) -> None:
         self._view = look_at(env, *_SIZE[path.suffix])
         dt = find_dt(env) or _DT

@@ -70,7 +70,6 @@ def make_drawable(spec: EnvSpec, warn: Warn) -> Env:
 
 
 def _make_reader(env: Env, warn: Warn) -> SceneReader | MujocoReader | Camera:
-    """Return what reads the world of a task or of MuJoCo, or takes the pictures of any other environment."""
     if find_mujoco(env):
         return MujocoReader(env)
     inner = env.unwrapped

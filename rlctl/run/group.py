@@ -136,8 +136,7 @@ def write_job(folder: Path, job: Job) -> None:
 def read_job(folder: Path, seed: int) -> Job | None:
     """Read the job of a seed; None if there is none, or its file cannot be read."""
     try:
-        content: Any = files.read_json(job_file(folder, seed))
-        return Job(**content)
+        return Job(**files.read_json(job_file(folder, seed)))
     except (ArtifactError, OSError, TypeError):
         return None
 

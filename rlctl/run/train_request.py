@@ -53,8 +53,7 @@ class TrainRequest:
         """Return the request as JSON data."""
         from pydantic_core import to_jsonable_python
 
-        content: dict[str, Any] = to_jsonable_python(self)
-        return content
+        return dict(to_jsonable_python(self))
 
     @classmethod
     def from_json(cls, content: Any) -> "TrainRequest":

@@ -163,5 +163,4 @@ def read_model(path: Path, model: type[Model]) -> Model:
 
 def dump(value: Any) -> str:
     """Return plain data as YAML, with the keys in their order."""
-    text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=100)
-    return text
+    return str(yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=100))

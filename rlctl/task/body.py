@@ -137,11 +137,10 @@ class Body(Properties):
         `position` [m]; `orientation` is a quaternion (x, y, z, w), by default any will do. The search starts at the
         current joint positions and stops within 0.1 mm or after 100 iterations, even if the pose is out of reach.
         """
-        pose = [position] if orientation is None else [position, orientation]
         solution = pybullet.calculateInverseKinematics(
             self.id,
             self._link_index(link),
-            *[list(part) for part in pose],
+            *[list(part) for part in (position, orientation) if part is not None],
             maxNumIterations=100,
             residualThreshold=1e-4,
             physicsClientId=self.client,

@@ -133,8 +133,7 @@ class MujocoSim:
         return Joined(first, second)
 
     def _add_equality(self, kind: Any, **values: Any) -> None:
-        solref = [2 * self._control_dt / self._substeps, 1.0]
-        self._spec.add_equality(type=kind, solref=solref, solimp=_RIGID, **values)
+        self._spec.add_equality(type=kind, solref=[2 * self._control_dt / self._substeps, 1.0], solimp=_RIGID, **values)
         self._compile()
 
     def _add_site(self, end: Attachment) -> str:

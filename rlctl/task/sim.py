@@ -238,8 +238,7 @@ class Sim(Constraints):
         """Add a visible sphere without collisions; return its id, for `move_marker`."""
         sphere, client = pybullet.GEOM_SPHERE, self.client
         shape = pybullet.createVisualShape(sphere, radius=radius, rgbaColor=color, physicsClientId=client)
-        marker = pybullet.createMultiBody(baseVisualShapeIndex=shape, basePosition=position, physicsClientId=client)
-        return int(marker)
+        return int(pybullet.createMultiBody(baseVisualShapeIndex=shape, basePosition=position, physicsClientId=client))
 
     def move_marker(self, marker: int, position: Sequence[float] | Array) -> None:
         """Move a marker to a world position [m]."""

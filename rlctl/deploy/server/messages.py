@@ -19,8 +19,7 @@ class MessageError(ValueError):
 
 def pack(value: Any) -> bytes:
     """Return a message: msgpack, in which an array is a map of its bytes, dtype and shape."""
-    packed: bytes = msgpack.packb(value, default=_encode)
-    return packed
+    return bytes(msgpack.packb(value, default=_encode))
 
 
 def _encode(value: Any) -> Any:
