@@ -78,8 +78,7 @@ class BatchRenorm(Layer):
     epsilon: np.float32
 
     def __call__(self, value: Array) -> Array:
-        result: Array = self.scale * ((value - self.mean) / np.sqrt(self.variance + self.epsilon)) + self.bias
-        return result
+        return self.scale * ((value - self.mean) / np.sqrt(self.variance + self.epsilon)) + self.bias
 
 
 @dataclasses.dataclass(slots=True)
@@ -138,8 +137,7 @@ class ScaleImage(Layer):
 
     def __call__(self, value: Any) -> Array:
         pixels = np.asarray(value).transpose(2, 0, 1) if self.channels_last else np.asarray(value)
-        result: Array = np.asarray(pixels, np.float32) / np.float32(255.0)
-        return result
+        return np.asarray(pixels, np.float32) / np.float32(255.0)
 
 
 @dataclasses.dataclass(slots=True)
@@ -199,8 +197,7 @@ class Lstm:
 
 
 def _sigmoid(value: Array) -> Array:
-    result: Array = np.float32(0.5) * (np.tanh(np.float32(0.5) * value) + np.float32(1.0))
-    return result
+    return np.float32(0.5) * (np.tanh(np.float32(0.5) * value) + np.float32(1.0))
 
 
 def _elu(value: Array) -> Array:

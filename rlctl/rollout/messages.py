@@ -163,8 +163,7 @@ def make_error(failure: WorkerException, task: str) -> RlctlError:
             return EpisodeFailed(message, *failure.where, hint=format_hint(task), details=details)
         # The policy or its server failed: check-env would not show it.
         message += "\nin environment {}, episode seed {}, step {}".format(*failure.where)
-    result: RlctlError = kind(message, details=details)
-    return result
+    return kind(message, details=details)
 
 
 def format_hint(task: str) -> str:

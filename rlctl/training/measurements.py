@@ -96,8 +96,7 @@ def _half_range(space: spaces.Space[Any]) -> NDArray[Any] | None:
     """Return half the range of each element of an action; None for actions without limits, or discrete ones."""
     if not isinstance(space, spaces.Box) or not np.isfinite([space.low, space.high]).all():
         return None
-    half: NDArray[Any] = np.maximum((space.high - space.low) / 2, 1e-12)
-    return half
+    return np.maximum((space.high - space.low) / 2, 1e-12)
 
 
 def summarize_steps(

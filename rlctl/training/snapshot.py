@@ -100,8 +100,7 @@ def _randomness_tensors() -> Tensors:
 
 
 def _array(tensor: torch.Tensor) -> NDArray[Any]:
-    values: NDArray[Any] = tensor.detach().cpu().numpy()
-    return values
+    return tensor.detach().cpu().numpy()
 
 
 def flatten(value: Any, path: str) -> tuple[Tensors, Any]:

@@ -183,8 +183,7 @@ class Command:
         action = action.astype(self._space.dtype).reshape(self._space.shape)
         if self._is_action:
             return action
-        result: NDArray[Any] = np.minimum(np.maximum(action, self._space.low), self._space.high)  # rounding
-        return result
+        return np.minimum(np.maximum(action, self._space.low), self._space.high)  # rounding
 
     def _note(self, limit: str, x: Array, allowed: Array, ends: tuple[Array, Array]) -> None:
         acted = np.abs(allowed - x) > 1e-9  # smaller differences are rounding errors: bounds are reached exactly

@@ -159,8 +159,7 @@ def share_gradients(parameters: Sequence[Tensor]) -> Floats:
     shared = torch.zeros(len(parameters), *parameters[0].shape)
     for parameter, part in zip(parameters, shared, strict=True):
         parameter.grad = part
-    array: Floats = shared.numpy()
-    return array
+    return shared.numpy()
 
 
 Result = TypeVar("Result")

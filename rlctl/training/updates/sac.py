@@ -202,8 +202,7 @@ class SacUpdate:
         inputs = np.concatenate([batch.next_features, sample.action], 1)[None]
         passes = self._side_by_side.run([functools.partial(stack.run, inputs, "target") for stack in self._targets])
         estimates = self._choose_estimates(np.concatenate([values[-1] for values in passes]))
-        target: Floats = batch.rewards + batch.discounts * (estimates - coefficient * sample.log_prob)
-        return target
+        return batch.rewards + batch.discounts * (estimates - coefficient * sample.log_prob)
 
     def _update_critics(self, inputs: Floats, target: Floats) -> Floats:
         """Return the critics' outputs before the update, shape (critics, batch, outputs)."""
