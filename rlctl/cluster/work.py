@@ -169,6 +169,4 @@ def _bind(work: Work) -> TrainRequest:
     """Return the request, or one that resumes the run of an earlier attempt."""
     request = TrainRequest.from_json(work.request)
     run = find_run_of_seed(work.folder, work.seed) if request.resume is None else None
-    if run is None:
-        return request
-    return request.to_resume(run.path, {})
+    return request if run is None else request.to_resume(run.path, {})

@@ -210,8 +210,7 @@ def check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -
     if known is None or any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):
         return
     for key in parameters:
-        is_of_gymnasium = key == "max_episode_steps" and hasattr(constructor, "gymnasium_id")
-        if not is_of_gymnasium:
+        if key != "max_episode_steps" or not hasattr(constructor, "gymnasium_id"):
             check_name(key, known, f"task.{key}: {task} has no parameter", RecipeError)
 
 

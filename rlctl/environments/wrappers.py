@@ -35,8 +35,7 @@ class TimeFeature(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._steps = 0
         space = env.observation_space
         if isinstance(space, spaces.Dict) and _KEY in space.spaces:
-            parts = {**space.spaces, _KEY: _append_bounds(space[_KEY])}
-            self.observation_space = spaces.Dict(list(parts.items()))
+            self.observation_space = spaces.Dict([*{**space.spaces, _KEY: _append_bounds(space[_KEY])}.items()])
         else:
             self.observation_space = _append_bounds(space)
 

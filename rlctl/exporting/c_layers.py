@@ -106,8 +106,7 @@ class CWriter:
         elif not isinstance(space, spaces.Box):
             counts = space.nvec.tolist() if isinstance(space, spaces.MultiDiscrete) else [size]
             for index, count in enumerate(counts):
-                offset = sum(counts[:index])
-                self.statements.append(f"action[{index}] = find_largest({value} + {offset}, {count});")
+                self.statements.append(f"action[{index}] = find_largest({value} + {sum(counts[:index])}, {count});")
         else:
             low, high = space.low.ravel(), space.high.ravel()
             x = f"{value}[i]"
@@ -153,8 +152,7 @@ def _offset(offset: int) -> str:
 
 def write_array(declaration: str, values: Sequence[str]) -> str:
     """Return the definition of an array; `declaration` is its type and name."""
-    rows = [", ".join(values[low : low + _PER_LINE]) for low in range(0, len(values), _PER_LINE)]
-    body = ",\n    ".join(rows)
+    body = ",\n    ".join(", ".join(values[low : low + _PER_LINE]) for low in range(0, len(values), _PER_LINE))
     return f"{declaration}[{len(values)}] = {{\n    {body},\n}};\n"
 
 

@@ -245,5 +245,4 @@ def measure_latency(torch_policy: TorchPolicy, exported: Policy) -> Latency:
 
 
 def _measure_median_us(call: Callable[[], Any]) -> float:
-    times = timeit.repeat(call, number=1, repeat=_WARM_UP + _REPETITIONS)
-    return statistics.median(times[_WARM_UP:]) * 1e6
+    return statistics.median(timeit.repeat(call, number=1, repeat=_WARM_UP + _REPETITIONS)[_WARM_UP:]) * 1e6

@@ -204,8 +204,7 @@ def _make_array(content: Any, dtype: Any, shape: Any, order: str) -> NDArray[Any
         content = content.arguments[0] if content.arguments else ""
     if isinstance(content, str):
         content = content.encode("latin1")
-    flat = np.frombuffer(content, read_dtype(dtype))
-    return flat.reshape(shape, order="F" if order == "F" else "C").copy()
+    return np.frombuffer(content, read_dtype(dtype)).reshape(shape, order="F" if order == "F" else "C").copy()
 
 
 def read_dtype(value: Any) -> np.dtype[Any]:

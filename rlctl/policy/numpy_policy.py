@@ -141,8 +141,7 @@ def _choose(values: Array, uniform: Array | None, index: int) -> int:
     if uniform is None:
         return int(values.argmax())
     cumulative = np.cumsum(np.exp(values.astype(np.float64) - values.max()))
-    choice = int(np.searchsorted(cumulative, uniform[index] * cumulative[-1], side="right"))
-    return min(choice, len(values) - 1)
+    return min(int(np.searchsorted(cumulative, uniform[index] * cumulative[-1], side="right")), len(values) - 1)
 
 
 def _count_choices(space: spaces.Space[Any]) -> Array:

@@ -52,7 +52,6 @@ class RecordedEpisode(Trajectory):
 def save_episode(path: Path, episode: RecordedEpisode) -> None:
     """Write an episode, atomically."""
     observations = split(episode.observations)
-    parts = {f"observations/{key}" if key else "observations": value for key, value in observations.items()}
     files.write_npz(
         path,
         {
@@ -60,7 +59,7 @@ def save_episode(path: Path, episode: RecordedEpisode) -> None:
             "actions": episode.actions,
             "rewards": episode.rewards,
             "terms": episode.terms,
-            **parts,
+            **{f"observations/{key}" if key else "observations": value for key, value in observations.items()},
         },
     )
 

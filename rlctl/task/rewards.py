@@ -100,8 +100,7 @@ def near_limits(positions: Array, low: Array, high: Array, margin: float) -> flo
     Everything in [rad] or [m], arrays of shape (joints,); beyond a limit the value rises further. A joint whose lower
     limit is not below its upper one has no limits.
     """
-    room = np.minimum(positions - low, high - positions)
-    inside = np.maximum(0.0, 1.0 - room / margin)
+    inside = np.maximum(0.0, 1.0 - np.minimum(positions - low, high - positions) / margin)
     return float(np.where(low < high, inside, 0.0).mean())
 
 

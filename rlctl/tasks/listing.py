@@ -76,8 +76,7 @@ def _read_algorithm(entry: installed.TaskEntry) -> str | None:
     from rlctl.storage import yaml_text
 
     content = yaml_text.load(file.read_text(encoding="utf-8"), str(file))
-    algo = content.get("algo", "ppo") if isinstance(content, dict) else "ppo"
-    return str(algo)
+    return str(content.get("algo", "ppo") if isinstance(content, dict) else "ppo")
 
 
 def _read_score(entry: installed.TaskEntry) -> dict[str, Any]:

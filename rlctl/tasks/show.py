@@ -99,8 +99,7 @@ def _list_quantities(quantities: list[Json]) -> list[Row]:
     rows = []
     for quantity in quantities:
         size = "x".join(map(str, quantity["shape"])) if quantity["kind"] == "Box" else str(quantity["kind"])
-        bounds = _format_bounds(quantity["low"], quantity["high"])
-        rows.append((quantity["name"], size, quantity["unit"] or "", bounds))
+        rows.append((quantity["name"], size, quantity["unit"] or "", _format_bounds(quantity["low"], quantity["high"])))
     return [row for row in rows if row[0]]  # an unnamed part is the whole space, which is in the title
 
 

@@ -228,8 +228,7 @@ class Evaluator:
     def _is_better(self, score: Score, episodes: int) -> bool:
         if self.best is not None and self.best.training_steps > self._learner.steps:
             return False  # a resumed run repeats this evaluation; a later best policy is already stored
-        best = None if self.best is None else self.best.evaluation
-        return is_better(score, best, self._highest_success, episodes)
+        return is_better(score, self.best.evaluation if self.best else None, self._highest_success, episodes)
 
     def _keep_as_best(self, policy: PolicyFile, score: Score) -> None:
         best = policy.with_info(evaluation=score)
