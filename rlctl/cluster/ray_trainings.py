@@ -199,6 +199,8 @@ def train_on_node(mailbox: Any, content: dict[str, Any]) -> int:
 class RayTrainings(Trainings):
     """Trains on Ray; as many at a time as its cores allow."""
 
+    is_local = False
+
     def __init__(
         self, address: str, folder: Path, task: str, waiting: int, jobs: int | None, settings: ClusterSettings
     ) -> None:
@@ -213,9 +215,6 @@ class RayTrainings(Trainings):
     def describe(self) -> str:
         """Describe where the runs train, and how many at a time."""
         return describe_slots(self._ray, self._settings.cpus, self._jobs)[0]
-
-    def _prepare_thread(self) -> None:
-        """The driver only waits."""
 
     def _execute(self, request: TrainRequest, receive: Callable[[str], None], next_signal: NextSignal) -> int:
         work = make_work(request, self._token, self._settings)

@@ -58,6 +58,7 @@ Result = TypeVar("Result")
 class SlurmTrainings(Trainings):
     """Trains all runs in one array of jobs; with `detach`, `run` raises `Detached` after submitting them."""
 
+    is_local = False
     resume_options = " --on slurm"
 
     def __init__(
@@ -84,9 +85,6 @@ class SlurmTrainings(Trainings):
     def describe(self) -> str:
         """Describe where the runs train."""
         return f"on SLURM, {output.format_count(self._settings.cpus, 'core')} each"
-
-    def _prepare_thread(self) -> None:
-        """The driver only waits."""
 
     def _execute(self, request: TrainRequest, receive: Callable[[str], None], next_signal: NextSignal) -> int:
         try:

@@ -39,6 +39,7 @@ NextSignal = Callable[[], int]
 class Trainings:
     """Runs calls of `train`, several at a time, on this machine; a signal stops all."""
 
+    is_local = True  # whether the trainings share the cores of this machine
     resume_options = ""  # options that the resume command needs: ` --on slurm`
 
     def __init__(self, jobs: int) -> None:
@@ -62,7 +63,7 @@ class Trainings:
 
     def _prepare_thread(self) -> None:
         """Give this thread's trainings their share of the cores, which also sets their number of workers."""
-        if self._jobs > 1 and hasattr(os, "sched_setaffinity"):
+        if self.is_local and self._jobs > 1 and hasattr(os, "sched_setaffinity"):
             cores = sorted(os.sched_getaffinity(0))
             share = max(1, len(cores) // self._jobs)
             first = next(self._thread_numbers) * share % len(cores)
