@@ -73,7 +73,6 @@ def _describe_input(info: PolicyInfo) -> str:
 
 
 def _emit_part(graph: Graph, source: tuple[str, Any], network: Network, key: str) -> str:
-    """Add the layers from a part of the observation to its features."""
     (value, dtype), layers = source, network.parts[key]
     if dtype != np.float32 and not isinstance(layers[0], Normalize | OneHot):
         value = graph.cast(value, np.float32)

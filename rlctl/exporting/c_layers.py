@@ -49,7 +49,6 @@ class CWriter:
         return self._write_layers([*network.trunk, *network.head], value, feature)
 
     def _write_part(self, layer: Layer, source: str, start: int, size: int, target: str, feature: int) -> None:
-        """Write the features of a part of the observation: one-hot, normalised or unchanged."""
         if isinstance(layer, OneHot):
             for number, count in enumerate(layer.sizes.ravel().tolist()):
                 element = f"{target}[{_offset(feature)}]"

@@ -118,8 +118,6 @@ def read_normalization(policy: PolicyFile) -> dict[str, layers.Normalize]:
 
 
 class _Reader:
-    """Turns the tensors of a policy file into layers."""
-
     def __init__(self, policy: PolicyFile) -> None:
         info = self.info = policy.info
         self.policy = policy

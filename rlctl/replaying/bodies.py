@@ -68,7 +68,6 @@ def _draw_ground(body: BodyMotion, scene: Scene, timelines: Timelines) -> None:
 
 
 def _draw_terrain(name: str, points: NDArray[np.float64], timelines: Timelines) -> None:
-    """Draw rough ground as a mesh of two triangles per cell."""
     rows, columns, _ = points.shape
     corner = np.arange(rows * columns).reshape(rows, columns)[:-1, :-1].ravel()
     right, above = corner + columns, corner + 1

@@ -40,8 +40,6 @@ _CLOSEST, _FARTHEST = 0.8, 8.0  # [m]; the renderer draws nothing beyond 10 m
 
 
 class _Pictures:
-    """The environment's own pictures."""
-
     def __init__(self, env: Env) -> None:
         self._env = env
 

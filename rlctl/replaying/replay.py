@@ -136,8 +136,6 @@ def _load_episode(path: Path) -> RecordedEpisode:
 
 
 class _RecordedSource:
-    """A recorded episode, whose actions are replayed."""
-
     def __init__(self, path: Path, output: Path | None) -> None:
         self._path, self._output = path, output
         self._episode = _load_episode(path)
@@ -160,8 +158,6 @@ class _RecordedSource:
 
 
 class _PolicySource:
-    """A policy and the environment it acts in."""
-
     def __init__(self, request: ReplayRequest) -> None:
         self._output = request.output
         policy = find_policy(request.source, request.checkpoint)

@@ -113,8 +113,6 @@ def play_episodes(
 
 
 class _Recorder:
-    """Joins the recorded segments of one episode."""
-
     def __init__(self, index: int, record: bool) -> None:
         self.index = index  # index of the episode in the list
         self._record = record
