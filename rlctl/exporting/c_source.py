@@ -69,9 +69,7 @@ class Layout:
 
     def _list_observed(self) -> list[Element]:
         env = self.info.env
-        sizes = env.observation_sizes
-        if SINGLE not in self.parts:
-            sizes = self.sizes
+        sizes = env.observation_sizes if SINGLE in self.parts else self.sizes
         if sum(sizes.values()) != self.size:
             sizes = {"observation": self.size}
         return [Element(name, size, env.observation_units.get(name, "")) for name, size in sizes.items()]

@@ -36,9 +36,8 @@ class Checkpoints:
         self.saved_step: int | None = None  # step of the last complete checkpoint
         self.problem = ""  # the last write that failed, and why
         self._learner = learner
-        self._replay: ReplaySegments | None = None
-        if (buffer := getattr(learner.model, "replay_buffer", None)) is not None:
-            self._replay = ReplaySegments(run.replay_segments, buffer)
+        buffer = getattr(learner.model, "replay_buffer", None)
+        self._replay = None if buffer is None else ReplaySegments(run.replay_segments, buffer)
         self._warn = warn
         self._next_s = time.monotonic()
         self._uncounted_checkpoints = 1  # checkpoints that are written even if not due: the last one

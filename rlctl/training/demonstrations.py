@@ -102,12 +102,11 @@ def _read(path: Path, task: str) -> list[Demonstration]:
 
 def _read_own(file: Path, task: str) -> Demonstration:
     episode = load_episode(file)
-    if make_slug(episode.info.spec.task) != make_slug(task):
-        raise ArtifactError(f"{file}: an episode of the task {episode.info.spec.task}, not of {task}")
+    info = episode.info
+    if make_slug(info.spec.task) != make_slug(task):
+        raise ArtifactError(f"{file}: an episode of the task {info.spec.task}, not of {task}")
     observations = {key: rows[: len(episode.actions)] for key, rows in split(episode.observations).items()}
-    return Demonstration(
-        str(file), observations, episode.actions, False if episode.info.failure else episode.info.success
-    )
+    return Demonstration(str(file), observations, episode.actions, False if info.failure else info.success)
 
 
 def _read_minari(folder: Path) -> list[Demonstration]:

@@ -111,9 +111,8 @@ def _build_learner(
     if workers.info.reward_weights and not workers.info.has_success:
         _refuse_success_rates(start)
     # A policy that begins trained is evaluated first: it may be better than all later ones.
-    progress = status.Progress(next_eval=0 if start.is_trained else recipe.eval.every_steps or recipe.total_timesteps)
-    if start.checkpoint is not None:
-        progress = start.checkpoint.state.progress
+    next_eval = 0 if start.is_trained else recipe.eval.every_steps or recipe.total_timesteps
+    progress = start.checkpoint.state.progress if start.checkpoint else status.Progress(next_eval)
     env = WorkerVecEnv(workers, recipe.seed)
     model = build_model(recipe, env, start.request.device)
     rollouts = (OnPolicyRollouts if recipe.algo in ON_POLICY else OffPolicyRollouts)(model, env, recipe, progress)

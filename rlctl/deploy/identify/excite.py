@@ -101,9 +101,7 @@ def _play(env: TaskEnv, trajectory: Array, driven: tuple[str, ...]) -> tuple[str
         side = row.reshape(low.shape)
         action = (middle + np.where(side > 0, side * (high - middle), side * (middle - low))).astype(low.dtype)
         actions.append(action.ravel())
-        measured.append(
-            [(body.joint_positions[index], body.joint_velocities[index]) for body, index in joints.values()]
-        )
+        measured.append([(body.joint_positions[i], body.joint_velocities[i]) for body, i in joints.values()])
         env.task.act(action)
         env.sim.step()
         reason, reached = _find_danger(env, joints)

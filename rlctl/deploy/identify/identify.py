@@ -193,9 +193,7 @@ def _estimate_value(
         end = parameter.low if position < 0.5 else parameter.high
         note = f"the estimate is at the end of its search range, {end:.3g}: the cause may be something else"
         known = False
-    return IdentifiedValue(
-        parameter.name, parameter.event, parameter.key, value, float(low), float(high), bool(known), note
-    )
+    return IdentifiedValue(parameter.name, parameter.event, parameter.key, value, float(low), float(high), known, note)
 
 
 def _explain_unknown(unknowns: Unknowns, index: int, information: Array) -> str:

@@ -173,9 +173,8 @@ class SideBySide:
     def __init__(self, networks: Sequence[Iterable[nn.Module]], batch_size: int) -> None:
         linears = [[module for module in network if isinstance(module, nn.Linear)] for network in networks]
         multiplications = batch_size * min(sum(linear.weight.numel() for linear in row) for row in linears)
-        self._second: ThreadPoolExecutor | None = None
-        if multiplications >= _WORTHWHILE and available_cores() > 1:
-            self._second = ThreadPoolExecutor(1, initializer=_prepare_thread)
+        is_worthwhile = multiplications >= _WORTHWHILE and available_cores() > 1
+        self._second = ThreadPoolExecutor(1, initializer=_prepare_thread) if is_worthwhile else None
 
     def make_stacks(self, networks: Iterable[Iterable[nn.Module]]) -> list[MlpStack]:
         """Return networks of equal shape as one stack, or, with a second thread, as one stack per network."""
