@@ -49,7 +49,6 @@ def write_excitation(spec: EnvSpec, path: Path, *, seconds: float, seed: int) ->
         # No random events: they would only disturb the motion.
         env.set_events(EventSettings())
         shape = _draw_sines(env, steps, seed)
-        reason = ""
         for amplitude in _AMPLITUDES:
             reason, log, share = _play(env, amplitude * shape, expected.driven)
             if not reason:

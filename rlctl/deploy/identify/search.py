@@ -106,15 +106,12 @@ def search(ask: Ask, unknowns: Unknowns, weights: Array, seed: int, report: Call
     starts = _choose_starts(trials[0], [trials[index] for index in np.argsort(costs, kind="stable")])
     report(f"least squares from {len(starts)} starts")
     fit_all([FindFit(start, weights, _EVALUATIONS) for start in starts])
-    best = _best(fits)
-    while neighbours := [
-        delay for delay in (best.delay - 1, best.delay + 1) if 0 <= delay <= _MAX_DELAY and delay not in fits
-    ]:
-        fit_all([FindFit(SearchPoint(best.at.tolist(), delay), weights, _EVALUATIONS) for delay in neighbours])
-        if _best(fits).delay == best.delay:
-            break
-        best = _best(fits)
-    best = _best(fits)
+    tried = -1  # the delay whose neighbours were tried last
+    while (best := _best(fits)).delay != tried:
+        tried = best.delay
+        delays = (delay for delay in (tried - 1, tried + 1) if 0 <= delay <= _MAX_DELAY and delay not in fits)
+        if neighbours := [FindFit(SearchPoint(best.at.tolist(), delay), weights, _EVALUATIONS) for delay in delays]:
+            fit_all(neighbours)
     report("intervals")
     weights = 1.0 / np.maximum(best.errors, 1e-4 / weights)
     near = [delay for delay in (best.delay - 1, best.delay, best.delay + 1) if delay in fits]
