@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 
-from rlctl.environments.dict_spaces import join, split
+from rlctl.environments.dict_spaces import join, map_parts, split
 from rlctl.training.updates.mlp import Floats
 
 
@@ -32,7 +32,7 @@ def sample_batches(model: Any, network: Any, count: int, size: int) -> list[Batc
 
 
 def _extract(network: Any, observations: Any) -> Floats:
-    tensors = join({key: torch.as_tensor(rows) for key, rows in split(observations).items()})
+    tensors = map_parts(torch.as_tensor, observations)
     features: Floats = network.extract_features(tensors, network.features_extractor).numpy()
     return features
 
@@ -51,9 +51,7 @@ def _gather(model: Any, count: int, size: int) -> dict[str, Any]:
     rows, envs = (np.concatenate(numbers) for numbers in zip(*drawn, strict=True))
 
     def normalize(observations: Any) -> Any:
-        return buffer._normalize_obs(
-            join({key: values[rows, envs] for key, values in split(observations).items()}), env
-        )
+        return buffer._normalize_obs(map_parts(lambda values: values[rows, envs], observations), env)
 
     dones = buffer.dones[rows, envs] * (1 - buffer.timeouts[rows, envs])
     return {

@@ -16,7 +16,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.distributions import DiagGaussianDistribution, StateDependentNoiseDistribution
 from stable_baselines3.common.utils import explained_variance
 
-from rlctl.environments.dict_spaces import join, split
+from rlctl.environments.dict_spaces import map_parts
 from rlctl.training.updates.mlp import LOG_SQRT_TAU, Floats, MlpStack, SideBySide, clip_norm, is_mlp, share_gradients
 
 _FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
@@ -72,9 +72,7 @@ class PpoUpdate:
     def _read_buffer(self) -> dict[str, NDArray[Any]]:
         """Return the rollout, shape (steps * environments, ...) each, with features for observations."""
         buffer = self._model.rollout_buffer
-        observations = join(
-            {key: torch.from_numpy(buffer.swap_and_flatten(rows)) for key, rows in split(buffer.observations).items()}
-        )
+        observations = map_parts(lambda rows: torch.from_numpy(buffer.swap_and_flatten(rows)), buffer.observations)
         data = {name: buffer.swap_and_flatten(getattr(buffer, name)) for name in _FIELDS}
         data |= {name: data[name].ravel() for name in _FIELDS[1:]}
         data["actions"] = data["actions"].astype(np.float32)  # the buffer has the type of the space
