@@ -110,10 +110,8 @@ class Tuning:
 
 def find_best(trials: list[Trial]) -> Trial | None:
     """Return the trial with the highest score among those that were trained to the end."""
-    done = [
-        (trial.score, -trial.number, trial) for trial in trials if trial.state == "done" and trial.score is not None
-    ]
-    return max(done)[2] if done else None
+    done = [trial for trial in trials if trial.state == "done" and trial.score is not None]
+    return max(done, key=lambda trial: (trial.score, -trial.number), default=None)
 
 
 def find(text: str, root: Path) -> Tuning:
