@@ -143,7 +143,6 @@ def export_policy(request: ExportRequest) -> list[ExportReport]:
             refuse_links_out(source.run.path)
         folder = Path() if request.checkpoint == PRETRAINED else source.file.parent
         target = source.run.onnx_file if source.run else folder / source.file.name
-        target = target.with_suffix(f".{formats[0]}")
     return _export(source, [target.with_suffix(f".{name}") for name in formats])
 
 
