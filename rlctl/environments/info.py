@@ -131,9 +131,8 @@ def _describe_joints(model: mujoco.MjModel) -> Joints | None:
         return None
     moved = model.actuator_trnid[:, 0]
     ranges, limited = model.jnt_range[moved], model.jnt_limited[moved].astype(bool).all()
-    strengths = np.abs(model.actuator_gainprm[:, 0] * model.actuator_gear[:, 0]) * np.abs(model.actuator_ctrlrange).max(
-        axis=1
-    )
+    gains = np.abs(model.actuator_gainprm[:, 0] * model.actuator_gear[:, 0])
+    strengths = gains * np.abs(model.actuator_ctrlrange).max(axis=1)
     motors = all(int(kind) == no_bias for kind in model.actuator_biastype) and model.actuator_ctrllimited.all()
     return Joints(
         names=[joint_name(model, joint) for joint in moved],

@@ -107,8 +107,7 @@ def stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any
         np.concatenate([space.high] * frames, axis=-1),
         dtype=space.dtype.type,
     )
-    wrapped = FrameStackObservation(env, frames)
     flat: gymnasium.Env[Any, Any] = TransformObservation(
-        wrapped, lambda stack: np.concatenate(list(stack), axis=-1), stacked
+        FrameStackObservation(env, frames), lambda stack: np.concatenate(list(stack), axis=-1), stacked
     )
     return flat

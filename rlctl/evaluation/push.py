@@ -79,9 +79,8 @@ def measure_push(
     has_success = any(result.success is not None for result in unpushed)
 
     def find_held(results: Sequence[EpisodeResult]) -> NDArray[np.bool_]:
-        return np.array(
-            [result.success if has_success else result.length >= pushed.max_steps for result in results], bool
-        )
+        held = [result.success if has_success else result.length >= pushed.max_steps for result in results]
+        return np.array(held, bool)
 
     played = {0.0: unpushed}
 

@@ -180,9 +180,8 @@ def format_command(result: Robustness, varied: RobustnessMap, cell: Cell) -> str
     settings = {f"task.{name}": json.dumps(value) for name, value in result.parameters.items()}
     settings |= {f"reward_weights.{name}": json.dumps(value) for name, value in result.reward_weights.items()}
     for name, event in result.events.items():
-        settings |= {f"events.{name}.{key}": json.dumps(value) for key, value in event.items()} or {
-            f"events.{name}": "{}"
-        }
+        values = {f"events.{name}.{key}": json.dumps(value) for key, value in event.items()}
+        settings |= values or {f"events.{name}": "{}"}
     settings["randomize"] = "false"
     engine = []
     for axis, value in zip(varied.axes, cell.values, strict=True):

@@ -148,9 +148,8 @@ def write_c(policy: PolicyFile, file_name: str) -> CSource:
     """
     if (weights := sum(tensor.size for tensor in policy.actor_only().tensors.values())) > LARGEST:
         raise UsageError(f"export --c: {weights:,} weights are too many, the limit is {LARGEST:,}; use export --onnx")
-    kwargs = policy.info.policy_kwargs
     for key in own_modules.KEYS:
-        if isinstance(own := kwargs.get(key), dict):
+        if isinstance(own := policy.info.policy_kwargs.get(key), dict):
             raise UsageError(f"export --c: the {key} {own['class']} cannot be written as C; use export --onnx")
     name, network = _make_identifier(file_name), Network(policy)
     layout = Layout(name, policy.info)

@@ -239,9 +239,8 @@ def measure_latency(torch_policy: TorchPolicy, exported: Policy) -> Latency:
         exported_us = _measure_median_us(lambda: exported.repeat(observation, _CALLS)) / _CALLS
     else:
         exported_us = _measure_median_us(lambda: exported.predict(observation))
-    return Latency(
-        exported_us, _measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True))
-    )
+    sb3_us = _measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True))
+    return Latency(exported_us, sb3_us)
 
 
 def _measure_median_us(call: Callable[[], Any]) -> float:

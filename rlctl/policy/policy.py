@@ -17,9 +17,8 @@ class Policy(abc.ABC):
     def __init__(self, info: PolicyInfo) -> None:
         self.info = info
         self.observation_space, self.action_space = info.env.spaces()
-        self._parts = {
-            key: (space.shape or (), space.dtype) for key, space in split_space(self.observation_space).items()
-        }
+        parts = split_space(self.observation_space)
+        self._parts = {key: (space.shape or (), space.dtype) for key, space in parts.items()}
 
     def __repr__(self) -> str:
         info = self.info

@@ -46,10 +46,8 @@ def _draw_marker(name: str, positions: NDArray[np.float64], color: tuple[int, in
     # Positions are not static: static data would hide the moving ones.
     stream.log(entity, rr.Points3D.from_fields(radii=0.03, colors=color, labels=name, show_labels=True), static=True)
     timelines.send(entity, steps, rr.Points3D.columns(positions=positions))
-    wireframe = rr.components.FillMode.MajorWireframe
-    halo = rr.Ellipsoids3D.from_fields(
-        half_sizes=[[_HALO_RADIUS] * 3], colors=color, line_radii=0.003, fill_mode=wireframe
-    )
+    mode = rr.components.FillMode.MajorWireframe
+    halo = rr.Ellipsoids3D.from_fields(half_sizes=[[_HALO_RADIUS] * 3], colors=color, line_radii=0.003, fill_mode=mode)
     stream.log(f"{entity}/halo", halo, static=True)
     timelines.send(f"{entity}/halo", steps, rr.Ellipsoids3D.columns(centers=positions))
 

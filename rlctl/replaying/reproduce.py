@@ -95,9 +95,8 @@ def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Rollout, Verif
             f"to see it fail again: rlctl replay {path}"
         )
     with closing(spec.make()) as env:
-        rollout = play_episode(
-            env, spec, info.seed, recorded_actions(episode, env.action_space, path), policy=info.policy
-        )
+        choose = recorded_actions(episode, env.action_space, path)
+        rollout = play_episode(env, spec, info.seed, choose, policy=info.policy)
     now = current_versions(spec.task)
     relevant = {name: version for name, version in info.versions.items() if name not in _ONLY_OF_POLICIES}
     other = {name: (version, now.get(name)) for name, version in relevant.items() if now.get(name) != version}

@@ -153,9 +153,8 @@ class OnPolicyRollouts(Rollouts):
         return values, distribution.log_prob(actions), RNNStates(after_pi, after_vf)
 
     def _to_tensor(self, observations: Arrays, rows: Any) -> Any:
-        return join(
-            {key: torch.as_tensor(value[rows], device=self.model.device) for key, value in observations.items()}
-        )
+        device = self.model.device
+        return join({key: torch.as_tensor(value[rows], device=device) for key, value in observations.items()})
 
     def _to_actions(self, actions: NDArray[Any]) -> torch.Tensor:
         chosen = torch.as_tensor(actions, device=self.model.device)

@@ -152,9 +152,8 @@ def _vary_batches(recipe: Recipe, parameters: Mapping[str, Any]) -> list[Dimensi
     elif recipe.her is None:
         dimensions.append(_choose("n_steps", {1, 3, 5, n_steps}))
     if batch_size is not None:
-        dimensions.append(
-            _choose("batch_size", {batch_size, *(value for value in _around(batch_size, 16) if value <= most)})
-        )
+        sizes = {batch_size, *(value for value in _around(batch_size, 16) if value <= most)}
+        dimensions.append(_choose("batch_size", sizes))
     return dimensions
 
 

@@ -53,13 +53,12 @@ class Command:
         self._before = self._zeros  # the motion of the last step
         self._sent: NDArray[Any] | None = None  # the last action
         self._smooth: Array | None = None
-        self._blend_from: Array | None = None
         self.begin_blend()
 
     def begin_blend(self) -> None:
         """Blend gradually from the present command into the next ones."""
         self._blend_left = self._blend_steps
-        self._blend_from = None
+        self._blend_from: Array | None = None
 
     def begin_from_measured(self) -> None:
         """Let the next command begin at the measured positions: a stopped robot may have been moved."""
