@@ -118,7 +118,8 @@ def _layout(rollout: Rollout, plots: Sequence[Plot], timeline: str, followed: Fo
     below: rrb.Container | rrb.View = rrb.TextLogView(name="events", origin="/events", columns=columns)
     if rollout.successes is not None:
         below = rrb.Horizontal(below, rrb.StateTimelineView(name="goal", origin="/goal"))
-    curves = _arrange_curves(plots)
+    rows = [[_arrange_plot(plot) for plot in plots if plot.kind in kinds] for kinds in _PLOT_ROWS]
+    curves = rrb.Vertical(*(rrb.Tabs(*views) if len(views) > 1 else views[0] for views in rows if views))
     content: rrb.Container = rrb.Vertical(rrb.Vertical(*left) if left else curves, below, row_shares=[4, 1])
     if left:
         content = rrb.Horizontal(content, curves, column_shares=[3, 2])
@@ -130,11 +131,6 @@ def _layout(rollout: Rollout, plots: Sequence[Plot], timeline: str, followed: Fo
         auto_views=False,
         auto_layout=False,
     )
-
-
-def _arrange_curves(plots: Sequence[Plot]) -> rrb.Container:
-    rows = [[_arrange_plot(plot) for plot in plots if plot.kind in kinds] for kinds in _PLOT_ROWS]
-    return rrb.Vertical(*(rrb.Tabs(*views) if len(views) > 1 else views[0] for views in rows if views))
 
 
 def _arrange_plot(plot: Plot) -> rrb.TimeSeriesView:
