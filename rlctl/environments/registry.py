@@ -105,9 +105,8 @@ def find_source_file(task: str) -> Path | None:
 
 def find_origin(task: str) -> dict[str, str]:
     """Return the `distribution` and `version` of an installed task; empty for any other."""
-    if entry := installed.find(task):
-        return {"distribution": entry.distribution, "version": entry.version}
-    return {}
+    entry = installed.find(task)
+    return {"distribution": entry.distribution, "version": entry.version} if entry else {}
 
 
 def identify_task(task: str) -> dict[str, Any]:

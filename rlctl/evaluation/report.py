@@ -222,11 +222,9 @@ def _draw_cell(cell: Cell, color: str, worst: Cell | None) -> Text:
 
 def _color_cells(varied: RobustnessMap) -> list[str]:
     """Return a colour per cell, from red over yellow to green: of success rates from 0 to 1, else of the returns."""
-    returns = [cell.mean_return for cell in varied.cells]
+    cells, returns = varied.cells, [cell.mean_return for cell in varied.cells]
     low, size = min(returns), max(returns) - min(returns) or 1.0
-    parts = [
-        (cell.mean_return - low) / size if cell.success_rate is None else cell.success_rate for cell in varied.cells
-    ]
+    parts = [(cell.mean_return - low) / size if cell.success_rate is None else cell.success_rate for cell in cells]
     return [f"rgb({min(255, round(510 * (1 - part)))},{min(255, round(510 * part))},80)" for part in parts]
 
 

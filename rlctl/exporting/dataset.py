@@ -113,7 +113,6 @@ def _write_lerobot(folder: Path, task: str, env: EnvInfo, episodes: list[Episode
 
 
 def _list_columns(episodes: list[Episode]) -> dict[str, NDArray[Any]]:
-    """Return the values per step by LeRobot's names."""
     rows = []
     for number, episode in enumerate(episodes):
         played, steps = episode.recorded, np.arange(episode.result.length)

@@ -126,9 +126,8 @@ class _Recorder:
             segment = workers.arrays.segment
             first = 1 if self._parts else 0  # row 0 repeats the last observation of the previous segment
             observations = {key: rows[env, first : steps + 1].copy() for key, rows in segment.observation.items()}
-            actions, rewards, terms = (
-                rows[env, :steps].copy() for rows in (segment.action, segment.reward, segment.terms)
-            )
+            arrays = (segment.action, segment.reward, segment.terms)
+            actions, rewards, terms = (rows[env, :steps].copy() for rows in arrays)
             self._parts.append(Trajectory(actions, observations, rewards, terms))
 
     def failed_actions(self, workers: Workers, error: EpisodeFailed) -> NDArray[Any]:
@@ -142,7 +141,6 @@ class _Recorder:
             return None
         rows = [split(part.observations) for part in self._parts]
         observations = {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
-        actions, rewards, terms = (
-            np.concatenate([getattr(part, name) for part in self._parts]) for name in ("actions", "rewards", "terms")
-        )
+        names = ("actions", "rewards", "terms")
+        actions, rewards, terms = (np.concatenate([getattr(part, name) for part in self._parts]) for name in names)
         return Trajectory(actions, join(observations), rewards, terms)

@@ -146,10 +146,8 @@ class Motors:
             )
 
     def _command(self, joints: list[int], mode: str, **values: Any) -> None:
-        links = [self.joint_indices[joint] for joint in joints]
-        pybullet.setJointMotorControlArray(
-            self.id, links, getattr(pybullet, mode), **values, physicsClientId=self.client
-        )
+        links, control = [self.joint_indices[joint] for joint in joints], getattr(pybullet, mode)
+        pybullet.setJointMotorControlArray(self.id, links, control, **values, physicsClientId=self.client)
 
     def drive_at(
         self, velocities: Array, *, max_force: float | Sequence[float] | None = None, joints: Sequence[str] = ()

@@ -4,6 +4,7 @@ Checkpoints are written between segments only. Steps decide what is done at a bo
 run equals one that was never stopped. Only the time of checkpoints depends on the clock, and they change no result.
 """
 
+import functools
 import shlex
 import time
 from pathlib import Path
@@ -124,11 +125,9 @@ class TrainingLoop:
     def write_end(self, recordings: int) -> list[Path]:
         """Write the status `finished`; return recordings of the last evaluation's last episodes."""
         run, learner, best = self.checkpoints.run, self.learner, self.evaluator.best
-        for _ in range(2):  # retry once if it cannot be written
-            if self.checkpoints.attempt(
-                "run.json", lambda: status.write_end(run, learner.steps, learner.progress, best)
-            ):
-                break
+        write = functools.partial(status.write_end, run, learner.steps, learner.progress, best)
+        if not self.checkpoints.attempt("run.json", write):
+            self.checkpoints.attempt("run.json", write)  # retry once
         written = self.evaluator.episodes.record(recordings)
         self.callbacks.call("on_end")
         return written

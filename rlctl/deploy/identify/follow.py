@@ -185,9 +185,9 @@ class Follower:
         """
         changes = {} if positions is None else self.unknowns.settings(positions.tolist())
         self._env.set_events(EventSettings(False, changes))
-        errors: Array = np.concatenate(
-            [self._play(start, delay, self.steps) for start in self.starts]
-        ) - np.concatenate([self._measured[start + 1 : start + 1 + self.steps] for start in self.starts])
+        played = np.concatenate([self._play(start, delay, self.steps) for start in self.starts])
+        measured = np.concatenate([self._measured[start + 1 : start + 1 + self.steps] for start in self.starts])
+        errors: Array = played - measured
         return errors
 
     def _choose_begin(self, smoothed: Array) -> Array:

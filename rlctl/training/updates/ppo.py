@@ -43,9 +43,8 @@ class PpoUpdate:
             return False
         distribution = policy.action_dist
         if isinstance(distribution, StateDependentNoiseDistribution):
-            plain = distribution.full_std and not (
-                distribution.use_expln or distribution.learn_features or distribution.bijector
-            )
+            changed = distribution.use_expln or distribution.learn_features or distribution.bijector
+            plain = distribution.full_std and not changed
         else:
             plain = type(distribution) is DiagGaussianDistribution
         return bool(plain) and is_mlp(_actor_modules(policy)) and is_mlp(_critic_modules(policy))
@@ -61,9 +60,8 @@ class PpoUpdate:
         logged: dict[str, list[float]] = collections.defaultdict(list)
         for _ in range(model.n_epochs):
             logged["approx_kl"] = []
-            finished = all(
-                self._update(batch, clip_range, clip_range_vf, logged) for batch in _shuffle(data, model.batch_size)
-            )
+            batches = _shuffle(data, model.batch_size)
+            finished = all(self._update(batch, clip_range, clip_range_vf, logged) for batch in batches)
             model._n_updates += 1
             if not finished:
                 break
