@@ -203,10 +203,9 @@ def _vary_parameter(name: str, task: Any, span: tuple[float, float, int], spec: 
         numbers = {name: hints[name] for name in task.parameters() if hints[name] in (int, float)}
         if parameter not in numbers:
             known = [*task.events, *numbers]
-            offered = ", ".join(known) or "nothing that can be varied"
             raise UsageError(
                 f"--vary {name}: {spec.task} has no event or number of that name.{did_you_mean(parameter, known)} "
-                f"It has: {offered}."
+                f"It has: {', '.join(known) or 'nothing that can be varied'}."
             )
         whole = numbers[parameter] is int
         nominal = task.parameters()[parameter].default

@@ -291,6 +291,5 @@ def rough_heights(
     heights = np.random.default_rng(seed).uniform(0.0, roughness, (rows, columns))
     x, y = ((np.arange(count) - (count - 1) / 2) * cell for count in heights.shape)
     if flat_radius > 0:
-        distance = np.hypot(x[:, None], y[None, :])
-        heights *= np.clip((distance - flat_radius) / flat_radius, 0.0, 1.0)
+        heights *= np.clip((np.hypot(x[:, None], y[None, :]) - flat_radius) / flat_radius, 0.0, 1.0)
     return heights

@@ -156,7 +156,6 @@ class Follower:
 
         self.unknowns = unknowns
         self._env = env
-        self._log = log
         self._joints = [find_joints(env)[name] for name in log.joints]
         self._bodies = {body.name: body for body, _ in self._joints}
         steps = max(10, round(WINDOW_S / env.task.control_dt))

@@ -36,10 +36,9 @@ def count_allowed_connections(max_clients: int) -> int:
     allowed = limit - len(os.listdir("/proc/self/fd" if os.path.isdir("/proc/self/fd") else "/dev/fd"))
     allowed -= BACKLOG + _RESERVED_FILES
     if allowed < max_clients + _HTTP_CONNECTIONS:
-        needed = limit + max_clients + _HTTP_CONNECTIONS - allowed
         raise UsageError(
             f"--max-clients {max_clients}: this process may open {limit} files, which is too few; "
-            f"raise the limit, ulimit -n {needed}, or allow fewer clients"
+            f"raise the limit, ulimit -n {limit + max_clients + _HTTP_CONNECTIONS - allowed}, or allow fewer clients"
         )
     return allowed
 
