@@ -152,6 +152,7 @@ def test_standing_that_still_gets_longer_is_no_finding(write_training):
         ("Q1", FLAT, {"episodes": [make_episode(0.001 * SMOOTH)]}),
         ("Q1", {**FLAT, "approx_kl": 1e-6, "clip_fraction": 0.0}, {}),
         ("Q1", STANDING, {"episodes": [survive(0.02)]}),
+        ("Q1", {"return": np.minimum(RISING, -25), "success": 0.0}, {}),
         ("Q2", {"success": 0.0, "distance": np.linspace(0.2, 0.9, UPDATES)}, {}),
         ("Q2", {"success": 0.0}, {"episodes": [make_episode(SHAKING, terms=np.eye(100, 2))]}),
         ("Q3", {"return": np.tile([0.0, 90.0, 10.0], 10), "approx_kl": 0.6, "clip_fraction": 0.7}, {}),
