@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from sb3_contrib import TQC
+from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from rlctl.environments.dict_spaces import split
 from rlctl.errors import RecipeError
 from rlctl.training.updates import choose_learner
+from rlctl.training.updates.crossq import CrossQUpdate
 from rlctl.training.updates.ppo import PpoUpdate
 from rlctl.training.updates.q_learning import DqnUpdate, Td3Update
 from rlctl.training.updates.sac import SacUpdate, TqcUpdate
@@ -138,6 +139,17 @@ TQC_CASES = {
 }
 OFF_POLICY_CASES = {name: (SacUpdate, SAC, case) for name, case in SAC_CASES.items()}
 OFF_POLICY_CASES |= {name: (TqcUpdate, TQC, case) for name, case in TQC_CASES.items()}
+CROSSQ_CASES = {
+    "crossq": {},
+    "crossq, renormalized from the third update": {"network": {"renorm_warmup_steps": 1, "batch_norm_momentum": 0.3}},
+    "crossq, gSDE, tanh, three critics": {
+        "use_sde": True,
+        "network": {"activation_fn": torch.nn.Tanh, "n_critics": 3, "renorm_warmup_steps": 0},
+    },
+    "crossq, actor in every update": {"policy_delay": 1, "ent_coef": 0.2},
+    "crossq, no batch normalization": {"network": {"batch_norm": False}},
+}
+OFF_POLICY_CASES |= {name: (CrossQUpdate, CrossQ, case) for name, case in CROSSQ_CASES.items()}
 OFF_POLICY_CASES |= {
     "td3": (Td3Update, TD3, {"policy_delay": 2}),
     "td3, tanh, three critics": (Td3Update, TD3, {"network": {"activation_fn": torch.nn.Tanh, "n_critics": 3}}),
@@ -162,7 +174,7 @@ def test_off_policy_updates_as_sb3(name):
         first.train(gradient_steps=1, batch_size=16)
         # The critics' loss is that of the first update, which stands for eight.
         expected = dict(one.logger.name_to_value)
-        if update in (SacUpdate, TqcUpdate):
+        if issubclass(update, SacUpdate):
             expected["train/critic_loss"] = first.logger.name_to_value["train/critic_loss"]
         assert dict(other.logger.name_to_value) == pytest.approx(expected, rel=1e-3, abs=1e-4)
     assert_same_weights(weights(one), weights(other), before)
@@ -172,7 +184,7 @@ WIDE = {"network": {"net_arch": [300, 300]}, "batch_size": 128}
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
-@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC])
+@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC, CrossQ])
 def test_wide_networks_are_updated_on_two_cores_to_the_same_bit(algorithm):
     def train():
         set_random_seed(1)

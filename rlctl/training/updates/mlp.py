@@ -28,7 +28,7 @@ class _Layer:
 
     def __init__(self, linears: Sequence[nn.Linear]) -> None:
         weights, biases = [linear.weight for linear in linears], [linear.bias for linear in linears]
-        self.parameters = [_share(weights), _share(biases)]
+        self.parameters = [share(weights), share(biases)]
         self.weight, self.bias = self.parameters[0].numpy(), self.parameters[1].numpy()[:, None, :]
         self.weight_gradient = share_gradients(weights)
         self.bias_gradient = share_gradients(biases)[:, None, :]
@@ -57,16 +57,19 @@ class MlpStack:
     def run(self, inputs: Floats, use: str) -> list[Floats]:
         """Return the inputs and the output of each layer. The next run with the same `use` overwrites these arrays."""
         values = [inputs, *self._get_buffers(use, inputs.shape[1])]
-        for index, layer in enumerate(self._layers):
-            output = values[index + 1]
-            np.matmul(values[index], layer.weight.swapaxes(1, 2), out=output)
-            output += layer.bias
-            is_hidden = index + 1 < len(self._layers)
-            if is_hidden and self._uses_tanh:
-                np.tanh(output, out=output)
-            elif is_hidden:
-                torch.from_numpy(output).relu_()  # a tenth of NumPy's time
+        for index in range(len(self._layers)):
+            self._run_layer(index, values[index], values[index + 1])
         return values
+
+    def _run_layer(self, index: int, inputs: Floats, output: Floats) -> None:
+        layer = self._layers[index]
+        np.matmul(inputs, layer.weight.swapaxes(1, 2), out=output)
+        output += layer.bias
+        is_hidden = index + 1 < len(self._layers)
+        if is_hidden and self._uses_tanh:
+            np.tanh(output, out=output)
+        elif is_hidden:
+            torch.from_numpy(output).relu_()  # a tenth of NumPy's time
 
     def _get_buffers(self, use: str, batch: int) -> list[Floats]:
         if (use, batch) not in self._buffers:
@@ -76,18 +79,20 @@ class MlpStack:
 
     def backpropagate(self, values: list[Floats], gradient: Floats, *, latent: Floats | None = None) -> None:
         """Set the weights' gradients from the outputs' gradient, and from `latent`, of the last hidden layer."""
-        ones = np.ones((1, gradient.shape[1]), np.float32)
         hidden = self._get_buffers("gradients", gradient.shape[1])
         for index in reversed(range(len(self._layers))):
-            layer = self._layers[index]
-            np.matmul(gradient.swapaxes(1, 2), values[index], out=layer.weight_gradient)
-            np.matmul(ones, gradient, out=layer.bias_gradient)  # the sum over the batch
+            self._set_gradients(index, values[index], gradient)
             if index > 0:
-                gradient = np.matmul(gradient, layer.weight, out=hidden[index - 1])
+                gradient = np.matmul(gradient, self._layers[index].weight, out=hidden[index - 1])
                 if latent is not None:
                     gradient += latent
                     latent = None
                 self._derive(gradient, values[index])
+
+    def _set_gradients(self, index: int, inputs: Floats, gradient: Floats) -> None:
+        layer = self._layers[index]
+        np.matmul(gradient.swapaxes(1, 2), inputs, out=layer.weight_gradient)
+        np.matmul(np.ones((1, gradient.shape[1]), np.float32), gradient, out=layer.bias_gradient)  # the batch's sum
 
     def input_gradient(self, values: list[Floats], gradient: Floats, first: int) -> Floats:
         """Return the gradient of inputs `first` and later, from the gradient of the outputs."""
@@ -146,8 +151,8 @@ def clip_norm(gradients: Iterable[Floats], limit: float) -> None:
             gradient *= limit / (norm + 1e-6)
 
 
-def _share(parameters: Sequence[Tensor]) -> Tensor:
-    """Make parameters of equal shape slices of one array; return it."""
+def share(parameters: Sequence[Tensor]) -> Tensor:
+    """Make parameters, or buffers, of equal shape slices of one array; return it."""
     shared = torch.stack([parameter.data for parameter in parameters])
     for parameter, part in zip(parameters, shared, strict=True):
         parameter.data = part
@@ -176,11 +181,11 @@ class SideBySide:
         is_worthwhile = multiplications >= _WORTHWHILE and available_cores() > 1
         self._second = ThreadPoolExecutor(1, initializer=_prepare_thread) if is_worthwhile else None
 
-    def make_stacks(self, networks: Iterable[Iterable[nn.Module]]) -> list[MlpStack]:
+    def make_stacks(self, networks: Iterable[Iterable[nn.Module]], kind: type[MlpStack] = MlpStack) -> list[MlpStack]:
         """Return networks of equal shape as one stack, or, with a second thread, as one stack per network."""
         if self._second is None:
-            return [MlpStack(list(networks))]
-        return [MlpStack([network]) for network in networks]
+            return [kind(list(networks))]
+        return [kind([network]) for network in networks]
 
     def run(self, calls: Sequence[Callable[[], Result]]) -> list[Result]:
         """Return what each call returns."""

@@ -17,13 +17,13 @@ from sb3_contrib import TQC
 from stable_baselines3 import SAC
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution, StateDependentNoiseDistribution
 
+from rlctl.training.updates.batch_norm import choose_stack
 from rlctl.training.updates.batches import Batch, sample_batches
 from rlctl.training.updates.mlp import (
     LOG_SQRT_TAU,
     Floats,
     MlpStack,
     SideBySide,
-    is_mlp,
     join_outputs,
     share_gradients,
     share_joined,
@@ -53,12 +53,14 @@ class SquashedGaussianActor:
         self._mean_limit = float(actor.clip_mean) if actor.use_sde and actor.clip_mean > 0 else None
         modules = _list_modules(actor)
         if actor.use_sde:
-            self._network = MlpStack([modules])
+            networks = [modules]
             self._log_std_gradient = share_gradients([actor.log_std])[0]
         else:
             heads = [modules[-1], actor.log_std]
             joined = join_outputs(heads)
-            self._network = MlpStack([[*modules[:-1], joined]])
+            networks = [[*modules[:-1], joined]]
+        self._network = (choose_stack(modules) or MlpStack)(networks)
+        if not actor.use_sde:
             share_joined(heads, joined)
         self._count = modules[-1].out_features
 
@@ -70,7 +72,7 @@ class SquashedGaussianActor:
             plain = distribution.full_std and not distribution.use_expln
         else:
             plain = type(distribution) is SquashedDiagGaussianDistribution
-        return plain and len(actor.latent_pi) > 0 and is_mlp(_list_modules(actor))
+        return plain and len(actor.latent_pi) > 0 and choose_stack(_list_modules(actor)) is not None
 
     def sample(self, features: Floats, use: str) -> Sample:
         """Draw actions for features, shape (batch, features); the next with the same `use` overwrites its `values`."""
@@ -132,14 +134,17 @@ class SacUpdate:
     """Updates a SAC model whose networks are multi-layer perceptrons on the CPU."""
 
     algorithm: ClassVar[Any] = SAC
+    first_update: ClassVar[int] = 0  # the number of the first one, of which every `policy_delay`th updates the actor
 
     def __init__(self, model: Any) -> None:
         self._model = model
         self._policy_delay = getattr(model, "policy_delay", 1)  # SB3's own models have none
         self._actor = SquashedGaussianActor(model.actor)
         self._side_by_side = SideBySide(list(model.critic.q_networks), model.batch_size)
-        self._critics = self._side_by_side.make_stacks(model.critic.q_networks)
-        self._targets = self._side_by_side.make_stacks(model.critic_target.q_networks)
+        kind = choose_stack(model.critic.q_networks[0]) or MlpStack
+        self._critics = self._side_by_side.make_stacks(model.critic.q_networks, kind)
+        targets = getattr(model, "critic_target", None)  # CrossQ has none
+        self._targets = [] if targets is None else self._side_by_side.make_stacks(targets.q_networks)
         self._followed = [values for critic in self._critics for values in critic.parameters]
         self._following = [values for target in self._targets for values in target.parameters]
 
@@ -149,7 +154,7 @@ class SacUpdate:
         if type(model) is not cls.algorithm:
             return False
         networks = model.critic.q_networks
-        return SquashedGaussianActor.supports(model.actor) and all(is_mlp(network) for network in networks)
+        return SquashedGaussianActor.supports(model.actor) and all(choose_stack(network) for network in networks)
 
     @torch.no_grad()
     def train(self, gradient_steps: int, batch_size: int) -> None:
@@ -161,9 +166,9 @@ class SacUpdate:
         model._update_learning_rate(optimizers)
         logged: dict[str, list[float]] = collections.defaultdict(list)
         for step, batch in enumerate(sample_batches(model, model.actor, gradient_steps, batch_size)):
-            learns_actor = (model._n_updates + step) % self._policy_delay == 0
+            learns_actor = (model._n_updates + step + self.first_update) % self._policy_delay == 0
             self._update(batch, logged, learns_actor=learns_actor, with_loss=step % _LOSS_EVERY == 0)
-            if step % model.target_update_interval == 0:
+            if self._targets and step % model.target_update_interval == 0:
                 torch._foreach_lerp_(self._following, self._followed, model.tau)
         model._n_updates += gradient_steps
         for name, values in logged.items():
@@ -174,8 +179,7 @@ class SacUpdate:
         model = self._model
         if model.use_sde:
             model.actor.reset_noise()
-        tensor = model.ent_coef_tensor if model.ent_coef_optimizer is None else model.log_ent_coef.exp()
-        coefficient, sample = float(tensor.item()), None
+        coefficient, sample = self._read_coefficient(), None
         if learns_actor:
             sample = self._actor.sample(batch.features, "learning")
             self._update_coefficient(sample, logged)
@@ -186,6 +190,11 @@ class SacUpdate:
             logged["critic_loss"].append(self._compute_loss(outputs, target))
         if sample is not None:
             logged["actor_loss"].append(self._update_actor(batch.features, sample, coefficient))
+
+    def _read_coefficient(self) -> float:
+        model = self._model
+        tensor = model.ent_coef_tensor if model.ent_coef_optimizer is None else model.log_ent_coef.exp()
+        return float(tensor.item())
 
     def _update_coefficient(self, sample: Sample, logged: dict[str, list[float]]) -> None:
         model = self._model
