@@ -89,7 +89,7 @@ class _Renorm:
 
 
 def _sum(values: Floats) -> Floats:
-    """Return the sum over the batch; as a product it takes a third of the time."""
+    """Return the sum over the batch; as a product it takes half the time."""
     result: Floats = np.ones((1, values.shape[1]), np.float32) @ values
     return result
 
