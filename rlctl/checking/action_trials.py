@@ -77,7 +77,7 @@ class Trials:
     def actions(self, seed: int, steps: int) -> list[Any]:
         """Return the actions of an episode before they are changed."""
         chosen = draw_actions(self.instance.env.action_space, "random", seed)
-        return self.instance.call("sample", lambda: list(itertools.islice(chosen, steps)))  # type: ignore[no-any-return]
+        return self.instance.call("sample", lambda: list(itertools.islice(chosen, steps)))
 
     def plain(self, seed: int, steps: int) -> list[Frame]:
         """Return an episode with unchanged actions."""

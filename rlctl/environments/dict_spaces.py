@@ -43,8 +43,7 @@ def take_row(observations: Any, row: int) -> Any:
 def stack(observations: Sequence[Any]) -> Observations:
     """Return observations as rows, shape (len(observations), ...)."""
     rows = [split(observation) for observation in observations]
-    stacked: Observations = join({key: np.stack([row[key] for row in rows]) for key in rows[0]})
-    return stacked
+    return join({key: np.stack([row[key] for row in rows]) for key in rows[0]})
 
 
 def split_names(observations: Any, sizes: Mapping[str, int]) -> dict[str, NDArray[Any]]:

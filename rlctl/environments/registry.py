@@ -162,7 +162,7 @@ def _load_target(task: str, target: str) -> Callable[..., Any]:
         constructor = getattr(constructor, part)
     if not callable(constructor):
         raise NoSuchClassError(f"{target}: {attribute} is a {type(constructor).__name__}, not a class or a function")
-    return constructor  # type: ignore[no-any-return]
+    return constructor
 
 
 def may_make_environments(constructor: Any) -> bool:

@@ -32,8 +32,7 @@ def apply(layers: Iterable[Layer], value: Any) -> Array:
     """Apply layers one after the other."""
     for layer in layers:
         value = layer(value)
-    result: Array = value
-    return result
+    return value
 
 
 @dataclasses.dataclass(slots=True)
@@ -63,8 +62,7 @@ class Convolution(Layer):
         windows = windows[:, :: self.stride, :: self.stride]
         rows, columns = windows.shape[1:3]
         patches = windows.transpose(0, 3, 4, 1, 2).reshape(channels * height * width, rows * columns)
-        result: Array = (self.weight.reshape(count, -1) @ patches + self.bias[:, None]).reshape(count, rows, columns)
-        return result
+        return (self.weight.reshape(count, -1) @ patches + self.bias[:, None]).reshape(count, rows, columns)
 
 
 @dataclasses.dataclass(slots=True)

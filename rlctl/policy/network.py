@@ -83,8 +83,7 @@ class Network:
     def compute_std(self, latent: Array) -> Array:
         """Return the standard deviation of a Gaussian action, shape (elements,)."""
         if self._log_std_layer is not None:
-            deviation: Array = np.exp(np.clip(self._log_std_layer(latent), -20.0, 2.0))
-            return deviation
+            return np.exp(np.clip(self._log_std_layer(latent), -20.0, 2.0))
         assert self._std is not None  # called for Gaussian heads only
         return self._std
 

@@ -98,10 +98,8 @@ class PolicyPlayer(Player):
             if self._matrix is None:
                 self._draw_matrix(seed, step)
             assert self._matrix is not None
-            result: Array = latent.dot(self._matrix)  # half the time of `@`
-            return result
-        noise: Array = self._network.compute_std(latent) * self._noise.draw(seed, step)[0][0]
-        return noise
+            return latent.dot(self._matrix)  # half the time of `@`
+        return self._network.compute_std(latent) * self._noise.draw(seed, step)[0][0]
 
     def _unscale(self, value: Array) -> Array:
         """Return an action of the environment from one in [-1, 1]."""

@@ -186,5 +186,4 @@ class OwnGraph:
             if key in self.normalize:
                 value = self.normalize[key](value)
             feed[OWN_INPUT + key] = np.asarray(value)[None]
-        result: NDArray[Any] = self._session.run([OWN_OUTPUT], feed)[0][0]
-        return result
+        return self._session.run([OWN_OUTPUT], feed)[0][0]

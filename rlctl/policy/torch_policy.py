@@ -170,8 +170,7 @@ class TorchPolicy(Policy):
         """Return one or several observations, normalised."""
         parts = split(observations)
         changed = {key: normalize(parts[key]) for key, normalize in self._normalize.items()}
-        normalized: Observations = join({**parts, **changed})
-        return normalized
+        return join({**parts, **changed})
 
     def act(self, observations: Observations) -> NDArray[Any]:
         """Return the actions for a batch of observations; a recurrent policy keeps one state per row."""

@@ -92,8 +92,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
     def observations(self, rows: Any = slice(None)) -> Observations:
         """Return a copy of the current observations, shape (rows, ...) or a dict of such."""
-        result: Observations = join({key: array[rows].copy() for key, array in self.arrays.observation.items()})
-        return result
+        return join({key: array[rows].copy() for key, array in self.arrays.observation.items()})
 
     def rebuild(self, spec: EnvSpec) -> EnvInfo:
         """Replace the environments by those of another spec; return their description.

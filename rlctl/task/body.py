@@ -27,7 +27,7 @@ class MassState(NamedTuple):
     @property
     def roll_pitch_yaw(self) -> Vector:
         """The orientation as angles about x, y, z [rad]."""
-        return pybullet.getEulerFromQuaternion(self.orientation)  # type: ignore[no-any-return]
+        return pybullet.getEulerFromQuaternion(self.orientation)
 
 
 class Contacts(NamedTuple):

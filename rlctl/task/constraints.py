@@ -47,7 +47,7 @@ class Attachment:
             return self.position, self.orientation
         info = pybullet.getDynamicsInfo(self.body.id, self.index, physicsClientId=self.body.client)
         inverse = pybullet.invertTransform(info[3], info[4])
-        return pybullet.multiplyTransforms(*inverse, self.position, self.orientation)  # type: ignore[no-any-return]
+        return pybullet.multiplyTransforms(*inverse, self.position, self.orientation)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -181,8 +181,7 @@ class Motors:
             raise TaskError(
                 f"{self.file.name}: {name} of shape {array.shape} for {count} joints; joint_names of the body has all"
             )
-        numbers: list[float] = array.tolist()
-        return numbers
+        return array.tolist()
 
     def _forget_torques(self, joints: list[int]) -> None:
         self._chosen.update(joints)

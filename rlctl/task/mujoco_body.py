@@ -102,25 +102,25 @@ class MujocoBody(Motors):
     @property
     def joint_positions(self) -> Array:
         """As `Body.joint_positions`."""
-        return self._sim.forward().qpos[self._positions]  # type: ignore[no-any-return]
+        return self._sim.forward().qpos[self._positions]
 
     @property
     def joint_velocities(self) -> Array:
         """As `Body.joint_velocities`."""
-        return self._sim.forward().qvel[self._velocities]  # type: ignore[no-any-return]
+        return self._sim.forward().qvel[self._velocities]
 
     @property
     def joint_torques(self) -> Array:
         """As `Body.joint_torques`."""
-        return self._sim.applied[self._velocities]  # type: ignore[no-any-return]
+        return self._sim.applied[self._velocities]
 
     def link_position(self, link: str) -> Array:
         """As `Body.link_position`."""
-        return self._sim.forward().xpos[self.find_link(link)].copy()  # type: ignore[no-any-return]
+        return self._sim.forward().xpos[self.find_link(link)].copy()
 
     def link_orientation(self, link: str) -> Array:
         """As `Body.link_orientation`."""
-        return self._sim.forward().xquat[self.find_link(link)][XYZW]  # type: ignore[no-any-return]
+        return self._sim.forward().xquat[self.find_link(link)][XYZW]
 
     def mass_state(self, link: str) -> MassState:
         """As `Body.mass_state`, at the end of the last physics step."""
@@ -133,7 +133,7 @@ class MujocoBody(Motors):
     @property
     def base_position(self) -> Array:
         """As `Body.base_position`."""
-        return self._sim.forward().xipos[self.find_link(self.base_name)].copy()  # type: ignore[no-any-return]
+        return self._sim.forward().xipos[self.find_link(self.base_name)].copy()
 
     @property
     def base_orientation(self) -> Array:
@@ -149,7 +149,7 @@ class MujocoBody(Motors):
     def joint_reaction(self, joint: str) -> Array:
         """As `Body.joint_reaction`, for a joint without a motor."""
         start = self._sim.model.sensor(f"{self.name}/{joint}").adr[0]
-        return self._sim.data.sensordata[start : start + 6].copy()  # type: ignore[no-any-return]
+        return self._sim.data.sensordata[start : start + 6].copy()
 
     def links_touching(self, other: MujocoBody) -> set[str]:
         """As `Body.links_touching`."""

@@ -189,8 +189,7 @@ def estimate_values(model: BaseAlgorithm, last: LastSteps) -> NDArray[Any]:
         else:
             estimates = model.critic(tensors, actions.float())  # type: ignore[attr-defined]
             values = estimates if isinstance(estimates, torch.Tensor) else torch.cat(estimates, dim=1)
-    result: NDArray[Any] = values.flatten(1).mean(1).cpu().numpy()
-    return result
+    return values.flatten(1).mean(1).cpu().numpy()
 
 
 def training_row(

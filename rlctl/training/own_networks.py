@@ -87,15 +87,13 @@ class _Actor(torch.nn.Module):
             for key, value in zip(self.parts, parts, strict=True)
         }
         observation: Any = preprocess_obs(join(arranged), self._space, normalize_images=self._normalize_images)
-        features: torch.Tensor = self.extractor(observation)
-        return features
+        return self.extractor(observation)
 
     def forward(self, *parts: torch.Tensor) -> torch.Tensor:
         features = self.compute_features(*parts)
         if self.trunk is None:
             return features
-        latent: torch.Tensor = getattr(self.trunk, "forward_actor", self.trunk)(features)
-        return latent
+        return getattr(self.trunk, "forward_actor", self.trunk)(features)
 
 
 def _write_graph(actor: _Actor, model: Any) -> NDArray[np.uint8]:

@@ -239,8 +239,7 @@ class Rollouts(abc.ABC):
             returns[:, step] = normalizer.returns
             normalizer.returns[done[:, step]] = 0.0
         normalizer.ret_rms.update(returns.ravel())
-        normalized: NDArray[np.float32] = normalizer.normalize_reward(rewards).astype(np.float32)
-        return normalized
+        return normalizer.normalize_reward(rewards).astype(np.float32)
 
     def finish_segment(self, segment: SegmentArrays) -> None:
         """Update the observation statistics with a stored segment."""

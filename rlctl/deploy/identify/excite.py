@@ -84,8 +84,7 @@ def _draw_sines(env: TaskEnv, steps: int, seed: int) -> Array:
         total += np.sin(2 * np.pi * hertz * time + rng.uniform(0, 2 * np.pi, count))
     fade = max(1, round(_FADE_S / env.task.control_dt))
     total *= np.minimum(1.0, np.minimum(np.arange(steps), np.arange(steps)[::-1])[:, None] / fade)
-    result: Array = total / np.abs(total).max(axis=0)
-    return result
+    return total / np.abs(total).max(axis=0)
 
 
 def _play(env: TaskEnv, trajectory: Array, driven: tuple[str, ...]) -> tuple[str, Log, float]:

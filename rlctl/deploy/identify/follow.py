@@ -174,8 +174,7 @@ class Follower:
     @property
     def spread(self) -> Array:
         """Standard deviation of each measured position and velocity, shape (2 * joints,)."""
-        spread: Array = np.maximum(self._measured.std(axis=0), 1e-9)
-        return spread
+        return np.maximum(self._measured.std(axis=0), 1e-9)
 
     def compare(self, positions: Array | None, delay: int) -> Array:
         """Return simulated minus measured positions and velocities, shape (rows, 2 * joints), window by window.
@@ -186,8 +185,7 @@ class Follower:
         self._env.set_events(EventSettings(False, changes))
         played = np.concatenate([self._play(start, delay, self.steps) for start in self.starts])
         measured = np.concatenate([self._measured[start + 1 : start + 1 + self.steps] for start in self.starts])
-        errors: Array = played - measured
-        return errors
+        return played - measured
 
     def _choose_begin(self, smoothed: Array) -> Array:
         """Return the start states: each column smoothed, or measured where that predicts the next row better."""

@@ -150,8 +150,7 @@ def _summarise(
 
 def _root_mean_squares(errors: Array) -> list[float]:
     """Return the error of all positions, and of all velocities."""
-    values: list[float] = np.sqrt(np.square(errors.reshape(len(errors), 2, -1)).mean(axis=(0, 2))).tolist()
-    return values
+    return np.sqrt(np.square(errors.reshape(len(errors), 2, -1)).mean(axis=(0, 2))).tolist()
 
 
 def _estimate_values(unknowns: Unknowns, fit: Fit) -> list[IdentifiedValue]:

@@ -67,8 +67,7 @@ def make_loop() -> asyncio.AbstractEventLoop:
     """Return a loop for a server: uvloop's, which answers a quarter faster than asyncio's own."""
     import uvloop
 
-    loop: asyncio.AbstractEventLoop = uvloop.new_event_loop()
-    return loop
+    return uvloop.new_event_loop()
 
 
 async def serve_until(

@@ -61,8 +61,7 @@ class Finding:
 def _texts() -> dict[str, Any]:
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where PyYAML has it
     text = Path(__file__).with_name("findings.yaml").read_text(encoding="utf-8")
-    content: dict[str, Any] = yaml.load(text, loader)  # noqa: S506
-    return content
+    return yaml.load(text, loader)  # noqa: S506
 
 
 def list_signs() -> dict[str, signs.Sign]:

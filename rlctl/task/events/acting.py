@@ -106,7 +106,7 @@ class Signals:
             )
         self.drawn[event.name], signal = result
         _check_drawn(event.name, self.drawn[event.name])
-        return signal  # type: ignore[no-any-return]
+        return signal
 
     def observe(self, parts: Parts) -> Parts:
         """Return an observation with noise and delay, as the policy sees it."""

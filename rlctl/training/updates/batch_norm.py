@@ -90,8 +90,7 @@ class _Renorm:
 
 def _sum(values: Floats) -> Floats:
     """Return the sum over the batch; as a product it takes half the time."""
-    result: Floats = np.ones((1, values.shape[1]), np.float32) @ values
-    return result
+    return np.ones((1, values.shape[1]), np.float32) @ values
 
 
 class _Passed(list[Floats]):

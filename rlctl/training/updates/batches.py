@@ -33,8 +33,7 @@ def sample_batches(model: Any, network: Any, count: int, size: int) -> list[Batc
 
 def _extract(network: Any, observations: Any) -> Floats:
     tensors = map_parts(torch.as_tensor, observations)
-    features: Floats = network.extract_features(tensors, network.features_extractor).numpy()
-    return features
+    return network.extract_features(tensors, network.features_extractor).numpy()
 
 
 def _gather(model: Any, count: int, size: int) -> dict[str, Any]:

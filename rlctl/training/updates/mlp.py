@@ -100,8 +100,7 @@ class MlpStack:
         for index in reversed(range(1, len(self._layers))):
             gradient = np.matmul(gradient, self._layers[index].weight, out=hidden[index - 1])
             self._derive(gradient, values[index])
-        result: Floats = gradient @ self._layers[0].weight[:, :, first:]
-        return result
+        return gradient @ self._layers[0].weight[:, :, first:]
 
     def _derive(self, gradient: Floats, activated: Floats) -> None:
         """Turn the gradient of activated values into that of the values before activation, in place."""

@@ -151,8 +151,7 @@ class PpoUpdate:
         log_std: Floats = policy.log_std.numpy()
         if not policy.use_sde:
             return np.exp(log_std)
-        std: Floats = np.sqrt(np.square(actor[-2][0]) @ np.exp(2 * log_std) + float(policy.action_dist.epsilon))
-        return std
+        return np.sqrt(np.square(actor[-2][0]) @ np.exp(2 * log_std) + float(policy.action_dist.epsilon))
 
     def _set_std_gradient(self, actor: list[Floats], std: Floats, to_log_std: Floats) -> None:
         """Set the gradient of `log_std` from that of the logarithm of `_compute_std`, shape (batch, actions)."""

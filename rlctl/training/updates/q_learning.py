@@ -101,8 +101,7 @@ class Td3Update:
         action = np.tanh(self._actor_target.run(batch.next_features[None], "target")[-1][0])
         inputs = np.concatenate([batch.next_features, (action + noise).clip(-1, 1)], 1)[None]
         passes = self._side_by_side.run([functools.partial(stack.run, inputs, "target") for stack in self._targets])
-        target: Floats = batch.rewards + batch.discounts * np.concatenate([values[-1] for values in passes]).min(0)
-        return target
+        return batch.rewards + batch.discounts * np.concatenate([values[-1] for values in passes]).min(0)
 
     def _update_critics(self, batch: Batch, target: Floats) -> float:
         """Return the critics' loss before the update."""

@@ -121,8 +121,7 @@ class SquashedGaussianActor:
         to_variance = (np.square(sample.noise) * precision - 1) * precision * (0.5 * to_log_prob)
         np.multiply(latent.T @ to_noise, matrix, out=self._log_std_gradient)
         self._log_std_gradient += (np.square(latent).T @ to_variance) * variances * 2
-        gradient: Floats = to_noise @ matrix.T + latent * (to_variance @ variances.T) * 2
-        return gradient
+        return to_noise @ matrix.T + latent * (to_variance @ variances.T) * 2
 
 
 def _list_modules(actor: Any) -> list[Any]:
@@ -244,8 +243,7 @@ class SacUpdate:
 
     def _choose_estimates(self, outputs: Floats) -> Floats:
         """Return the target critics' estimates that form the target, shape (batch, estimates)."""
-        estimates: Floats = outputs.min(0)
-        return estimates
+        return outputs.min(0)
 
     def _compute_loss(self, outputs: Floats, target: Floats) -> float:
         return 0.5 * float(np.square(outputs - target).mean((1, 2)).sum())
@@ -287,8 +285,7 @@ class TqcUpdate(SacUpdate):
         total = slopes @ ones
         size = np.abs(slopes, out=slopes) @ ones
         count = np.float32(-2 * slopes[0].size * len(self._model.critic.q_networks))
-        gradient: Floats = (total + (2 * _quantile_shares(outputs) - 1) * size) / count
-        return gradient
+        return (total + (2 * _quantile_shares(outputs) - 1) * size) / count
 
     def _value(self, outputs: Floats) -> tuple[Floats, Floats]:
         count = outputs.shape[0] * outputs.shape[2]
