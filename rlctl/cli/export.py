@@ -53,7 +53,10 @@ def export(
         return
     from rlctl.exporting.export import export_policy, show
 
-    show(export_policy(request), json)
+    reports = export_policy(request)
+    show(reports, json)
+    for report in reports:
+        report.check()
 
 
 @command

@@ -101,6 +101,7 @@ def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:
 def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
     if (folder := request.record) is not None and (folder.is_file() or any(folder.glob("*"))):
         raise UsageError(f"--record {folder}: exists already; give a new folder, or remove this one")
+    gates.check_reachable(request.episodes)
     with start_workers(spec, request) as workers:
         limits = None if request.limits is None else _read_limits(request.limits, workers.info)
         actor.give_to(workers)

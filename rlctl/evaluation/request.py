@@ -79,6 +79,13 @@ class Gates:
         if not has_success and (self.min_success is not None or self.min_success_lower is not None):
             raise UsageError("--min-success: this task reports no success (no is_success); use --min-return")
 
+    def check_reachable(self, episodes: int) -> None:
+        """Raise `UsageError` for a lower bound that so many episodes cannot reach, even if all succeed."""
+        lower, highest = self.min_success_lower or 0.0, 0.025 ** (1 / episodes)  # by Clopper and Pearson
+        if lower > highest:
+            enough = f"; {math.log(0.025) / math.log(lower):,.0f} can" if lower < 1 else ""
+            raise UsageError(f"--min-success-lower {lower:g}: {episodes} successes reach at most {highest:.3f}{enough}")
+
     def check(self, result: Evaluation) -> None:
         """Raise `AnswerIsNo`, naming every gate that was missed."""
         if missed := self.list_missed(result.success_rate, result.success_interval, result.returns.mean):

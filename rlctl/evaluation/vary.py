@@ -62,6 +62,7 @@ def measure_robustness(
         values = [float(sim.partition(":")[2])] if ":" in sim else robustness.SOLREFS
         maps.append([Axis(name="mujoco solref", setting=robustness.SIM, values=values, nominal=None)])
     cells = sum(math.prod(len(axis.values) for axis in axes) for axes in maps)
+    gates.check_reachable(request.episodes)
     with start_workers(spec, request) as workers:
         policy.give_to(workers)
         player = CellPlayer(workers, policy, request)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shlex
 import tempfile
 from collections.abc import Mapping
@@ -56,6 +57,11 @@ class ExportReport:
             result |= {name: getattr(self.agreement, name) for name in ("max_difference", "observations")}
             result["latency"]["speedup"] = self.latency.speedup
         return result
+
+    def check(self) -> None:
+        """Raise `AnswerIsNo` if the file was not verified."""
+        if self.not_verified:
+            raise AnswerIsNo(f"{self.path}: not verified: {self.not_verified}")
 
     def list_rows(self) -> list[tuple[str, str]]:
         """Return the lines of the report: pairs of a word and a text."""
@@ -210,7 +216,8 @@ def _export_c(policy: TorchPolicy, workers: Workers, target: Path, code: CSource
     compiler = find_compiler()
     # The source includes the header by the identifier: policy-1.c includes policy_1.h.
     header = target.with_name(f"{code.name}.h")
-    fields: dict[str, Any] = {"not_verified": "no C compiler (cc, or $CC) on this machine"}
+    command = os.environ.get("CC") or "cc"
+    fields: dict[str, Any] = {"not_verified": f"there is no C compiler {command!r}; set CC to one"}
     if compiler is not None:
         with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
             library = build_library(code, policy.info, Path(folder), compiler)

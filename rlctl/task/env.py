@@ -245,7 +245,7 @@ def _make_world(task: Task, sim: str, render_mode: str | None) -> Sim:
     if render_mode is not None:
         raise UsageError("--sim mujoco draws no pictures and no window; record the episode to see it in 3-D")
     world: Any = MujocoSim(control_dt=task.control_dt, substeps=task.substeps, solref=solref)
-    return world
+    return world  # has the methods of Sim; UsageError for those without an equivalent
 
 
 def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]:

@@ -135,7 +135,9 @@ def test_without_a_compiler_it_is_not_verified(small, train, write, monkeypatch)
     assert report.path.is_file()
     assert report.details["header"].name == "my_policy_2.h"
     assert report.as_json()["verified"] is False
-    assert ("not verified", "no C compiler (cc, or $CC) on this machine") in report.list_rows()
+    assert ("not verified", "there is no C compiler 'no-such-compiler'; set CC to one") in report.list_rows()
+    with pytest.raises(AnswerIsNo, match=r"my policy-2\.c: not verified: there is no C compiler"):
+        report.check()
 
 
 def test_images_are_refused(small, train, write):

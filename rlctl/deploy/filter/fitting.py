@@ -153,6 +153,16 @@ def _merge(limits: Limits, name: str, known: dict[str, Any]) -> JointLimits:
     for key in ("all", name):
         if key in limits.limits:
             merged |= limits.limits[key].model_dump(exclude_none=True)
+    if "position" in known:
+        (low, high), (least, most) = merged["position"], known["position"]
+        merged["position"] = max(low, least), min(high, most)
+        own = limits.limits.get(name, JointLimits()).position is not None
+        wider = not np.allclose((low, high), np.clip((low, high), least, most), rtol=0.01)  # it may be rounded
+        if (own and wider) or max(low, least) >= min(high, most):
+            raise RecipeError(
+                f"limits: {name}.position: {low:g} to {high:g} is not within the robot model's {least:g} to {most:g}; "
+                "positions are in rad or m"
+            )
     return JointLimits(**merged)
 
 
