@@ -79,7 +79,8 @@ def report_runs(
 @command
 def compare_runs(
     runs: Annotated[
-        list[str], Argument("Runs, groups, globs or folders of runs; the first is the baseline.", metavar="RUN")
+        list[str],
+        Argument("Runs, policy files, groups, globs or folders of runs; the first is the baseline.", metavar="RUN"),
     ],
     episodes: Annotated[int, Option("Episodes that each run plays.", min=2, max=1_000_000)] = 100,
     seed: EpisodeSeed = 0,
@@ -92,6 +93,9 @@ def compare_runs(
         bool, Option("Compare although the task has changed or a seed is unfinished.", ("--force",))
     ] = False,
     gate: Annotated[Literal["not-worse"] | None, Option("Exit 1 if any is worse than the first.")] = None,
+    margin: Annotated[
+        float | None, Option("With --gate: exit 1 also if a larger loss is not excluded, e.g. 0.05.", min=0)
+    ] = None,
     json: Json = None,
 ) -> None:
     """Test whether a policy, or a recipe trained with several seeds, is better than another."""
@@ -104,8 +108,8 @@ def compare_runs(
         runs, EvalRequest(None, task=task, episodes=episodes, seed=seed, changes=changes), threshold, force=force
     )
     show(result, json)
-    if gate:
-        result.check()
+    if gate or margin is not None:
+        result.check(margin)
 
 
 @app.command("import")

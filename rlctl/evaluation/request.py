@@ -83,7 +83,7 @@ class Gates:
         """Raise `UsageError` for a lower bound that so many episodes cannot reach, even if all succeed."""
         lower, highest = self.min_success_lower or 0.0, 0.025 ** (1 / episodes)  # by Clopper and Pearson
         if lower > highest:
-            enough = f"; {math.log(0.025) / math.log(lower):,.0f} can" if lower < 1 else ""
+            enough = f"; {math.ceil(math.log(0.025) / math.log(lower)):,} can" if lower < 1 else ""
             raise UsageError(f"--min-success-lower {lower:g}: {episodes} successes reach at most {highest:.3f}{enough}")
 
     def check(self, result: Evaluation) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self
@@ -108,12 +109,17 @@ class PolicyFile:
         return dataclasses.replace(self, info=self.info.model_copy(update=changes))
 
     def encode(self) -> bytes:
-        """Return the content of the file."""
+        """Return the content of the file; equal policies have equal bytes."""
         from safetensors.numpy import save
 
         contiguous = {name: np.asarray(value, order="C") for name, value in self.tensors.items()}
         text = self.info.model_dump_json()
-        return save(contiguous, metadata={"rlctl": text, "sha256": compute_digest(text, contiguous)})
+        content = save(contiguous, metadata={"rlctl": text, "sha256": compute_digest(text, contiguous)})
+        # The header, after 8 bytes with its size, has the metadata in random order.
+        size = int.from_bytes(content[:8], "little")
+        header = json.dumps(json.loads(content[8 : 8 + size]), sort_keys=True, separators=(",", ":")).encode()
+        header += b" " * (-len(header) % 8)
+        return len(header).to_bytes(8, "little") + header + content[8 + size :]
 
     def write(self, path: Path) -> None:
         """Write the file atomically."""

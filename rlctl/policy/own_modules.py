@@ -45,7 +45,10 @@ def locate(recipe: Recipe) -> Recipe:
 
 def _locate(value: Any) -> Any:
     place, _, name = str(value).rpartition(":")
-    return f"{Path(place).expanduser().resolve()}:{name}" if place.endswith(".py") else value
+    file = Path(place).expanduser()
+    if not file.is_file() and Path(file.name).is_file():
+        file = Path(file.name)  # the recipe of a run on another machine; its files are in the current folder
+    return f"{file.resolve()}:{name}" if place.endswith(".py") else value
 
 
 def _import(key: str, name: str) -> type:

@@ -17,7 +17,7 @@ from rlctl.hub import store
 from rlctl.output import format_duration
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.shipped import PRETRAINED, find_shipped_policy
-from rlctl.run.directory import ROOT, TUNE_FILE, RunDirectory, is_group
+from rlctl.run.directory import GROUP_FILE, ROOT, TUNE_FILE, RunDirectory, is_group
 
 _MOST_COMPARED = 50  # older runs whose scores are looked at
 _IN_TASK = ("*/run.json", "*_seeds/*/run.json")
@@ -54,7 +54,8 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
             raise ArtifactError(f"no run yet under {root.resolve()}{hint}")
         return newest
     if (Path(text) / "run.json").is_file():
-        return RunDirectory(Path(text))
+        # `latest` may soon lead to another run.
+        return RunDirectory(Path(text).parent / os.readlink(text) if Path(text).is_symlink() else Path(text))
     if Path(text).name == "latest" and Path(text).is_symlink():  # to a run that was removed
         return find_run("latest", Path(text).parent)
     refuse_tuning(Path(text))
@@ -63,7 +64,9 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
     if runs := _list_newest_first(root / registry.make_slug(text), *_IN_TASK):
         return runs[0]
     if text and Path(text).is_dir():
-        raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json")
+        inside = next((file.parent for name in (GROUP_FILE, "run.json") for file in Path(text).rglob(name)), None)
+        hint = f"; in it is {inside}" if inside else ""
+        raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json{hint}")
     if Path(text).is_file() and Path(text).suffix != ".zip":
         hint = f"; its run: {Path(text).parent}" if (Path(text).parent / "run.json").is_file() else ""
         raise ArtifactError(f"{text}: neither a run nor a policy (.safetensors, .onnx){hint}")

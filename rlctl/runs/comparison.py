@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.evaluate import Evaluation, run_evaluation
 from rlctl.evaluation.request import EvalRequest
+from rlctl.policy.numpy_policy import load_policy
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference, find_mixed
 from rlctl.run.directory import RunDirectory
@@ -25,6 +26,15 @@ from rlctl.runs.significance import MeanDifference, Quantity, Verdict, compare_e
 from rlctl.runs.summary import read_table, summarize
 
 THRESHOLD = 0.9  # the default threshold, a success rate
+_POLICIES = (".safetensors", ".onnx")
+
+
+class _PolicyAlone(RunDirectory):
+    """A policy file, such as the one that is in use, in the place of the run it comes from."""
+
+    def status(self) -> dict[str, Any]:
+        """Return what is known of its training; raises `ArtifactError` if it is not a policy."""
+        return {"task": load_policy(self.path).info.spec.task, "status": "finished"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +78,8 @@ class Candidate:
 
     side: Side
     differences: Mapping[Quantity, MeanDifference]  # `success`, where the task reports it, then `return`
-    recipe_changes: dict[str, tuple[Any, Any]]  # per dotted key, the value here and the baseline's
+    recipe_changes: dict[str, tuple[Any, Any]] | None
+    """Per dotted key the value here and the baseline's; None where a recipe is not known."""
 
     @property
     def verdict(self) -> Verdict:
@@ -91,7 +102,7 @@ class RunComparison:
     @property
     def world_differences(self) -> list[str]:
         """Recipe keys of the environment in which a candidate differs from the baseline; all play in the baseline's."""
-        keys = dict.fromkeys(key for candidate in self.candidates for key in candidate.recipe_changes)
+        keys = dict.fromkeys(key for candidate in self.candidates for key in candidate.recipe_changes or ())
         return [key for key in keys if key.partition(".")[0] in ("task", "reward_weights", "randomize", "events")]
 
     @property
@@ -99,11 +110,21 @@ class RunComparison:
         """The baseline, then the candidates' sides."""
         return [self.baseline, *(candidate.side for candidate in self.candidates)]
 
-    def check(self) -> None:
-        """Raise `AnswerIsNo` if a candidate is worse than the baseline."""
+    def check(self, margin: float | None = None) -> None:
+        """Raise `AnswerIsNo` if a candidate is worse than the baseline, or may be by more than `margin`.
+
+        `margin` is a success rate, or a return if the task reports no success.
+        """
         worse = [candidate.side.name for candidate in self.candidates if candidate.verdict is Verdict.WORSE]
         if worse:
             raise AnswerIsNo(f"gate missed: {', '.join(worse)} worse than {self.baseline.name}")
+        for candidate in self.candidates:
+            (quantity, difference), *_ = candidate.differences.items()
+            if margin is not None and difference.low < -margin:
+                raise AnswerIsNo(
+                    f"gate missed: {candidate.side.name}: its {quantity} may be lower by {-difference.low:.3g}, "
+                    f"more than {margin:g}"
+                )
 
 
 def compare(
@@ -111,14 +132,14 @@ def compare(
 ) -> RunComparison:
     """Evaluate every run with the other fields of `request` than `run`, and compare each side with the first.
 
-    `texts` are runs, groups, globs, or folders of runs; the first is the baseline. `threshold` is a success rate, or a
-    return if the task reports no success; the result has the steps until an evaluation reached it. `force` compares
-    even if the task has changed since a training or a seed has not finished its own. Raises `UsageError` for sides
-    that cannot be compared.
+    `texts` are runs, policy files, groups, globs, or folders of runs; the first is the baseline. `threshold` is a
+    success rate, or a return if the task reports no success; the result has the steps until an evaluation reached it.
+    `force` compares even if the task has changed since a training or a seed has not finished its own. Raises
+    `UsageError` for sides that cannot be compared.
     """
     if len(texts) < 2:
         raise UsageError("give two or more to compare, the baseline first: rlctl runs compare A B")
-    groups = [find_runs_of(text) for text in texts]
+    groups = [[_PolicyAlone(Path(text))] if Path(text).suffix in _POLICIES else find_runs_of(text) for text in texts]
     names = [
         text.rstrip("/") if len(group) > 1 else str(group[0].path) for text, group in zip(texts, groups, strict=True)
     ]
@@ -143,7 +164,7 @@ def compare_runs(
         if change := describe_source_change(run):
             raise UsageError(
                 f"{run.path}: {change}\nit was trained on another version of the task, so the comparison is not fair; "
-                "--force compares anyway"
+                "--force compares anyway, on the task as it is now"
             )
     seeds = [run for group in groups if len(group) > 1 for run in group]
     if unfinished := next((run for run in seeds if run.status().get("status") != "finished" and not force), None):
@@ -151,7 +172,7 @@ def compare_runs(
             f"{unfinished.path}: this seed has not finished its training\n"
             "the comparison is not fair; --force compares anyway"
         )
-    recipes = [[run.recipe() for run in group] for group in groups]
+    recipes = [[] if isinstance(group[0], _PolicyAlone) else [run.recipe() for run in group] for group in groups]
     for name, own in zip(names, recipes, strict=True):
         if any(one == two for one, two in itertools.combinations(own, 2)):
             raise UsageError(f"{name}: two of its runs have the same recipe and seed, which count as one training")
@@ -176,7 +197,7 @@ def compare_runs(
             Candidate(
                 side,
                 _differences(baseline, side, of_recipes, len(others)),
-                find_recipe_changes(recipe[0], recipes[0][0]),
+                find_recipe_changes(recipe[0], recipes[0][0]) if recipe and recipes[0] else None,
             )
             for side, recipe in zip(others, recipes[1:], strict=True)
         ],
@@ -227,7 +248,7 @@ def _evaluate(run: RunDirectory, request: EvalRequest, threshold: float | None) 
     steps = reached.get("steps")
     return EvaluatedRun(
         path=run.path,
-        seed=summarize(run.path).seed,
+        seed=None if isinstance(run, _PolicyAlone) else summarize(run.path).seed,
         evaluation=evaluation,
         steps_to_threshold=None if steps is None else int(steps),
         seconds_to_threshold=reached.get("seconds"),

@@ -30,9 +30,9 @@ def show(result: RunComparison, json: str | None) -> None:
         question = f"\n{candidate.side.name} against {result.baseline.name}: "
         out.print(Text.assemble(question, (candidate.verdict, "bold")))
         lines = describe_candidate(result, candidate)
-        for key, (value, before) in candidate.recipe_changes.items():
+        for key, (value, before) in (candidate.recipe_changes or {}).items():
             lines.append(f"recipe: {key}: {format_value(key, before)} -> {format_value(key, value)}")
-        for line in lines if candidate.recipe_changes else [*lines, "recipe: the same"]:
+        for line in [*lines, "recipe: the same"] if candidate.recipe_changes == {} else lines:
             out.print(f"  {line}")
 
 
@@ -43,10 +43,15 @@ def _show_seeds(result: RunComparison) -> None:
     rows = [(side.name, *_format_seed(run))[: len(columns)] for side in result.sides for run in side.runs]
     output.print_table(columns, rows, left=("recipe",))
     for side in result.sides:
-        scores = "; ".join(_format_aggregate(side, quantity) for quantity in result.candidates[0].differences)
-        output.out().print(f"{side.name}: {len(side.runs)} seeds, {scores}")
+        output.out().print(describe_seeds(result, side))
         if side.mixed:
             output.out().print(f"warning: {side.name} is not one recipe: its runs differ in {', '.join(side.mixed)}")
+
+
+def describe_seeds(result: RunComparison, side: Side) -> str:
+    """Return a recipe's scores in the episodes of the comparison."""
+    scores = "; ".join(_format_aggregate(side, quantity) for quantity in result.candidates[0].differences)
+    return f"{side.name}: {len(side.runs)} seeds, {scores}"
 
 
 def _or_dash(value: float | None, form: str) -> str:
@@ -106,7 +111,9 @@ def format_needed(candidate: Candidate, comparisons: int) -> str:
     ]
     if needed:
         count, quantity = min(needed)
-        parts.append(f"about {count:,} {unit} would decide, if the true difference in {quantity} is the measured one")
+        parts.append(
+            f"about {count:,} new {unit} would decide, if the true difference in {quantity} is the measured one"
+        )
     return "; ".join(parts) or "no difference at all: more data would not decide"
 
 
@@ -115,7 +122,7 @@ def describe_tests(result: RunComparison) -> str:
     quantities = " and ".join(result.candidates[0].differences)
     count = len(result.candidates)
     of = "" if count == 1 else f" of {count} candidates"
-    together = "" if count == 1 and " and " not in quantities else ", p-values adjusted for all tests together"
+    together = "" if count == 1 and " and " not in quantities else ", p-values (not intervals) adjusted for all tests"
     rate = f"{significance.ALPHA:.0%} of comparisons report a difference"
     return f"tested: {quantities}{of}{together}; if all are equal, {rate}"
 
@@ -140,7 +147,7 @@ def as_json(result: RunComparison) -> dict[str, Any]:
                 },
                 "recipe_changes": {
                     key: {"here": value, "baseline": before}
-                    for key, (value, before) in candidate.recipe_changes.items()
+                    for key, (value, before) in (candidate.recipe_changes or {}).items()
                 },
             }
             for candidate in result.candidates

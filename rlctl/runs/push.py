@@ -7,6 +7,7 @@ from pathlib import Path
 from rlctl import output
 from rlctl.errors import UsageError
 from rlctl.hub import store
+from rlctl.policy import own_modules
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.run.directory import RunDirectory, refuse_links_out
 from rlctl.run.lookup import find_run
@@ -37,6 +38,8 @@ def push_run(run: str | None, address: str) -> PushResult:
     others = (directory.recipe_file, directory.evals_file, directory.onnx_file, *recordings)
     contents |= {file.relative_to(directory.path).as_posix(): file for file in others if file.is_file()}
     status = {key: value for key, value in directory.status().items() if key not in _PRIVATE}
+    if own := own_modules.list_names(directory.recipe()):
+        output.print_notes([f"not uploaded, although the recipe names them: {', '.join(own)}"])
     contents["run.json"] = json.dumps(status, indent=2).encode()
     contents[_CARD] = describe(directory, info, sorted(contents)).encode()
     manifest = store.push(contents, address)

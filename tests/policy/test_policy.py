@@ -64,6 +64,12 @@ def path(saved):
     return saved(policy_kwargs={"net_arch": [16]}, normalized_keys=[""], clip_observation=10.0)
 
 
+def test_equal_policies_have_equal_bytes():
+    info = describe()
+    file = PolicyFile(info, tensors_of(info))
+    assert len({file.encode() for _ in range(8)}) == 1
+
+
 def test_round_trip(tmp_path):
     info = describe(policy_kwargs={"net_arch": [8]})
     tensors = tensors_of(info)

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,6 +33,19 @@ def test_the_newest_run(root, make_run):
     assert find_run("reach", root).path == reach.path
     assert find_run(str(newest.path), root).path == newest.path
     assert find_run("some/where/ant.py:ant", root).path == newest.path
+
+
+def test_latest_is_the_run_that_it_leads_to_now(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    (root / "latest").symlink_to(Path("reach", run.path.name))
+    assert find_run(str(root / "latest"), root).path == run.path
+
+
+def test_a_folder_of_runs_names_one(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    assert error(ArtifactError, find_run, str(root), root) == (
+        f"{root}: not a run of rlctl: it has no run.json; in it is {run.path}"
+    )
 
 
 def test_of_two_in_one_second_the_later(root, make_run):

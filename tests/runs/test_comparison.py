@@ -1,5 +1,6 @@
 """Comparing runs: real policies on a small task, and what is refused."""
 
+import dataclasses
 import json
 import shutil
 
@@ -137,6 +138,31 @@ def test_seeds_that_have_not_finished_are_not_compared(root, monkeypatch):
     assert len(compare(texts, EvalRequest(None, episodes=1), force=True).candidates[0].side.runs) == 2
 
 
+def test_policy_files_are_compared(root, tmp_path, rlctl):
+    one, two = sorted((root / "0.9/Line").iterdir())
+    kept = shutil.copy(one / "policies/best.safetensors", tmp_path / "kept.safetensors")
+    runs = compare([str(one), str(two)], EvalRequest(None, episodes=4))
+    files = compare([str(kept), str(two)], EvalRequest(None, episodes=4))
+    assert files.candidates[0].differences == runs.candidates[0].differences
+    assert files.candidates[0].recipe_changes is None
+    done = rlctl("runs", "compare", kept, two, "--episodes", 4)
+    assert done.returncode == 0, done.stderr
+    assert "kept.safetensors" in done.stdout
+    assert "recipe: " not in done.stdout
+
+
+def test_a_margin_must_be_excluded(root):
+    one, two = sorted((root / "0.9/Line").iterdir())
+    result = compare([str(one), str(two)], EvalRequest(None, episodes=4))
+    (difference, *_) = result.candidates[0].differences.values()
+    tied = dataclasses.replace(difference, low=-0.2, high=0.1, p=1.0)
+    candidate = dataclasses.replace(result.candidates[0], differences={"success": tied})
+    result = dataclasses.replace(result, candidates=[candidate])
+    result.check(margin=0.2)
+    with pytest.raises(AnswerIsNo, match=r"its success may be lower by 0\.2, more than 0\.1$"):
+        result.check(margin=0.1)
+
+
 def test_gate(root):
     one, two = sorted((root / "0.9/Line").iterdir())
     result = compare([str(one), str(two)], EvalRequest(None, episodes=4))
@@ -163,4 +189,6 @@ def test_a_report_of_two_recipes_begins_with_the_verdict(root):
     text = write_report([f"{root}/0.9*/Line/*"], "md", root / "report.md", episodes=2).read_text()
     assert "\n**gamma 0.99 against gamma 0.9: cannot tell**\n" in text
     assert text.index("cannot tell") < text.index("In the evaluations that selected them")
-    assert "- tested: success and return, p-values adjusted for all tests together; if all are equal, 5% of" in text
+    assert (
+        "- tested: success and return, p-values (not intervals) adjusted for all tests; if all are equal, 5% of" in text
+    )

@@ -140,6 +140,13 @@ def test_a_wrong_name_is_a_recipe_error(train, tmp_path, name, problem):
     assert not (tmp_path / "runs").exists()
 
 
+def test_a_file_of_another_machine_is_found_beside_its_recipe(train, tmp_path, monkeypatch):
+    (tmp_path / "count.py").write_text("import rlctl\n\n\nclass Count(rlctl.Callback):\n    pass\n")
+    monkeypatch.chdir(tmp_path)
+    run = train("Line", {**SMALL_PPO, "callbacks": {"/another/machine/count.py:Count": None}}).run
+    assert list(run.recipe().callbacks) == [f"{tmp_path}/count.py:Count"]
+
+
 def test_the_example_of_the_page(train, tmp_path):
     page = (Path(__file__).parents[2] / "docs" / "callbacks.md").read_text()
     (code,) = re.findall(r"`my\.py`:\n\n```python\n(.*?)```", page, re.DOTALL)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -103,7 +104,7 @@ def _group_by_recipe(runs: Sequence[RunDescription]) -> list[RecipeRuns]:
 def _name_recipe(settings: Mapping[str, Any]) -> str:
     """Return `learning_rate 0.001, gamma 0.98`; of many settings the first."""
     names = [
-        f"{key.removeprefix('algo_kwargs.')} {short_repr(format_value(key, value), 30)}"
+        f"{key.rpartition('.')[2]} {short_repr(re.sub(r'[^ ]*/', '', format_value(key, value)), 30)}"
         for key, value in settings.items()
     ]
     return ", ".join(names[:_SETTINGS_NAMED]) + (", ..." if len(names) > _SETTINGS_NAMED else "")

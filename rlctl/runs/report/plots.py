@@ -2,6 +2,7 @@
 
 import io
 import re
+import textwrap
 from typing import Any, Literal
 
 import matplotlib
@@ -16,6 +17,7 @@ from rlctl.runs.report.content import RecipeRuns, RunReport, mean_curve
 _SIZE = (4.4, 2.7)  # [inches]: the width of a phone, so that text is readable there
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text: smaller, and can be searched
+    "pdf.fonttype": 42,  # TrueType; journals refuse Type 3
     "font.size": 9,
     "font.family": "sans-serif",
     "axes.spines.top": False,
@@ -40,22 +42,25 @@ def draw_learning(report: RunReport, form: Literal["svg", "pdf"]) -> bytes:
     with matplotlib.rc_context(_STYLE):
         figure, file = Figure(figsize=(2 * _SIZE[0], _SIZE[1]), layout="constrained"), io.BytesIO()
         for axes, column in zip(figure.subplots(1, 2), _TITLES, strict=True):
-            if not _draw_learning(axes, report, column):
+            if not _draw_learning(axes, report, column, for_paper=True):
                 axes.remove()
-        figure.savefig(file, format=form)
+        figure.savefig(file, format=form, metadata={"Date": None} if form == "svg" else {"CreationDate": None})
     return file.getvalue()
 
 
-def _draw_learning(axes: Axes, report: RunReport, column: str) -> bool:
+def _draw_learning(axes: Axes, report: RunReport, column: str, *, for_paper: bool = False) -> bool:
     for number, recipe in enumerate(report.recipes):
         training = mean_curve([run.metrics for run in recipe.runs], column)
         evaluated = mean_curve([run.evaluations for run in recipe.runs], column)
         color = {"color": f"C{number}"} if recipe.name else {}  # a colour per recipe
-        if training is not None:
-            _draw_curve(axes, training, recipe.name or "training", color)
+        name = textwrap.fill(textwrap.shorten(recipe.name, 64, placeholder=" ..."), 34)
+        alone = for_paper and evaluated is not None  # readers expect one curve per recipe
+        if training is not None and not alone:
+            _draw_curve(axes, training, name or "training", color)
         if evaluated is not None:
-            line = {"linestyle": "none", **color} if recipe.name else {}
-            _draw_curve(axes, evaluated, "" if recipe.name else "evaluations", {"marker": "o", "ms": 3, **line})
+            line = {"linestyle": "-" if alone else "none", **color} if recipe.name else {}
+            label = "evaluations" if not name else name if alone else ""
+            _draw_curve(axes, evaluated, label, {"marker": "o", "ms": 3, **line})
     if column == "success":
         _scale_rates(axes)
     axes.legend(loc="best", **_LEGEND) if axes.lines else None

@@ -11,7 +11,7 @@ from rlctl import output
 from rlctl.errors import RlctlError
 from rlctl.evaluation.request import EvalRequest
 from rlctl.runs.comparison import compare_runs
-from rlctl.runs.comparison_report import describe_candidate, describe_tests
+from rlctl.runs.comparison_report import describe_candidate, describe_seeds, describe_tests
 from rlctl.runs.report import content
 from rlctl.runs.report.content import RunReport
 from rlctl.runs.show import describe_robustness, tabulate
@@ -102,11 +102,12 @@ def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, lis
         result = compare_runs(names, groups, EvalRequest(None, episodes=episodes))
     except RlctlError as error:
         return [], [f"not compared: {str(error).splitlines()[0]}"]
+    seeds = [describe_seeds(result, side) for side in result.sides] if result.of_recipes else []
     verdicts = [
         (
             f"{candidate.side.name} against {result.baseline.name}",
             str(candidate.verdict),
-            [*describe_candidate(result, candidate), describe_tests(result)],
+            [*seeds, *describe_candidate(result, candidate), describe_tests(result)],
         )
         for candidate in result.candidates
     ]

@@ -121,6 +121,19 @@ def test_what_the_task_knows_of_its_joints(write, arm):
         SafetyFilter(arm, write("{command: speed, offset: 1}"))
 
 
+def test_position_limits_stay_within_the_robot_models(write, arm):
+    arm = arm.model_copy(update={"joints": Joints(["hip", "knee"], low=[-1, -2.6], high=[0.6, 2.6])})
+    units = "command: position\nscale: 1\nmeasured: {position: positions}\n"
+    with pytest.raises(RecipeError, match=r"knee\.position: -140 to 140 is not within the robot model's -2\.6 to 2\.6"):
+        SafetyFilter(arm, write(units + "limits: {knee: {position: [-140, 140]}}"))
+    SafetyFilter(arm, write(units + "limits: {knee: {position: [-2.61, 2.6]}}"))  # rounded
+    safety = SafetyFilter(arm, write(units + "limits: {all: {position: [-2, 2]}}"))
+    safety.observe(observe_at(0, 0))
+    assert safety.limit([9.0, -9.0]) == pytest.approx([0.6, -2.0])
+    with pytest.raises(RecipeError, match=r"hip\.position: 1 to 2 is not within"):
+        SafetyFilter(arm, write(units + "limits: {all: {position: [1, 2]}}"))
+
+
 def test_a_joint_without_limits_of_its_own(write, arm):
     known = Joints(["hip", "knee"], low=[0, -2], high=[-1, 0], max_speed=[0, 9], max_torque=[0, 3])
     arm = arm.model_copy(update={"joints": known})
