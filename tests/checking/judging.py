@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ def records_of(task, *experiments):
 def shared_records_of(task, *experiments):
     """What some experiments find out, each in a process of its own, and once for all tests: many have one twin."""
     records = Records(_path(task))
-    for experiment in families.EXPERIMENTS:
+    for experiment in itertools.chain(*families.PROCESSES.values()):
         if experiment == "build" or (experiment in experiments and records.built):
             for message in _play(task, experiment):
                 records.add(message)

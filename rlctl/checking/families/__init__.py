@@ -26,32 +26,16 @@ what `Recording.run()` returns. Name, severity, meaning and fix of a rule are in
 severity or fix only if they differ.
 """
 
+import importlib
+import pkgutil
 from collections.abc import Collection
 
-from rlctl.checking.families import (
-    actions,
-    determinism,
-    episodes,
-    incentives,
-    interface,
-    isolation,
-    loading,
-    observations,
-    physics,
-    reset,
-    rewards,
-    search,
-    speed,
-)
 from rlctl.checking.rules import RULES, Check, Experiment
 
 PROCESS_S = 18.0  # for the experiments of one process [s], besides importing and building
 
-MODULES = (
-    *(loading, observations, interface, determinism, reset, isolation, episodes),
-    *(rewards, incentives, search, actions, physics, speed),
-)
-_MEMBERS = [value for module in MODULES for value in vars(module).values()]
+_MODULES = [importlib.import_module(f"{__name__}.{module.name}") for module in pkgutil.iter_modules(__path__)]
+_MEMBERS = [value for module in _MODULES for value in vars(module).values()]
 CHECKS = {member.rule: member for member in _MEMBERS if isinstance(member, Check)}
 EXPERIMENTS = {member.name: member for member in _MEMBERS if isinstance(member, Experiment)}
 DECIDED_BY = {rule: experiment for experiment in EXPERIMENTS.values() for rule in experiment.rules}
