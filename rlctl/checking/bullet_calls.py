@@ -164,19 +164,6 @@ class _Replacement:
         return types.BuiltinFunctionType
 
 
-class _RecordedFunction(_Replacement):
-    def __init__(self, name: str, function: Any, calls: BulletCalls) -> None:
-        self._name, self._function, self._calls = name, function, calls
-
-    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        frame = sys._getframe(1)
-        self._calls.note_call(self._name, frame, arguments, keywords)
-        result = self._function(*arguments, **keywords)
-        if self._name in RECORDED:
-            self._calls.note_result(self._name, frame, arguments, keywords, result)
-        return result
-
-
 @contextlib.contextmanager
 def _replace_functions(replace: Callable[[str, Any], Any]) -> Iterator[None]:
     pybullet = sys.modules.get("pybullet")
@@ -197,7 +184,15 @@ def record_calls() -> Iterator[BulletCalls]:
     calls = BulletCalls()
 
     def replace(name: str, function: Any) -> Any:
-        return function if NO_CLIENT.fullmatch(name) else _RecordedFunction(name, function, calls)
+        def call(self: Any, *arguments: Any, **keywords: Any) -> Any:
+            frame = sys._getframe(1)
+            calls.note_call(name, frame, arguments, keywords)
+            result = function(*arguments, **keywords)
+            if name in RECORDED:
+                calls.note_result(name, frame, arguments, keywords, result)
+            return result
+
+        return function if NO_CLIENT.fullmatch(name) else type(name, (_Replacement,), {"__call__": call})()
 
     with _replace_functions(replace):
         yield calls

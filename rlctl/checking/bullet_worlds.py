@@ -119,7 +119,8 @@ def _body(client: int, body: int) -> WorldBody:
     p = ClientCalls(client)
     base, name = (text.decode(errors="replace") for text in p.getBodyInfo(body))
     infos = [p.getJointInfo(body, i) for i in range(p.getNumJoints(body))]
-    joints = [_joint(info) for info in infos if info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)]
+    moving = [info for info in infos if info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)]
+    joints = [Joint(i[0], i[1].decode(errors="replace"), i[2] == p.JOINT_REVOLUTE, i[8], i[9]) for i in moving]
     links = [base, *(info[12].decode(errors="replace") for info in infos)]
     base_mass, *masses = (p.getDynamicsInfo(body, i)[0] for i in range(-1, len(infos)))
     name, has_heavy_links = name or base or "a body", bool(joints) and any(mass > 0 for mass in masses)
@@ -149,10 +150,6 @@ def read_orientations(world: World) -> dict[Link, list[float]]:
         for link, state in zip(links, p.getLinkStates(body.id, links, computeForwardKinematics=1) or (), strict=False):
             orientations[body.id, link] = list(state[5])
     return orientations
-
-
-def _joint(info: Any) -> Joint:
-    return Joint(info[0], info[1].decode(errors="replace"), info[2] == bullet().JOINT_REVOLUTE, info[8], info[9])
 
 
 def read_physics(client: int) -> tuple[list[float], float]:

@@ -11,7 +11,7 @@ from rlctl import output
 from rlctl.checking import families
 from rlctl.checking.children import Supervisor
 from rlctl.checking.records import Records
-from rlctl.checking.rules import RULES, Experiment, NotApplicable, NotJudged, RuleFinding, Severity
+from rlctl.checking.rules import RULES, NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.values import name_leaf
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
@@ -181,21 +181,17 @@ def _findings(rule: str, records: Records) -> list[RuleFinding]:
     if check is not None and not findings:
         findings += check.run(records)
     if experiment is not None and not findings:
-        _require_complete(records, experiment, rule)
+        if rule in records.skipped:
+            raise NotJudged(records.skipped[rule])
+        if rule in records.not_applicable:
+            raise NotApplicable(records.not_applicable[rule])
+        finished = records.finished.get(experiment.name)
+        is_failed_build = records.built is None and experiment.name == "build"
+        if not is_failed_build and (finished is None or not finished.is_complete):
+            raise NotJudged(records.why_missing(experiment.name))
     if not findings or (check is not None and check.of_absence):
         records.require_whole(*families.find_needs([rule]))
     return findings
-
-
-def _require_complete(records: Records, experiment: Experiment, rule: str) -> None:
-    if rule in records.skipped:
-        raise NotJudged(records.skipped[rule])
-    if rule in records.not_applicable:
-        raise NotApplicable(records.not_applicable[rule])
-    finished = records.finished.get(experiment.name)
-    is_complete = finished is not None and finished.is_complete
-    if not is_complete and not (records.built is None and experiment.name == "build"):
-        raise NotJudged(records.why_missing(experiment.name))
 
 
 def _waive(verdict: CheckVerdict, waivers: Mapping[str, str]) -> None:

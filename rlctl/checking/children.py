@@ -166,10 +166,7 @@ class Supervisor:
     def __init__(
         self, spec: EnvSpec, budget_s: float, env_timeout_s: float, receive: Callable[[ChildMessage], None]
     ) -> None:
-        self._spec = spec
-        self._budget_s = budget_s
-        self._env_timeout_s = env_timeout_s
-        self._receive = receive
+        self._spec, self._budget_s, self._env_timeout_s, self._receive = spec, budget_s, env_timeout_s, receive
         self._waiting: dict[str, Sequence[str]] = {}
         self._active: dict[Connection, Child] = {}
         self._has_built = False

@@ -1,7 +1,5 @@
 """Instances of an untrusted environment: how they are called, and what a call raised, as plain data."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import inspect
@@ -178,7 +176,7 @@ class Budget:
 class Instance:
     """One environment, and how it is called."""
 
-    def __init__(self, env: Any, context: Context) -> None:
+    def __init__(self, env: Any, context: "Context") -> None:
         """Raises `TaskError` where its observation space cannot be read."""
         try:
             self.leaves = find_leaves(getattr(env, "observation_space", None))

@@ -82,14 +82,12 @@ class Profile:
 
     def suspicious(self) -> list[TimedCall]:
         """Return the functions of a suspicious kind that no other such calls, with the time in all they call."""
-        return self._sum_up(
-            [
-                (function, self._place(function if function in self._own else caller), spent[3])
-                for function, stats in self._stats.items()
-                for caller, spent in stats[4].items()
-                if self._kinds[function] and not self._kinds[caller]
-            ]
-        )
+        calls = []
+        for function in (function for function, kind in self._kinds.items() if kind):
+            for caller, spent in self._stats[function][4].items():
+                if not self._kinds[caller]:
+                    calls.append((function, self._place(function if function in self._own else caller), spent[3]))
+        return self._sum_up(calls)
 
     def _place(self, function: Function | None) -> str:
         """Return the place of a function, or of the own function that most of its time is spent for."""

@@ -127,6 +127,7 @@ class Recording:
     @property
     def trajectory(self) -> CheckedEpisode:
         """What was recorded."""
+        forms = self._forms.items()
         return CheckedEpisode(
             role=self.role,
             episode=self.episode.number,
@@ -139,10 +140,7 @@ class Recording:
             terminated=np.array([flag for flag, _ in self._flags], np.bool_),
             truncated=np.array([flag for _, flag in self._flags], np.bool_),
             infos={name: _to_series(*recorded) for name, recorded in self._infos.items()},
-            forms=[
-                Form(what, type_name, step, count, *more)
-                for (what, type_name, *more), (step, count) in self._forms.items()
-            ],
+            forms=[Form(what, kind, step, count, *more) for (what, kind, *more), (step, count) in forms],
         )
 
 
