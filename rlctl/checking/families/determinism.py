@@ -118,11 +118,8 @@ def _find_cause(records: Records) -> tuple[str, str]:
     if not fresh or find_difference(records, records.require_role("alone"), fresh[0]) is not None:
         return "", ""  # a new process differs too: chance
     if find_difference(records, records.require_role("reused"), records.require_role("dirty")) is None:
-        first = "the first episode of an instance differs from all later ones"
-        return (
-            f"; {first}",
-            "Let every reset do what the first one does: restore a saved state before anything reads it.",
-        )
+        fix = "Let every reset do what the first one does: restore a saved state before anything reads it."
+        return "; the first episode of an instance differs from all later ones", fix
     kept = list_names(names, most=3)
     what = kept or "every attribute that step changes, and the whole simulation"
     shown = f" ({kept})" if kept else ""

@@ -182,9 +182,7 @@ def _find_no_time_limit(records: Records) -> Iterator[RuleFinding]:
     if built.truncation == "computed":
         return  # its limit was not reached
     why = "step always returns truncated=False" if built.truncation == "never" else "none is declared or was reached"
-    message = (
-        f"no time limit was seen: {why}; all {len(episodes)} episodes ended with terminated=True, the longest after "
-    )
+    ends = f"all {len(episodes)} episodes ended with terminated=True, the longest after {max(lengths)} steps"
     evidence = {"episodes": len(episodes), "value": None, "expected": "max_episode_steps", "step": max(lengths)}
     severity = Severity.WARNING if is_continuous and built.truncation == "never" else Severity.INFO
-    yield RuleFinding("RL506", f"{message}{max(lengths)} steps", evidence, severity)
+    yield RuleFinding("RL506", f"no time limit was seen: {why}; {ends}", evidence, severity)

@@ -33,11 +33,8 @@ def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
         raise NotApplicable("nothing ended an episode early")
     longest = records.require_built().max_steps or max(episode.steps for episode in episodes)
     inner = np.concatenate([episode.rewards[: episode.steps - episode.has_ended] for episode in episodes])
-    early = [
-        episode
-        for episode in episodes
-        if episode.ended == "terminated" and episode.steps < longest and not rewards.ends_in_success(episode)
-    ]
+    ended = [episode for episode in episodes if episode.ended == "terminated" and episode.steps < longest]
+    early = [episode for episode in ended if not rewards.ends_in_success(episode)]
     if not early or not inner.size or inner.max() > 0 or inner.mean() == 0:
         return
     mean = float(inner.mean())
@@ -49,11 +46,10 @@ def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
         return
     usual = int(np.argsort(gains)[len(gains) // 2])
     example, last = early[usual], float(early[usual].rewards[-1])
-    message = (
-        f"{len(early)} of {len(episodes)} episodes ended early without success. The mean reward is {mean:.3g} and none "
-        f"but the last is above 0, so ending at step {example.steps} with {last:.3g} saves {saved[usual]:.3g} "
-        f"(discounted by {rewards.DISCOUNT} up to step {longest})"
-    )
+    ends = f"{len(early)} of {len(episodes)} episodes ended early without success"
+    why = f"The mean reward is {mean:.3g} and none but the last is above 0, so ending at step {example.steps} with"
+    much = f"{saved[usual]:.3g} (discounted by {rewards.DISCOUNT} up to step {longest})"
+    message = f"{ends}. {why} {last:.3g} saves {much}"
     yield RuleFinding("RL604", message, example.at(example.steps, value=last, mean_reward=mean, gain=gain), severity)
 
 
@@ -88,10 +84,8 @@ def _find_paid_idleness(records: Records) -> Iterator[RuleFinding]:
         return
     bonus, share = _bonus(idle)
     because = f"; {100 * share:.0f} % of it is the term {bonus!r}, which never changes" if bonus else ""
-    message = (
-        f"doing nothing earns {mean:.4g} over {steps} steps (discounted by {rewards.DISCOUNT}), the best of "
-        f"{len(something)} other episodes {best:.4g}{because}"
-    )
+    earned = f"doing nothing earns {mean:.4g} over {steps} steps (discounted by {rewards.DISCOUNT})"
+    message = f"{earned}, the best of {len(something)} other episodes {best:.4g}{because}"
     evidence = idle[0].at(steps, value=mean, best=best, term=bonus, share=share)
     yield RuleFinding("RL606", message, evidence, Severity.WARNING if bonus else Severity.INFO)
 

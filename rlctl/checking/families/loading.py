@@ -67,7 +67,8 @@ def _explain(context: Context, error: RlctlError) -> RuleFinding:
     details = {"traceback": error.details} if error.details else {}
     if isinstance(error, NoSuchClassError):
         return RuleFinding("RL005", str(error), details)
-    if isinstance(error, OldGymError) or _imports_old_gym(cause):
+    missing_modules = [str(e.name) for e in get_causes(cause) if isinstance(e, ModuleNotFoundError)]
+    if isinstance(error, OldGymError) or any(name.partition(".")[0] == "gym" for name in missing_modules):
         return RuleFinding("RL008", str(error), details)
     if (file := find_missing_file(cause)) is not None:
         return _not_found("the constructor", file, error.details)
@@ -83,11 +84,6 @@ def _explain(context: Context, error: RlctlError) -> RuleFinding:
     if is_without_trace and not registry.is_task(registry.load(context.spec.task)):
         return RuleFinding("RL003", str(error))
     return RuleFinding("RL002", str(error), details, fix=opengl_fix(str(cause)), where=where)
-
-
-def _imports_old_gym(error: BaseException | None) -> bool:
-    missing = [str(cause.name) for cause in get_causes(error) if isinstance(cause, ModuleNotFoundError)]
-    return any(name.partition(".")[0] == "gym" for name in missing)
 
 
 def _base_class(instance: Instance) -> Iterator[RuleFinding]:

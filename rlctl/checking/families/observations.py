@@ -95,10 +95,9 @@ def _find_out_of_range(records: Records) -> Iterator[RuleFinding]:
         columns = np.flatnonzero(np.any([record[2].any(axis=0) for record in recorded], axis=0))
         others = [built.element(index, int(column)) for column in columns if column != flat]
         more = f"; so are {list_names(others)}" if others else ""
-        message = (
-            f"{element} is {value:.9g} {_when(step)}; the space allows [{low:.9g}, {high:.9g}]"
-            f"{' (float rounding)' if is_rounding else ''}; {count} of {total} observations are outside{more}"
-        )
+        allowed = f"the space allows [{low:.9g}, {high:.9g}]{' (float rounding)' if is_rounding else ''}"
+        share = f"{count} of {total} observations are outside{more}"
+        message = f"{element} is {value:.9g} {_when(step)}; {allowed}; {share}"
         counts = {"observations_outside": count, "observations": total}
         evidence = trajectory.at(step, element=element, value=value, expected=[low, high], **counts)
         severity = Severity.WARNING if is_rounding else _severity_of_outside(recorded, outside)

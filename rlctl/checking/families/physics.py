@@ -127,10 +127,8 @@ def _penetration(world: LoggedWorld) -> Iterator[RuleFinding]:
         limit, place = log.deep[at][pair][1], log.places[at]
         names = [log.world.link_name(link) for link in pair]
         more = f"; so are {len(worst) - 1} other pairs of links" if len(worst) > 1 else ""
-        message = (
-            f"{names[0]} is {100 * depth:.1f} cm inside {names[1]} {_when(place)}, and deeper than "
-            f"{100 * limit:.1f} cm for {len(row)} steps in a row{more}"
-        )
+        lasts = f"deeper than {100 * limit:.1f} cm for {len(row)} steps in a row{more}"
+        message = f"{names[0]} is {100 * depth:.1f} cm inside {names[1]} {_when(place)}, and {lasts}"
         yield RuleFinding("RL803", message, {**place, "value": depth, "expected": limit, "links": names})
 
 
@@ -155,10 +153,9 @@ def _joint_limits(world: LoggedWorld) -> Iterator[RuleFinding]:
     for _, name, joint, steps, place, value in joints[:1]:
         unit = "rad" if joint.is_angle else "m"
         more = f"; outside of theirs are {list_names(names[1:])}" if names[1:] else ""
-        message = (
-            f"{name} is at {value:.3g} {unit} {_when(place)}; its limits are [{joint.low:.3g}, {joint.high:.3g}] "
-            f"{unit}; it is far outside them in {steps} steps{more}"
-        )
+        limits = f"its limits are [{joint.low:.3g}, {joint.high:.3g}] {unit}"
+        lasts = f"it is far outside them in {steps} steps{more}"
+        message = f"{name} is at {value:.3g} {unit} {_when(place)}; {limits}; {lasts}"
         evidence = {**place, "joint": name, "value": value, "expected": [joint.low, joint.high]}
         yield RuleFinding("RL804", message, {**evidence, "other_joints": names[1:]})
 
@@ -208,9 +205,7 @@ def _thrown(world: LoggedWorld) -> dict[str, Jump]:
 
 def _unrest(world: LoggedWorld) -> Iterator[RuleFinding]:
     for jump in _thrown(world).values():
-        message = (
-            f"{jump.body} moves at {jump.speed:.2f} m/s {jump.after_s:.2g} s after reset, without any action; "
-            f"falling explains {jump.explained:.2f} m/s"
-        )
+        moves = f"{jump.body} moves at {jump.speed:.2f} m/s {jump.after_s:.2g} s after reset, without any action"
+        message = f"{moves}; falling explains {jump.explained:.2f} m/s"
         evidence = {"seed": jump.seed, "body": jump.body, "value": jump.speed, "expected": jump.explained}
         yield RuleFinding("RL807", message, evidence)

@@ -97,13 +97,11 @@ def explains(observed: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool
 
 def _hidden(instance: Instance, name: str, plain: Sequence[Frame], changed: Sequence[Frame]) -> RuleFinding:
     step = int(np.argmax([abs(a[REWARD] - b[REWARD]) for a, b in zip(plain, changed, strict=False)]))
-    message = (
-        f"reset draws {name}, the reward uses it, and the observation does not show it: with the value of another seed "
-        f"the same episode has the same observations, and at step {step} the reward {changed[step][REWARD]:.4g} "
-        f"instead of {plain[step][REWARD]:.4g}"
-    )
-    rewards = {"value": float(changed[step][REWARD]), "expected": float(plain[step][REWARD])}
-    evidence = {"element": name, "seed": FIRST_SEED, "step": step, **rewards}
+    value, expected = float(changed[step][REWARD]), float(plain[step][REWARD])
+    fault = f"reset draws {name}, the reward uses it, and the observation does not show it"
+    proof = "with the value of another seed the same episode has the same observations"
+    message = f"{fault}: {proof}, and at step {step} the reward {value:.4g} instead of {expected:.4g}"
+    evidence = {"element": name, "seed": FIRST_SEED, "step": step, "value": value, "expected": expected}
     return RuleFinding("RL114", message, evidence, where=find_assignment(instance.env, name))
 
 

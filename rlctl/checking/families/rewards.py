@@ -83,11 +83,8 @@ def find_constant_terms(episodes: Sequence[CheckedEpisode]) -> dict[str, float]:
     for episode in episodes:
         for name, values in find_terms(episode).items():
             by_name.setdefault(name, []).append(values)
-    return {
-        name: float(parts[0][0])
-        for name, parts in by_name.items()
-        if len(parts) == len(episodes) and all((part == parts[0][0]).all() for part in parts)
-    }
+    terms = {name: np.concatenate(parts) for name, parts in by_name.items() if len(parts) == len(episodes)}
+    return {name: float(values[0]) for name, values in terms.items() if (values == values[0]).all()}
 
 
 def reports_success(episodes: Sequence[CheckedEpisode]) -> bool:
@@ -189,10 +186,8 @@ def _find_wrong_sum(records: Records) -> Iterator[RuleFinding]:
     if wrong > FEW_WRONG * len(off):
         episode, step = [(episode, step) for episode in episodes for step in range(1, episode.steps + 1)][worst]
         total, reward = float(np.concatenate(totals)[worst]), float(rewards[worst])
-        message = (
-            f"reward_terms do not add up to the reward in {wrong} of {len(off)} steps: at step {step} their sum is "
-            f"{total:.6g} and the reward {reward:.6g}"
-        )
+        example = f"at step {step} their sum is {total:.6g} and the reward {reward:.6g}"
+        message = f"reward_terms do not add up to the reward in {wrong} of {len(off)} steps: {example}"
         yield RuleFinding("RL607", message, episode.at(step, value=total, expected=reward))
 
 

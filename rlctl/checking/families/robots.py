@@ -31,10 +31,8 @@ def _find_far_targets(worlds: Sequence[LoggedWorld], calls: BulletCalls) -> Iter
             continue
         outside = max(joint.low - target.value, target.value - joint.high)
         if outside > FAR_RANGES * (joint.high - joint.low) and abs(target.value) > FULL_TURN:
-            message = (
-                f"{target.call.name} gives joint {joint.name} the position {target.value:.4g} rad; its limits are "
-                f"[{joint.low:.3g}, {joint.high:.3g}] rad: degrees?"
-            )
+            limits = f"its limits are [{joint.low:.3g}, {joint.high:.3g}] rad: degrees?"
+            message = f"{target.call.name} gives joint {joint.name} the position {target.value:.4g} rad; {limits}"
             evidence = {"element": joint.name, "value": target.value, "expected": [joint.low, joint.high]}
             yield RuleFinding("RL810", message, evidence, where=(target.call.file, target.call.line))
             return
@@ -53,12 +51,11 @@ def _find_wrong_order(world: LoggedWorld) -> Iterator[RuleFinding]:
             is_sorted_same = np.abs(values[order] - np.sort(positions)).max() <= NEAR
             wrong = np.flatnonzero(np.abs(values - positions) > APART)
             if is_sorted_same and wrong.size >= 2:
-                joint, target = body.joints[list(driven)[wrong[0]]], list(driven.values())[wrong[0]]
-                message = (
-                    f"with the zero action the {len(driven)} motor targets of {body.name} are its joint positions at "
-                    f"reset in another order: {joint.name} is at {positions[wrong[0]]:.3g} and gets {target.value:.3g}"
-                )
-                evidence = {"element": joint.name, "value": target.value, "expected": float(positions[wrong[0]])}
+                (index, target), position = list(driven.items())[wrong[0]], float(positions[wrong[0]])
+                targets, joint = f"the {len(driven)} motor targets of {body.name}", body.joints[index].name
+                what = f"with the zero action {targets} are its joint positions at reset in another order"
+                message = f"{what}: {joint} is at {position:.3g} and gets {target.value:.3g}"
+                evidence = {"element": joint, "value": target.value, "expected": position}
                 yield RuleFinding("RL811", message, evidence, where=(target.call.file, target.call.line))
                 return
 
@@ -78,10 +75,8 @@ def _find_weak_motors(world: LoggedWorld, calls: BulletCalls) -> Iterator[RuleFi
             target = calls.targets.get((world.world.client, body.id, joint.index))
             if target is not None and 0 < target.force < torque:
                 unit = "N m" if joint.is_angle else "N"
-                message = (
-                    f"the motor of {joint.name} has at most {target.force:.4g} {unit}, "
-                    f"and to hold the weight at reset takes {torque:.4g} {unit}"
-                )
+                needed = f"to hold the weight at reset takes {torque:.4g} {unit}"
+                message = f"the motor of {joint.name} has at most {target.force:.4g} {unit}, and {needed}"
                 evidence = {"element": joint.name, "value": target.force, "expected": torque}
                 yield RuleFinding("RL814", message, evidence, where=(target.call.file, target.call.line))
                 return
@@ -149,9 +144,8 @@ def _find_touching(log: WorldLog, query: ContactQuery) -> list[set[tuple[int, in
 
 def _are_joined(client: int, one: tuple[int, int], two: tuple[int, int]) -> bool:
     p = ClientCalls(client)
-    return any(
-        link >= 0 and p.getJointInfo(body, link)[16] == parent for (body, link), (_, parent) in ((one, two), (two, one))
-    )
+    pairs = (one, two), (two, one)
+    return any(link >= 0 and p.getJointInfo(body, link)[16] == parent for (body, link), (_, parent) in pairs)
 
 
 def _find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:

@@ -189,9 +189,8 @@ def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[Ch
         return
     best = max(stops, key=lambda stop: stop.stopping - stop.finishing)
     if best.per_step > 0 and best.stopping > best.finishing + CLEARLY * abs(best.finishing):
-        message = (
-            f"finishing at step {finished.steps} earns {best.finishing:.4g} from step {best.step} on; stopping there "
-            f"earns {best.per_step:.3g} per step instead, {best.stopping:.4g} in all (discount {rewards.DISCOUNT})"
-        )
+        more = f"{best.per_step:.3g} per step instead, {best.stopping:.4g} in all (discount {rewards.DISCOUNT})"
+        finishing = f"finishing at step {finished.steps} earns {best.finishing:.4g} from step {best.step} on"
+        message = f"{finishing}; stopping there earns {more}"
         earned = {"value": best.stopping, "expected": f"below {best.finishing:.6g}", "per_step": best.per_step}
         yield RuleFinding("RL605", message, finished.at(best.step, **earned))
