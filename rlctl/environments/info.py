@@ -156,18 +156,11 @@ def describe_randomization(events: Mapping[str, bool]) -> str:
 
 def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
     """Return a space as plain data; raises `UsageError` for a kind or size of space that policies do not support."""
-    if isinstance(space, spaces.Box | spaces.MultiBinary) and math.prod(space.shape or ()) > LARGEST_SPACE:
-        raise UsageError(
-            f"a space of {math.prod(space.shape or ()):,} elements; at most {LARGEST_SPACE:,} are supported"
-        )
+    if isinstance(space, spaces.Box | spaces.MultiBinary) and (size := math.prod(space.shape or ())) > LARGEST_SPACE:
+        raise UsageError(f"a space of {size:,} elements; at most {LARGEST_SPACE:,} are supported")
     if isinstance(space, spaces.Box):
-        return {
-            "type": "Box",
-            "low": _encode_bounds(space.low),
-            "high": _encode_bounds(space.high),
-            "shape": list(space.shape),
-            "dtype": str(space.dtype),
-        }
+        bounds = {"low": _encode_bounds(space.low), "high": _encode_bounds(space.high)}
+        return {"type": "Box", **bounds, "shape": list(space.shape), "dtype": str(space.dtype)}
     if isinstance(space, spaces.Discrete):
         return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
     if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim == 1:
@@ -176,10 +169,8 @@ def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
         return {"type": "MultiBinary", "n": space.n if isinstance(space.n, int) else list(space.n)}
     if isinstance(space, spaces.Dict):
         return {"type": "Dict", "spaces": {key: space_to_json(value) for key, value in space.spaces.items()}}
-    raise UsageError(
-        f"the space {short_repr(space)} is not supported; "
-        "Box, Discrete, MultiDiscrete of one axis, MultiBinary, Dict are"
-    )
+    kinds = "Box, Discrete, MultiDiscrete of one axis, MultiBinary, Dict"
+    raise UsageError(f"the space {short_repr(space)} is not supported; {kinds} are")
 
 
 def _encode_bounds(values: Any) -> Any:

@@ -45,9 +45,8 @@ def check_source(task: str, named_by: str) -> None:
 def _make_error(task: str, named_by: str, why: str) -> ArtifactError:
     shown = task if len(task) <= 80 else f"{task[:80]}..."
     hint = "; if you trust it, name it with --task" if named_by == POLICY else ""
-    return ArtifactError(
-        f"{named_by} names {shown!r} as its task, but {why}; not run, because a file may name environments only{hint}"
-    )
+    not_run = f"not run, because a file may name environments only{hint}"
+    return ArtifactError(f"{named_by} names {shown!r} as its task, but {why}; {not_run}")
 
 
 def _look_before_import(task: str, named_by: str) -> None:

@@ -17,17 +17,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from rlctl import errors
 from rlctl.environments import installed
-from rlctl.errors import (
-    NoSuchClassError,
-    OldGymError,
-    RlctlError,
-    TaskError,
-    UsageError,
-    describe_exception,
-    did_you_mean,
-    format_plugin_traceback,
-)
+from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError, did_you_mean
 from rlctl.storage import files
 
 _GYMNASIUM_ID = re.compile(r"^(?:[\w.]+:)?(?:[\w.-]+/)?[\w.-]+-v\d+$")
@@ -56,15 +48,12 @@ def load(task: str) -> Callable[..., Any]:
             forms = " or ".join(f"{file}:{name}" for name in _list_classes(file)) or f"{file}:CLASS"
             raise UsageError(f"no task {task!r} is installed; to name a class in {file}: {forms}")
     if task and Path(task).is_dir():
-        raise UsageError(
-            f"{task} is a folder, not a task: pip install -e {task} installs a plugin; or name a class: "
-            f"{task}/FILE.py:CLASS"
-        )
+        forms = f"pip install -e {task} installs a plugin; or name a class: {task}/FILE.py:CLASS"
+        raise UsageError(f"{task} is a folder, not a task: {forms}")
     names = [entry.name for entry in installed.list_installed()]
-    raise UsageError(
-        f"no task {task!r}.{did_you_mean(task, names)} Installed: {', '.join(dict.fromkeys(names)) or 'none'}. "
-        "Other forms: package.module:Class, path/to/file.py:Class, Pendulum-v1."
-    )
+    listed, close = ", ".join(dict.fromkeys(names)) or "none", did_you_mean(task, names)
+    forms = "Other forms: package.module:Class, path/to/file.py:Class, Pendulum-v1."
+    raise UsageError(f"no task {task!r}.{close} Installed: {listed}. {forms}")
 
 
 def _list_classes(file: Path) -> list[str]:
@@ -155,10 +144,8 @@ def _load_target(task: str, target: str) -> Callable[..., Any]:
         if not hasattr(constructor, part):
             classes = [name for name, value in vars(module).items() if inspect.isclass(value)]
             own = [name for name in classes if getattr(module, name).__module__ == module.__name__]
-            raise NoSuchClassError(
-                f"{place} has no {attribute!r}.{did_you_mean(attribute, classes)} "
-                f"It defines: {', '.join(own) or 'no class'}."
-            )
+            close, defined = did_you_mean(attribute, classes), ", ".join(own) or "no class"
+            raise NoSuchClassError(f"{place} has no {attribute!r}.{close} It defines: {defined}.")
         constructor = getattr(constructor, part)
     if not callable(constructor):
         raise NoSuchClassError(f"{target}: {attribute} is a {type(constructor).__name__}, not a class or a function")
@@ -194,9 +181,8 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
             old = getattr(sys.modules.get("gym"), "envs", None)  # imported, so an id may be registered there
             registry = getattr(old, "registry", {})
             if name in getattr(registry, "env_specs", registry):
-                raise OldGymError(
-                    f"{name} is registered with the old gym package; Gymnasium cannot find it there"
-                ) from None
+                known = f"{name} is registered with the old gym package"
+                raise OldGymError(f"{known}; Gymnasium cannot find it there") from None
             close = did_you_mean(name, gymnasium.registry)
             raise UsageError(f"Gymnasium has no environment {task!r}.{close}") from None
         except (gymnasium.error.DeprecatedEnv, ModuleNotFoundError) as error:
@@ -221,10 +207,8 @@ def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
         own = frames and Path(frames[-1].filename).parent == Path(__file__).parent
         if frames and not own and not frames[-1].filename.startswith("<frozen"):  # a syntax error names its place
             where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})"
-        raise TaskError(
-            f"task {task!r}: {doing}{describe_exception(error)}{where}",
-            details=format_plugin_traceback(error) or None,
-        ) from error
+        reason, details = errors.describe_exception(error), errors.format_plugin_traceback(error) or None
+        raise TaskError(f"task {task!r}: {doing}{reason}{where}", details=details) from error
 
 
 def import_module(task: str, name: str) -> Any:

@@ -83,16 +83,13 @@ class EnvSpec:
 
         check_parameters(constructor)
         parameters = check_fields(constructor, self.parameters)
-        env: TaskEnv = call_plugin(
-            self.task,
-            lambda: TaskEnv(
-                constructor(**parameters),
-                render_mode=render_mode,
-                reward_weights=self.reward_weights,
-                events=EventSettings(self.randomize, self.events),
-                sim=self.sim,
-            ),
-        )
+        weights, events = self.reward_weights, EventSettings(self.randomize, self.events)
+
+        def build() -> TaskEnv:
+            task = constructor(**parameters)
+            return TaskEnv(task, render_mode=render_mode, reward_weights=weights, events=events, sim=self.sim)
+
+        env: TaskEnv = call_plugin(self.task, build)
         env.set_level(self.level)
         return env
 
@@ -112,19 +109,16 @@ class EnvSpec:
                 raise RecipeError(f"{self.task} takes no render_mode") from None
         env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
         if hasattr(env, "num_envs") and not isinstance(env, gymnasium.Env):
-            raise TaskError(
-                f"{self.task}: {type(env).__name__} is a vectorised environment\n"
-                "give a single environment; rlctl itself runs n_envs of them in parallel"
-            )
+            hint = "give a single environment; rlctl itself runs n_envs of them in parallel"
+            raise TaskError(f"{self.task}: {type(env).__name__} is a vectorised environment\n{hint}")
         if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):
             self._refuse(type(env))
         return env
 
     def _refuse(self, what: Any, hint: str = "") -> NoReturn:
-        raise TaskError(
-            f"{self.task}: {getattr(what, '__name__', what)} is neither a Gymnasium environment (reset, step, spaces) "
-            f"nor a subclass of rlctl.task.Task{hint}"
-        )
+        name = getattr(what, "__name__", what)
+        expected = "neither a Gymnasium environment (reset, step, spaces) nor a subclass of rlctl.task.Task"
+        raise TaskError(f"{self.task}: {name} is {expected}{hint}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,9 +176,8 @@ def make(
         from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
         kwargs = {"task": task, "render_mode": render_mode, "randomize": randomize, "events": events, **parameters}
-        env.unwrapped.spec = GymnasiumSpec(
-            f"rlctl/{make_slug(task)}-v0", "rlctl.environments.spec:make", kwargs=kwargs, disable_env_checker=True
-        )
+        name, entry_point = f"rlctl/{make_slug(task)}-v0", "rlctl.environments.spec:make"
+        env.unwrapped.spec = GymnasiumSpec(name, entry_point, kwargs=kwargs, disable_env_checker=True)
     return env
 
 

@@ -28,9 +28,8 @@ class TimeFeature(gymnasium.Wrapper[Any, Any, Any, Any]):
         inner = env.unwrapped
         limit = inner.max_steps if isinstance(inner, TaskEnv) else find_time_limit(env)
         if not limit:
-            raise RecipeError(
-                f"time_feature: {type(inner).__name__} has no time limit, so there is no remaining time to observe"
-            )
+            name = type(inner).__name__
+            raise RecipeError(f"time_feature: {name} has no time limit, so there is no remaining time to observe")
         self._limit = limit
         self._steps = 0
         space = env.observation_space
@@ -102,12 +101,7 @@ def stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any
     if (count := math.prod(space.shape) * frames) > LARGEST_SPACE:
         raise RecipeError(f"frame_stack: {frames:,} makes {count:,} elements; at most {LARGEST_SPACE:,} are supported")
     # Gymnasium stacks along a new first axis; networks want vectors and images of the same rank.
-    stacked = spaces.Box(
-        np.concatenate([space.low] * frames, axis=-1),
-        np.concatenate([space.high] * frames, axis=-1),
-        dtype=space.dtype.type,
-    )
-    flat: gymnasium.Env[Any, Any] = TransformObservation(
-        FrameStackObservation(env, frames), lambda stack: np.concatenate(list(stack), axis=-1), stacked
-    )
-    return flat
+    low, high = (np.concatenate([bounds] * frames, axis=-1) for bounds in (space.low, space.high))
+    flat = spaces.Box(low, high, dtype=space.dtype.type)
+    stacked = FrameStackObservation(env, frames)
+    return TransformObservation(stacked, lambda stack: np.concatenate(list(stack), axis=-1), flat)
