@@ -18,7 +18,6 @@ import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import TypeVar
 
 from rlctl import output
 from rlctl.cluster.work import PREEMPTED, TAKEN, ClusterSettings, Work, execute, make_work, mark_shared_folder
@@ -28,7 +27,7 @@ from rlctl.run.group import JOBS, Job, job_file, list_jobs, read_job, write_job
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.signals import HandledSignals
-from rlctl.training.trainings import Detached, NextSignal, Trainings
+from rlctl.training.trainings import Detached, NextSignal, Result, Trainings
 
 STOP_FILE = f"{JOBS}/stop"  # when this file exists, nodes save a checkpoint and stop their training
 BEAT_FILE = f"{JOBS}/beat"  # if it exists and does not change for `lease_s`, nodes do the same: the driver was killed
@@ -52,7 +51,6 @@ case $code in  # saved, or ended by a signal before it began
 esac
 exit $code
 """
-Result = TypeVar("Result")
 
 
 class SlurmTrainings(Trainings):
@@ -209,15 +207,13 @@ def _call(command: list[str]) -> str:
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     except FileNotFoundError:
-        raise UsageError(
-            f"--on slurm: {command[0]} is not installed on this machine; use a login node of the cluster"
-        ) from None
+        hint = "is not installed on this machine; use a login node of the cluster"
+        raise UsageError(f"--on slurm: {command[0]} {hint}") from None
     except subprocess.TimeoutExpired:
         raise TaskError(f"--on slurm: {command[0]} did not answer within 60 s") from None
     if done.returncode:
-        raise TaskError(
-            f"--on slurm: {command[0]} failed: {(done.stderr or done.stdout).strip().partition(chr(10))[0]}"
-        )
+        reason = (done.stderr or done.stdout).strip().partition("\n")[0]
+        raise TaskError(f"--on slurm: {command[0]} failed: {reason}")
     return done.stdout
 
 
@@ -269,9 +265,8 @@ def run_on_node(works: Path, index: int) -> int:
         if is_retried and attempts > work.settings["retries"]:
             print(f"error: gave up after {attempts} attempts; raise retries in cluster.yaml for more", file=log)
             is_retried = False
-    write_job(
-        folder, dataclasses.replace(job, state="queued" if is_retried else "ended", code=None if is_retried else code)
-    )
+    state, result = ("queued", None) if is_retried else ("ended", code)
+    write_job(folder, dataclasses.replace(job, state=state, code=result))
     return PREEMPTED if is_retried else code
 
 

@@ -122,7 +122,9 @@ def execute(work: Work, receive: Callable[[str], None], next_signal: NextSignal)
         _enter_folder(work)
         for warning in compare_versions(work.task, work.versions, work.source_sha256):
             receive(warning)
-        request = _bind(work)
+        request = TrainRequest.from_json(work.request)
+        if request.resume is None and (run := find_run_of_seed(work.folder, work.seed)) is not None:
+            request = request.to_resume(run.path, {})  # of an earlier attempt
     except RlctlError as error:
         receive(f"error: {error}")
         return error.exit_code
@@ -139,10 +141,8 @@ def _enter_folder(work: Work) -> None:
     except OSError:
         is_same = False
     if not is_same:
-        raise ArtifactError(
-            f"{platform.node()}: {work.root}: this node has a different folder there, or none; "
-            "share the runs folder and the current folder at the same paths"
-        )
+        hint = "share the runs folder and the current folder at the same paths"
+        raise ArtifactError(f"{platform.node()}: {work.root}: this node has a different folder there, or none; {hint}")
 
 
 def describe_driver(task: str) -> dict[str, Any]:
@@ -158,15 +158,6 @@ def compare_versions(task: str, versions: Mapping[str, str], source_sha256: str 
         raise ArtifactError("{}: rlctl {}, but {} on the driver: install the same version".format(node, *both))
     if identify_task(task)["source_sha256"] != source_sha256:
         raise ArtifactError(f"{node}: the file of task {task!r} differs from the driver's: install the same version")
-    return [
-        f"warning: not bit-equal: {name} {version} on the driver, {here.get(name, 'none')} on {node}"
-        for name, version in versions.items()
-        if here.get(name) != version
-    ]
-
-
-def _bind(work: Work) -> TrainRequest:
-    """Return the request, or one that resumes the run of an earlier attempt."""
-    request = TrainRequest.from_json(work.request)
-    run = find_run_of_seed(work.folder, work.seed) if request.resume is None else None
-    return request if run is None else request.to_resume(run.path, {})
+    others = {name: version for name, version in versions.items() if here.get(name) != version}
+    pairs = (f"{name} {version} on the driver, {here.get(name, 'none')} on {node}" for name, version in others.items())
+    return [f"warning: not bit-equal: {pair}" for pair in pairs]
