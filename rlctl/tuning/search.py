@@ -55,19 +55,16 @@ class StepSearch:
     def _open_study(self) -> optuna.Study:
         """Return Optuna's study; with a storage, tuners with an equal search share it."""
         tuning = self._tuning
+        random_trials = max(2, tuning.trials_per_step // _RANDOM_SHARE)
+        # Tuners that share a study must not propose equal values.
+        seed = None if tuning.storage else tuning.seed + self._number
         study = optuna.create_study(
             storage=tuning.storage,
             study_name=self._name_study() if tuning.storage else None,
             load_if_exists=True,
             direction="maximize",
-            sampler=optuna.samplers.TPESampler(
-                # Tuners that share a study must not propose equal values.
-                seed=None if tuning.storage else tuning.seed + self._number,
-                n_startup_trials=max(2, tuning.trials_per_step // _RANDOM_SHARE),
-            ),
-            pruner=optuna.pruners.MedianPruner(
-                0, n_warmup_steps=_EVALUATIONS_BEFORE_PRUNING, n_min_trials=_TRIALS_BEFORE_PRUNING
-            ),
+            sampler=optuna.samplers.TPESampler(seed=seed, n_startup_trials=random_trials),
+            pruner=optuna.pruners.MedianPruner(0, _EVALUATIONS_BEFORE_PRUNING, n_min_trials=_TRIALS_BEFORE_PRUNING),
         )
         for asked in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             if str(asked.user_attrs.get(_LABEL, "")).startswith(f"{tuning.path.name}/"):  # its tuner was stopped

@@ -1,7 +1,5 @@
 """The search space: hyperparameters and their values, in the order in which they are tuned."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re
@@ -46,7 +44,7 @@ class Dimension:
         """Return all choices, or the lower and upper end of the range."""
         return list(self.choices) or [self._format(self.low), self._format(self.high)]
 
-    def make_distribution(self) -> BaseDistribution:
+    def make_distribution(self) -> "BaseDistribution":
         """Return Optuna's distribution: of numbers, logarithmic if wide, or of indices of the choices."""
         from optuna import distributions
 

@@ -91,9 +91,8 @@ def _check_resumed(tuning: Tuning) -> None:
     except ArgumentError:
         raise ArtifactError(f"{tuning.path}: its storage {tuning.storage!r} is not the URL of a database") from None
     if url.get_backend_name() == "sqlite" and not os.path.isfile(url.database or ""):
-        raise ArtifactError(
-            f"{tuning.path}: {url.database}, the database of its trials, does not exist in the current folder"
-        )
+        what = f"{url.database}, the database of its trials,"
+        raise ArtifactError(f"{tuning.path}: {what} does not exist in the current folder")
 
 
 def _check_storage(url: str) -> None:
@@ -162,7 +161,5 @@ def _describe(tuning: Tuning, recipe: Recipe, where: str) -> str:
     trials = output.format_count(tuning.trials_per_step, "trial")
     if len(tuning.steps) > 1:
         trials += f" each, {tuning.trials_per_step * len(tuning.steps):,} trainings in all,"
-    return (
-        f"{tuning.path}: {names}; at most {trials} of {recipe.total_timesteps:,} steps, {where}; "
-        "-n changes their length, --trials their number"
-    )
+    size = f"at most {trials} of {recipe.total_timesteps:,} steps, {where}"
+    return f"{tuning.path}: {names}; {size}; -n changes their length, --trials their number"

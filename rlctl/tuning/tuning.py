@@ -101,9 +101,8 @@ class Tuning:
 
     def _make_recipe(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the changes to the task's recipe, without seed, length and evaluations."""
-        settings = {
-            key: value for key, value in self.settings.items() if key not in ("seed", "total_timesteps", "eval")
-        }
+        left_out = ("seed", "total_timesteps", "eval")
+        settings = {key: value for key, value in self.settings.items() if key not in left_out}
         config = read(self.config) if self.config is not None else {}
         return merge(merge(config, settings), nest(values))
 
@@ -148,9 +147,8 @@ def show(tuning: Tuning, json: str | None) -> None:
     ranked = sorted(tuning.trials, key=_rank, reverse=True)
     own = list_values(tuning.resolve_recipe())
     out.print(f"{tuning.task}: {tuning.path}, by {tuning.metric}; means over the last third of the evaluations")
-    output.print_table(
-        columns, [_list_cells(tuning, trial, keys, own, runs.get(trial.number)) for trial in ranked], left=("",)
-    )
+    rows = [_list_cells(tuning, trial, keys, own, runs.get(trial.number)) for trial in ranked]
+    output.print_table(columns, rows, left=("",))
     best = tuning.best
     assert best is not None
     task, file, unchanged = map(shlex.quote, (tuning.task, str(tuning.best_file), str(tuning.unchanged_file)))
@@ -174,11 +172,8 @@ def _rank(trial: Trial) -> tuple[bool, float]:
 def _list_cells(
     tuning: Tuning, trial: Trial, keys: list[str], own: Mapping[str, Any], run: RunSummary | None
 ) -> tuple[str, ...]:
-    notes = {
-        "done": "",
-        "failed": f"failed: {trial.problem}",
-        "begun": f"not finished: {trial.problem or 'interrupted'}",
-    }
+    unfinished = f"not finished: {trial.problem or 'interrupted'}"
+    notes = {"done": "", "failed": f"failed: {trial.problem}", "begun": unfinished}
     total, success = tuning.measure(trial, "return"), tuning.measure(trial, "success")
     seconds = None if run is None else run.seconds
     return (
