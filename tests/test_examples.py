@@ -152,6 +152,7 @@ def test_my_task_as_a_wheel(tmp_path: Path) -> None:
     run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(project / "tests"), cwd=empty, path=site)
 
 
+@pytest.mark.slow
 def test_the_check_env_action_runs(tmp_path: Path) -> None:
     """The text of its step, as GitHub's runner executes it."""
     action = yaml.safe_load((EXAMPLES / "ci" / "check-env" / "action.yml").read_text())

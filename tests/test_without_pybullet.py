@@ -24,7 +24,10 @@ def rlctl_without(tmp_path, monkeypatch):
     return run
 
 
-@pytest.mark.parametrize("command", [("train", "reach", "-n", "100"), ("eval", "reach", "--pretrained")])
+@pytest.mark.parametrize(
+    "command",
+    [("train", "reach", "-n", "100"), pytest.param(("eval", "reach", "--pretrained"), marks=pytest.mark.slow)],
+)
 def test_a_task_of_rlctl_names_what_is_missing(rlctl_without, command):
     done = rlctl_without(*command)
     assert done.returncode == 2

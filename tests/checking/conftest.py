@@ -9,6 +9,18 @@ from rlctl.checking.families import episodes
 pytest.register_assert_rewrite("tests.checking.judging")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Let one mistake for each rule be quick; all mistakes are slow tests, and in test_all_rules.py."""
+    rules = set()
+    for item in items:
+        if item.name.startswith("test_finds_the_mistake_and_only_that") and "test_all_rules" not in item.nodeid:
+            case = item.callspec.params["case"]
+            if rules.issuperset(case.rules):
+                item.add_marker(pytest.mark.slow)
+            rules.update(case.rules)
+
+
 @pytest.fixture(autouse=True)
 def _cut_endless_episodes(monkeypatch):
     """Cut episodes that do not end as soon as that is judged, by steps: how many there is time for differs."""

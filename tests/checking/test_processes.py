@@ -171,6 +171,7 @@ def test_findings_of_the_baseline_fail_nothing(tmp_path):
     assert (run.returncode, run.stdout) == (5, "")
 
 
+@pytest.mark.slow
 def test_command_shows_the_worst_first_with_numbers_and_fix():
     run = rlctl(f"{BROKEN}:ArrayReward", "--select", "RL2")
     assert run.returncode == 1

@@ -19,7 +19,9 @@ def shell(command, **environment):
     )
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "ascii:strict", "latin-1:strict"])
+@pytest.mark.parametrize(
+    "encoding", ["ascii:strict", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ascii", "latin-1:strict"))]
+)
 def test_a_terminal_that_is_not_utf8(encoding):
     commands = [["--help"], ["tasks"], ["eval", "nothing_of_the_name_é"]]
     code = f"import sys; from rlctl.cli import run; print([run(each) for each in {commands!r}], file=sys.stderr)"

@@ -110,7 +110,7 @@ def test_a_band_per_recipe(group):
     assert "not compared: learning_rate 0.002: a single run cannot be compared" in write(*group)
 
 
-@pytest.mark.parametrize(("form", "begins"), [("svg", b"<?xml"), ("pdf", b"%PDF-")])
+@pytest.mark.parametrize(("form", "begins"), [("svg", b"<?xml"), pytest.param("pdf", b"%PDF-", marks=pytest.mark.slow)])
 def test_curves_for_a_paper(group, rlctl, form, begins):
     write_recipes(group, a={"learning_rate": 0.001}, b={"learning_rate": 0.001}, c={"learning_rate": 0.002})
     done = rlctl("runs", "report", *group, "--format", form)

@@ -87,6 +87,7 @@ class Read:
         return self.hand_mass, self.friction, self.gravity, self.damping, self.color, self.task.arm.motor_strength
 
 
+@pytest.mark.slow
 def test_a_thousand_resets_stay_around_nominal(make):
     env = make(Arm(), randomize=True)
     read = Read(env)

@@ -123,6 +123,7 @@ def test_the_policy_of_step_0_acts_as_the_demonstrations(record, train, monkeypa
     assert run.status()["demos"]["path"] == str(record(env))
 
 
+@pytest.mark.slow
 def test_discrete_actions_are_cloned(record, tmp_path):
     demos = record("Discrete", "sign")
     run = rlctl.train(f"{ENVS}:Discrete", demos=demos, root=tmp_path, check=False, **TINY).run
@@ -173,7 +174,7 @@ def kill_at(monkeypatch):
     return kill
 
 
-@pytest.mark.parametrize("case", ["ppo", "sac with gSDE, normalised"])
+@pytest.mark.parametrize("case", [pytest.param("ppo", marks=pytest.mark.slow), "sac with gSDE, normalised"])
 @pytest.mark.usefixtures("every_boundary")
 def test_killed_and_resumed(record, changed, train, resume, monkeypatch, kill_at, case):
     monkeypatch.setattr(demonstrations, "_UPDATES", 50)

@@ -59,10 +59,10 @@ CASES = {
     "tqc": ("Line", settings("tqc")),
     "crossq": ("Line", settings("crossq")),
 }
-# A kind of state each: noise matrices, stages, a world of PyBullet with contacts, hidden states, whole episodes with
-# their goals and statistics, a target network. Killed trainings of plain ppo and sac are in tests/crash.
+# A kind of state each: noise matrices, stages, hidden states, whole episodes with their goals and statistics. Killed
+# trainings of plain ppo and sac are in tests/crash.
 QUICK = {
-    *("ppo with gSDE", "ppo, curriculum", "ppo, on hopper", "recurrent_ppo", "sac, hindsight, normalised", "dqn"),
+    *("ppo with gSDE", "ppo, curriculum", "recurrent_ppo", "sac, hindsight, normalised"),
 }
 
 

@@ -50,6 +50,7 @@ def test_it_fails_again_as_it_did(fail, rlctl, case):
         run_replay(ReplayRequest(None, verify=file))
 
 
+@pytest.mark.slow
 def test_the_command_that_the_error_names(rlctl, tmp_path):
     arguments = ["train", f"{FAULTY}:Faulty", "--no-check", "-n", "128", "--n-envs", "2"]
     settings = [f"task.faulty_seed={FAULTY_SEED}", "task.fault=raise", "algo_kwargs.n_steps=16", "eval.episodes=1"]

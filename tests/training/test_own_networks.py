@@ -181,7 +181,7 @@ OWN_POLICIES = {
 
 
 @pytest.mark.parametrize(
-    "algo", ["ppo", "sac", *(pytest.param(algo, marks=pytest.mark.slow) for algo in ("td3", "dqn", "recurrent_ppo"))]
+    "algo", ["ppo", *(pytest.param(algo, marks=pytest.mark.slow) for algo in ("sac", "td3", "dqn", "recurrent_ppo"))]
 )
 def test_an_own_policy_class_trains_resumes_and_exports(train, resume, algo):
     env, name, kwargs = OWN_POLICIES[algo]

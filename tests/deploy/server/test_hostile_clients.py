@@ -126,6 +126,7 @@ def test_request_heads_that_never_end_are_timed_out(server, monkeypatch):
         assert client.act(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]  # robots stay
 
 
+@pytest.mark.slow
 def test_a_stop_is_served_with_few_file_descriptors_and_many_connections(tmp_path):
     file = write_policy(tmp_path / "policy.safetensors")
     command = f"ulimit -n 256; exec {sys.executable} -m rlctl serve {file} --port 0 --max-clients 8"
