@@ -3,6 +3,7 @@
 import collections
 from typing import Any
 
+import numpy as np
 from pydantic_core import to_jsonable_python
 from rich.text import Text
 
@@ -17,6 +18,7 @@ from rlctl.policy.shipped import Interval, MeasuredScore
 from rlctl.version import collect_versions
 
 _MOST_COLUMNS = 25  # of a map that is drawn
+_LIKELY = (0.1, 3.0)  # measured motion per commanded motion; a slow motor is behind, but none is far ahead
 _NOMINAL, _WORST = "*", "<"
 
 
@@ -60,6 +62,11 @@ def _show_limits(result: Evaluation, unlimited: Evaluation) -> None:
     returns = f"return {unlimited.returns.mean:.4g} without them, {result.returns.mean:.4g} with them"
     out.print(f"limits of {result.limited_by}: {success}{returns}")
     steps = sum(episode.result.length for episode in result.played)
+    measured, commanded = np.sum([episode.result.report["moved"] for episode in result.played], axis=0)
+    if commanded and not _LIKELY[0] < measured / commanded < _LIKELY[1]:
+        out.print(
+            f"warning: the joints moved {measured / commanded:.2g} times as far as commanded: check scale in the limits"
+        )
     rows = [(name, f"{1000 * count / steps:.4g}") for name, count in count_interventions(result).most_common()]
     if rows:
         output.print_table(("limit", "per 1,000 steps"), rows, left=("limit",))

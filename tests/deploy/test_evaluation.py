@@ -15,7 +15,7 @@ from rlctl.deploy.server import messages
 from rlctl.deploy.server.client import PolicyClient, RemotePlayer
 from rlctl.errors import PolicyError, RecipeError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
-from rlctl.evaluation.report import as_json, count_interventions
+from rlctl.evaluation.report import as_json, count_interventions, show
 from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.self_test import run_self_test
 from rlctl.policy.shipped import PRETRAINED
@@ -51,6 +51,13 @@ def test_what_limits_cost(tmp_path):
     content = as_json(result)["limits"]
     assert content["success_rate_without"] == 1.0
     assert content["interventions"] == counts
+
+
+def test_a_wrong_scale_is_noticed_by_how_far_the_joints_move(tmp_path, capfd):
+    show(evaluate(tmp_path, STEP.replace("0.03", "0.001") + "limits: {all: {speed: 100}}"), None)
+    assert " times as far as commanded: check scale in the limits" in capfd.readouterr().out
+    show(evaluate(tmp_path, STEP + "limits: {all: {speed: 100}}"), None)
+    assert "as far as commanded" not in capfd.readouterr().out
 
 
 def test_limits_that_never_step_in_cost_nothing(tmp_path):

@@ -73,6 +73,11 @@ class Command:
                 self._expected = self._reference + self._before
         self.position = position.copy()
 
+    @property
+    def motion(self) -> Array | None:
+        """The last commanded motion, where commands are motions."""
+        return None if self._bounds.is_value else self._before
+
     def find_error(self) -> float:
         """Return the largest difference between a joint's position and the expected one; NaN if unknown."""
         if self._expected is None or self.position is None:

@@ -40,9 +40,18 @@ class FittedLimits:
     safe: Array  # the command while holding or stopped, if commands are values
 
 
-@np.errstate(over="ignore", invalid="ignore")  # a later check refuses such numbers
 def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     """Convert limits to arrays for a policy; raises `RecipeError` for limits that do not fit it."""
+    try:
+        return _fit_limits(limits, info)
+    except (RecipeError, UsageError) as error:
+        if limits.file is None:
+            raise
+        raise type(error)(f"{limits.file}: {error}") from None
+
+
+@np.errstate(over="ignore", invalid="ignore")  # a later check refuses such numbers
+def _fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     layout = ObservationLayout(info)
     control_dt = limits.control_dt or info.control_dt
     if control_dt is not None and not 1e-9 <= control_dt <= 1e9:

@@ -57,6 +57,13 @@ class Measured(Section):
 class Limits(Section):
     """Limits on the commands of a robot."""
 
+    _file: Path | None = None
+
+    @property
+    def file(self) -> Path | None:
+        """The file that the limits were read from."""
+        return self._file
+
     command: Literal["position", "step", "speed", "torque", "action"] = "action"
     """What an action commands: joint positions, steps from the present positions, speeds, torques, or anything."""
     scale: Positive | list[Positive] | None = None
@@ -92,4 +99,6 @@ class Limits(Section):
 
 def read_limits(path: Path) -> Limits:
     """Read a limits file; raises `ArtifactError` if it cannot be read, `RecipeError` if its content is invalid."""
-    return yaml_text.read_model(path, Limits)
+    limits = yaml_text.read_model(path, Limits)
+    limits._file = path
+    return limits

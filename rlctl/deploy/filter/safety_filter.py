@@ -265,6 +265,7 @@ class LimitedPlayer(Player):
         self._player = player
         self._safety = SafetyFilter(info, limits)
         self._before: collections.Counter[str] = collections.Counter()
+        self._moved = np.zeros(2)  # sums of the joints' measured and commanded motions in this episode
 
     @property
     def state(self) -> Any:
@@ -284,8 +285,13 @@ class LimitedPlayer(Player):
         if step == 0:
             self._safety.resume()
             self._safety.reset()
-            self._before = self._safety.counts
-        policy_action = self._player.act(observation, seed, step)[1] if self._safety.observe(observation) else None
+            self._before, self._moved = self._safety.counts, np.zeros(2)
+        command = self._safety._command
+        before = None if command is None else command.position
+        is_sound = self._safety.observe(observation)
+        if command is not None and command.motion is not None and before is not None and command.position is not None:
+            self._moved += np.abs(command.position - before).sum(), np.abs(command.motion).sum()
+        policy_action = self._player.act(observation, seed, step)[1] if is_sound else None
         action = self._safety.limit(policy_action)
         return action, action
 
@@ -294,5 +300,6 @@ class LimitedPlayer(Player):
         self._player.close()
 
     def report(self) -> dict[str, Any]:
-        """Return the player's report with the number of interventions per limit and of faults in this episode."""
-        return {**self._player.report(), "interventions": dict(self._safety.counts - self._before)}
+        """Return the player's report with this episode's interventions per limit, faults, and motions of the joints."""
+        limited = {"interventions": dict(self._safety.counts - self._before), "moved": self._moved.tolist()}
+        return {**self._player.report(), **limited}
