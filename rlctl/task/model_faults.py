@@ -69,8 +69,8 @@ def _find_text(owner: ElementTree.Element, inertia_used: bool = True) -> str:
     """Return what is wrong with the first value that is not a number, or numbers separated by spaces."""
     for element in owner.iter():
         for name, value in element.items() if element.tag in _NUMERIC else ():
-            is_used = inertia_used or element.tag != "inertia"
-            if is_used and not all(re.fullmatch(_NUMBER, number) for number in value.replace(", ", " ").split()):
+            is_used, numbers = inertia_used or element.tag != "inertia", value.replace(", ", " ").split()
+            if is_used and not (numbers and all(re.fullmatch(_NUMBER, number) for number in numbers)):
                 return f"{element.tag} {name}={value!r} is not a number; PyBullet reads its first digits, or 0."
     return ""
 

@@ -65,6 +65,7 @@ def test_the_inertia_of_the_file(sim, tmp_path):
             "inertia ixx='0,3' is not a number; PyBullet reads its first digits, or 0.",
         ),
         (inertial(1, 1, 1, mass="${m}"), "mass value='${m}' is not a number; PyBullet reads its first digits, or 0."),
+        (inertial(1, 1, 1, mass=""), "mass value='' is not a number; PyBullet reads its first digits, or 0."),
         (inertial(0.0003, 0.0076, 0.0076), None),
         (inertial(0.0003, 0.0076, 0.0076, mass=-1), "a mass of -1 kg."),
     ],
