@@ -146,7 +146,7 @@ def test_a_joint_without_limits_of_its_own(write, arm):
 def test_actions_from_minus_1_to_1_need_a_scale(write, arm):
     normalised = arm.model_copy(update={"action_space": space_to_json(spaces.Box(-1, 1, (2,)))})
     with pytest.raises(
-        RecipeError, match=r"limits.yaml: limits: scale: required when actions range from -1 to 1; .* the torque of action 1 "
+        RecipeError, match=r"limits.yaml: limits: scale: required .* from -1 to 1; .* the torque of action 1 "
     ):
         SafetyFilter(normalised, write("command: torque\nlimits: {all: {torque: 8}}"))  # 1 of it may be 10 N m
     safety = SafetyFilter(normalised, write("command: torque\nscale: 10\nlimits: {all: {torque: 8}}"))
