@@ -52,6 +52,9 @@ class EnvInfo(pydantic.BaseModel):
             if ours != theirs:
                 own, foreign = (format_space(space_from_json(space), 120) for space in (ours, theirs))
                 return f"its {name} space is {own}, {whose} is {foreign}"
+        own, foreign = (", ".join(info.observation_sizes) for info in (self, other))
+        if own != foreign and sorted(self.observation_sizes) == sorted(other.observation_sizes):
+            return f"its observations are in the order {own}, {whose} in the order {foreign}"
         return None
 
 

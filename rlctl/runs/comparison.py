@@ -111,16 +111,20 @@ class RunComparison:
         return [self.baseline, *(candidate.side for candidate in self.candidates)]
 
     def check(self, margin: float | None = None) -> None:
-        """Raise `AnswerIsNo` if a candidate is worse than the baseline, or may be by more than `margin`.
+        """Raise `AnswerIsNo` if a candidate is worse than the baseline; with `margin` if it may be by more than that.
 
-        `margin` is a success rate, or a return if the task reports no success.
+        `margin` is a success rate, and only success counts then; or a return if the task reports no success.
         """
         worse = [candidate.side.name for candidate in self.candidates if candidate.verdict is Verdict.WORSE]
-        if worse:
-            raise AnswerIsNo(f"gate missed: {', '.join(worse)} worse than {self.baseline.name}")
+        if margin is None:
+            if worse:
+                raise AnswerIsNo(f"gate missed: {', '.join(worse)} worse than {self.baseline.name}")
+            return
         for candidate in self.candidates:
             (quantity, difference), *_ = candidate.differences.items()
-            if margin is not None and difference.low < -margin:
+            if quantity == "success" and margin > 1:
+                raise UsageError(f"--margin {margin:g}: a success rate is at most 1; 5 points are 0.05")
+            if difference.low < -margin:
                 raise AnswerIsNo(
                     f"gate missed: {candidate.side.name}: its {quantity} may be lower by {-difference.low:.3g}, "
                     f"more than {margin:g}"

@@ -68,7 +68,9 @@ def compare_episodes(
 
     `comparisons` is how many candidates are compared with this baseline; p-values are adjusted by Bonferroni.
     """
-    changes = {quantity: candidate[quantity] - baseline[quantity] for quantity in baseline}
+    # An exported policy differs by rounding, in the same direction in every episode.
+    equal = {quantity: np.isclose(candidate[quantity], baseline[quantity], rtol=1e-6) for quantity in baseline}
+    changes = {name: np.where(equal[name], 0.0, candidate[name] - baseline[name]) for name in baseline}
     p_values = flip_signs(np.array([np.where(np.isfinite(change), change, 0.0) for change in changes.values()]))
     differences = {}
     for (quantity, change), p in zip(changes.items(), p_values, strict=True):

@@ -109,3 +109,15 @@ def test_differences_are_described():
     assert info(box, box).find_difference(info(box, spaces.Discrete(2))) == (
         "its action space is Box(-1.0, 1.0, (2,), float32), the environment's is Discrete(2)"
     )
+
+
+def test_the_order_of_the_observations_counts():
+    box = space_to_json(spaces.Box(-1.0, 1.0, (4,)))
+    one, other, renamed = (
+        EnvInfo(observation_space=box, action_space=box, observation_sizes=dict.fromkeys(names, 2))
+        for names in (("position", "speed"), ("speed", "position"), ("place", "speed"))
+    )
+    assert one.find_difference(other) == (
+        "its observations are in the order position, speed, the environment's in the order speed, position"
+    )
+    assert one.find_difference(renamed) is None

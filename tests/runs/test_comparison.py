@@ -161,6 +161,8 @@ def test_a_margin_must_be_excluded(root):
     result.check(margin=0.2)
     with pytest.raises(AnswerIsNo, match=r"its success may be lower by 0\.2, more than 0\.1$"):
         result.check(margin=0.1)
+    with pytest.raises(UsageError, match=r"--margin 5: a success rate is at most 1; 5 points are 0\.05"):
+        result.check(margin=5)
 
 
 def test_gate(root):

@@ -88,6 +88,11 @@ def test_returns_are_paired():
     assert 0.8 < difference.low < difference.mean < difference.high < 1.2
 
 
+def test_rounding_is_no_difference():
+    baseline = np.random.default_rng(0).normal(20.0, 5.0, 100)
+    assert return_difference(baseline, baseline * (1 - 1e-8)).verdict is Verdict.CANNOT_TELL
+
+
 def test_unequal_groups_reach_half_the_p_value():
     difference = seed_difference(np.arange(4.0), np.arange(3.0) + 100.0)
     assert difference.p == pytest.approx(1 / 35)
