@@ -47,7 +47,7 @@ class ServedPolicy:
         own = self.info.env
         difference = own.find_difference(other, "the served policy's")
         if difference is None and list(own.observation_sizes.items()) != list(other.observation_sizes.items()):
-            difference = "its observation has different names or a different order"
+            difference = "its observations have other names"
         if difference is None and own.control_dt != other.control_dt:
             difference = f"its control_dt is {own.control_dt} s, the served policy's {other.control_dt} s"
         if difference is not None:

@@ -269,7 +269,10 @@ def test_another_policy_without_a_gap(serve, tmp_path):
         end.set()
         thread.join()
     assert [code for code, _ in refused] == [422] * 5
-    assert "different names or a different order" in refused[2][1]
+    assert (
+        "its observations are in the order goal, positions, the served policy's in"
+        in json.loads(refused[2][1])["error"]
+    )
     assert (status, json.loads(text)["policy"]) == (200, "other.safetensors")
     changes = [index for index in range(1, len(seen)) if seen[index] != seen[index - 1]]
     assert len(changes) == 1  # never a mixture, and never back
