@@ -11,6 +11,7 @@ import pytest
 from aiohttp import web
 from gymnasium import spaces
 
+from rlctl import output
 from rlctl.deploy.server import messages
 from rlctl.deploy.server.client import PolicyClient, RemotePlayer
 from rlctl.errors import PolicyError, RecipeError, UsageError
@@ -53,11 +54,14 @@ def test_what_limits_cost(tmp_path):
     assert content["interventions"] == counts
 
 
-def test_a_wrong_scale_is_noticed_by_how_far_the_joints_move(tmp_path, capfd):
-    show(evaluate(tmp_path, STEP.replace("0.03", "0.001") + "limits: {all: {speed: 100}}"), None)
-    assert " times as far as commanded: check scale in the limits" in capfd.readouterr().out
-    show(evaluate(tmp_path, STEP + "limits: {all: {speed: 100}}"), None)
-    assert "as far as commanded" not in capfd.readouterr().out
+def test_a_wrong_scale_is_noticed_by_how_far_the_joints_move(tmp_path):
+    def print_with(text):
+        with output.out().capture() as captured:
+            show(evaluate(tmp_path, text + "limits: {all: {speed: 100}}"), None)
+        return captured.get()
+
+    assert " times as far as commanded: check scale in the limits" in print_with(STEP.replace("0.03", "0.001"))
+    assert "as far as commanded" not in print_with(STEP)
 
 
 def test_limits_that_never_step_in_cost_nothing(tmp_path):
