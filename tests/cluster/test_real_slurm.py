@@ -85,7 +85,7 @@ def test_a_job_that_loses_its_node_resumes_to_the_same_bit(begin, request_of_lin
 @pytest.mark.parametrize(("number", "code"), STOPS)
 def test_a_driver_that_ends(slurm, installed_rlctl, tmp_path, number, code):
     (tmp_path / "cluster.yaml").write_text("cpus: 1\nlease_s: 4\n")
-    driver = Driver(tmp_path, "--on", "slurm")
+    driver = Driver(tmp_path, "--on", "slurm", steps=60_000)  # still training when the lease has ended
     run_folder, pid = driver.wait_for_checkpoint()
     ended, printed = driver.end(number)
     assert ended == code
