@@ -145,9 +145,10 @@ def as_json(result: RunComparison) -> dict[str, Any]:
                     quantity: {**vars(difference), "verdict": str(difference.verdict)}
                     for quantity, difference in candidate.differences.items()
                 },
-                "recipe_changes": {
+                "recipe_changes": candidate.recipe_changes
+                and {
                     key: {"here": value, "baseline": before}
-                    for key, (value, before) in (candidate.recipe_changes or {}).items()
+                    for key, (value, before) in candidate.recipe_changes.items()
                 },
             }
             for candidate in result.candidates
