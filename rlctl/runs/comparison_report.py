@@ -145,8 +145,9 @@ def as_json(result: RunComparison) -> dict[str, Any]:
                     quantity: {**vars(difference), "verdict": str(difference.verdict)}
                     for quantity, difference in candidate.differences.items()
                 },
-                "recipe_changes": candidate.recipe_changes
-                and {
+                "recipe_changes": None
+                if candidate.recipe_changes is None
+                else {
                     key: {"here": value, "baseline": before}
                     for key, (value, before) in candidate.recipe_changes.items()
                 },
