@@ -110,8 +110,8 @@ class Worker:
             self._player = PolicyPlayer(PolicyFile(message.info, tensors))
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
+        from rlctl.deploy.filter.limited_player import LimitedPlayer  # few evaluations need it
         from rlctl.deploy.filter.limits import Limits
-        from rlctl.deploy.filter.safety_filter import LimitedPlayer  # few evaluations need it
 
         self._player = LimitedPlayer(self._loaded_player, self._info, Limits.model_validate(message.limits))
 

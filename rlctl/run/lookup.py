@@ -64,7 +64,8 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
     if runs := _list_newest_first(root / registry.make_slug(text), *_IN_TASK):
         return runs[0]
     if text and Path(text).is_dir():
-        inside = next((file.parent for name in (GROUP_FILE, "run.json") for file in Path(text).rglob(name)), None)
+        patterns = (f"*/{GROUP_FILE}", f"*/*/{GROUP_FILE}", "*/run.json", "*/*/run.json")  # deeper takes long in a home
+        inside = next((file.parent for pattern in patterns for file in Path(text).glob(pattern)), None)
         hint = f"; in it is {inside}" if inside else ""
         raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json{hint}")
     if Path(text).is_file() and Path(text).suffix != ".zip":

@@ -32,9 +32,14 @@ _POLICIES = (".safetensors", ".onnx")
 class _PolicyAlone(RunDirectory):
     """A policy file, such as the one that is in use, in the place of the run it comes from."""
 
+    def __init__(self, path: Path) -> None:
+        """Read it; raises `ArtifactError` if it is not a policy."""
+        super().__init__(path)
+        self._task = load_policy(path).info.spec.task
+
     def status(self) -> dict[str, Any]:
-        """Return what is known of its training; raises `ArtifactError` if it is not a policy."""
-        return {"task": load_policy(self.path).info.spec.task, "status": "finished"}
+        """Return what is known of its training."""
+        return {"task": self._task, "status": "finished"}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,6 +6,7 @@ from multiprocessing.connection import Connection
 from types import FrameType
 from typing import Any
 
+from rlctl.errors import Interrupted
 from rlctl.processes import error_boundary, messages
 
 
@@ -31,6 +32,4 @@ def _train(connection: Connection, content: dict[str, Any]) -> int:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    from rlctl.errors import Interrupted
-
     raise Interrupted("interrupted before the training began", number)

@@ -17,7 +17,6 @@ from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.deploy.filter.observation import ObservationError, SensorChecks, read_numbers
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import UsageError, short_repr
-from rlctl.policy.players.player import Exploration, Player
 
 Array = NDArray[Any]
 FilterState = Literal["idle", "running", "holding", "stopped"]
@@ -52,7 +51,7 @@ class SafetyFilter:
         self._sensors = SensorChecks(limits, fitted.layout, fitted.control_dt)
         bounds = fitted.bounds
         self._joints = [] if bounds is None else bounds.names
-        self._command = None if bounds is None else Command(limits, fitted, bounds, self._record_intervention)
+        self.command = None if bounds is None else Command(limits, fitted, bounds, self._record_intervention)
         self._clock = clock
         self._history: collections.deque[SafetyEvent | Intervention] = collections.deque(maxlen=_MAX_EVENTS)
         count = math.prod(fitted.space.shape or ())
@@ -73,8 +72,8 @@ class SafetyFilter:
         """Begin an episode. A stop, a `hold` or `home`, and an override stay in effect."""
         self._fault, self._observed = "", False
         self._sensors.reset()
-        if self._command is not None:
-            self._command.reset()
+        if self.command is not None:
+            self.command.reset()
         if self.state != "stopped" and not self._ordered:
             self._enter("idle", "")
 
@@ -100,8 +99,8 @@ class SafetyFilter:
     def resume(self) -> None:
         """Let the policy act again from the robot's present position; a fault that persists holds it again at once."""
         self._ordered, self._fault = False, ""
-        if self._command is not None and self.state == "stopped":
-            self._command.begin_from_measured()
+        if self.command is not None and self.state == "stopped":
+            self.command.begin_from_measured()
         self.begin_blend()
         self._enter("idle", "")
 
@@ -138,13 +137,13 @@ class SafetyFilter:
 
     def begin_blend(self) -> None:
         """Blend gradually into the next actions, as after a change of the policy."""
-        if self._command is not None:
-            self._command.begin_blend()
+        if self.command is not None:
+            self.command.begin_blend()
 
     @property
     def control_error(self) -> float:
         """Largest difference between a joint's position and the one expected from the last command; NaN if unknown."""
-        return math.nan if self._command is None else self._command.find_error()
+        return math.nan if self.command is None else self.command.find_error()
 
     @property
     def trusts_observation(self) -> bool:
@@ -165,8 +164,8 @@ class SafetyFilter:
         self._observed = True
         if (fault := self._sensors.check(values, float(age))) is not None:
             return self.fail(*fault)
-        if self._measured is not None and self._command is not None:
-            self._command.measure(values[self._measured])
+        if self._measured is not None and self.command is not None:
+            self.command.measure(values[self._measured])
         self._fault = ""
         return True
 
@@ -184,16 +183,16 @@ class SafetyFilter:
         fault = self._fault or self._find_fault(requested, problem)
         if self.state != "stopped" and not self._ordered:
             self._update_state(fault)
-        if self._command is None:
+        if self.command is None:
             return self._choose(requested if self.state == "running" else None)
         try:
             if self.state == "running" and requested is not None:
-                return self._command.follow(requested)
-            return self._command.rest(self._goes_home and self.state == "holding")
+                return self.command.follow(requested)
+            return self.command.rest(self._goes_home and self.state == "holding")
         except UnsafeCommand as unsafe:
             self._record("limit", unsafe.limit, unsafe.value, unsafe.bound)
             self._enter("stopped", str(unsafe))
-            return self._command.stand_still()
+            return self.command.stand_still()
 
     def _read_action(self, action: Any | None) -> tuple[Array | None, str]:
         """Return an action as numbers, or None and why it is invalid."""
@@ -204,7 +203,7 @@ class SafetyFilter:
         except ObservationError as error:
             return None, str(error)
         is_valid = np.isfinite(numbers).tobytes() == self._all_finite
-        if is_valid and self._command is None:
+        if is_valid and self.command is None:
             with np.errstate(invalid="ignore"):
                 choice = self._choose(numbers)
             is_valid = self._space.contains(choice) and bool((choice.ravel() == numbers).all())
@@ -215,7 +214,7 @@ class SafetyFilter:
             fault = "invalid action"
         elif requested is None and self.state != "stopped" and not self._ordered:
             fault = "no action"
-        elif requested is not None and self._measured is not None and self._command and self._command.position is None:
+        elif requested is not None and self._measured is not None and self.command and self.command.position is None:
             fault = "no position"
         else:
             return ""
@@ -256,50 +255,3 @@ class SafetyFilter:
         self._history.append(event)
         if self.on_event is not None:
             self.on_event(event)
-
-
-class LimitedPlayer(Player):
-    """Plays another player's actions within limits; reports the number of interventions."""
-
-    def __init__(self, player: Player, info: EnvInfo, limits: Limits) -> None:
-        self._player = player
-        self._safety = SafetyFilter(info, limits)
-        self._before: collections.Counter[str] = collections.Counter()
-        self._moved = np.zeros(2)  # sums of the joints' measured and commanded motions in this episode
-
-    @property
-    def state(self) -> Any:
-        """Recurrent state of the player."""
-        return self._player.state
-
-    def explore(self, exploration: Exploration) -> None:
-        """Let the player explore."""
-        self._player.explore(exploration)
-
-    def begin_segment(self, seed: int, step: int) -> None:
-        """Begin a segment at a step of an episode."""
-        self._player.begin_segment(seed, step)
-
-    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Return the limited action twice, to record and to step with."""
-        if step == 0:
-            self._safety.resume()
-            self._safety.reset()
-            self._before, self._moved = self._safety.counts, np.zeros(2)
-        command = self._safety._command
-        before = None if command is None else command.position
-        is_sound = self._safety.observe(observation)
-        if command is not None and command.motion is not None and before is not None and command.position is not None:
-            self._moved += np.abs(command.position - before).sum(), np.abs(command.motion).sum()
-        policy_action = self._player.act(observation, seed, step)[1] if is_sound else None
-        action = self._safety.limit(policy_action)
-        return action, action
-
-    def close(self) -> None:
-        """Close the player."""
-        self._player.close()
-
-    def report(self) -> dict[str, Any]:
-        """Return the player's report with this episode's interventions per limit, faults, and motions of the joints."""
-        limited = {"interventions": dict(self._safety.counts - self._before), "moved": self._moved.tolist()}
-        return {**self._player.report(), **limited}

@@ -40,8 +40,7 @@ class CrossQUpdate(SacUpdate):
         count, sample = len(batch.features), self._actor.sample(batch.next_features, "next")
         features = np.concatenate([batch.features, batch.next_features])
         inputs = np.concatenate([features, np.concatenate([batch.actions, sample.action])], 1)[None]
-        runs = [functools.partial(critics.run, inputs, "learning") for critics in self._critics]
-        passes = self._side_by_side.run(runs)
+        passes = self._side_by_side.run([functools.partial(stack.run, inputs, "learning") for stack in self._critics])
         values = np.concatenate([passed[-1] for passed in passes])[:, count:].min(0) - coefficient * sample.log_prob
         target = batch.rewards + batch.discounts * values
 

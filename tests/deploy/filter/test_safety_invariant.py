@@ -238,7 +238,7 @@ def test_a_result_that_is_not_finite_stops_the_robot(arm, state):
     safety = make_filter(arm, command="position", limits=limits, lowpass_hz=3)
     rest = observe_at(0, 0)
     last = run_filter(safety, rest, [0.05, 0.05])
-    setattr(safety._command, state, np.full(2, math.nan))  # a mistake in our arithmetic, as there was one
+    setattr(safety.command, state, np.full(2, math.nan))  # a mistake in our arithmetic, as there was one
     for _ in range(3):
         output = run_filter(safety, rest, [0.05, 0.05])
         assert np.isfinite(output).all()
