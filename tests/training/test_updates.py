@@ -12,11 +12,11 @@ from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rlctl.environments.dict_spaces import split
 from rlctl.errors import RecipeError
-from rlctl.training.updates import choose_learner
+from rlctl.training.updates import adam, choose_learner
 from rlctl.training.updates.crossq import CrossQUpdate
 from rlctl.training.updates.ppo import PpoUpdate
 from rlctl.training.updates.q_learning import DqnUpdate, Td3Update
@@ -100,11 +100,18 @@ def test_ppo_updates_as_sb3(name):
     assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
 
 
-def make_off_policy(algorithm=SAC, observations=VECTOR, policy="MlpPolicy", network=None, actions=ACTIONS, **settings):
-    """A model with a replay buffer of made-up numbers."""
+def make_off_policy(
+    algorithm=SAC, observations=VECTOR, policy="MlpPolicy", network=None, actions=ACTIONS, normalize=False, **settings
+):
+    """A model with a replay buffer of made-up numbers; with `normalize` of two environments whose scales differ."""
     settings = {"batch_size": 16, "learning_rate": 1e-2, "buffer_size": 200, "seed": 0, **settings}
     network = {"net_arch": [16, 16], **(network or {})}
-    envs = DummyVecEnv([lambda: Still(observations, actions)])
+    envs = DummyVecEnv([lambda: Still(observations, actions)] * (2 if normalize else 1))
+    if normalize:
+        envs = VecNormalize(envs, clip_obs=1.5)
+        for rms in split(envs.obs_rms).values():
+            rms.mean[:], rms.var[:] = 0.3, 0.25
+        envs.ret_rms.var = 4.0
     model = algorithm(policy, envs, policy_kwargs=network, device="cpu", **settings)
     model.set_logger(Logger(None, []))
     rng, buffer = np.random.default_rng(0), model.replay_buffer
@@ -114,7 +121,8 @@ def make_off_policy(algorithm=SAC, observations=VECTOR, policy="MlpPolicy", netw
     if isinstance(actions, spaces.Discrete):
         buffer.actions[...] = rng.integers(0, actions.n, buffer.actions.shape)
     buffer.dones[...] = rng.random(buffer.dones.shape) < 0.1
-    buffer.full = True
+    buffer.timeouts[...] = buffer.dones * (rng.random(buffer.dones.shape) < 0.5)
+    buffer.pos, buffer.full = 50, True
     return model
 
 
@@ -129,7 +137,15 @@ SAC_CASES = {
     "gSDE, clipped mean": {"use_sde": True, "network": {"clip_mean": 0.02}},
     "fixed entropy coefficient, three critics": {"ent_coef": 0.2, "network": {"n_critics": 3}},
     "several steps": {"n_steps": 3},
+    "several steps, normalized": {"n_steps": 4, "normalize": True, "batch_size": 100},
+    "normalized": {"normalize": True},
     "dict": {"observations": spaces.Dict({"a": VECTOR, "b": VECTOR}), "policy": "MultiInputPolicy"},
+    "dict, normalized": {
+        "observations": spaces.Dict({"a": VECTOR, "b": VECTOR}),
+        "policy": "MultiInputPolicy",
+        "normalize": True,
+        "seed": 2,
+    },
 }
 
 
@@ -167,11 +183,11 @@ def test_off_policy_updates_as_sb3(name):
     learner = update(other)
     for steps in (1, 7):
         set_random_seed(steps)
-        one.train(gradient_steps=steps, batch_size=16)
+        one.train(gradient_steps=steps, batch_size=one.batch_size)
         set_random_seed(steps)
-        learner.train(gradient_steps=steps, batch_size=16)
+        learner.train(gradient_steps=steps, batch_size=one.batch_size)
         set_random_seed(steps)
-        first.train(gradient_steps=1, batch_size=16)
+        first.train(gradient_steps=1, batch_size=one.batch_size)
         # The critics' loss is that of the first update, which stands for eight.
         expected = dict(one.logger.name_to_value)
         if issubclass(update, SacUpdate):
@@ -237,3 +253,20 @@ def test_sb3_cannot_delay_the_actor():
     model.policy_delay = 2
     with pytest.raises(RecipeError, match="policy_delay: supported only for multi-layer perceptrons"):
         choose_learner(model)
+
+
+def test_the_short_step_of_adam_is_torchs():
+    def train(step):
+        set_random_seed(0)
+        values = [torch.nn.Parameter(torch.randn(shape)) for shape in ((64, 9), (64,), ())]
+        unused = torch.nn.Parameter(torch.zeros(2))
+        optimizer = torch.optim.Adam([*values, unused], 1e-2, (0.5, 0.9), 1e-5, weight_decay=0.1, fused=True)
+        for _ in range(5):
+            for value in values:
+                value.grad = torch.randn(value.shape)
+            step(optimizer)
+        return [*values, *(state for value in values for state in optimizer.state[value].values())]
+
+    with torch.no_grad():
+        pairs = list(zip(train(adam.step), train(torch.optim.Adam.step), strict=True))
+    assert all(torch.equal(ours, theirs) for ours, theirs in pairs)

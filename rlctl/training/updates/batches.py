@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 
 from rlctl.environments.dict_spaces import join, map_parts, split
+from rlctl.training.snapshot import observation_statistics
 from rlctl.training.updates.mlp import Floats
 
 
@@ -39,7 +40,7 @@ def _extract(network: Any, observations: Any) -> Floats:
 def _gather(model: Any, count: int, size: int) -> dict[str, Any]:
     """Return the transitions of all minibatches, one after the other."""
     buffer, env = model.replay_buffer, model._vec_normalize_env
-    if type(buffer) not in (ReplayBuffer, DictReplayBuffer) or buffer.optimize_memory_usage:
+    if type(buffer) not in (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer) or buffer.optimize_memory_usage:
         return _join_samples([buffer.sample(size, env=env) for _ in range(count)], model.gamma)
     stored = buffer.buffer_size if buffer.full else buffer.pos
     # SB3's generator, in SB3's order: checkpoints hold its state.
@@ -48,17 +49,35 @@ def _gather(model: Any, count: int, size: int) -> dict[str, Any]:
         for _ in range(count)
     ]
     rows, envs = (np.concatenate(numbers) for numbers in zip(*drawn, strict=True))
+    statistics = observation_statistics(env)
 
-    def normalize(observations: Any) -> Any:
-        return buffer._normalize_obs(map_parts(lambda values: values[rows, envs], observations), env)
+    def take(values: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
+        return values.reshape(-1, *values.shape[2:]).take(rows * buffer.n_envs + envs, axis=0)
 
-    dones = buffer.dones[rows, envs] * (1 - buffer.timeouts[rows, envs])
+    def take_observations(observations: Any, rows: NDArray[Any]) -> Any:
+        parts = {key: take(values, rows) for key, values in split(observations).items()}
+        for key, rms in statistics.items():
+            parts[key] -= rms.mean  # in place: SB3's copies in double precision take five times as long
+            parts[key] /= np.sqrt(rms.var + env.epsilon)
+            np.clip(parts[key], -env.clip_obs, env.clip_obs, out=parts[key])
+        return join(parts)
+
+    returns, discounts = np.zeros((2, len(rows), 1), np.float32)
+    last, goes_on = rows, np.ones(len(rows), bool)
+    for step in range(getattr(buffer, "n_steps", 1)):
+        last = np.where(goes_on, (rows + step) % buffer.buffer_size, last)
+        rewards = buffer._normalize_reward(take(buffer.rewards, last), env)
+        returns[goes_on, 0] += model.gamma**step * rewards[goes_on]
+        discounts[goes_on] = model.gamma ** (step + 1)
+        # The newest step ends the sum too: what the buffer holds after it is older.
+        goes_on &= (last != (buffer.pos - 1) % buffer.buffer_size) & ~take(buffer.dones, last).astype(bool)
+    discounts[:, 0] *= 1 - take(buffer.dones, last) * (1 - take(buffer.timeouts, last))
     return {
-        "observations": normalize(buffer.observations),
-        "next_observations": normalize(buffer.next_observations),
-        "actions": buffer.actions[rows, envs],
-        "rewards": np.asarray(buffer._normalize_reward(buffer.rewards[rows, envs, None], env), np.float32),
-        "discounts": np.asarray((1 - dones[:, None]) * model.gamma, np.float32),
+        "observations": take_observations(buffer.observations, rows),
+        "next_observations": take_observations(buffer.next_observations, last),
+        "actions": take(buffer.actions, rows),
+        "rewards": returns,
+        "discounts": discounts,
     }
 
 

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from sb3_contrib import CrossQ
 
+from rlctl.training.updates import adam
 from rlctl.training.updates.batches import Batch
 from rlctl.training.updates.mlp import Floats, MlpStack
 from rlctl.training.updates.sac import SacUpdate
@@ -22,9 +23,7 @@ class CrossQUpdate(SacUpdate):
     first_update: ClassVar[int] = 1
 
     def _update(self, batch: Batch, logged: dict[str, list[float]], *, learns_actor: bool, with_loss: bool) -> None:
-        model = self._model
-        if model.use_sde:
-            model.actor.reset_noise()
+        self._actor.reset_noise()
         coefficient = self._read_coefficient()
         logged["ent_coef"].append(coefficient)
         loss = self._update_joint_critics(batch, coefficient)
@@ -53,5 +52,5 @@ class CrossQUpdate(SacUpdate):
 
         pairs = zip(self._critics, passes, strict=True)
         losses = self._side_by_side.run([functools.partial(learn, critics, passed) for critics, passed in pairs])
-        self._model.critic.optimizer.step()
+        adam.step(self._model.critic.optimizer)
         return sum(losses)

@@ -17,6 +17,7 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution, Sta
 from stable_baselines3.common.utils import explained_variance
 
 from rlctl.environments.dict_spaces import map_parts
+from rlctl.training.updates import adam
 from rlctl.training.updates.mlp import LOG_SQRT_TAU, Floats, MlpStack, SideBySide, clip_norm, is_mlp, share_gradients
 
 _FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
@@ -99,7 +100,7 @@ class PpoUpdate:
         if model.target_kl is not None and losses["approx_kl"] > 1.5 * model.target_kl:
             return False
         clip_norm(self._gradients, model.max_grad_norm)
-        self._policy.optimizer.step()
+        adam.step(self._policy.optimizer)
         return True
 
     def _compute_actor_gradients(self, batch: dict[str, NDArray[Any]], clip_range: float) -> dict[str, float]:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from stable_baselines3 import DDPG, DQN, TD3
 
+from rlctl.training.updates import adam
 from rlctl.training.updates.batches import Batch, sample_batches
 from rlctl.training.updates.mlp import Floats, MlpStack, SideBySide, clip_norm, is_mlp
 
@@ -50,7 +51,7 @@ class DqnUpdate:
         np.put_along_axis(to_values[0], actions, errors.clip(-1, 1) / np.float32(len(errors)), 1)
         self._network.backpropagate(values, to_values)
         clip_norm(self._network.gradients, self._model.max_grad_norm)
-        self._model.policy.optimizer.step()
+        adam.step(self._model.policy.optimizer)
         sizes = np.abs(errors)
         return float(np.where(sizes <= 1, 0.5 * np.square(sizes), sizes - 0.5).mean())
 
@@ -114,7 +115,7 @@ class Td3Update:
             return float(np.square(errors).mean((1, 2)).sum())
 
         losses = self._side_by_side.run([functools.partial(learn, critics) for critics in self._critics])
-        self._model.critic.optimizer.step()
+        adam.step(self._model.critic.optimizer)
         return sum(losses)
 
     def _update_actor(self, features: Floats) -> float:
@@ -127,5 +128,5 @@ class Td3Update:
         to_value[0] = -1 / len(features)
         to_action = first.input_gradient(values, to_value, features.shape[1])[:1]
         self._actor.backpropagate(passed, to_action * (1 - np.square(action)))
-        self._model.actor.optimizer.step()
+        adam.step(self._model.actor.optimizer)
         return -float(values[-1][0].mean())

@@ -17,6 +17,7 @@ from sb3_contrib import TQC
 from stable_baselines3 import SAC
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution, StateDependentNoiseDistribution
 
+from rlctl.training.updates import adam
 from rlctl.training.updates.batch_norm import choose_stack
 from rlctl.training.updates.batches import Batch, sample_batches
 from rlctl.training.updates.mlp import (
@@ -73,6 +74,13 @@ class SquashedGaussianActor:
         else:
             plain = type(distribution) is SquashedDiagGaussianDistribution
         return plain and len(actor.latent_pi) > 0 and choose_stack(_list_modules(actor)) is not None
+
+    def reset_noise(self) -> None:
+        """Draw gSDE's matrix with the numbers that SB3 would draw."""
+        if self._actor.use_sde:
+            std = self._actor.log_std.exp()
+            self._actor.action_dist.exploration_mat = torch.randn(std.shape) * std
+            torch.randn(std.shape)  # of the matrices for parallel exploration, which are not used here
 
     def sample(self, features: Floats, use: str) -> Sample:
         """Draw actions for features, shape (batch, features); the next with the same `use` overwrites its `values`."""
@@ -175,9 +183,7 @@ class SacUpdate:
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
 
     def _update(self, batch: Batch, logged: dict[str, list[float]], *, learns_actor: bool, with_loss: bool) -> None:
-        model = self._model
-        if model.use_sde:
-            model.actor.reset_noise()
+        self._actor.reset_noise()
         coefficient, sample = self._read_coefficient(), None
         if learns_actor:
             sample = self._actor.sample(batch.features, "learning")
@@ -202,7 +208,7 @@ class SacUpdate:
         missing = -(float(sample.log_prob.mean()) + float(model.target_entropy))
         logged["ent_coef_loss"].append(model.log_ent_coef.item() * missing)
         model.log_ent_coef.grad = torch.full_like(model.log_ent_coef, missing)
-        model.ent_coef_optimizer.step()
+        adam.step(model.ent_coef_optimizer)
 
     def _compute_target(self, batch: Batch, coefficient: float) -> Floats:
         """Return the critics' targets, shape (batch, estimates)."""
@@ -222,7 +228,7 @@ class SacUpdate:
             return values[-1]
 
         outputs = self._side_by_side.run([functools.partial(learn, index) for index in range(len(self._critics))])
-        self._model.critic.optimizer.step()
+        adam.step(self._model.critic.optimizer)
         return np.concatenate(outputs)
 
     def _update_actor(self, features: Floats, sample: Sample, coefficient: float) -> float:
@@ -238,7 +244,7 @@ class SacUpdate:
             first += critics.count
         to_action = np.concatenate(self._side_by_side.run(calls)).sum(0)
         self._actor.backpropagate(sample, to_action, coefficient / len(value))
-        self._model.actor.optimizer.step()
+        adam.step(self._model.actor.optimizer)
         return float((coefficient * sample.log_prob - value).mean())
 
     def _choose_estimates(self, outputs: Floats) -> Floats:
