@@ -64,7 +64,6 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         )
         if recipe.algo in _DELAYED_BY_US:
             model.policy_delay = recipe.algo_kwargs.get("policy_delay", 1)  # type: ignore[attr-defined]
-        _use_fused_adam(model)
         write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # reports faults of a user's network
         if own_policy is not None:
             use_sde = {"use_sde": True} if getattr(model, "use_sde", False) else {}
@@ -86,16 +85,6 @@ def keep_compiler_out() -> None:
         setattr(torch.optim.Optimizer, name, inspect.unwrap(getattr(torch.optim.Optimizer, name)))
     for optimizer in (torch.optim.Adam, torch.optim.RMSprop):
         setattr(optimizer, "step", torch.no_grad()(inspect.unwrap(optimizer.step)))  # noqa: B010
-
-
-def _use_fused_adam(model: BaseAlgorithm) -> None:
-    """Let Adam update all weights in one call: with small networks most time is spent on calls. Same results."""
-    for part in (model, *(getattr(model.policy, name, None) for name in ("actor", "critic")), model.policy):
-        for name in ("optimizer", "ent_coef_optimizer"):
-            optimizer = getattr(part, name, None)
-            if isinstance(optimizer, torch.optim.Adam):
-                for group in optimizer.param_groups:
-                    group["fused"] = True
 
 
 def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:

@@ -1,15 +1,15 @@
-"""Steps of Adam whose checks and hooks do not take longer than their arithmetic."""
+"""Steps of Adam without the checks and hooks that take longer than its arithmetic."""
 
 import torch
 
 
 def step(optimizer: torch.optim.Optimizer) -> None:
-    """Do what `optimizer.step` does, to the same bit."""
+    """Do what `optimizer.step` does on the CPU, with torch's fused kernel where that is possible."""
     group = optimizer.param_groups[0]
     parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
     states = [optimizer.state[parameter] for parameter in parameters]
-    is_plain = type(optimizer) is torch.optim.Adam and len(optimizer.param_groups) == 1 and group["fused"]
-    if not is_plain or group["amsgrad"] or group["maximize"] or not all(states):  # the first step creates the states
+    is_plain = type(optimizer) is torch.optim.Adam and len(optimizer.param_groups) == 1 and not group["amsgrad"]
+    if not is_plain or not all(states):  # the first step creates the states
         optimizer.step()
         return
     steps = [state["step"] for state in states]
@@ -27,5 +27,5 @@ def step(optimizer: torch.optim.Optimizer) -> None:
         weight_decay=group["weight_decay"],
         eps=group["eps"],
         amsgrad=False,
-        maximize=False,
+        maximize=group["maximize"],
     )
