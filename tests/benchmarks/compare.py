@@ -1,8 +1,8 @@
 """Return over minutes of rlctl, RL Baselines3 Zoo and sbx on the same cores: `make compare`. Hours.
 
 RLCTL_ZOO names a Python with rl_zoo3 2.9.2 and rlctl, RLCTL_SBX one with sbx-rl 0.28 and rlctl. One training runs at a
-time, with all cores. Minutes count from the start of the process and include evaluations. Trainings that were measured
-before are kept; the table and the picture are written from all of them.
+time, with all cores. Minutes count from the start of the process and include evaluations. What was measured before, and
+its folder, is kept in build/compare; the table and the picture are written from all of it.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import json
 import os
 import platform
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -184,21 +184,22 @@ TOOLS = {"rlctl": train_rlctl, "rl-zoo3": train_zoo, "sbx": train_sbx}
 
 def measure(task: str, tool: str, seed: int, limit_minutes: float) -> Curve:
     """Train until the tool ends or the time is over; raises `RuntimeError` if it fails."""
-    with tempfile.TemporaryDirectory(prefix="rlctl-compare-") as name:
-        folder = Path(name)
-        command, read = TOOLS[tool](task, seed, folder)
-        shown = shlex.join([_NAMES.get(command[0], command[0]), *command[1:]]).replace(name, "FOLDER")
-        curve = Curve(task, tool, seed, shown, [], [], [])
-        log = folder / "log.txt"
-        began = time.monotonic()
-        with log.open("wb") as output, _start(command, output) as process:
-            while process.poll() is None and time.monotonic() - began < 60 * limit_minutes:
-                time.sleep(_POLL_S)
-                _add_new(curve, read(), (time.monotonic() - began) / 60)
-            was_stopped = process.poll() is None
-        _add_new(curve, read(), (time.monotonic() - began) / 60)
-        if not was_stopped and process.returncode != 0:
-            raise RuntimeError(f"{tool} {task}: exit code {process.returncode}\n{log.read_text()[-2000:]}")
+    folder = (FOLDER / f"{task}_{tool}_{seed}").resolve()
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    command, read = TOOLS[tool](task, seed, folder)
+    shown = shlex.join([_NAMES.get(command[0], command[0]), *command[1:]]).replace(str(folder), "FOLDER")
+    curve = Curve(task, tool, seed, shown, [], [], [])
+    log = folder / "log.txt"
+    began = time.monotonic()
+    with log.open("wb") as output, _start(command, output) as process:
+        while process.poll() is None and time.monotonic() - began < 60 * limit_minutes:
+            time.sleep(_POLL_S)
+            _add_new(curve, read(), (time.monotonic() - began) / 60)
+        was_stopped = process.poll() is None
+    _add_new(curve, read(), (time.monotonic() - began) / 60)
+    if not was_stopped and process.returncode != 0:
+        raise RuntimeError(f"{tool} {task}: exit code {process.returncode}\n{log.read_text()[-2000:]}")
     return curve
 
 
