@@ -233,16 +233,14 @@ def _find_effective(recipe: Recipe, key: str, value: Any) -> Any:
 
 
 def _refuse_unequal(names: Sequence[str], groups: Sequence[Sequence[RunDirectory]]) -> None:
-    sizes = {len(group) > 1 for group in groups}
-    if len(sizes) > 1:
+    if len({len(group) > 1 for group in groups}) > 1:
         alone = next(name for name, group in zip(names, groups, strict=True) if len(group) == 1)
         raise UsageError(
             f"{alone}: a single run cannot be compared with a group of seeds; "
             "train more seeds, or compare two single runs as policies"
         )
     paths = [run.path.resolve() for group in groups for run in group]
-    twice = next((path for path in paths if paths.count(path) > 1), None)
-    if twice is not None:
+    if (twice := next((path for path in paths if paths.count(path) > 1), None)) is not None:
         raise UsageError(f"{twice}: given twice; a run cannot be compared with itself")
 
 

@@ -84,17 +84,12 @@ def show(runs: list[RunSummary], json: str | None, root: Path = ROOT) -> None:
         out.print(f"no runs yet under {root.resolve()}; train one: rlctl train reach")
         return
     output.print_table(_COLUMNS, map(_cells, runs), left=_LEFT, drop=_DROP)
-    for change, names in _find_source_changes(runs).items():
-        out.print(f"warning: {change}, in: {', '.join(names)}")
-
-
-def _find_source_changes(runs: list[RunSummary]) -> dict[str, list[str]]:
-    """Return the names of the runs whose task has changed since they began, by what has changed."""
-    changes: dict[str, list[str]] = {}
+    changed: dict[str, list[str]] = {}  # what has changed in a task since runs began -> names of the runs
     for run in runs:
         if run.source_sha256 and (change := describe_source_change(RunDirectory(run.path))):
-            changes.setdefault(change, []).append(run.name)
-    return changes
+            changed.setdefault(change, []).append(run.name)
+    for change, names in changed.items():
+        out.print(f"warning: {change}, in: {', '.join(names)}")
 
 
 def _cells(run: RunSummary) -> list[Any]:
@@ -114,12 +109,11 @@ def _cells(run: RunSummary) -> list[Any]:
 
 def format_changes(changes: dict[str, Any]) -> str:
     """Return recipe changes as `key=value`, the first few of them."""
-    first = list(changes.items())[:_CHANGES_SHOWN]
     shown = [
         f"{len(value)} stages"
         if key == "stages" and value
         else f"{key.removeprefix('algo_kwargs.').removeprefix('policy_kwargs.')}={value}"
-        for key, value in first
+        for key, value in list(changes.items())[:_CHANGES_SHOWN]
     ]
     more = len(changes) - len(shown)
     return " ".join(shown) + (f" and {more} more" if more > 0 else "")
@@ -156,8 +150,7 @@ def plan_removal(runs: Sequence[str], *, keep_best: int | None = None, root: Pat
 
 def _resolve_run_folder(path: Path, root: Path) -> Path:
     """Return the folder of a run: one with a run.json of rlctl, or a damaged one two levels below `root`."""
-    below = root / path
-    folder = path if path.is_dir() else below
+    folder = path if path.is_dir() else root / path
     is_run = (folder / "run.json").is_file()
     is_below_root = folder.resolve().parent.parent == root.resolve() and folder.is_dir()
     if folder.is_symlink() or not (is_run or is_below_root):

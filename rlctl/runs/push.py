@@ -52,7 +52,6 @@ def describe(run: RunDirectory, info: PolicyInfo, names: list[str]) -> str:
     measured = ["not evaluated"] if score is None else [f"mean return {score.mean_return:.4g}"]
     if score is not None and score.success is not None:
         measured.append(f"success {score.success:.1%}")
-    status = run.status()
     rows = {
         "task": info.spec.task,
         "algorithm": info.algo,
@@ -60,7 +59,7 @@ def describe(run: RunDirectory, info: PolicyInfo, names: list[str]) -> str:
         "seed": str(run.recipe().seed),
         "evaluation during training": ", ".join(measured),
         "time between two actions": "unknown" if info.env.control_dt is None else f"{info.env.control_dt:g} s",
-        "SHA-256 of the task's file": str(status.get("source_sha256") or "unknown"),
+        "SHA-256 of the task's file": str(run.status().get("source_sha256") or "unknown"),
         "versions": ", ".join(f"{name} {version}" for name, version in sorted(info.versions.items())),
     }
     table = "\n".join(f"| {key} | {_escape(value)} |" for key, value in rows.items())

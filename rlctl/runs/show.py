@@ -78,7 +78,6 @@ def _measure_sizes(run: RunDirectory) -> dict[str, int]:
 def show(run: RunDescription, json: str | None) -> None:
     """Print the description, or JSON alone for `-`."""
     out, summary, sizes = output.out(), run.summary, _measure_sizes(run.run)
-    source = run.status.get("from")
     records = {"evaluations": run.evaluations, "metrics": run.metrics, "warnings": run.warnings}
     measured = {"findings": run.findings, "robustness": run.robustness, "bytes": sizes}
     if output.present({**as_json(summary), **records, **measured}, json):
@@ -90,7 +89,7 @@ def show(run: RunDescription, json: str | None) -> None:
     if summary.best_return is not None:
         success = "" if summary.best_success is None else f"success {summary.best_success:.1%}, "
         out.print(f"best evaluation at step {summary.best_step:,}: {success}return {summary.best_return:.4g}")
-    if isinstance(source, dict):
+    if isinstance(source := run.status.get("from"), dict):
         out.print(f"started from {source.get('policy')}, step {source.get('training_steps')}")
     for key, value in summary.changes.items():
         out.print(f"differs from the task's recipe: {key} = {format_value(key, value)}")

@@ -163,15 +163,12 @@ def read_table(path: Path) -> Rows:
 
     Infinite and absurdly large values are None. Raises `ArtifactError` for what is not a table.
     """
-    names, *rows = _parse(path, _read_lines(path)) or [[]]
-    tables = (dict(zip(names, row, strict=True)) for row in rows if len(row) == len(names))
-    return [numbers for row in tables if (numbers := _numbers(row)) is not None and numbers.get("steps") is not None]
-
-
-def _read_lines(path: Path) -> list[str]:
     if not path.exists():
         return []
-    return list(io.StringIO(untrusted.read_bytes(path).decode(errors="replace"), newline=""))
+    lines = io.StringIO(untrusted.read_bytes(path).decode(errors="replace"), newline="")
+    names, *rows = _parse(path, lines) or [[]]
+    tables = (dict(zip(names, row, strict=True)) for row in rows if len(row) == len(names))
+    return [numbers for row in tables if (numbers := _numbers(row)) is not None and numbers.get("steps") is not None]
 
 
 def _parse(path: Path, lines: Iterable[str]) -> list[list[str]]:

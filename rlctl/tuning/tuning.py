@@ -122,8 +122,7 @@ def find(text: str, root: Path) -> Tuning:
 
 def load(folder: Path) -> Tuning:
     """Read the folder of a tuning; raises `ArtifactError` if it is not one or damaged."""
-    file = folder / TUNE_FILE
-    if not file.is_file():
+    if not (file := folder / TUNE_FILE).is_file():
         raise ArtifactError(f"{folder}: not the folder of a tuning: it has no {TUNE_FILE}")
     content = files.read_json(file)
     try:

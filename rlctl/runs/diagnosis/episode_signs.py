@@ -131,9 +131,8 @@ def badly_scaled_observations(run: History) -> str | None:
 def _named_observations(episode: RecordedEpisode, run: History) -> dict[str, Array]:
     """Return observations by name, each of shape (T + 1, elements)."""
     sizes = run.env.observation_sizes if run.env is not None else {}
-    parts = split_names(episode.observations, sizes).items()
     return {
         name or "observation": np.asarray(rows, np.float64).reshape(len(rows), -1)
-        for name, rows in parts
+        for name, rows in split_names(episode.observations, sizes).items()
         if rows.ndim <= 2
     }

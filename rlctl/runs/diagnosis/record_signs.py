@@ -87,8 +87,7 @@ def _read_change(run: History) -> _Change | None:
 
 def exploration_vanishes(run: History) -> str | None:
     """The policy is almost deterministic halfway through the training, or from the beginning."""
-    curve = _exploration(run)
-    if len(curve) < LEAST_ROWS:
+    if len(curve := _exploration(run)) < LEAST_ROWS:
         return None
     half = curve.values[max(0, len(curve) // 2 - 2) : len(curve) // 2 + 1].mean()
     if half > 0.1 * curve.values[0] and not (curve.values[0] < 0.02 and half < 0.02):
@@ -103,8 +102,7 @@ def _exploration(run: History) -> Curve:
 
 def exploration_does_not_fall(run: History) -> str | None:
     """The policy is as random at the end as at the beginning, or more so."""
-    curve = _exploration(run)
-    if len(curve) < LEAST_ROWS or run.progress < 0.5:
+    if len(curve := _exploration(run)) < LEAST_ROWS or run.progress < 0.5:
         return None
     first, last = curve.thirds()
     return f"exploration {first:.2g} in the first third, {last:.2g} in the last" if last >= 0.97 * first else None
@@ -112,8 +110,7 @@ def exploration_does_not_fall(run: History) -> str | None:
 
 def exploration_explodes(run: History) -> str | None:
     """The policy becomes far more random than the actions' range."""
-    curve = _exploration(run)
-    if len(curve) < LEAST_ROWS:
+    if len(curve := _exploration(run)) < LEAST_ROWS:
         return None
     first, last = curve.thirds()
     grows = last > max(2 * first, 2.0)

@@ -92,8 +92,7 @@ def _group_by_recipe(runs: Sequence[RunDescription]) -> list[RecipeRuns]:
             groups.append((recipe, [run]))
         else:
             same.append(run)
-    first = groups[0][0]
-    changes = [find_recipe_changes(recipe, first) for recipe, _ in groups]
+    changes = [find_recipe_changes(recipe, groups[0][0]) for recipe, _ in groups]
     baseline = {key: before for change in changes for key, (_, before) in change.items()}
     return [
         RecipeRuns(_name_recipe(baseline | {key: value for key, (value, _) in change.items()}), group)
@@ -124,13 +123,12 @@ def list_facts(report: RunReport) -> list[tuple[str, str]]:
     trained = f"{of_steps} steps in {seconds}"
     if len(summaries) > 1:
         trained = f"{len(summaries)} trainings, {of_steps} steps each, {seconds} together"
-    versions = ", ".join(f"{name} {version}" for name, version in summaries[0].versions.items())
     facts = {
         "Task": f"{task}: {summary}" if summary else task,
         "Started": " to ".join(dict.fromkeys((started[0], started[-1]))) + " UTC" if started else "",
         "Trained": trained,
         "Machine": "; ".join(host.strip(", ") for host in hosts),
-        "Versions": versions,
+        "Versions": ", ".join(f"{name} {version}" for name, version in summaries[0].versions.items()),
     }
     return [(name, text) for name, text in facts.items() if text]
 

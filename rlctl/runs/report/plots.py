@@ -146,8 +146,7 @@ def _value(cell: Any, quantity: str) -> float:
 def _make_figure() -> tuple[Figure, Axes]:
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=_SIZE, layout="constrained")
-        axes = figure.add_subplot()
-    return figure, axes
+        return figure, figure.add_subplot()
 
 
 def _label(axes: Axes, x: str, y: str, title: str) -> None:

@@ -94,10 +94,8 @@ def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, lis
     """Return question, verdict and evidence per candidate, and notes, such as why nothing was compared."""
     if not episodes or len(report.recipes) == 1:
         return [], []
-    names, groups = (
-        [recipe.name for recipe in report.recipes],
-        [[run.run for run in recipe.runs] for recipe in report.recipes],
-    )
+    names = [recipe.name for recipe in report.recipes]
+    groups = [[run.run for run in recipe.runs] for recipe in report.recipes]
     try:
         result = compare_runs(names, groups, EvalRequest(None, episodes=episodes))
     except RlctlError as error:
