@@ -78,8 +78,7 @@ class EpisodePlayer:
         self.steps += 1
         call, env = self.instance.call, self.instance.env
         action = call("sample", next, self._next, step=self.steps)
-        returned = call("step", env.step, action, step=self.steps)
-        moment = self._read(action, returned)
+        moment = self._read(action, call("step", env.step, action, step=self.steps))
         terminated, truncated = moment.flags
         if not moment.is_readable:
             self.ended = "raised"
@@ -133,8 +132,7 @@ def build_action(space: spaces.Space[Any], value_of: Callable[[Leaf], Any], path
     if isinstance(space, spaces.Tuple):
         return tuple(build_action(part, value_of, (*path, i)) for i, part in enumerate(space.spaces))
     (leaf,) = find_leaves(space, path)
-    value = value_of(leaf)
-    if value is None:
+    if (value := value_of(leaf)) is None:
         return space.sample()
     if not leaf.supported:
         return value

@@ -2,13 +2,14 @@
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 import linecache
 import re
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -232,7 +233,6 @@ class Context:
         self.budget = Budget(read_clock())  # What the experiment that is running may use
         self.unseeded_calls: set[tuple[str, int]] = set()  # file and line of default_rng() in reset or step
         self.generators: dict[str, str] | None = None  # State of each after the first watched reset; None before
-        self._instance: Instance | None = None
 
     def build(self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None) -> Instance:
         """Return a new instance; what its import or constructor raises is an `EnvironmentRaised`."""
@@ -247,26 +247,21 @@ class Context:
         except BaseException as error:
             raise EnvironmentRaised("build", error) from error
 
-    @property
+    @functools.cached_property
     def instance(self) -> Instance:
         """The instance that this process keeps; built by its first use."""
-        if self._instance is None:
-            self._instance = self.build()
-        return self._instance
+        return self.build()
 
     @property
     def is_built(self) -> bool:
         """Whether this process keeps an instance."""
-        return self._instance is not None
+        return "instance" in vars(self)
 
-    @contextlib.contextmanager
-    def fresh(self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None) -> Iterator[Instance]:
+    def fresh(
+        self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None
+    ) -> contextlib.closing[Instance]:
         """A new instance for one experiment, closed after it; exceptions of its close are ignored."""
-        instance = self.build(render_mode, spec)
-        try:
-            yield instance
-        finally:
-            instance.close()
+        return contextlib.closing(self.build(render_mode, spec))
 
 
 def _accepts(env: Any, name: str) -> bool:

@@ -68,8 +68,7 @@ class Recording:
         self._add_observation(moment.observation)
 
     def _count_form(self, what: str, type_name: str, *more: Any) -> None:
-        form = self._forms.setdefault((what, type_name, *more), [self._step, 0])
-        form[1] += 1
+        self._forms.setdefault((what, type_name, *more), [self._step, 0])[1] += 1
 
     def _add_info(self, info: Any) -> None:
         self._count_form("info", name_type(info))

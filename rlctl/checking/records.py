@@ -262,8 +262,7 @@ class Records:
 
     def require_role(self, role: str) -> CheckedEpisode:
         """Return the episode of a comparison; raises `NotJudged` if there is none."""
-        episodes = self.role(role)
-        if not episodes:
+        if not (episodes := self.role(role)):
             raise NotJudged(f"the episode {role!r} could not be played")
         return episodes[0]
 

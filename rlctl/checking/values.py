@@ -40,8 +40,7 @@ class Leaf:
     @property
     def flat_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lowest and highest value of each number. Shape (elements,)."""
-        low, high = (np.ravel(np.asarray(bound, np.float64)) for bound in (self.low, self.high))
-        return low, high
+        return np.ravel(np.asarray(self.low, np.float64)), np.ravel(np.asarray(self.high, np.float64))
 
 
 def name_leaf(leaf: Leaf, of: str = "observation") -> str:
@@ -54,8 +53,7 @@ def name_element(leaf: Leaf, index: int, of: str = "observation") -> str:
     where = name_leaf(leaf, of)
     if not leaf.shape:
         return where
-    position = np.unravel_index(index, leaf.shape)
-    return f"{where}[{', '.join(str(int(i)) for i in position)}]"
+    return f"{where}[{', '.join(str(int(i)) for i in np.unravel_index(index, leaf.shape))}]"
 
 
 def find_leaves(space: Any, path: Path = ()) -> list[Leaf]:
@@ -64,12 +62,10 @@ def find_leaves(space: Any, path: Path = ()) -> list[Leaf]:
         return [leaf for key, value in space.spaces.items() for leaf in find_leaves(value, (*path, key))]
     if isinstance(space, spaces.Tuple):
         return [leaf for i, value in enumerate(space.spaces) for leaf in find_leaves(value, (*path, i))]
-    bounds = _bounds(space)
     kind = type(space).__name__
-    if bounds is None:
+    if (bounds := _bounds(space)) is None:
         return [Leaf(path, kind)]
-    low, high = bounds
-    return [Leaf(path, kind, tuple(space.shape), str(space.dtype), low, high)]
+    return [Leaf(path, kind, tuple(space.shape), str(space.dtype), *bounds)]
 
 
 def _bounds(space: spaces.Space[Any]) -> tuple[NDArray[Any], NDArray[Any]] | None:
@@ -103,8 +99,7 @@ def flatten(observation: Any) -> NDArray[Any]:
     if isinstance(observation, dict):
         observation = tuple(observation.values())
     if isinstance(observation, (tuple, list)) and any(isinstance(part, (np.ndarray, dict)) for part in observation):
-        parts = [flatten(value) for value in observation]
-        return np.concatenate(parts) if parts else np.zeros(0)
+        return np.concatenate([flatten(value) for value in observation])
     try:
         array = np.array(observation)
     except Exception:  # a ragged list, or an object of its own kind
@@ -115,8 +110,7 @@ def flatten(observation: Any) -> NDArray[Any]:
 def find_numbers(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:
     """Yield the numbers of an info by name; those in a dictionary of it as `reward_terms/distance`."""
     for key, value in info.items():
-        inner = value.items() if isinstance(value, dict) else [("", value)]
-        for name, number in inner:
+        for name, number in value.items() if isinstance(value, dict) else [("", value)]:
             # Some libraries make an array without axes of a comparison.
             is_scalar = isinstance(number, np.ndarray) and number.shape == () and number.dtype.kind in "biuf"
             if isinstance(number, NUMBERS) or is_scalar:

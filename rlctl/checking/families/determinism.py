@@ -60,8 +60,7 @@ def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
         instance.progress.phase(role)
         if role == "dirty":
             unfinished = min(DIRTY_STEPS, max(1, steps // 2))
-            other = EpisodePlayer(instance, SECOND_SEED, "extreme", max_steps=unfinished)
-            Recording(role, other).run()
+            Recording(role, EpisodePlayer(instance, SECOND_SEED, "extreme", max_steps=unfinished)).run()
         if budget.is_over():
             return
         seed, first = SECOND_SEED if role == "seeds" else FIRST_SEED, FIRST_SEED
@@ -139,12 +138,10 @@ def _compare_itself(rule: str, what: str, *, at_reset: bool) -> Check:
 def _compare_other(rule: str, first: str, second: str, what: str, *needs: str) -> Check:
     @check(rule, "comparisons", *needs)
     def compare_other(records: Records) -> Iterator[RuleFinding]:
-        difference = compare(records, first, second)
-        if difference is not None:
+        if (difference := compare(records, first, second)) is not None:
             if compare(records, "alone", "reused") is not None:
                 raise NotJudged("the same instance already differs from itself (RL301, RL302)")
-            is_late = second == "dirty" and difference.step > LATE
-            yield report(rule, records, difference, what, mild=is_late)
+            yield report(rule, records, difference, what, mild=second == "dirty" and difference.step > LATE)
 
     return compare_other
 

@@ -108,8 +108,7 @@ def _find_shared_world(records: Records) -> Iterator[RuleFinding]:
         yield finding
         return
     for alone, beside in (("fresh process", "interleaved"), ("second alone", "interleaved second")):
-        difference = compare(records, alone, beside)
-        if difference is not None:
+        if (difference := compare(records, alone, beside)) is not None:
             draws = any(finding.rule == "RL309" for finding in records.findings)
             because = ("; both draw from a global random generator (RL309)", RULES["RL309"].fix) if draws else ()
             yield report("RL401", records, difference, f"{IN_TURNS}, compared with one alone", *because)
@@ -124,8 +123,7 @@ def _find_effect_of_closing(records: Records) -> Iterator[RuleFinding]:
         return
     if list(_find_shared_world.run(records)):
         raise NotJudged("the instances already affect each other before one is closed (RL401)")
-    difference = compare(records, "second alone", "after close")
-    if difference is not None:
+    if (difference := compare(records, "second alone", "after close")) is not None:
         yield report("RL402", records, difference, f"{AFTER_CLOSE}, compared with one alone")
 
 
@@ -180,8 +178,7 @@ class Counts:
         # Python would otherwise reuse freed memory, and a leak would not show.
         if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
             trim(0)
-        pages = int((_PROCESS / "statm").read_text().split()[1])
-        self.memory.append(pages * os.sysconf("SC_PAGE_SIZE"))
+        self.memory.append(int((_PROCESS / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
 
 
 @experiment("leaks", "RL405", share=3.0)

@@ -126,8 +126,7 @@ def _excess(leaf: Leaf, series: Series) -> NDArray[np.float64]:
 def _find_not_finite(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     for index, _ in enumerate(built.leaves):
-        floats = (pair for pair in records.series(index) if pair[1].rows.dtype.kind == "f")
-        first = next((pair for pair in floats if not np.isfinite(pair[1].rows).all()), None)
+        first = next((pair for pair in records.series(index) if not np.isfinite(pair[1].rows).all()), None)
         if first is not None:
             trajectory, series = first
             row, flat = np.argwhere(~np.isfinite(series.rows))[0].tolist()

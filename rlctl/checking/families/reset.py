@@ -154,14 +154,12 @@ FEWEST_SEEDS = 4
 
 @check("RL306", "comparisons", "episodes", of_absence=True)
 def _compare_seeds(records: Records) -> Iterator[RuleFinding]:
-    built = records.require_built()
     if compare(records, "alone", "seeds") is not None:
         return
     starts = [episode for episode in records.require_alone() if 0 in episode.observations]
-    seeds = len({start.seed for start in starts})
-    if seeds < FEWEST_SEEDS:
+    if (seeds := len({start.seed for start in starts})) < FEWEST_SEEDS:
         raise NotJudged(f"fewer than {FEWEST_SEEDS} seeds were tried")
-    for index, _ in enumerate(built.leaves):
+    for index, _ in enumerate(records.require_built().leaves):
         values = [start.observations[index].values[0] for start in starts if index in start.observations]
         if any(not np.array_equal(values[0], other) for other in values[1:]):
             return
@@ -212,8 +210,7 @@ def compare_generators(context: Context) -> Iterator[ChildMessage]:
     episode = EpisodePlayer(context.instance, FIRST_SEED, max_steps=WATCHED_STEPS)
     before = _read_generators()
     for moment in episode:
-        after = _read_generators()
-        for generator, state in after.items():
+        for generator, state in _read_generators().items():
             if state != before.get(generator, state) and generator not in moved:
                 moved.add(generator)
                 call, at = ("step", f" at step {moment.step}") if moment.step else ("reset", "")

@@ -114,8 +114,7 @@ def _explain_empty(world: LoggedWorld, query: ContactQuery) -> tuple[str, Severi
         if body in known and link is not None and not _has_shape(world, body, link):
             name = world.world.link_name((body, link))
             return f"{name} (link {link}) has no collision shape", Severity.WARNING
-    touched = [_find_touching(log, query) for log in world.logs]
-    looks = [links for log in touched for links in log]
+    looks = [links for log in world.logs for links in _find_touching(log, query)]
     others = {link for links in looks for link in links}
     if not looks or sum(bool(links) for links in looks) < MOSTLY * len(looks) or query.links == (None, None):
         return None

@@ -123,8 +123,7 @@ class _Search:
                 two = self.attempts[-1].played
                 is_same = np.array_equal(one.rewards[:at], two.rewards[:at]) and two.ended != "raised"
                 if is_same and two.steps > one.steps and not _finishes(two, is_reported):
-                    limit = self.instance.max_steps
-                    longest = limit or max(attempt.played.steps for attempt in self.attempts)
+                    longest = self.instance.max_steps or max(attempt.played.steps for attempt in self.attempts)
                     stops.append(compare_returns(one, two, at, longest))
         if not is_reported:
             stops = [stop for stop in stops if stop.finishing > 0]  # an end that costs more than it pays is no goal
