@@ -227,8 +227,7 @@ def _gather(joints: list[JointLimits], key: str, default: float, end: int) -> Ar
 
 
 def _find_measured(limits: Limits, layout: ObservationLayout, count: int) -> slice | None:
-    name = limits.measured.position
-    if name is None:
+    if (name := limits.measured.position) is None:
         return None
     check_name(name, layout.slices, "limits: measured.position: no observation", RecipeError, listed="Known")
     part = layout.slices[name]

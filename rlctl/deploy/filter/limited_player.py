@@ -44,8 +44,7 @@ class LimitedPlayer(Player):
         is_sound = self._safety.observe(observation)
         if command is not None and command.motion is not None and before is not None and command.position is not None:
             self._moved += np.abs(command.position - before).sum(), np.abs(command.motion).sum()
-        policy_action = self._player.act(observation, seed, step)[1] if is_sound else None
-        action = self._safety.limit(policy_action)
+        action = self._safety.limit(self._player.act(observation, seed, step)[1] if is_sound else None)
         return action, action
 
     def close(self) -> None:

@@ -1,5 +1,6 @@
 """An informative trajectory within a robot's limits: each action is a sum of sines."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -39,8 +40,7 @@ def write_excitation(spec: EnvSpec, path: Path, *, seconds: float, seed: int) ->
     world touches another one, and the task does not end. Raises `AnswerIsNo` if even 5 % of the action range is unsafe,
     `UsageError` for unbounded actions or a trajectory that is too short.
     """
-    env = open_world(spec)
-    try:
+    with contextlib.closing(open_world(spec)) as env:
         if not np.isfinite([env.action_space.low, env.action_space.high]).all():  # type: ignore[attr-defined]
             raise UsageError(f"{spec.task}: its actions have no bounds; --excite scales its trajectory by them")
         if (steps := round(seconds / env.task.control_dt)) < MIN_ROWS:
@@ -57,8 +57,6 @@ def write_excitation(spec: EnvSpec, path: Path, *, seconds: float, seed: int) ->
         raise AnswerIsNo(
             f"{spec.task}: no safe trajectory found: even at {_AMPLITUDES[-1]:.0%} of the action range, {reason}"
         )
-    finally:
-        env.close()
 
 
 def show_excitation(result: Excitation, json: str | None) -> None:

@@ -1,5 +1,6 @@
 """Estimates the physical values of a task's events from a log, each with a confidence interval."""
 
+import contextlib
 import dataclasses
 import sys
 from collections.abc import Callable, Collection
@@ -91,8 +92,7 @@ def identify(
     Raises `ArtifactError` for an invalid log, `UsageError` for an event or joint that the task does not have, and
     `AnswerIsNo` if the log determines none of the values.
     """
-    env = open_world(spec)
-    try:
+    with contextlib.closing(open_world(spec)) as env:
         unknowns = find_unknowns(env.task.events, events, spec.task)
         log = read_log(log_file, describe_expected(env, spec.task))
         space: Any = env.action_space
@@ -104,9 +104,8 @@ def identify(
                 f"{', '.join(names)}; to create a trajectory that moves: rlctl identify {spec.task} --excite FILE"
             )
         follower = Follower(env, log, unknowns)
-        weights = 1.0 / follower.spread
         with start_search_workers(spec, log, unknowns, n_workers or available_cores()) as ask:
-            fits = search(ask, unknowns, weights, seed, report)
+            fits = search(ask, unknowns, 1.0 / follower.spread, seed, report)
         best = min(fits.values(), key=lambda fit: fit.cost)
         values = _estimate_values(unknowns, best)
         delay_known = all(fit.cost > _MIN_COST_RATIO * best.cost for fit in fits.values() if fit is not best)
@@ -117,8 +116,6 @@ def identify(
                 f"to create a trajectory that moves more: rlctl identify {spec.task} --excite FILE"
             )
         return _summarise(spec.task, log_file, follower, log, best, values, delay_known)
-    finally:
-        env.close()
 
 
 def _summarise(

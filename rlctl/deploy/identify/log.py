@@ -75,13 +75,12 @@ def read_log(path: Path, expected: Expected) -> Log:
         raise ArtifactError(
             f"{path}: no column with a joint's position, such as {_POSITION}{next(iter(expected.joints))}"
         )
-    stacked = {
-        kind: np.column_stack([_take(path, columns, f"{kind}{joint}") for joint in joints])
-        for kind in (_POSITION, _VELOCITY)
-    }
-    _check_units(path, joints, stacked[_POSITION], expected)
+    positions, velocities = (
+        np.column_stack([_take(path, columns, f"{kind}{joint}") for joint in joints]) for kind in (_POSITION, _VELOCITY)
+    )
+    _check_units(path, joints, positions, expected)
     actions = np.column_stack([_take(path, columns, name) for name in expected.action_columns])
-    return Log(joints, actions, stacked[_POSITION], stacked[_VELOCITY])
+    return Log(joints, actions, positions, velocities)
 
 
 def _read_columns(path: Path) -> tuple[dict[str, Array], list[int]]:

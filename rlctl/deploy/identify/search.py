@@ -107,7 +107,7 @@ def search(ask: Ask, unknowns: Unknowns, weights: Array, seed: int, report: Call
     report(f"least squares from {len(starts)} starts")
     fit_all([FindFit(start, weights, _EVALUATIONS) for start in starts])
     tried = -1  # the delay whose neighbours were tried last
-    while (best := _best(fits)).delay != tried:
+    while (best := min(fits.values(), key=lambda fit: fit.cost)).delay != tried:
         tried = best.delay
         delays = (delay for delay in (tried - 1, tried + 1) if 0 <= delay <= _MAX_DELAY and delay not in fits)
         if neighbours := [FindFit(SearchPoint(best.at.tolist(), delay), weights, _EVALUATIONS) for delay in delays]:
@@ -121,10 +121,6 @@ def search(ask: Ask, unknowns: Unknowns, weights: Array, seed: int, report: Call
     return fits
 
 
-def _best(fits: dict[int, Fit]) -> Fit:
-    return min(fits.values(), key=lambda fit: fit.cost)
-
-
 def _make_trials(unknowns: Unknowns, seed: int) -> list[SearchPoint]:
     """Return the nominal values with every delay, then points all over the ranges, with the delays in turn."""
     from scipy.stats import qmc
@@ -134,8 +130,7 @@ def _make_trials(unknowns: Unknowns, seed: int) -> list[SearchPoint]:
     built = [SearchPoint([parameter.first for parameter in unknowns.parameters], delay) for delay in delays]
     if size == 0:
         return built
-    count = max(len(delays), _TRIALS * (size + 1))
-    points = qmc.Halton(size, seed=seed).random(count).tolist()
+    points = qmc.Halton(size, seed=seed).random(max(len(delays), _TRIALS * (size + 1))).tolist()
     return built + [SearchPoint(point, delays[index % len(delays)]) for index, point in enumerate(points)]
 
 

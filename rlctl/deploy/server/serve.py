@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
 import os
@@ -88,7 +89,6 @@ async def serve_until(
     web_server = runner.server
     assert web_server is not None
     loop = asyncio.get_running_loop()
-    listener: asyncio.Server | None = None
     try:
         try:
             listener = await loop.create_server(
@@ -97,17 +97,16 @@ async def serve_until(
         except OSError as error:
             reason = f"{error.strerror or error}; --port 0 takes any free port"
             raise UsageError(f"--host {request.host} --port {request.port}: {reason}") from None
-        if handle_signals:
-            _handle_signals(server, end)
-        gc.collect()
-        gc.freeze()  # these objects stay until the end: the garbage collector can skip them
-        port = listener.sockets[0].getsockname()[1]
-        host = f"[{request.host}]" if ":" in request.host else request.host
-        on_start(f"{host}:{port}")
-        await end.wait()
+        with contextlib.closing(listener):
+            if handle_signals:
+                _handle_signals(server, end)
+            gc.collect()
+            gc.freeze()  # these objects stay until the end: the garbage collector can skip them
+            port = listener.sockets[0].getsockname()[1]
+            host = f"[{request.host}]" if ":" in request.host else request.host
+            on_start(f"{host}:{port}")
+            await end.wait()
     finally:
-        if listener is not None:
-            listener.close()
         await runner.cleanup()
 
 
