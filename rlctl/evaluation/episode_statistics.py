@@ -29,10 +29,9 @@ class Spread:
         """Describe values, one per episode."""
         array = np.asarray(values, np.float64)
         quarter = array.size // 4
-        middle = np.sort(array)[quarter : array.size - quarter]
         return cls(
             mean=float(array.mean()),
-            iqm=float(middle.mean()),
+            iqm=float(np.sort(array)[quarter : array.size - quarter].mean()),
             std=float(array.std(ddof=1)) if array.size > 1 else 0.0,
             min=float(array.min()),
             max=float(array.max()),

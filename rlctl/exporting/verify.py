@@ -106,25 +106,21 @@ class Comparison:
         self.agreement.beyond_limit += int(differs.sum())
 
     def _is_near_tie(self, row: int, expected: NDArray[Any], action: NDArray[Any]) -> bool:
-        margins = _list_margins(self._space, self._logits[row], expected, action)
-        return all(margin <= MAX_DIFFERENCE * max(1.0, size) for margin, size in margins)
+        space, logits = self._space, self._logits[row]
+        if isinstance(space, spaces.MultiBinary):  # compared with a logit of 0, a probability of 0.5
+            return all(abs(float(logits[index])) <= MAX_DIFFERENCE for index in np.flatnonzero(expected != action))
+        sizes = space.nvec if isinstance(space, spaces.MultiDiscrete) else [len(logits)]
+        groups = np.split(logits, np.cumsum(sizes)[:-1])
+        choices = zip(groups, np.atleast_1d(expected), np.atleast_1d(action), strict=True)
+        return all(
+            float(group[ours] - group[theirs]) <= MAX_DIFFERENCE * max(1.0, abs(float(group[ours])))
+            for group, ours, theirs in choices
+        )
 
     def close(self) -> None:
         """Stop reading logits."""
         if not isinstance(self._space, spaces.Box):
             self._hook.remove()
-
-
-def _list_margins(
-    space: spaces.Space[Any], logits: NDArray[np.float32], expected: NDArray[Any], action: NDArray[Any]
-) -> list[tuple[float, float]]:
-    """Return per choice how much larger the logit of the expected choice is, and the size of that logit."""
-    if isinstance(space, spaces.MultiBinary):  # compared with a logit of 0, a probability of 0.5
-        return [(abs(float(logits[index])), 0.0) for index in np.flatnonzero(expected != action)]
-    sizes = space.nvec if isinstance(space, spaces.MultiDiscrete) else [len(logits)]
-    groups = np.split(logits, np.cumsum(sizes)[:-1])
-    choices = zip(groups, np.atleast_1d(expected), np.atleast_1d(action), strict=True)
-    return [(float(group[ours] - group[theirs]), abs(float(group[ours]))) for group, ours, theirs in choices]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -193,8 +193,7 @@ def read_normalization(path: Path) -> SavedNormalization | None:
             raise NotPlainData(f"{kind} where VecNormalize is expected")
         if not state.get("norm_obs", True):
             return None
-        epsilon = float(state.get("epsilon", 1e-8))
-        if epsilon != 1e-8:
+        if (epsilon := float(state.get("epsilon", 1e-8))) != 1e-8:
             raise NotPlainData(f"an epsilon of {epsilon:g}; only Stable-Baselines3's default, 1e-08, is supported")
         statistics = state["obs_rms"]
         parts = statistics if isinstance(statistics, dict) else {"": statistics}

@@ -3,6 +3,7 @@
 A task is drawn by PyBullet's software renderer, any other environment by its own `render()`.
 """
 
+import contextlib
 import dataclasses
 import fractions
 import os
@@ -116,9 +117,8 @@ def take_pictures(episode: RecordedEpisode, count: int) -> PictureStrip:
     chosen = {int(step) for step in np.linspace(0, steps, count)}
     pictures: list[tuple[int, bytes]] = []
     deepest = 0.0
-    env = spec.make("rgb_array")
-    sim = getattr(env.unwrapped, "sim", None)
-    try:
+    with contextlib.closing(spec.make("rgb_array")) as env:
+        sim = getattr(env.unwrapped, "sim", None)
         view = look_at(env, *_STRIP_SIZE)
 
         def watch(step: int) -> None:
@@ -132,8 +132,6 @@ def take_pictures(episode: RecordedEpisode, count: int) -> PictureStrip:
 
         choose = recorded_actions(episode, env.action_space)
         rollout = play_episode(env, spec, episode.info.seed, choose, policy=episode.info.policy, watch=watch)
-    finally:
-        env.close()
     if difference := find_difference(episode, rollout):
         raise ArtifactError(f"the replayed episode differs from the recorded one; {difference}")
     return PictureStrip(pictures, deepest)

@@ -88,9 +88,7 @@ def read_complaint(call: Callable[[], object]) -> str:
 
 def check_display() -> None:
     """Raise `UsageError` where PyBullet's window cannot open: PyBullet itself would end the process."""
-    if sys.platform != "linux":
-        return
-    if not _x_server_answers():
+    if sys.platform == "linux" and not _x_server_answers():
         display = os.environ.get("DISPLAY")
         why = f"no X server answers at {display}" if display else "DISPLAY is not set"
         raise UsageError(f"PyBullet's window needs a display, and {why}; leave out --gui (in Python: render_mode)")

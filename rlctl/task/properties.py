@@ -57,11 +57,10 @@ class Properties(Motors):
 
     @cached_property
     def _dynamics(self) -> dict[int, _Dynamics]:
-        infos = {
-            link: pybullet.getDynamicsInfo(self.id, link, physicsClientId=self.client)
+        return {
+            link: _Dynamics(*pybullet.getDynamicsInfo(self.id, link, physicsClientId=self.client)[:3])
             for link in range(-1, len(self._links))
         }
-        return {link: _Dynamics(info[0], info[1], info[2]) for link, info in infos.items()}
 
     @cached_property
     def _damping(self) -> list[float]:
