@@ -66,7 +66,7 @@ def _row(algo: str, net_arch: list[int], updates: int, repeat: int) -> Row:
 def _our_speed(algo: str, net_arch: list[int], settings: dict[str, Any]) -> float:
     recipe = {
         "algo": algo.lower(),
-        "algo_kwargs": {**settings, "n_steps": 1, "use_sde": False},  # the task's own recipe has others
+        "algo_kwargs": {**settings, "n_steps": 1, "policy_delay": 1, "use_sde": False},  # unlike the task's recipe
         "policy_kwargs": {"net_arch": net_arch},
         "n_envs": ENVS,
         "stages": [],

@@ -188,7 +188,7 @@ def test_off_policy_updates_as_sb3(name):
         learner.train(gradient_steps=steps, batch_size=one.batch_size)
         set_random_seed(steps)
         first.train(gradient_steps=1, batch_size=one.batch_size)
-        # The critics' loss is that of the first update, which stands for eight.
+        # The critics' loss is that of the first update, which stands for 32.
         expected = dict(one.logger.name_to_value)
         if issubclass(update, SacUpdate):
             expected["train/critic_loss"] = first.logger.name_to_value["train/critic_loss"]

@@ -30,7 +30,7 @@ from rlctl.training.updates.mlp import (
     share_joined,
 )
 
-_LOSS_EVERY = 8  # every so many updates the losses are computed, for the log only
+_LOSS_EVERY = 32  # every so many updates the losses are computed, for the log only
 _LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0  # SB3's limits, without gSDE
 
 
@@ -285,13 +285,12 @@ class TqcUpdate(SacUpdate):
     def _differentiate_loss(self, outputs: Floats, target: Floats) -> Floats:
         # The derivative of the Huber loss is the error, clipped to [-1, 1]. Its weight is the
         # quantile's share if positive, else 1 - share; both sums follow from the slopes' sum and absolute sum.
-        slopes = target[:, None, :] - outputs[..., None]
-        np.clip(slopes, -1, 1, out=slopes)
-        ones = np.ones(target.shape[1], np.float32)  # short sums are faster as products
-        total = slopes @ ones
-        size = np.abs(slopes, out=slopes) @ ones
-        count = np.float32(-2 * slopes[0].size * len(self._model.critic.q_networks))
-        return (total + (2 * _quantile_shares(outputs) - 1) * size) / count
+        # The batch is the last axis here, since short innermost loops take twice as long.
+        errors = torch.from_numpy(target).T.contiguous() - torch.from_numpy(outputs).mT.contiguous()[:, :, None]
+        slopes = errors.clamp_(-1, 1)  # shape (critics, quantiles, estimates, batch)
+        total, size = slopes.sum(2).mT.numpy(), slopes.abs_().sum(2).mT.numpy()
+        count = np.float32(-2 * slopes[0].numel() * len(self._model.critic.q_networks))
+        return np.ascontiguousarray((total + (2 * _quantile_shares(outputs) - 1) * size) / count)
 
     def _value(self, outputs: Floats) -> tuple[Floats, Floats]:
         count = outputs.shape[0] * outputs.shape[2]
