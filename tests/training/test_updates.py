@@ -20,7 +20,8 @@ from rlctl.training.updates import adam, choose_learner
 from rlctl.training.updates.crossq import CrossQUpdate
 from rlctl.training.updates.ppo import PpoUpdate
 from rlctl.training.updates.q_learning import DqnUpdate, Td3Update
-from rlctl.training.updates.sac import SacUpdate, TqcUpdate
+from rlctl.training.updates.sac import SacUpdate
+from rlctl.training.updates.tqc import TqcUpdate
 
 pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 

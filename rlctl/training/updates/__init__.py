@@ -10,7 +10,8 @@ from rlctl.training.own_networks import has_own_parts
 from rlctl.training.updates.crossq import CrossQUpdate
 from rlctl.training.updates.ppo import PpoUpdate
 from rlctl.training.updates.q_learning import DqnUpdate, Td3Update
-from rlctl.training.updates.sac import SacUpdate, TqcUpdate
+from rlctl.training.updates.sac import SacUpdate
+from rlctl.training.updates.tqc import TqcUpdate
 
 
 def choose_learner(model: Any) -> Any:

@@ -1,6 +1,7 @@
 """Minibatches of a replay buffer as NumPy arrays, for several updates at once."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from rlctl.environments.dict_spaces import join, map_parts, split
 from rlctl.training.snapshot import observation_statistics
 from rlctl.training.updates.mlp import Floats
+
+_Take = Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,16 +65,7 @@ def _gather(model: Any, count: int, size: int) -> dict[str, Any]:
             np.clip(parts[key], -env.clip_obs, env.clip_obs, out=parts[key])
         return join(parts)
 
-    returns, discounts = np.zeros((2, len(rows), 1), np.float32)
-    last, goes_on = rows, np.ones(len(rows), bool)
-    for step in range(getattr(buffer, "n_steps", 1)):
-        last = np.where(goes_on, (rows + step) % buffer.buffer_size, last)
-        rewards = buffer._normalize_reward(take(buffer.rewards, last), env)
-        returns[goes_on, 0] += model.gamma**step * rewards[goes_on]
-        discounts[goes_on] = model.gamma ** (step + 1)
-        # The newest step ends the sum too: what the buffer holds after it is older.
-        goes_on &= (last != (buffer.pos - 1) % buffer.buffer_size) & ~take(buffer.dones, last).astype(bool)
-    discounts[:, 0] *= 1 - take(buffer.dones, last) * (1 - take(buffer.timeouts, last))
+    last, returns, discounts = _sum_rewards(model, rows, take)
     return {
         "observations": take_observations(buffer.observations, rows),
         "next_observations": take_observations(buffer.next_observations, last),
@@ -79,6 +73,25 @@ def _gather(model: Any, count: int, size: int) -> dict[str, Any]:
         "rewards": returns,
         "discounts": discounts,
     }
+
+
+def _sum_rewards(model: Any, rows: NDArray[Any], take: _Take) -> tuple[NDArray[Any], Floats, Floats]:
+    """Return the row of each sum's last reward, the sums of `n_steps` rewards, and the factors of the next values.
+
+    `take` returns the stored values in the given rows.
+    """
+    buffer, env, gamma = model.replay_buffer, model._vec_normalize_env, model.gamma
+    returns, discounts = np.zeros((2, len(rows), 1), np.float32)
+    last, goes_on = rows, np.ones(len(rows), bool)
+    for step in range(getattr(buffer, "n_steps", 1)):
+        last = np.where(goes_on, (rows + step) % buffer.buffer_size, last)
+        rewards = buffer._normalize_reward(take(buffer.rewards, last), env)
+        returns[goes_on, 0] += gamma**step * rewards[goes_on]
+        discounts[goes_on] = gamma ** (step + 1)
+        # The newest step ends the sum too: what the buffer holds after it is older.
+        goes_on &= (last != (buffer.pos - 1) % buffer.buffer_size) & ~take(buffer.dones, last).astype(bool)
+    discounts[:, 0] *= 1 - take(buffer.dones, last) * (1 - take(buffer.timeouts, last))
+    return last, returns, discounts
 
 
 def _join_samples(samples: list[Any], gamma: float) -> dict[str, Any]:
