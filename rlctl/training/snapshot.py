@@ -68,7 +68,8 @@ def take(model: BaseAlgorithm) -> tuple[Tensors, dict[str, Any]]:
     """Return the state of a model at a boundary between updates."""
     tensors, structure = learned_tensors(model)
     counters = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
-    return tensors | _randomness_tensors() | _rollout_tensors(model), {"counters": counters, "parameters": structure}
+    tensors |= _randomness_tensors(model.device) | _rollout_tensors(model)
+    return tensors, {"counters": counters, "parameters": structure}
 
 
 def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> None:
@@ -83,6 +84,8 @@ def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> No
             setattr(model, name, plain["counters"][name])
         # The generators that updates draw from; gSDE's matrices are drawn again by updates.
         torch.set_rng_state(torch.from_numpy(tensors["randomness/torch"].copy()))
+        if (state := tensors.get(f"randomness/{model.device.type}")) is not None:  # not after a change of the device
+            torch.get_device_module(model.device).set_rng_state(torch.from_numpy(state.copy()), model.device)
         keys, position, has_gauss, cached = (tensors[f"randomness/numpy/{part}"] for part in _NUMPY)
         np.random.set_state(("MT19937", keys, int(position), int(has_gauss), float(cached)))  # noqa: NPY002 (SB3 draws there)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
@@ -92,10 +95,12 @@ def restore(model: BaseAlgorithm, tensors: Tensors, plain: dict[str, Any]) -> No
 _NUMPY = ("keys", "position", "has_gauss", "cached")
 
 
-def _randomness_tensors() -> Tensors:
+def _randomness_tensors(device: torch.device) -> Tensors:
     _, *state = np.random.get_state()  # noqa: NPY002 (SB3 draws from it)
     tensors = {f"randomness/numpy/{part}": np.asarray(value) for part, value in zip(_NUMPY, state, strict=True)}
     tensors["randomness/torch"] = torch.get_rng_state().numpy()
+    if device.type != "cpu":  # its own generator: updates and exploration draw there
+        tensors[f"randomness/{device.type}"] = torch.get_device_module(device).get_rng_state(device).numpy()
     return tensors
 
 

@@ -44,11 +44,10 @@ def train(tmp_path: Path):
 
 @pytest.fixture
 def resume(tmp_path: Path):
-    def run(run: TrainResult | RunDirectory, *, force=False, **settings) -> TrainResult:
+    def run(run: TrainResult | RunDirectory, *, force=False, device="cpu", **settings) -> TrainResult:
         path = run.path if isinstance(run, RunDirectory) else run.run.path
-        return run_training(
-            TrainRequest(resume=str(path), settings=settings, root=tmp_path / "runs", force=force, check=False)
-        )
+        request = {"force": force, "device": device, "check": False}
+        return run_training(TrainRequest(resume=str(path), settings=settings, root=tmp_path / "runs", **request))
 
     return run
 

@@ -1,6 +1,7 @@
 """A run that was killed and resumed is the run that was never stopped, bit for bit."""
 
 import pytest
+import torch
 
 from rlctl.recipe import recipe as recipes
 from rlctl.rollout.workers import available_cores
@@ -104,21 +105,32 @@ def kill_after(monkeypatch):
 )
 @pytest.mark.usefixtures("every_boundary")
 def test_killed_and_resumed(train, resume, kill_after, case):
+    kill_and_resume(train, resume, kill_after, case, "cpu")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("case", ["ppo", "recurrent_ppo", "sac", "sac with gSDE", "td3", "dqn", "tqc", "crossq"])
+@pytest.mark.usefixtures("every_boundary")
+def test_on_a_gpu(train, resume, kill_after, case):
+    kill_and_resume(train, resume, kill_after, case, "cuda")
+
+
+def kill_and_resume(train, resume, kill_after, case, device):
     env, given = CASES[case]
-    whole = train(env, given).run
+    whole = train(env, given, device=device).run
     undo = kill_after(0)  # in the first step
     with pytest.raises(Killed):
-        train(env, given)
+        train(env, given, device=device)
     undo()
     run = newest_other_than(whole)
     assert [int(each.name) for each in run.checkpoints()] == [0]
     for steps in (37, 11) if given["algo"] in ON_POLICY else (13, 5):
         undo = kill_after(steps)
         with pytest.raises(Killed):
-            resume(run)
+            resume(run, device=device)
         undo()
         assert int(run.checkpoints()[-1].name) > 0
-    resume(run)
+    resume(run, device=device)
     assert_same_run(whole, run)
 
 
