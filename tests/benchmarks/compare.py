@@ -1,8 +1,9 @@
 """Return over minutes of rlctl, RL Baselines3 Zoo and sbx on the same cores: `make compare`. Hours.
 
 RLCTL_ZOO names a Python with rl_zoo3 2.9.2 and rlctl, RLCTL_SBX one with sbx-rl 0.28 and rlctl. One training runs at a
-time, with all cores. Minutes count from the start of the process and include evaluations. What was measured before, and
-its folder, is kept in build/compare; the table and the picture are written from all of it.
+time, or `--jobs` of them, peers beside peers and ours beside ours. Minutes count from the start of the process and
+include evaluations. What was measured before, and its folder, is kept in build/compare; the table and the picture are
+written from all of it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +67,8 @@ class Curve:
     minutes: list[float]
     returns: list[float]
     success: list[float | None]
+    jobs: int = 1
+    """How many trainings ran at a time."""
 
     @property
     def scores(self) -> list[float]:
@@ -182,14 +186,14 @@ _NAMES = {sys.executable: "python"} | {
 TOOLS = {"rlctl": train_rlctl, "rl-zoo3": train_zoo, "sbx": train_sbx}
 
 
-def measure(task: str, tool: str, seed: int, limit_minutes: float) -> Curve:
+def measure(task: str, tool: str, seed: int, limit_minutes: float, jobs: int) -> Curve:
     """Train until the tool ends or the time is over; raises `RuntimeError` if it fails."""
     folder = (FOLDER / f"{task}_{tool}_{seed}").resolve()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     command, read = TOOLS[tool](task, seed, folder)
     shown = shlex.join([_NAMES.get(command[0], command[0]), *command[1:]]).replace(str(folder), "FOLDER")
-    curve = Curve(task, tool, seed, shown, [], [], [])
+    curve = Curve(task, tool, seed, shown, [], [], [], jobs)
     log = folder / "log.txt"
     began = time.monotonic()
     with log.open("wb") as output, _start(command, output) as process:
@@ -226,7 +230,7 @@ def write_page(curves: list[Curve], limit_minutes: float) -> None:
     lines = [
         "# How long a training takes, next to RL Baselines3 Zoo and sbx\n",
         f"Written by `make compare` on {_describe_machine()}.",
-        "One training at a time; minutes from the start of the process, evaluations included.",
+        f"{_describe_jobs(curves)}; minutes from the start of the process, evaluations included.",
         "rl-zoo3 has its own tuned hyperparameters (TQC), for `reach` those of an earlier recipe of rlctl (PPO).",
         "sbx has TQC [256, 256] with the zoo's learning rate, batch, gamma and tau, for `reach` PPO.",
         f"Peers are evaluated on {EPISODES} episodes, rlctl as its recipes say. If a training ended earlier, its best",
@@ -252,6 +256,15 @@ def write_page(curves: list[Curve], limit_minutes: float) -> None:
     files.write_text(PAGE, "\n".join([*lines, "", "The commands:\n", *(f"- {text}" for text in commands), ""]))
 
 
+def _describe_jobs(curves: list[Curve]) -> str:
+    parts = []
+    for jobs in sorted({curve.jobs for curve in curves}):
+        tasks = ", ".join(dict.fromkeys(f"`{curve.task}`" for curve in curves if curve.jobs == jobs))
+        parts.append(f"{'one training' if jobs == 1 else f'{jobs} trainings'} at a time for {tasks}")
+    text = "; ".join(parts)
+    return text[:1].upper() + text[1:]
+
+
 def _describe_machine() -> str:
     with open("/proc/cpuinfo") as info:
         model = next((line.partition(":")[2].strip() for line in info if line.startswith("model name")), "")
@@ -264,17 +277,29 @@ def draw(curves: list[Curve], target: Path) -> None:
     from matplotlib.figure import Figure
 
     tasks = list(dict.fromkeys(curve.task for curve in curves))
-    figure = Figure(figsize=(3.6 * len(tasks), 2.8), layout="constrained")
+    columns = min(3, len(tasks))
+    rows = -(-len(tasks) // columns)
+    figure = Figure(figsize=(3.6 * columns, 2.8 * rows), layout="constrained")
     for number, task in enumerate(tasks, start=1):
-        axes = figure.add_subplot(1, len(tasks), number, title=task, xlabel="minutes")
+        axes = figure.add_subplot(rows, columns, number, title=task, xlabel="minutes")
         axes.axhline(PUBLISHED[task], color="0.7", linestyle=":")
+        labelled: set[str] = set()
         for curve in curves:
             if curve.task == task:
                 color = f"C{list(TOOLS).index(curve.tool)}"
-                axes.plot(curve.minutes, curve.scores, color=color, label=curve.tool if curve.seed == 0 else None)
+                label = None if curve.tool in labelled else curve.tool
+                axes.plot(curve.minutes, curve.scores, color=color, label=label)
+                labelled.add(curve.tool)
         axes.set_ylabel("success rate" if task in BY_SUCCESS else "return")
         axes.legend(frameon=False)
     figure.savefig(target, dpi=110)
+
+
+def _measure_missing(task: str, tool: str, seed: int, options: argparse.Namespace) -> None:
+    file = FOLDER / f"{task}_{tool}_{seed}.json"
+    if not file.exists():
+        print(f"{task} {tool} seed {seed}", file=sys.stderr, flush=True)
+        files.write_json(file, dataclasses.asdict(measure(task, tool, seed, options.minutes, options.jobs)))
 
 
 def main() -> int:
@@ -284,15 +309,19 @@ def main() -> int:
     parser.add_argument("--tools", nargs="*", default=list(TOOLS), choices=list(TOOLS))
     parser.add_argument("--seeds", type=int, nargs="*", default=[0])
     parser.add_argument("--minutes", type=float, default=60.0, help="limit of one training")
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
     options = parser.parse_args()
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for task in options.tasks:
-        for seed in options.seeds:
-            for tool in options.tools:
-                file = FOLDER / f"{task}_{tool}_{seed}.json"
-                if not file.exists():
-                    print(f"{task} {tool} seed {seed}", file=sys.stderr, flush=True)
-                    files.write_json(file, dataclasses.asdict(measure(task, tool, seed, options.minutes)))
+    for tools in ({"rl-zoo3", "sbx"}, {"rlctl"}):  # alike trainings beside each other: ours keeps more than a core busy
+        with ThreadPoolExecutor(options.jobs) as pool:
+            for done in [
+                pool.submit(_measure_missing, task, tool, seed, options)
+                for task in options.tasks
+                for seed in options.seeds
+                for tool in options.tools
+                if tool in tools
+            ]:
+                done.result()
     curves = [Curve(**json.loads(file.read_text())) for file in FOLDER.glob("*.json")]
     curves.sort(key=lambda curve: (list(PUBLISHED).index(curve.task), list(TOOLS).index(curve.tool), curve.seed))
     write_page(curves, 30.0)
