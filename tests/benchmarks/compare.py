@@ -66,8 +66,6 @@ class Curve:
     minutes: list[float]
     returns: list[float]
     success: list[float | None]
-    shared: bool = False
-    """Whether another training ran on the same cores."""
 
     @property
     def scores(self) -> list[float]:
@@ -185,14 +183,14 @@ _NAMES = {sys.executable: "python"} | {
 TOOLS = {"rlctl": train_rlctl, "rl-zoo3": train_zoo, "sbx": train_sbx}
 
 
-def measure(task: str, tool: str, seed: int, limit_minutes: float, shared: bool) -> Curve:
+def measure(task: str, tool: str, seed: int, limit_minutes: float) -> Curve:
     """Train until the tool ends or the time is over; raises `RuntimeError` if it fails."""
     folder = (FOLDER / f"{task}_{tool}_{seed}").resolve()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     command, read = TOOLS[tool](task, seed, folder)
-    shown = shlex.join([_NAMES.get(command[0], command[0]), *command[1:]]).replace(str(folder), "FOLDER")
-    curve = Curve(task, tool, seed, shown, [], [], [], shared)
+    shown = f"{_NAMES[command[0]]} {shlex.join(command[1:])}".replace(str(folder), "FOLDER")
+    curve = Curve(task, tool, seed, shown, [], [], [])
     log = folder / "log.txt"
     began = time.monotonic()
     with log.open("wb") as output, _start(command, output) as process:
@@ -229,7 +227,7 @@ def write_page(curves: list[Curve], limit_minutes: float) -> None:
     lines = [
         "# How long a training takes, next to RL Baselines3 Zoo and sbx\n",
         f"Written by `make compare` on {_describe_machine()}.",
-        "One training at a time, two where minutes have <=; from the start of the process, evaluations included.",
+        "One training at a time; minutes from the start of the process, evaluations included.",
         "rl-zoo3 has its own tuned hyperparameters (TQC), for `reach` those of an earlier recipe of rlctl (PPO).",
         "sbx has TQC [256, 256] with the zoo's learning rate, batch, gamma and tau, for `reach` PPO.",
         f"Peers are evaluated on {EPISODES} episodes, rlctl as its recipes say. If a training ended earlier, its best",
@@ -247,7 +245,7 @@ def write_page(curves: list[Curve], limit_minutes: float) -> None:
             f"{goal:{form}}",
             curve.tool,
             str(curve.seed),
-            "not reached" if reached is None else f"{'<= ' if curve.shared else ''}{reached:.1f}",
+            "not reached" if reached is None else f"{reached:.1f}",
             "no evaluation" if best is None else f"{best:{form}}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
@@ -273,15 +271,13 @@ def draw(curves: list[Curve], target: Path) -> None:
     for number, task in enumerate(tasks, start=1):
         axes = figure.add_subplot(rows, columns, number, title=task, xlabel="minutes")
         axes.axhline(PUBLISHED[task], color="0.7", linestyle=":")
-        labelled: set[str] = set()
+        lines = {}
         for curve in curves:
             if curve.task == task:
                 color = f"C{list(TOOLS).index(curve.tool)}"
-                label = None if curve.tool in labelled else curve.tool
-                axes.plot(curve.minutes, curve.scores, color=color, label=label)
-                labelled.add(curve.tool)
+                (lines[curve.tool],) = axes.plot(curve.minutes, curve.scores, color=color)
         axes.set_ylabel("success rate" if task in BY_SUCCESS else "return")
-        axes.legend(frameon=False)
+        axes.legend(lines.values(), lines, frameon=False)
     figure.savefig(target, dpi=110)
 
 
@@ -292,7 +288,6 @@ def main() -> int:
     parser.add_argument("--tools", nargs="*", default=list(TOOLS), choices=list(TOOLS))
     parser.add_argument("--seeds", type=int, nargs="*", default=[0])
     parser.add_argument("--minutes", type=float, default=60.0, help="limit of one training")
-    parser.add_argument("--shared", action="store_true", help="another training runs on the same cores")
     options = parser.parse_args()
     FOLDER.mkdir(parents=True, exist_ok=True)
     for task in options.tasks:
@@ -301,8 +296,7 @@ def main() -> int:
                 file = FOLDER / f"{task}_{tool}_{seed}.json"
                 if not file.exists():
                     print(f"{task} {tool} seed {seed}", file=sys.stderr, flush=True)
-                    curve = measure(task, tool, seed, options.minutes, options.shared)
-                    files.write_json(file, dataclasses.asdict(curve))
+                    files.write_json(file, dataclasses.asdict(measure(task, tool, seed, options.minutes)))
     curves = [Curve(**json.loads(file.read_text())) for file in FOLDER.glob("*.json")]
     curves.sort(key=lambda curve: (list(PUBLISHED).index(curve.task), list(TOOLS).index(curve.tool), curve.seed))
     write_page(curves, 30.0)

@@ -46,8 +46,10 @@ def train(tmp_path: Path):
 def resume(tmp_path: Path):
     def run(run: TrainResult | RunDirectory, *, force=False, device="cpu", **settings) -> TrainResult:
         path = run.path if isinstance(run, RunDirectory) else run.run.path
-        request = {"force": force, "device": device, "check": False}
-        return run_training(TrainRequest(resume=str(path), settings=settings, root=tmp_path / "runs", **request))
+        request = TrainRequest(
+            resume=str(path), settings=settings, root=tmp_path / "runs", force=force, device=device, check=False
+        )
+        return run_training(request)
 
     return run
 

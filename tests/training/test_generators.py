@@ -23,11 +23,11 @@ def gpu(monkeypatch):
 def test_the_generator_of_a_gpu(gpu):
     model = SAC("MlpPolicy", "Pendulum-v1", device="cpu", policy_kwargs={"net_arch": [4]}, buffer_size=4)
     on_cpu = snapshot.take(model)
-    monkey = torch.device("cuda:1")
-    model.device = monkey
+    device = torch.device("cuda:1")
+    model.device = device
     tensors, plain = snapshot.take(model)
-    gpu[monkey] = torch.zeros(16, dtype=torch.uint8)
+    gpu[device] = torch.zeros(16, dtype=torch.uint8)
     snapshot.restore(model, *on_cpu)  # of a training on the CPU: the generator stays
-    assert not gpu[monkey].any()
+    assert not gpu[device].any()
     snapshot.restore(model, tensors, plain)
-    assert gpu[monkey].tolist() == list(range(16))
+    assert gpu[device].tolist() == list(range(16))
