@@ -177,9 +177,8 @@ def train_sbx(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[
     return [os.environ["RLCTL_SBX"], str(script), json.dumps(job)], lambda: _read_evaluations(folder)
 
 
-_NAMES = {sys.executable: "python"} | {
-    os.environ[name]: f"${name}" for name in ("RLCTL_ZOO", "RLCTL_SBX") if name in os.environ
-}
+PEERS = {"rl-zoo3": "RLCTL_ZOO", "sbx": "RLCTL_SBX"}
+_NAMES = {sys.executable: "python"} | {os.environ[name]: f"${name}" for name in PEERS.values() if name in os.environ}
 TOOLS = {"rlctl": train_rlctl, "rl-zoo3": train_zoo, "sbx": train_sbx}
 
 
@@ -289,6 +288,12 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, nargs="*", default=[0])
     parser.add_argument("--minutes", type=float, default=60.0, help="limit of one training")
     options = parser.parse_args()
+    for task in options.tasks:
+        if task not in PUBLISHED:
+            parser.error(f"no task {task!r} here; give {', '.join(PUBLISHED)}")
+    for tool in options.tools:
+        if tool in PEERS and PEERS[tool] not in os.environ:
+            parser.error(f"set {PEERS[tool]} to a Python with {tool} and rlctl, or give --tools rlctl")
     FOLDER.mkdir(parents=True, exist_ok=True)
     for task in options.tasks:
         for seed in options.seeds:
