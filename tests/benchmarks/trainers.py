@@ -28,23 +28,25 @@ _ZOO_ID = {
     "walker2d": "Walker2DBulletEnv-v0",
     "humanoid": "HumanoidBulletEnv-v0",
 }
+SCORES = dict.fromkeys(_ZOO_ID, "return") | {"humanoid": "length", "reach": "success"}
+"""What is compared: a column of `evals.csv`, the mean of an evaluation."""
+_IN_NPZ = {"return": "results", "length": "ep_lengths", "success": "successes"}
 EPISODES = 10  # of a peer's evaluation; rlctl evaluates as its recipe says
 _ZOO_EVERY = {"ppo": 20_000, "tqc": 10_000}
 """Steps between the evaluations of rl-zoo3: minutes of its TQC, seconds of its PPO."""
 
 
-def train_rlctl(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[], list[Any]]]:
-    """Return the command of the shipped recipe, and a function that reads (returns, success) of its evaluations."""
+def train_rlctl(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[], list[float]]]:
+    """Return the command of the shipped recipe, and a function that reads the scores of its evaluations."""
 
-    def read() -> list[Any]:
+    def read() -> list[float]:
         file = RunDirectory(folder / "latest").evals_file
-        rows = read_csv(file) if file.exists() else []
-        return [(float(row["return"]), float(row["success"]) if row["success"] else None) for row in rows]
+        return [float(row[SCORES[task]]) for row in read_csv(file)] if file.exists() else []
 
     return [sys.executable, "-m", "rlctl", "train", task, "--seed", str(seed), "-o", str(folder)], read
 
 
-def train_zoo(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[], list[Any]]]:
+def train_zoo(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[], list[float]]]:
     """Return the zoo's command with its own tuned hyperparameters; for `reach`, those of an earlier recipe of rlctl."""
     algo, settings = _read_zoo_settings(task)
     file = folder / "zoo.yml"
@@ -55,7 +57,7 @@ def train_zoo(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[
         *("--eval-freq", str(_ZOO_EVERY[algo]), "--eval-episodes", str(EPISODES), "--save-freq", "-1"),
         *("-f", str(folder), "--device", "cpu"),
     ]
-    return command, lambda: _read_evaluations(folder)
+    return command, lambda: _read_evaluations(task, folder)
 
 
 def _read_zoo_settings(task: str) -> tuple[str, dict[str, Any]]:
@@ -70,14 +72,11 @@ def _read_zoo_settings(task: str) -> tuple[str, dict[str, Any]]:
     return "tqc", settings
 
 
-def _read_evaluations(folder: Path) -> list[Any]:
-    rows: list[Any] = []
+def _read_evaluations(task: str, folder: Path) -> list[float]:
     for file in folder.rglob("evaluations.npz"):
         with contextlib.suppress(OSError, ValueError, EOFError), np.load(file) as arrays:  # while it is written
-            success = arrays.get("successes")
-            for index, returns in enumerate(arrays["results"]):
-                rows.append((float(returns.mean()), None if success is None else float(success[index].mean())))
-    return rows
+            return [float(mean) for mean in arrays[_IN_NPZ[SCORES[task]]].mean(axis=1)]
+    return []
 
 
 _SBX = """
@@ -109,7 +108,7 @@ _SBX_TQC = {
 _SBX_PPO = {"learning_rate": 1.2e-3, "n_steps": 320, "batch_size": 640, "n_epochs": 5, "gamma": 0.93}
 
 
-def train_sbx(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[], list[Any]]]:
+def train_sbx(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[], list[float]]]:
     """Return the command of sbx's TQC with the zoo's learning rate, batch, gamma and tau; for `reach` its PPO."""
     algo, settings, steps = ("PPO", _SBX_PPO, 1_000_000) if task == "reach" else ("TQC", _SBX_TQC, 2_000_000)
     job = {
@@ -125,7 +124,7 @@ def train_sbx(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[
     }
     script = folder / "train.py"
     script.write_text(_SBX)
-    return [os.environ["RLCTL_SBX"], str(script), json.dumps(job)], lambda: _read_evaluations(folder)
+    return [os.environ["RLCTL_SBX"], str(script), json.dumps(job)], lambda: _read_evaluations(task, folder)
 
 
 PEERS = {"rl-zoo3": "RLCTL_ZOO", "sbx": "RLCTL_SBX"}
