@@ -84,7 +84,7 @@ def tqc_half_cheetah(repeat: int) -> Row:
 def _off_policy(algo: str, repeat: int) -> Row:
     kwargs = {**SAC, "n_steps": 1, "policy_delay": 1}  # the task's own recipe has others
     settings = {"algo": algo, "algo_kwargs": kwargs, "policy_kwargs": SAC_NETWORK, "n_envs": ZOO_ENVS, "stages": []}
-    return _row("half-cheetah", algo, settings, SAC, SAC_NETWORK, False, 8_000, 3.0, repeat)
+    return _row("half-cheetah", algo, settings, SAC, SAC_NETWORK, False, 8_000, 2.0, repeat)
 
 
 def _row(
