@@ -67,7 +67,7 @@ def ppo_reach(repeat: int) -> Row:
 
 def ppo_half_cheetah(repeat: int) -> Row:
     """The zoo's PPO: 640 updates for 4,096 steps."""
-    ours = {"algo": "ppo", "algo_kwargs": PPO, "policy_kwargs": PPO_NETWORK, "n_envs": ZOO_ENVS}
+    ours = {"algo": "ppo", "algo_kwargs": PPO, "policy_kwargs": PPO_NETWORK, "n_envs": ZOO_ENVS, "stages": []}
     return _row("half-cheetah", "ppo", ours, PPO, PPO_NETWORK, True, 16_384, 3.0, repeat)
 
 
