@@ -17,10 +17,10 @@ import yaml
 
 from tests.benchmarks import shipped
 from tests.benchmarks.row import Row, side_by_side
+from tests.benchmarks.zoo import OFF_POLICY
 
 TASK, ENVS, STEPS, TARGET = "half-cheetah", 16, 20_000, 1.3
-SETTINGS = {"learning_rate": 7.3e-4, "buffer_size": 300_000, "batch_size": 256, "gamma": 0.98, "tau": 0.02}
-CHUNK = 8  # steps of each environment between updates: 128 of all
+CHUNK = OFF_POLICY["train_freq"]  # steps of each environment between updates: 128 of all
 _PEER = """
 import json, sys, time, gymnasium, sbx, torch, rlctl.gym
 from stable_baselines3.common.env_util import make_vec_env
@@ -44,7 +44,7 @@ def _row(algo: str, net_arch: list[int], updates: int, repeat: int) -> Row:
     peer = os.environ.get("RLCTL_SBX")
     if not peer:
         raise RuntimeError("set RLCTL_SBX to a Python with sbx-rl 0.28 and rlctl")
-    settings = {**SETTINGS, "train_freq": CHUNK, "gradient_steps": updates, "learning_starts": 1000}
+    settings = {**OFF_POLICY, "gradient_steps": updates}
     job = {"algo": algo, "task": TASK, "n_envs": ENVS, "net_arch": net_arch, "settings": settings, "steps": STEPS}
     pair = side_by_side(
         lambda: _our_speed(algo, net_arch, settings),

@@ -19,7 +19,7 @@ import yaml
 
 from rlctl.run.directory import RunDirectory
 from tests.benchmarks.shipped import read_csv
-from tests.benchmarks.zoo import PPO_REACH, PPO_REACH_ENVS, ZOO_ENVS
+from tests.benchmarks.zoo import OFF_POLICY, PPO_REACH_OF_ZOO, ZOO_ENVS
 
 _ZOO_ID = {
     "ant": "AntBulletEnv-v0",
@@ -62,9 +62,8 @@ def train_zoo(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[
 
 def _read_zoo_settings(task: str) -> tuple[str, dict[str, Any]]:
     if task == "reach":
-        steps = {"n_steps": PPO_REACH_ENVS * PPO_REACH["n_steps"] // ZOO_ENVS}
         network = "dict(log_std_init=-2, net_arch=[64, 64])"
-        settings = {**PPO_REACH, **steps, "policy_kwargs": network, "normalize": True, "n_timesteps": 1_000_000}
+        settings = {**PPO_REACH_OF_ZOO, "policy_kwargs": network, "normalize": True, "n_timesteps": 1_000_000}
         return "ppo", {**settings, "n_envs": ZOO_ENVS, "policy": "MlpPolicy"}
     find = "import rl_zoo3, pathlib; print(pathlib.Path(rl_zoo3.__file__).parent / 'hyperparams/tqc.yml')"
     file = subprocess.run([os.environ["RLCTL_ZOO"], "-c", find], check=True, capture_output=True, text=True).stdout
@@ -94,17 +93,7 @@ if __name__ == "__main__":
     model = getattr(sbx, job["algo"])("MlpPolicy", env, seed=job["seed"], **job["settings"])
     model.learn(job["steps"], callback=callback)
 """
-_SBX_TQC = {
-    "learning_rate": 7.3e-4,
-    "buffer_size": 300_000,
-    "batch_size": 256,
-    "gamma": 0.98,
-    "tau": 0.02,
-    "train_freq": 8,
-    "gradient_steps": 32,
-    "learning_starts": 1000,
-    "policy_kwargs": {"net_arch": [256, 256]},
-}
+_SBX_TQC = {**OFF_POLICY, "gradient_steps": 32, "policy_kwargs": {"net_arch": [256, 256]}}
 _SBX_PPO = {"learning_rate": 1.2e-3, "n_steps": 320, "batch_size": 640, "n_epochs": 5, "gamma": 0.93}
 
 

@@ -30,17 +30,17 @@ PPO = {
     "sde_sample_freq": 4,
 }
 PPO_NETWORK = {"net_arch": [256, 256], "log_std_init": -2, "ortho_init": False, "activation_fn": "relu"}
-SAC = {
+OFF_POLICY = {
     "learning_rate": 7.3e-4,
     "buffer_size": 300_000,
     "batch_size": 256,
     "gamma": 0.98,
     "tau": 0.02,
     "train_freq": 8,
-    "gradient_steps": 8,
     "learning_starts": 1000,
-    "use_sde": True,
 }
+"""What SAC and TQC share; against sbx too."""
+SAC = {**OFF_POLICY, "gradient_steps": 8, "use_sde": True}
 PPO_REACH: dict[str, Any] = {
     "learning_rate": "lin_1.2e-3",
     "n_steps": 40,
@@ -51,18 +51,18 @@ PPO_REACH: dict[str, Any] = {
     "sde_sample_freq": 8,
 }
 PPO_REACH_NETWORK, PPO_REACH_ENVS = {"net_arch": [64, 64], "log_std_init": -2}, 64
+PPO_REACH_OF_ZOO = {**PPO_REACH, "n_steps": PPO_REACH_ENVS * PPO_REACH["n_steps"] // ZOO_ENVS}
+"""Rollouts that are as long, from the peer's environments."""
 SAC_NETWORK = {"net_arch": [400, 300], "log_std_init": -3}
 
 
 def ppo_reach(repeat: int) -> Row:
     """Hyperparameters that are written down here, so that the row stays what it is when reach's recipe changes.
 
-    They are the recipe's when the number to reach was set; since then it makes twice as many, smaller minibatches. The
-    peer's rollouts are as long, from 8 environments.
+    They are the recipe's when the number to reach was set; since then it makes twice as many, smaller minibatches.
     """
     ours = {"algo": "ppo", "algo_kwargs": PPO_REACH, "policy_kwargs": PPO_REACH_NETWORK, "n_envs": PPO_REACH_ENVS}
-    theirs = {**PPO_REACH, "n_steps": PPO_REACH_ENVS * PPO_REACH["n_steps"] // ZOO_ENVS}
-    return _row("reach", "ppo", ours, theirs, PPO_REACH_NETWORK, True, 102_400, 5.0, repeat)
+    return _row("reach", "ppo", ours, PPO_REACH_OF_ZOO, PPO_REACH_NETWORK, True, 102_400, 5.0, repeat)
 
 
 def ppo_half_cheetah(repeat: int) -> Row:
