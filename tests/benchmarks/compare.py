@@ -188,4 +188,12 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        code = main()
+    except KeyboardInterrupt:
+        print(f"interrupted: what was measured to the end is kept in {FOLDER}", file=sys.stderr)
+        code = 130
+    except RuntimeError as error:  # of a training
+        print(f"error: {error}", file=sys.stderr)
+        code = 1
+    sys.exit(code)
