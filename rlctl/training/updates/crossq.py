@@ -30,14 +30,14 @@ class CrossQUpdate(SacUpdate):
         if with_loss:
             logged["critic_loss"].append(loss)
         if learns_actor:
-            sample = self._actor.sample(batch.features, "learning")
+            sample = self._actor.sample(self._actor.network.run(batch.features[None], "learning"))
             self._update_coefficient(sample, logged)
             logged["actor_loss"].append(self._update_actor(batch.features, sample, coefficient))
 
     def _update_joint_critics(self, batch: Batch, coefficient: float) -> float:
         """Return the critics' loss before the update."""
-        count, sample = len(batch.features), self._actor.sample(batch.next_features, "next")
-        features = np.concatenate([batch.features, batch.next_features])
+        sample = self._actor.sample(self._actor.network.run(batch.next_features[None], "next"))
+        count, features = len(batch.features), np.concatenate([batch.features, batch.next_features])
         inputs = np.concatenate([features, np.concatenate([batch.actions, sample.action])], 1)[None]
         passes = self._side_by_side.run([functools.partial(stack.run, inputs, "learning") for stack in self._critics])
         values = np.concatenate([passed[-1] for passed in passes])[:, count:].min(0) - coefficient * sample.log_prob

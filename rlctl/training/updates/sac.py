@@ -45,7 +45,7 @@ class Sample:
 class SquashedGaussianActor:
     """A normal distribution, with or without gSDE, of actions that tanh squashes."""
 
-    def __init__(self, actor: Any) -> None:
+    def __init__(self, actor: Any, side_by_side: SideBySide) -> None:
         self._actor = actor
         self._epsilon = float(actor.action_dist.epsilon)
         self._mean_limit = float(actor.clip_mean) if actor.use_sde and actor.clip_mean > 0 else None
@@ -57,7 +57,8 @@ class SquashedGaussianActor:
             heads = [modules[-1], actor.log_std]
             joined = join_outputs(heads)
             networks = [[*modules[:-1], joined]]
-        self._network = (choose_stack(modules) or MlpStack)(networks)
+        self.network = (choose_stack(modules) or MlpStack)(networks)
+        self.network.run_calls = side_by_side.run
         if not actor.use_sde:
             share_joined(heads, joined)
         self._count = modules[-1].out_features
@@ -79,9 +80,8 @@ class SquashedGaussianActor:
             self._actor.action_dist.exploration_mat = torch.randn(std.shape) * std
             torch.randn(std.shape)  # of the matrices for parallel exploration, which are not used here
 
-    def sample(self, features: Floats, use: str) -> Sample:
-        """Draw actions for features, shape (batch, features); the next with the same `use` overwrites its `values`."""
-        values = self._network.run(features[None], use)
+    def sample(self, values: list[Floats]) -> Sample:
+        """Draw actions from what the network's `run` returned for a batch of features."""
         latent, mean = values[-2][0], values[-1][0, :, : self._count]
         if self._actor.use_sde:
             if self._mean_limit is not None:
@@ -109,12 +109,12 @@ class SquashedGaussianActor:
             to_latent = self._backpropagate_gsde(sample.values[-2][0], sample, to_mean, to_log_prob)
             if self._mean_limit is not None:
                 to_mean = to_mean * (np.abs(outputs) < self._mean_limit)
-            self._network.backpropagate(sample.values, to_mean[None], latent=to_latent[None])
+            self.network.backpropagate(sample.values, to_mean[None], latent=to_latent[None])
             return
         log_std = outputs[:, self._count :]
         within = (log_std >= _LOG_STD_MIN) & (log_std <= _LOG_STD_MAX)
         to_log_std = (to_mean * sample.noise - np.float32(to_log_prob)) * within
-        self._network.backpropagate(sample.values, np.concatenate([to_mean, to_log_std], 1)[None])
+        self.network.backpropagate(sample.values, np.concatenate([to_mean, to_log_std], 1)[None])
 
     def _backpropagate_gsde(self, latent: Floats, sample: Sample, to_mean: Floats, to_log_prob: float) -> Floats:
         """Set the gradient of `log_std`, and return that of the latent values."""
@@ -143,8 +143,8 @@ class SacUpdate:
     def __init__(self, model: Any) -> None:
         self._model = model
         self._policy_delay = getattr(model, "policy_delay", 1)  # SB3's own models have none
-        self._actor = SquashedGaussianActor(model.actor)
         self._side_by_side = SideBySide(list(model.critic.q_networks), model.batch_size)
+        self._actor = SquashedGaussianActor(model.actor, self._side_by_side)
         kind = choose_stack(model.critic.q_networks[0]) or MlpStack
         self._critics = self._side_by_side.make_stacks(model.critic.q_networks, kind)
         targets = getattr(model, "critic_target", None)  # CrossQ has none
@@ -164,10 +164,8 @@ class SacUpdate:
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """Do `gradient_steps` updates with minibatches of the replay buffer; log what SB3 logs."""
         model = self._model
-        optimizers = [model.actor.optimizer, model.critic.optimizer]
-        if model.ent_coef_optimizer is not None:
-            optimizers.append(model.ent_coef_optimizer)
-        model._update_learning_rate(optimizers)
+        optimizers = (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer)
+        model._update_learning_rate([optimizer for optimizer in optimizers if optimizer is not None])
         logged: dict[str, list[float]] = collections.defaultdict(list)
         for step, batch in enumerate(sample_batches(model, model.actor, gradient_steps, batch_size)):
             learns_actor = (model._n_updates + step + self.first_update) % self._policy_delay == 0
@@ -182,11 +180,14 @@ class SacUpdate:
     def _update(self, batch: Batch, logged: dict[str, list[float]], *, learns_actor: bool, with_loss: bool) -> None:
         self._actor.reset_noise()
         coefficient, sample = self._read_coefficient(), None
+        run, uses = self._actor.network.run, [(batch.next_features, "next"), (batch.features, "learning")]
+        calls = [functools.partial(run, features[None], use) for features, use in uses[: 1 + learns_actor]]
+        passes = self._side_by_side.run(calls)
         if learns_actor:
-            sample = self._actor.sample(batch.features, "learning")
+            sample = self._actor.sample(passes[1])  # before the other: SB3's order of random numbers
             self._update_coefficient(sample, logged)
             logged["ent_coef"].append(coefficient)
-        target = self._compute_target(batch, coefficient)
+        target = self._compute_target(batch, self._actor.sample(passes[0]), coefficient)
         outputs = self._update_critics(np.concatenate([batch.features, batch.actions], 1), target)
         if with_loss:
             logged["critic_loss"].append(self._compute_loss(outputs, target))
@@ -194,8 +195,8 @@ class SacUpdate:
             logged["actor_loss"].append(self._update_actor(batch.features, sample, coefficient))
 
     def _read_coefficient(self) -> float:
-        model = self._model
-        tensor = model.ent_coef_tensor if model.ent_coef_optimizer is None else model.log_ent_coef.exp()
+        is_fixed = self._model.ent_coef_optimizer is None
+        tensor = self._model.ent_coef_tensor if is_fixed else self._model.log_ent_coef.exp()
         return float(tensor.item())
 
     def _update_coefficient(self, sample: Sample, logged: dict[str, list[float]]) -> None:
@@ -207,9 +208,8 @@ class SacUpdate:
         model.log_ent_coef.grad = torch.full_like(model.log_ent_coef, missing)
         adam.step(model.ent_coef_optimizer)
 
-    def _compute_target(self, batch: Batch, coefficient: float) -> Floats:
+    def _compute_target(self, batch: Batch, sample: Sample, coefficient: float) -> Floats:
         """Return the critics' targets, shape (batch, estimates)."""
-        sample = self._actor.sample(batch.next_features, "next")
         inputs = np.concatenate([batch.next_features, sample.action], 1)[None]
         passes = self._side_by_side.run([functools.partial(stack.run, inputs, "target") for stack in self._targets])
         estimates = self._choose_estimates(np.concatenate([values[-1] for values in passes]))
@@ -234,11 +234,9 @@ class SacUpdate:
         passes = self._side_by_side.run([functools.partial(critics.run, inputs, "actor") for critics in self._critics])
         value, to_outputs = self._value(np.concatenate([values[-1] for values in passes]))
         to_outputs /= -len(value)
-        calls, first = [], 0
-        for critics, values in zip(self._critics, passes, strict=True):
-            part = to_outputs[first : first + critics.count]
-            calls.append(functools.partial(critics.input_gradient, values, part, features.shape[1]))
-            first += critics.count
+        parts, size = np.split(to_outputs, len(self._critics)), features.shape[1]
+        trios = zip(self._critics, passes, parts, strict=True)
+        calls = [functools.partial(critics.input_gradient, values, part, size) for critics, values, part in trios]
         to_action = np.concatenate(self._side_by_side.run(calls)).sum(0)
         self._actor.backpropagate(sample, to_action, coefficient / len(value))
         adam.step(self._model.actor.optimizer)
