@@ -49,7 +49,7 @@ class MlpStack:
         self._layers = [_Layer(row) for row in zip(*linears, strict=True)]
         self._buffers: dict[tuple[str, int], list[Floats]] = {}
         self.count = len(modules)  # number of networks
-        self.run_calls: Callable[..., list[Any]] = lambda calls: [call() for call in calls]  # a layer's two products
+        self.run_calls: Callable[..., list[Any]] = lambda calls: [call() for call in calls]  # for a layer's gradients
         self.parameters = [values for layer in self._layers for values in layer.parameters]
         """Weights and biases, of all networks together."""
         self.gradients = [layer.weight_gradient for layer in self._layers]

@@ -180,14 +180,15 @@ class SacUpdate:
     def _update(self, batch: Batch, logged: dict[str, list[float]], *, learns_actor: bool, with_loss: bool) -> None:
         self._actor.reset_noise()
         coefficient, sample = self._read_coefficient(), None
-        run, uses = self._actor.network.run, [(batch.next_features, "next"), (batch.features, "learning")]
-        calls = [functools.partial(run, features[None], use) for features, use in uses[: 1 + learns_actor]]
+        calls = [functools.partial(self._actor.network.run, batch.next_features[None], "next")]
+        if learns_actor:
+            calls.insert(0, functools.partial(self._actor.network.run, batch.features[None], "learning"))
         passes = self._side_by_side.run(calls)
         if learns_actor:
-            sample = self._actor.sample(passes[1])  # before the other: SB3's order of random numbers
+            sample = self._actor.sample(passes[0])  # before the other: SB3's order of random numbers
             self._update_coefficient(sample, logged)
             logged["ent_coef"].append(coefficient)
-        target = self._compute_target(batch, self._actor.sample(passes[0]), coefficient)
+        target = self._compute_target(batch, self._actor.sample(passes[-1]), coefficient)
         outputs = self._update_critics(np.concatenate([batch.features, batch.actions], 1), target)
         if with_loss:
             logged["critic_loss"].append(self._compute_loss(outputs, target))
@@ -195,8 +196,8 @@ class SacUpdate:
             logged["actor_loss"].append(self._update_actor(batch.features, sample, coefficient))
 
     def _read_coefficient(self) -> float:
-        is_fixed = self._model.ent_coef_optimizer is None
-        tensor = self._model.ent_coef_tensor if is_fixed else self._model.log_ent_coef.exp()
+        model = self._model
+        tensor = model.ent_coef_tensor if model.ent_coef_optimizer is None else model.log_ent_coef.exp()
         return float(tensor.item())
 
     def _update_coefficient(self, sample: Sample, logged: dict[str, list[float]]) -> None:
@@ -234,9 +235,9 @@ class SacUpdate:
         passes = self._side_by_side.run([functools.partial(critics.run, inputs, "actor") for critics in self._critics])
         value, to_outputs = self._value(np.concatenate([values[-1] for values in passes]))
         to_outputs /= -len(value)
-        parts, size = np.split(to_outputs, len(self._critics)), features.shape[1]
-        trios = zip(self._critics, passes, parts, strict=True)
-        calls = [functools.partial(critics.input_gradient, values, part, size) for critics, values, part in trios]
+        parts = zip(self._critics, passes, np.split(to_outputs, len(self._critics)), strict=True)
+        size = features.shape[1]
+        calls = [functools.partial(critics.input_gradient, values, part, size) for critics, values, part in parts]
         to_action = np.concatenate(self._side_by_side.run(calls)).sum(0)
         self._actor.backpropagate(sample, to_action, coefficient / len(value))
         adam.step(self._model.actor.optimizer)
