@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.storage import files
-from tests.benchmarks.trainers import EPISODES, PEERS, SCORES, TRAINERS
+from tests.benchmarks.trainers import EPISODES, PACKAGES, PEERS, SCORES, TRAINERS
 
 PUBLISHED = {  # the scores of the recipes: return, steps until it falls, success
     "ant": 3300.0,
@@ -47,6 +47,7 @@ class Curve:
     task: str
     tool: str
     seed: int
+    version: str
     command: str
     minutes: list[float]
     scores: list[float]
@@ -67,7 +68,9 @@ def measure(task: str, tool: str, seed: int, limit_minutes: float) -> Curve:
     folder.mkdir(parents=True)
     command, read = TRAINERS[tool](task, seed, folder)
     shown = f"{_NAMES[command[0]]} {shlex.join(command[1:])}".replace(str(folder), "FOLDER")
-    curve = Curve(task, tool, seed, shown, [], [])
+    ask = f"import importlib.metadata; print(importlib.metadata.version({PACKAGES[tool]!r}))"
+    version = subprocess.run([command[0], "-c", ask], check=True, capture_output=True, text=True).stdout.strip()
+    curve = Curve(task, tool, seed, f"{PACKAGES[tool]} {version}", shown, [], [])
     log = folder / "log.txt"
     began = time.monotonic()
     with log.open("wb") as output, _start(command, output) as process:
@@ -102,7 +105,7 @@ def write_page(curves: list[Curve], limit_minutes: float) -> None:
     """Write the table of all curves."""
     lines = [
         "# How long a training takes, next to RL Baselines3 Zoo and sbx\n",
-        f"Written by `make compare` on {_describe_machine()}.",
+        f"Written by `make compare` on {_describe_machine()}, {', '.join(dict.fromkeys(c.version for c in curves))}.",
         "One training at a time; minutes from the start of the process, evaluations included.",
         "rl-zoo3 has its own tuned hyperparameters (TQC), for `reach` those of an earlier recipe of rlctl (PPO).",
         "sbx has TQC [256, 256] with the zoo's learning rate, batch, gamma and tau, for `reach` PPO.",
@@ -133,8 +136,8 @@ def write_page(curves: list[Curve], limit_minutes: float) -> None:
 def _describe_machine() -> str:
     with open("/proc/cpuinfo") as info:
         model = next((line.partition(":")[2].strip() for line in info if line.startswith("model name")), "")
-    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("rlctl", "torch", "numpy"))
-    return f"{os.cpu_count()} cores of {model or platform.machine()}, {versions}, rl_zoo3 2.9.2, sbx-rl 0.28.0"
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("torch", "numpy"))
+    return f"{os.cpu_count()} cores of {model or platform.machine()}, {versions}"
 
 
 def draw(curves: list[Curve], target: Path) -> None:
