@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,6 +23,7 @@ AT_LIMIT = float(np.float32(0.99))  # of the way from the middle of a joint's ra
 OBSERVED = 5.0  # what is observed is cut off beyond it
 
 
+@dataclass
 class Locomotion(Task):
     """Run towards +x and stay on your feet. A robot fills in its model, feet and motors, and says when it stands."""
 
@@ -36,7 +38,8 @@ class Locomotion(Task):
     power_weight, torque_weight = 2.0, 0.1
     """Of the mean |action * joint speed / 10|, and of the mean squared action."""
 
-    control_dt, substeps, episode_s = 0.0165, 4, 16.5  # [s], -, [s]
+    episode_s: float = 16.5  # [s]
+    control_dt, substeps = 0.0165, 4  # [s], -
     solver_iterations = 5
     action_meaning = "joint torques; 1 is a motor's top torque"
     observation_units = {"height": "m", "roll_pitch": "rad"}
