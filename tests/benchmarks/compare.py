@@ -62,15 +62,14 @@ class Curve:
 
 
 def measure(task: str, tool: str, seed: int, limit_minutes: float) -> Curve:
-    """Train until the tool ends or the time is over; raises `RuntimeError` if it fails."""
+    """Train until the tool ends or the time is over; raises `RuntimeError` if it is missing or fails."""
+    version = _read_version(tool)
     folder = (FOLDER / f"{task}_{tool}_{seed}").resolve()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     command, read = TRAINERS[tool](task, seed, folder)
     shown = f"{_NAMES[command[0]]} {shlex.join(command[1:])}".replace(str(folder), "FOLDER")
-    ask = f"import importlib.metadata; print(importlib.metadata.version({PACKAGES[tool]!r}))"
-    version = subprocess.run([command[0], "-c", ask], check=True, capture_output=True, text=True).stdout.strip()
-    curve = Curve(task, tool, seed, f"{PACKAGES[tool]} {version}", shown, [], [])
+    curve = Curve(task, tool, seed, version, shown, [], [])
     log = folder / "log.txt"
     began = time.monotonic()
     with log.open("wb") as output, _start(command, output) as process:
@@ -82,6 +81,16 @@ def measure(task: str, tool: str, seed: int, limit_minutes: float) -> Curve:
     if not was_stopped and process.returncode != 0:
         raise RuntimeError(f"{tool} {task}: exit code {process.returncode}\n{log.read_text()[-2000:]}")
     return curve
+
+
+def _read_version(tool: str) -> str:
+    package, python = PACKAGES[tool], os.environ[PEERS[tool]] if tool in PEERS else sys.executable
+    ask = f"import importlib.metadata; print(importlib.metadata.version({package!r}))"
+    try:
+        found = subprocess.run([python, "-c", ask], check=True, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise RuntimeError(f"{python} is no Python with {package}; trainers.py says what the peers need") from error
+    return f"{package} {found.stdout.strip()}"
 
 
 @contextlib.contextmanager

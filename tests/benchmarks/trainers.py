@@ -120,3 +120,4 @@ PEERS = {"rl-zoo3": "RLCTL_ZOO", "sbx": "RLCTL_SBX"}
 """The variable that names the Python of a tool."""
 TRAINERS = {"rlctl": train_rlctl, "rl-zoo3": train_zoo, "sbx": train_sbx}
 PACKAGES = {"rlctl": "rlctl", "rl-zoo3": "rl_zoo3", "sbx": "sbx-rl"}
+"""The package of a tool, whose version the page names."""
