@@ -184,3 +184,11 @@ def test_nothing_is_found_by_check_env(rlctl, name):
     done = rlctl("check-env", name)
     assert done.returncode == 0, done.stdout
     assert f"{name}: no findings" in done.stdout
+
+
+def test_the_time_limit_is_a_parameter():
+    env = TaskEnv(Ant(episode_s=0.033))
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(env.action_space.shape, np.float32))[2:4] for _ in range(2)]
+    assert ends == [(False, False), (False, True)]
+    assert Ant().max_steps == 1000
