@@ -157,16 +157,16 @@ def draw(curves: list[Curve], target: Path) -> None:
     columns = min(3, len(tasks))
     rows = -(-len(tasks) // columns)
     figure = Figure(figsize=(3.6 * columns, 2.8 * rows), layout="constrained")
+    lines = {}
     for number, task in enumerate(tasks, start=1):
         axes = figure.add_subplot(rows, columns, number, title=task, xlabel="minutes")
         axes.axhline(PUBLISHED[task], color="0.7", linestyle=":")
-        lines = {}
         for curve in curves:
             if curve.task == task:
                 color = f"C{list(TRAINERS).index(curve.tool)}"
                 (lines[curve.tool],) = axes.plot(curve.minutes, curve.scores, color=color)
         axes.set_ylabel(SCORES[task])
-        axes.legend(lines.values(), lines, frameon=False)
+    figure.axes[0].legend(lines.values(), lines, frameon=False)
     figure.savefig(target, dpi=110)
 
 
