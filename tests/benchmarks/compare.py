@@ -138,8 +138,23 @@ def write_page(curves: list[Curve], limit_minutes: float) -> None:
             "no evaluation" if best is None else f"{best:{form}}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
+    ahead = ", ".join(f"{curve.tool} in `{curve.task}`" for curve in _find_peers_ahead(curves))
+    lines += ["", f"Earlier at the score than every seed of rlctl: {ahead or 'no peer'}."]
     commands = dict.fromkeys(f"{curve.tool}: `{curve.command}`" for curve in curves)
     files.write_text(PAGE, "\n".join([*lines, "", "The commands:\n", *(f"- {text}" for text in commands), ""]))
+
+
+def _find_peers_ahead(curves: list[Curve]) -> list[Curve]:
+    def minutes(curve: Curve) -> float:
+        reached = curve.minutes_to(PUBLISHED[curve.task])
+        return float("inf") if reached is None else reached
+
+    ahead = []
+    for peer in curves:
+        ours = [minutes(curve) for curve in curves if (curve.task, curve.tool) == (peer.task, "rlctl")]
+        if ours and minutes(peer) < min(ours):
+            ahead.append(peer)
+    return ahead
 
 
 def _describe_machine() -> str:
