@@ -12,6 +12,7 @@ import contextlib
 import dataclasses
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import shlex
@@ -52,9 +53,9 @@ class Curve:
     minutes: list[float]
     scores: list[float]
 
-    def minutes_to(self, score: float) -> float | None:
-        """Return the minutes to the first evaluation with a score; None if there is none."""
-        return next((m for m, reached in zip(self.minutes, self.scores, strict=True) if reached >= score), None)
+    def minutes_to(self, score: float) -> float:
+        """Return the minutes to the first evaluation with a score; infinity if there is none."""
+        return next((m for m, reached in zip(self.minutes, self.scores, strict=True) if reached >= score), math.inf)
 
     def best_after(self, minutes: float) -> float | None:
         """Return the best score of the evaluations until then; None if there was none."""
@@ -134,7 +135,7 @@ def write_page(curves: list[Curve], limit_minutes: float) -> None:
             f"{goal:{form}}",
             curve.tool,
             str(curve.seed),
-            "not reached" if reached is None else f"{reached:.1f}",
+            "not reached" if reached == math.inf else f"{reached:.1f}",
             "no evaluation" if best is None else f"{best:{form}}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
@@ -145,16 +146,11 @@ def write_page(curves: list[Curve], limit_minutes: float) -> None:
 
 
 def _find_peers_ahead(curves: list[Curve]) -> list[Curve]:
-    def minutes(curve: Curve) -> float:
-        reached = curve.minutes_to(PUBLISHED[curve.task])
-        return float("inf") if reached is None else reached
-
-    ahead = []
-    for peer in curves:
-        ours = [minutes(curve) for curve in curves if (curve.task, curve.tool) == (peer.task, "rlctl")]
-        if ours and minutes(peer) < min(ours):
-            ahead.append(peer)
-    return ahead
+    ours = {
+        task: [c.minutes_to(goal) for c in curves if (c.task, c.tool) == (task, "rlctl")]
+        for task, goal in PUBLISHED.items()
+    }
+    return [c for c in curves if c.minutes_to(PUBLISHED[c.task]) < min(ours[c.task], default=0.0)]
 
 
 def _describe_machine() -> str:
