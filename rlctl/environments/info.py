@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 from rlctl.environments.dict_spaces import LARGEST_SPACE, format_space
 from rlctl.errors import ArtifactError, UsageError, short_repr
-from rlctl.task.motors import Joints
+from rlctl.task.joints import Joints
 
 if TYPE_CHECKING:
     import mujoco

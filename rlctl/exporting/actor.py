@@ -15,7 +15,7 @@ from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.layers import Normalize, OneHot
 from rlctl.policy.network import Network
 from rlctl.policy.onnx_policy import OwnGraph
-from rlctl.task.motors import Joints
+from rlctl.task.joints import Joints
 
 _TAKEN = (onnx_policy.ACTION, *onnx_policy.STATE_INPUTS, *onnx_policy.STATE_OUTPUTS)
 _STATE_MEANING = "LSTM state; zeros when an episode begins, then the output of the step before"

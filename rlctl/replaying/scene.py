@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rlctl.errors import describe_exception
 from rlctl.replaying.mjcf import Shape, ShapeKind, read_shapes
 from rlctl.task.body import Body
-from rlctl.task.bullet import pybullet
+from rlctl.task.pybullet.library import pybullet
 from rlctl.task.env import TaskEnv
 
 Env = gymnasium.Env[Any, Any]

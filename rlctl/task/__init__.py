@@ -8,10 +8,10 @@ from gymnasium.spaces import MultiDiscrete as MultiDiscrete
 from rlctl.errors import TaskError as TaskError
 from rlctl.task import events as events
 from rlctl.task import rewards as rewards
+from rlctl.task.attachments import Attachment as Attachment
 from rlctl.task.body import Body as Body
-from rlctl.task.constraints import Attachment as Attachment
 from rlctl.task.events import Event as Event
-from rlctl.task.motors import Joints as Joints
+from rlctl.task.joints import Joints as Joints
 from rlctl.task.sim import Sim as Sim
-from rlctl.task.sim import rough_heights as rough_heights
+from rlctl.task.terrain import rough_heights as rough_heights
 from rlctl.task.task import Task as Task

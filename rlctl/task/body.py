@@ -1,19 +1,23 @@
-"""A body of the world: joints and links by name, state as numpy, motors with limits."""
+"""`Body`: a body of the world, the same in every physics engine: joints and links by name, state, motors."""
+
+from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, check_name
-from rlctl.task.bullet import pybullet
-from rlctl.task.properties import Properties
+from rlctl.errors import TaskError, UsageError, check_name
+from rlctl.task.joints import Joints
+from rlctl.task.rotations import roll_pitch_yaw
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
+Limit = float | Array | Sequence[float] | None
+"""One number for all joints, one per joint, or None: the limit of the model file."""
 
 
 class MassState(NamedTuple):
@@ -27,7 +31,7 @@ class MassState(NamedTuple):
     @property
     def roll_pitch_yaw(self) -> Vector:
         """The orientation as angles about x, y, z [rad]."""
-        return pybullet.getEulerFromQuaternion(self.orientation)
+        return roll_pitch_yaw(self.orientation)
 
 
 class Contacts(NamedTuple):
@@ -38,62 +42,63 @@ class Contacts(NamedTuple):
     distances: Array  # [m], shape (points,), negative where the bodies overlap, as in `rewards.penetration`
 
 
-class Body(Properties):
-    """A body of the world. Joint arrays have one element per movable joint, in `joint_names` order."""
+class Drives(NamedTuple):
+    """Spring and damper of the position controllers of joints; each of shape (joints,)."""
 
-    def __init__(self, client: int, substeps: int, name: str, body_id: int, file: Path, fixed: bool) -> None:
-        super().__init__()
-        self.name = name
-        self.id = body_id
-        self.file = file
-        self.fixed = fixed
-        self.terrain: Array | None = None
-        """Points of rough ground [m], world frame, shape (along x, along y, 3); None for any other body."""
-        self.inertia_from_file = False
-        self.client = client
-        self._substeps = substeps
-        self._cache: dict[Any, Any] = {}
-        self._force_sensors: set[str] = set()
-        infos = [
-            pybullet.getJointInfo(body_id, index, physicsClientId=client)
-            for index in range(pybullet.getNumJoints(body_id, physicsClientId=client))
-        ]
-        self.all_joint_names = [info[1].decode() for info in infos]
-        self._links = {info[12].decode(): index for index, info in enumerate(infos)}
-        self.link_names = list(self._links)  # names of all links but the base
-        self.base_name: str = pybullet.getBodyInfo(body_id, physicsClientId=client)[0].decode()
-        self._all_names = [*self._links, self.base_name]
-        movable = [info for info in infos if info[2] in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)]
-        self.joint_names = [info[1].decode() for info in movable]
-        self.joint_indices = [int(info[0]) for info in movable]
-        limits = np.array([info[8:10] for info in movable]).reshape(-1, 2)
-        # PyBullet gives a joint without limits a lower limit above the upper one.
-        self.joint_low, self.joint_high = np.where(limits[:, :1] > limits[:, 1:], (-np.inf, np.inf), limits).T
-        """Joint limits [rad or m], infinite where the model file has none; each of shape (joints,)."""
-        self.joint_max_force: Array = np.array([info[10] for info in movable])
-        """Torque or force limit in the model file [N m or N], shape (joints,)."""
-        self.joint_max_speed: Array = np.array([info[11] for info in movable])
-        """Velocity limit in the model file [rad/s or m/s], shape (joints,)."""
+    stiffness: Array  # [N m/rad or N/m]
+    damping: Array  # [N m s/rad or N s/m]
 
-    def _joint_states(self) -> tuple[Array, Array, Any]:
-        # Positions, velocities, and motor torques in a tuple: few tasks need them as an array.
-        state = self._cache.get("joints")
-        if state is None:
-            # None for a body without joints.
-            raw = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self.client) or ()
-            positions, velocities, _, torques = zip(*raw, strict=True) if raw else ((), (), (), ())
-            state = self._cache["joints"] = (np.array(positions), np.array(velocities), torques)
-        return state
+
+class Body:
+    """A body of the world. Joint arrays have one element per movable joint, in `joint_names` order.
+
+    In a world of a `BatchTask` all arrays that are returned or given have a leading axis: one row per world. Methods
+    that change the state of bodies take `worlds`, the numbers of the worlds to change; the arrays have a row for each.
+    `joints` and `links` are names, by default all; `links` may include `base_name`. Units: [rad], [rad/s] and [N m] for
+    rotating joints, [m], [m/s] and [N] for sliding joints. A method that an engine lacks raises `UsageError`.
+    """
+
+    engine: ClassVar[str]
+    name: str
+    file: Path
+    fixed: bool
+    base_name: str
+    link_names: list[str]
+    """Names of all links but the base."""
+    joint_names: list[str]
+    joint_low: Array
+    """Joint limits [rad or m], infinite where the model file has none; shape (joints,), as `joint_high`."""
+    joint_high: Array
+    joint_max_force: Array
+    """Torque or force limit in the model file [N m or N], shape (joints,); 0 where the file has none."""
+    joint_max_speed: Array
+    """Velocity limit in the model file [rad/s or m/s], shape (joints,); 0 where the file has none."""
+    terrain: Array | None
+    """Points of rough ground [m], world frame, shape (along x, along y, 3); None for any other body."""
+    drives: Drives | None
+    """What `set_drives` set; None: `drive_to` uses its `gain`."""
+
+    def _refuse(self, what: str) -> NoReturn:
+        raise UsageError(f"{what}: not in {self.engine}; see docs/engines.md")
+
+    def find_joints(self, joints: Collection[str] = ()) -> list[int]:
+        """Return the indices of joints, or of all, in joint arrays; raises `TaskError` for a name that is not there."""
+        for joint in joints:
+            if joint not in self.joint_names:  # checked first because tasks may name joints at every step
+                check_name(joint, self.joint_names, f"{self.file.name} has no joint", TaskError)
+        if not self.joint_names:
+            raise TaskError(f"{self.file.name} has no joints")
+        return [self.joint_names.index(joint) for joint in joints] or list(range(len(self.joint_names)))
 
     @property
     def joint_positions(self) -> Array:
         """Joint angles [rad] or displacements [m], shape (joints,)."""
-        return self._joint_states()[0]
+        raise NotImplementedError
 
     @property
     def joint_velocities(self) -> Array:
         """Joint velocities [rad/s] or [m/s], shape (joints,)."""
-        return self._joint_states()[1]
+        raise NotImplementedError
 
     @property
     def joint_torques(self) -> Array:
@@ -101,19 +106,11 @@ class Body(Properties):
 
         They include those of `drive_to` and `drive_at`, limited by their maximum force, and those of `set_torques`.
         """
-        torques: Array | None = self._cache.get("torques")
-        if torques is None:
-            # PyBullet divides a substep's impulse by the time of the whole step.
-            torques = self._substeps * np.array(self._joint_states()[2])
-            if self._commanded is not None:
-                torques = np.where(np.isnan(self._commanded), torques, self._commanded)
-            self._cache["torques"] = torques
-        return torques
+        raise NotImplementedError
 
     def add_force_sensor(self, joint: str) -> None:
         """Measure the load of a joint, which may be fixed; `joint_reaction` reads it. Call it in `build`."""
-        pybullet.enableJointForceTorqueSensor(self.id, self._joint_number(joint), True, physicsClientId=self.client)
-        self._force_sensors.add(joint)
+        self._refuse("add_force_sensor")
 
     def joint_reaction(self, joint: str) -> Array:
         """Return the force [N] and torque [N m] that a joint carried in the last physics step, shape (6,).
@@ -121,13 +118,7 @@ class Body(Properties):
         Both act on the link that the joint moves, in the axes of that link's inertial frame; the torque is about its
         centre of mass, without that of the joint's own motor. If a load hangs from the joint, the force points up.
         """
-        if joint not in self._force_sensors:
-            raise TaskError(f"joint {joint!r} has no force sensor: call add_force_sensor({joint!r}) in build")
-        return np.array(pybullet.getJointState(self.id, self._joint_number(joint), physicsClientId=self.client)[2])
-
-    def _joint_number(self, joint: str) -> int:
-        check_name(joint, self.all_joint_names, f"{self.file.name} has no joint", TaskError)
-        return self.all_joint_names.index(joint)
+        self._refuse("joint_reaction")
 
     def solve_inverse_kinematics(
         self, link: str, position: Sequence[float] | Array, orientation: Sequence[float] | Array | None = None
@@ -137,125 +128,222 @@ class Body(Properties):
         `position` [m]; `orientation` is a quaternion (x, y, z, w), by default any will do. The search starts at the
         current joint positions and stops within 0.1 mm or after 100 iterations, even if the pose is out of reach.
         """
-        solution = pybullet.calculateInverseKinematics(
-            self.id,
-            self._link_index(link),
-            *[list(part) for part in (position, orientation) if part is not None],
-            maxNumIterations=100,
-            residualThreshold=1e-4,
-            physicsClientId=self.client,
-        )
-        return np.array(solution)
-
-    def _link_pose(self, link: str) -> tuple[Array, Array]:
-        pose = self._cache.get(("link", link))  # a pair: a link may be called "base" or "joints"
-        if pose is None:
-            index = self._link_index(link)
-            state = pybullet.getLinkState(self.id, index, computeForwardKinematics=1, physicsClientId=self.client)
-            # Items 4 and 5 are the link frame; 0 and 1 are the centre of mass.
-            pose = self._cache["link", link] = (np.array(state[4]), np.array(state[5]))
-        return pose
+        self._refuse("solve_inverse_kinematics")
 
     def link_position(self, link: str) -> Array:
         """Position of the link frame [m], world frame, shape (3,)."""
-        return self._link_pose(link)[0]
+        raise NotImplementedError
 
     def link_orientation(self, link: str) -> Array:
         """Orientation of the link frame, quaternion (x, y, z, w), world frame, shape (4,)."""
-        return self._link_pose(link)[1]
+        raise NotImplementedError
 
     def mass_state(self, link: str) -> MassState:
         """Return where the centre of mass of a link, or of the base, is and how it moves.
 
-        The position and orientation of a link are from the beginning of the last physics step (substep), because
-        PyBullet computes them without `computeForwardKinematics`. Its velocities, and all values of the base, are from
-        the end of that step.
+        In PyBullet the position and orientation of a link are from the beginning of the last physics step (substep),
+        because it computes them without `computeForwardKinematics`. All other values are from the end of that step.
         """
-        state = self._cache.get(("mass", link))
-        if state is None:
-            state = self._cache["mass", link] = self._read_mass_state(link)
-        return state
-
-    def _read_mass_state(self, link: str) -> MassState:
-        if link in self._links:
-            raw = pybullet.getLinkState(self.id, self._links[link], computeLinkVelocity=1, physicsClientId=self.client)
-            return MassState(raw[0], raw[1], raw[6], raw[7])
-        if link != self.base_name:
-            self._link_index(link)
-        pose = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
-        return MassState(*pose, *pybullet.getBaseVelocity(self.id, physicsClientId=self.client))
+        self._refuse("mass_state")
 
     def mass_positions(self, links: Sequence[str]) -> list[Vector]:
         """Return the positions of the centres of mass of links [m], world frame, as in `mass_state`; not cached."""
-        numbers = [self._links[link] if link in self._links else self._link_index(link) for link in links]
-        states = pybullet.getLinkStates(self.id, numbers, physicsClientId=self.client) or ()
-        return [state[0] for state in states]
+        self._refuse("mass_positions")
 
-    def links_touching(self, other: "Body") -> set[str]:
+    def links_touching(self, other: Any) -> set[str]:
         """Return the links, or the base, that touched `other` in the last step; `other` may be the body itself."""
-        points = self._contact_points()
-        # Each point lists this body first; a contact of the body with itself is listed once for both links.
-        numbers = {point[3] for point in points if point[2] == other.id}
-        if other is self:
-            numbers |= {point[4] for point in points if point[2] == self.id}
-        return {self._all_names[number] for number in numbers}  # the base, -1, is the last name
+        self._refuse("links_touching")
 
-    def contacts_with(self, other: "Body") -> Contacts:
+    def contacts_with(self, other: Any) -> Contacts:
         """Return the points where this body touches `other`, at the last physics step."""
-        points = [point for point in self._contact_points() if point[2] == other.id]
-        names = [self._all_names[point[3]] for point in points]
-        # PyBullet divides a substep's impulse by the time of the whole step.
-        forces = np.array([point[9] for point in points]) * self._substeps
-        return Contacts(names, forces, np.array([point[8] for point in points]))
+        self._refuse("contacts_with")
 
-    def distance_to(self, other: "Body", link: str | None = None) -> float:
+    def distance_to(self, other: Any, link: str | None = None) -> float:
         """Return the shortest distance [m] between the collision shapes of two bodies, negative where they overlap.
 
         If `link` is given, only that link of this body is measured.
         """
-        index = {} if link is None else {"linkIndexA": self._part_index(link)}
-        points = pybullet.getClosestPoints(self.id, other.id, 100.0, **index, physicsClientId=self.client)
-        return min((float(point[8]) for point in points), default=math.inf)
-
-    def _contact_points(self) -> Any:
-        points = self._cache.get("contacts")
-        if points is None:
-            points = self._cache["contacts"] = pybullet.getContactPoints(self.id, physicsClientId=self.client)
-        return points
-
-    def _base_state(self) -> tuple[Array, Array]:
-        state = self._cache.get("base")
-        if state is None:
-            position, orientation = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
-            state = self._cache["base"] = (np.array(position), np.array(orientation))
-        return state
+        self._refuse("distance_to")
 
     @property
     def base_position(self) -> Array:
         """Position of the base's centre of mass [m], world frame, shape (3,)."""
-        return self._base_state()[0]
+        raise NotImplementedError
 
     @property
     def base_orientation(self) -> Array:
         """Orientation of the base's inertial frame, quaternion (x, y, z, w), shape (4,)."""
-        return self._base_state()[1]
+        raise NotImplementedError
 
-    def set_base(self, position: Sequence[float], orientation: Sequence[float] = (0, 0, 0, 1)) -> None:
+    @property
+    def base_velocity(self) -> Array:
+        """Velocity of the base's centre of mass [m/s], world frame, shape (3,)."""
+        raise NotImplementedError
+
+    @property
+    def base_angular_velocity(self) -> Array:
+        """Angular velocity of the base [rad/s], world frame, shape (3,)."""
+        raise NotImplementedError
+
+    def set_base(
+        self, position: Any, orientation: Any = (0.0, 0.0, 0.0, 1.0), *, worlds: NDArray[np.int64] | None = None
+    ) -> None:
         """Place the base at rest, its centre of mass at `position` [m]; `Sim.load` places its origin."""
-        pybullet.resetBasePositionAndOrientation(self.id, position, orientation, physicsClientId=self.client)
-        self._cache.clear()
+        raise NotImplementedError
 
     def add_velocity(self, velocity: Sequence[float]) -> None:
         """Add to the velocity of the base [m/s], world frame; all links move with it."""
-        linear, angular = pybullet.getBaseVelocity(self.id, physicsClientId=self.client)
-        pybullet.resetBaseVelocity(self.id, np.add(linear, velocity).tolist(), angular, physicsClientId=self.client)
-        self._cache.clear()
+        self._refuse("add_velocity")
 
-    def set_joints(self, positions: Array, velocities: Array | None = None) -> None:
+    def set_joints(
+        self, positions: Array, velocities: Array | None = None, *, worlds: NDArray[np.int64] | None = None
+    ) -> None:
         """Place the joints: `positions` and `velocities` of shape (joints,); without velocities they are at rest."""
-        count = len(self.joint_indices)
-        angles = self._read_values("positions", positions, count)
-        speeds = [0.0] * count if velocities is None else self._read_values("velocities", velocities, count)
-        states = [[angle] for angle in angles], [[speed] for speed in speeds]
-        pybullet.resetJointStatesMultiDof(self.id, self.joint_indices, *states, physicsClientId=self.client)
-        self._cache.clear()
+        raise NotImplementedError
+
+    def set_drives(
+        self,
+        stiffness: float | Sequence[float] | Array,
+        damping: float | Sequence[float] | Array,
+        *,
+        armature: float | Sequence[float] | Array = 0.0,
+    ) -> None:
+        """Make `drive_to` a spring and a damper, as the position controllers of real robots are. Call it in `build`.
+
+        `stiffness` [N m/rad or N/m], `damping` [N m s/rad or N s/m] and `armature`, the inertia of motor and gears at the
+        joint [kg m^2 or kg], are one number for all joints or one per joint. The torque on a joint is
+        `stiffness * (target - position) - damping * velocity`, within its force limit.
+        """
+        self._refuse("set_drives")
+
+    def drive_to(
+        self,
+        positions: Array,
+        *,
+        max_speed: float | Sequence[float] | None = None,
+        max_force: float | Sequence[float] | None = None,
+        gain: float = 0.1,
+        joints: Sequence[str] = (),
+    ) -> None:
+        """Set position targets [rad or m]; the default limits of speed and force are those of the model file.
+
+        With `set_drives` joints are springs and dampers, without a limit of speed unless `max_speed` is given. Otherwise
+        `gain` is the fraction of the position error that one physics step removes, in (0, 1].
+        """
+        raise NotImplementedError
+
+    def drive_at(
+        self, velocities: Array, *, max_force: float | Sequence[float] | None = None, joints: Sequence[str] = ()
+    ) -> None:
+        """Set velocity targets [rad/s or m/s]; the default limit of the force is that of the model file.
+
+        A target of 0 brakes the joint with at most that force.
+        """
+        raise NotImplementedError
+
+    def disable_motors(self, joints: Sequence[str] = ()) -> None:
+        """Switch off the motors that hold joints, so that only `set_torques` moves them."""
+        raise NotImplementedError
+
+    def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
+        """Apply `torques` [N m or N] to the joints in all substeps of the next step.
+
+        Disable the motors of these joints first, with `disable_motors`. Raises `TaskError` for a joint whose default
+        motor still holds it in place.
+        """
+        raise NotImplementedError
+
+    def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
+        """Scale the force of the joints' motors by `factor`, until the next reset."""
+        raise NotImplementedError
+
+    def cap_joint_speed(self, speed: float) -> None:
+        """Limit the speed of all joints to `speed` [rad/s or m/s], even under external forces.
+
+        PyBullet has one such limit per body, which also applies to the base of a free body; MuJoCo has none, and speeds
+        are cut at the end of a control step. `Sim.load` sets it for a fixed body to the highest speed limit of the
+        joints in the URDF.
+        """
+        raise NotImplementedError
+
+    def total_mass(self) -> float:
+        """Return the mass of all links as the world was built [kg]."""
+        raise NotImplementedError
+
+    def find_trunk(self) -> str | None:
+        """Return the link that moves through the world: a free base, or a link on a sliding joint longer than 100 m."""
+        raise NotImplementedError
+
+    def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:
+        """Set mass and inertia to `factor` times the built world's values, until the next reset."""
+        raise NotImplementedError
+
+    def set_friction(self, friction: float, links: Sequence[str] = ()) -> None:
+        """Set the lateral friction, until the next reset; that of a contact is the product of both links'."""
+        raise NotImplementedError
+
+    def set_contact_stiffness(self, stiffness: float, links: Sequence[str] = ()) -> None:
+        """Set the stiffness of a contact point of the links [N/m], until the next reset.
+
+        Contacts are rigid by default. In PyBullet they stay springs after the first call, very stiff ones after a reset.
+        """
+        self._refuse("set_contact_stiffness")
+
+    def scale_joint_damping(self, factor: float, joints: Sequence[str] = ()) -> None:
+        """Set the joints' damping to `factor` times the built world's values, until the next reset.
+
+        Raises `TaskError` if all of these are 0, because no factor can change that.
+        """
+        raise NotImplementedError
+
+    def set_joint_damping(self, damping: float, joints: Sequence[str] = ()) -> None:
+        """Set the joints' damping [N m s/rad or N s/m], until the next reset."""
+        raise NotImplementedError
+
+    def set_color(self, rgb: Sequence[float], links: Sequence[str] = ()) -> None:
+        """Paint the links, until the next reset: red, green, blue in [0, 1]; their opacity does not change."""
+        self._refuse("set_color")
+
+    def describe_joints(
+        self, joints: Sequence[str], *, default_positions: Sequence[float] = (), action_scale: Sequence[float] = ()
+    ) -> Joints:
+        """Return joints with the limits of the model file, for `Task.describe_joints`.
+
+        If a limit is missing, 0 or infinite for one of the joints, it is left out for all of them.
+        """
+        chosen = self.find_joints(joints)
+        low, high = self.joint_low[chosen], self.joint_high[chosen]
+        speed, torque = (
+            limits.tolist() if (limits > 0).all() and np.isfinite(limits).all() else ()
+            for limits in (self.joint_max_speed[chosen], self.joint_max_force[chosen])
+        )
+        bounded = bool((low < high).all() and np.isfinite([low, high]).all())
+        return Joints(
+            names=[self.joint_names[joint] for joint in chosen],
+            default_positions=default_positions,
+            action_scale=action_scale,
+            stiffness=() if self.drives is None else self.drives.stiffness[chosen].tolist(),
+            damping=() if self.drives is None else self.drives.damping[chosen].tolist(),
+            low=low.tolist() if bounded else (),
+            high=high.tolist() if bounded else (),
+            max_speed=speed,
+            max_torque=torque,
+        )
+
+    def _find_force_limits(self, joints: list[int], max_force: Limit) -> Array:
+        """Return the force limits of motors, shape (joints,); raises `TaskError` where neither task nor file has one."""
+        limits = self.joint_max_force[joints] if max_force is None else np.broadcast_to(max_force, len(joints))
+        if max_force is None and not limits.all():
+            names = [self.joint_names[joint] for joint, limit in zip(joints, limits, strict=True) if limit == 0]
+            raise TaskError(
+                f"{self.file.name} gives no effort limit for joint {names[0]!r}, so its motor would have no force: "
+                "pass max_force= [N m], or write <limit effort=...> into the model"
+            )
+        return np.asarray(limits, float)
+
+    def _spread(self, name: str, value: Any) -> Array:
+        """Return one number, or one per joint, as an array of shape (joints,)."""
+        array, count = np.asarray(value, float), len(self.joint_names)
+        if array.shape not in ((), (count,)) or not (array >= 0).all() or not math.isfinite(array.sum()):
+            raise TaskError(f"{self.file.name}: {name} {value} is not one number, or one for each of {count} joints")
+        return np.broadcast_to(array, count).copy()

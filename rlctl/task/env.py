@@ -14,8 +14,8 @@ from gymnasium.envs.registration import EnvSpec
 from rlctl.errors import RecipeError, TaskError, UsageError, check_name, short_repr
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
-from rlctl.task.motors import Joints
-from rlctl.task.mujoco_sim import MujocoSim, read_solref
+from rlctl.task.joints import Joints
+from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.observation import Observation, ObservationFormat
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_definition, check_parameters

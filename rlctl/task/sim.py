@@ -1,82 +1,44 @@
-"""A PyBullet world: bodies by name, SI units, numpy arrays.
+"""`Sim`: the world of a task, the same in every physics engine."""
 
-Quaternions are (x, y, z, w), as in PyBullet. The state of a body is read at most once per control step.
-"""
+from __future__ import annotations
 
-import contextlib
-import dataclasses
-import functools
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import ClassVar, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, check_name
+from rlctl.errors import TaskError, UsageError, check_name
+from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.body import Array, Body
-from rlctl.task.bullet import check_display, find_model_file, pybullet, pybullet_data, read_complaint
-from rlctl.task.constraints import Constraints
 
 
-@dataclasses.dataclass
-class _Push:
-    body: Body
-    link: int
-    force: Sequence[float]  # [N], world frame
-    steps: int  # control steps that it still acts
+class Sim:
+    """A world of its own: bodies by name, SI units, NumPy arrays, quaternions (x, y, z, w).
 
-
-def _check_joint_names(path: Path) -> None:
-    """Raise `TaskError` for two joints of one name, which crash PyBullet."""
-    with contextlib.suppress(ElementTree.ParseError, LookupError, ValueError):  # PyBullet reads more than XML allows
-        names = [joint.get("name") for joint in ElementTree.fromstring(path.read_bytes().strip()).findall("joint")]
-        if (name := next((name for name in names if names.count(name) > 1), None)) is not None:
-            raise TaskError(f"{path}: {names.count(name)} joints are called {name!r}; give each its own name")
-
-
-class Sim(Constraints):
-    """A PyBullet world of its own.
-
-    One call of PyBullet simulates `control_dt` [s] in `substeps` physics steps, so that a force acts in all of them.
+    Each engine has a subclass; a method that an engine cannot offer raises `UsageError`. Constraints (`connect_*`) are
+    made in `build` and last as long as the world. Their `max_force` is the largest force [N], for gears the largest
+    torque [N m]; a stronger load pulls the frames apart.
     """
 
-    def __init__(self, *, control_dt: float, substeps: int, solver_iterations: int = 50, gui: bool = False) -> None:
-        if gui:
-            check_display()
-        self.client: int = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
-        if self.client < 0:
-            raise TaskError("PyBullet could not open a window; leave out --gui on a machine without a display")
-        self.bodies: dict[str, Body] = {}
-        self._substeps = substeps
-        self._settings = {
-            "fixedTimeStep": control_dt,
-            "numSubSteps": substeps,
-            "numSolverIterations": solver_iterations,
-            # Without it, contacts after a restored state come in another order: see tests/task/test_reset.py.
-            "deterministicOverlappingPairs": 1,
-        }
-        self._saved: int | None = None
-        self._built_gravity: tuple[float, ...] | None = None  # [m/s^2], set while events have changed the gravity
-        self._pushes: list[_Push] = []
-        self._prepare()
+    engine: ClassVar[str]
+    """Name of the physics engine, for people."""
+    bodies: Mapping[str, Body]
 
-    def _prepare(self) -> None:
-        pybullet.setAdditionalSearchPath(pybullet_data.getDataPath(), physicsClientId=self.client)
-        pybullet.setPhysicsEngineParameter(**self._settings, physicsClientId=self.client)
-        self.set_gravity(9.81)
+    def _refuse(self, what: str) -> NoReturn:
+        raise UsageError(f"{what}: not in {self.engine}; see docs/engines.md")
 
     def set_gravity(self, gravity: float) -> None:
         """Set the downward gravity of the built world [m/s^2], by default 9.81. Call it in `build`."""
-        pybullet.setGravity(0.0, 0.0, -gravity, physicsClientId=self.client)
+        self._refuse("set_gravity")
 
     def set_contact_erp(self, erp: float) -> None:
         """Set the fraction of a contact's depth that one physics step removes, in (0, 1]: Bullet's contact ERP.
 
         The default is 0.2. Call it in `build`: resets keep the value.
         """
-        pybullet.setDefaultContactERP(erp, physicsClientId=self.client)
+        self._refuse("set_contact_erp")
 
     def load(
         self,
@@ -90,159 +52,86 @@ class Sim(Constraints):
         self_collision: bool = False,
         inertia: Literal["file", "shape"] = "file",
     ) -> Body:
-        """Load the body of a URDF, MJCF (`.xml`) or SDF file: a path, or a name in `pybullet_data`.
+        """Load the body of a URDF, MJCF (`.xml`) or SDF file: a path, or the name of a model of rlctl or `pybullet_data`.
 
         `position` [m] and `orientation` of the base's origin, and `fixed`, are for URDF files; other formats contain
         them. `flags` are PyBullet's URDF_* flags. With `self_collision` links collide, except with their ancestors.
-        `inertia="shape"` is for a URDF whose inertias are wrong (see `rlctl.task.model_faults`): PyBullet computes them
-        from the collision shapes and the file's masses.
+        `inertia="shape"` is for a URDF whose inertias are wrong (see `rlctl.task.pybullet.model_faults`): the engine
+        computes them from the collision shapes and the file's masses.
         """
-        self._check_new(name)
-        path = find_model_file(file)
-        if path.suffix == ".urdf":
-            _check_joint_names(path)
-            flags |= pybullet.URDF_USE_INERTIA_FROM_FILE if inertia == "file" else 0
-        if self_collision:
-            flags |= pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS
-        if path.suffix in (".xml", ".sdf"):
-            if fixed or any(position) or tuple(orientation) != (0, 0, 0, 1):
-                raise TaskError(
-                    f"{path.name} contains the pose of its body: position, orientation and fixed are for URDF"
-                )
-            load, options = (pybullet.loadMJCF, {"flags": flags}) if path.suffix == ".xml" else (pybullet.loadSDF, {})
-            ids = self._call_loader(path, load, **options)
-            if len(ids) != 1:
-                raise TaskError(f"{path} contains {len(ids)} bodies; split it into files of one body each")
-            body_id = int(ids[0])
-            fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0  # a base without mass
-        else:
-            body_id = self._call_loader(path, pybullet.loadURDF, position, orientation, useFixedBase=fixed, flags=flags)
-        body = self.bodies[name] = Body(self.client, self._substeps, name, body_id, path, fixed)
-        body.inertia_from_file = bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE)
-        speeds = body.joint_max_speed
-        if path.suffix == ".urdf" and fixed and speeds.size and (speeds > 0).all():
-            body.cap_joint_speed(float(speeds.max()))
-        return body
+        self._refuse("load")
 
-    def _call_loader(self, path: Path, load: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        call = functools.partial(load, str(path), *args, **kwargs, physicsClientId=self.client)
-        try:
-            return call()
-        except pybullet.error as error:
-            raise TaskError(f"PyBullet cannot load {path}: {read_complaint(call) or error}") from None
+    def add_height_field(
+        self, name: str, heights: Array, *, cell: float, color: Sequence[float] = (0.55, 0.6, 0.5)
+    ) -> Body:
+        """Add rough ground, centred at 0, 0: `heights` [m] above z = 0, such as `rough_heights`, `cell` [m] apart."""
+        self._refuse("add_height_field")
 
-    def _check_new(self, name: str) -> None:
-        if name in self.bodies:  # the cache of the first body would never be cleared
-            raise TaskError(f"a body {name!r} is already loaded; give each body its own name")
+    def connect_gear(
+        self, body: Body, driver: str, driven: str, *, ratio: float, max_force: float = 1e4, stiffness: float = 0.1
+    ) -> None:
+        """Gear two joints of a body: the position of `driven` is `ratio` times that of `driver`.
+
+        `stiffness` is the fraction of the position error that one physics step removes, in (0, 1].
+        """
+        self._refuse("connect_gear")
+
+    def connect_point(self, first: Attachment, second: Attachment, *, max_force: float = 1e4) -> Joined:
+        """Join a point of a link to a point of another; both links can rotate. A URDF cannot describe such a loop."""
+        self._refuse("connect_point")
+
+    def connect_fixed(self, first: Attachment, second: Attachment, *, max_force: float = 1e4) -> Joined:
+        """Join a frame of a link to a frame of another: both links move as one."""
+        self._refuse("connect_fixed")
 
     def body(self, name: str) -> Body:
         """Return a loaded body by its name."""
         check_name(name, self.bodies, "no body", TaskError, listed="Loaded")
         return self.bodies[name]
 
+    def _check_new(self, name: str) -> None:
+        if name in self.bodies:
+            raise TaskError(f"a body {name!r} is already loaded; give each body its own name")
+
     def step(self) -> None:
         """Simulate `control_dt` seconds."""
-        if self._pushes:
-            self._apply_pushes()
-        pybullet.stepSimulation(physicsClientId=self.client)
-        for body in self.bodies.values():
-            body._cache.clear()
+        raise NotImplementedError
 
     @property
     def deepest_contact(self) -> float:
         """The largest overlap of two bodies [m] at the end of the last step; 0 if none overlap."""
-        points = pybullet.getContactPoints(physicsClientId=self.client)
-        return max((-float(point[8]) for point in points if point[8] < 0.0), default=0.0)
+        raise NotImplementedError
 
     def save(self) -> None:
         """Save the current world for `restore`."""
-        self._saved = pybullet.saveState(physicsClientId=self.client)
-        self._built_gravity = None
-        for body in self.bodies.values():
-            body._save_nominal()
+        raise NotImplementedError
 
     def restore(self) -> None:
         """Restore the saved world."""
-        self._pushes.clear()
-        if self._built_gravity is not None:
-            pybullet.setGravity(*self._built_gravity, physicsClientId=self.client)
-            self._built_gravity = None
-        pybullet.restoreState(self._saved, physicsClientId=self.client)
-        # Without it, contacts of the last episode would act in the first step.
-        pybullet.performCollisionDetection(physicsClientId=self.client)
-        for body in self.bodies.values():
-            body._cache.clear()
-            body._restore_nominal()
+        raise NotImplementedError
+
+    def clear(self) -> None:
+        """Remove everything from the world."""
+        raise NotImplementedError
 
     def shift_gravity(self, change: float) -> None:
         """Set the vertical gravity to the built world's value plus `change` [m/s^2], until the next reset."""
-        if self._built_gravity is None:
-            engine = pybullet.getPhysicsEngineParameters(physicsClientId=self.client)
-            self._built_gravity = tuple(engine[f"gravityAcceleration{axis}"] for axis in "XYZ")
-        x, y, z = self._built_gravity
-        pybullet.setGravity(x, y, z + change, physicsClientId=self.client)
+        self._refuse("shift_gravity")
 
     def push(self, body: str, force: Sequence[float], duration_s: float, link: str | None = None) -> None:
         """Push a link, or the base, at its centre of mass with `force` [N, world frame] for `duration_s` [s].
 
         The duration is rounded to control steps, at least one. The push begins with the next step; a reset ends it.
         """
-        pushed = self.body(body)
-        index = -1 if link is None else pushed._part_index(link)
-        self._pushes.append(_Push(pushed, index, force, max(1, round(duration_s / self._settings["fixedTimeStep"]))))
-
-    def _apply_pushes(self) -> None:
-        # PyBullet drops a force after a step, but not in restoreState: forces are applied directly before the step.
-        for push in self._pushes:
-            centre = push.body._mass_centre(push.link)
-            pybullet.applyExternalForce(
-                push.body.id, push.link, push.force, centre, pybullet.WORLD_FRAME, physicsClientId=self.client
-            )
-            push.steps -= 1
-        self._pushes = [push for push in self._pushes if push.steps]
-
-    def clear(self) -> None:
-        """Remove everything from the world."""
-        pybullet.resetSimulation(physicsClientId=self.client)
-        self.bodies.clear()
-        self._pushes.clear()
-        self._saved = self._built_gravity = None
-        self._prepare()
-
-    def add_height_field(
-        self, name: str, heights: Array, *, cell: float, color: Sequence[float] = (0.55, 0.6, 0.5)
-    ) -> Body:
-        """Add rough ground, centred at 0, 0: `heights` [m] above z = 0, such as `rough_heights`, `cell` [m] apart."""
-        self._check_new(name)
-        rows, columns = heights.shape
-        shape = pybullet.createCollisionShape(
-            pybullet.GEOM_HEIGHTFIELD,
-            meshScale=(cell, cell, 1.0),
-            heightfieldTextureScaling=rows / 2,
-            heightfieldData=heights.T.ravel().tolist(),  # x goes fastest
-            numHeightfieldRows=rows,
-            numHeightfieldColumns=columns,
-            physicsClientId=self.client,
-        )
-        # Bullet puts the middle between the lowest and the highest point at the origin.
-        middle = (0.0, 0.0, float(heights.min() + heights.max()) / 2)
-        body_id = pybullet.createMultiBody(0, shape, basePosition=middle, physicsClientId=self.client)
-        pybullet.changeVisualShape(body_id, -1, rgbaColor=(*color, 1), physicsClientId=self.client)
-        body = Body(self.client, self._substeps, name, body_id, Path("height field"), True)
-        x, y = ((np.arange(count) - (count - 1) / 2) * cell for count in heights.shape)
-        body.terrain = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1)
-        self.bodies[name] = body
-        return body
+        self._refuse("push")
 
     def add_marker(self, position: Sequence[float], radius: float, color: Sequence[float]) -> int:
         """Add a visible sphere without collisions; return its id, for `move_marker`."""
-        sphere, client = pybullet.GEOM_SPHERE, self.client
-        shape = pybullet.createVisualShape(sphere, radius=radius, rgbaColor=color, physicsClientId=client)
-        return int(pybullet.createMultiBody(baseVisualShapeIndex=shape, basePosition=position, physicsClientId=client))
+        self._refuse("add_marker")
 
     def move_marker(self, marker: int, position: Sequence[float] | Array) -> None:
         """Move a marker to a world position [m]."""
-        pybullet.resetBasePositionAndOrientation(marker, position, (0, 0, 0, 1), physicsClientId=self.client)
+        self._refuse("move_marker")
 
     def render(
         self,
@@ -254,42 +143,11 @@ class Sim(Constraints):
         up: Sequence[float] = (0.0, 0.0, 1.0),
         field_of_view: float = 45.0,
     ) -> NDArray[np.uint8]:
-        """Draw the world on the CPU and return an RGB image of shape (height, width, 3).
+        """Draw the world without a display and return an RGB image of shape (height, width, 3).
 
-        The camera is at `eye` [m] and looks at `target` [m], with a vertical `field_of_view` [degrees]. It takes 20 to
-        40 ms at 320x240.
+        The camera is at `eye` [m] and looks at `target` [m], with a vertical `field_of_view` [degrees].
         """
-        view = pybullet.computeViewMatrix(eye, target, up)
-        projection = pybullet.computeProjectionMatrixFOV(field_of_view, width / height, 0.05, 10.0)
-        image = pybullet.getCameraImage(
-            width, height, view, projection, shadow=0, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=self.client
-        )
-        # PyBullet returns a flat tuple if it was built without numpy.
-        return np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[:, :, :3]
+        self._refuse("render")
 
     def close(self) -> None:
-        """End the client; a second call does nothing."""
-        if self.client >= 0 and pybullet.isConnected(physicsClientId=self.client):
-            pybullet.disconnect(physicsClientId=self.client)
-        self.client = -1
-
-
-def rough_heights(
-    seed: int, *, size: tuple[float, float], cell: float, roughness: float, flat_radius: float = 0.0
-) -> Array:
-    """Return heights [m] of shape (along x, along y): uniform in [0, roughness] at points `cell` [m] apart.
-
-    The ground covers `size` [m], centred at 0, 0. Within `flat_radius` [m] of the centre, where a robot starts, its
-    height is 0; from there the roughness rises to its full value at twice that radius. Equal seeds give equal ground.
-    Raises `TaskError` for a negative roughness, and for a size of less than two cells.
-    """
-    if roughness < 0:
-        raise TaskError(f"terrain: roughness {roughness:g} m is negative")
-    rows, columns = (round(length / cell) + 1 for length in size)
-    if min(rows, columns) < 3:
-        raise TaskError(f"terrain: {size[0]:g} m x {size[1]:g} m is less than two cells of {cell:g} m")
-    heights = np.random.default_rng(seed).uniform(0.0, roughness, (rows, columns))
-    x, y = ((np.arange(count) - (count - 1) / 2) * cell for count in heights.shape)
-    if flat_radius > 0:
-        heights *= np.clip((np.hypot(x[:, None], y[None, :]) - flat_radius) / flat_radius, 0.0, 1.0)
-    return heights
+        """End the simulation; a second call does nothing."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
 from rlctl.task.events import Event
-from rlctl.task.motors import Joints
+from rlctl.task.joints import Joints
 from rlctl.task.sim import Sim
 
 

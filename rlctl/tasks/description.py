@@ -107,7 +107,7 @@ def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> 
 
 
 def _describe_definition(env: TaskEnv) -> dict[str, Any]:
-    from rlctl.task.model_faults import find_model_faults
+    from rlctl.task.pybullet.model_faults import find_model_faults
 
     task = env.task
     return {

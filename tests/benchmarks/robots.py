@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import rlctl
-from rlctl.task.bullet import pybullet
+from rlctl.task.pybullet.library import pybullet
 from tests.benchmarks.row import Row
 
 STEPS = 500

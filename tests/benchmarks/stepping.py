@@ -16,7 +16,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.policy.players.player import Exploration
 from rlctl.rollout.messages import Play
 from rlctl.rollout.workers import Workers, available_cores
-from rlctl.task.bullet import pybullet, pybullet_data
+from rlctl.task.pybullet.library import pybullet, pybullet_data
 from tests.benchmarks.acting import make_policy
 from tests.benchmarks.row import Row, side_by_side
 

@@ -13,8 +13,8 @@ import numpy as np
 from gymnasium import spaces
 
 import rlctl
-from rlctl.task.bullet import pybullet as p
-from rlctl.task.bullet import pybullet_data
+from rlctl.task.pybullet.library import pybullet as p
+from rlctl.task.pybullet.library import pybullet_data
 from rlctl_manipulation import reach
 
 JOINTS, HAND = 7, 6  # number of joints; index of the hand's link

@@ -16,7 +16,7 @@ from rlctl.exporting.request import ExportRequest
 from rlctl.policy.c_policy import CPolicy
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy
-from rlctl.task.motors import Joints
+from rlctl.task.joints import Joints
 from tests.exporting.test_export_graph import random_observations
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler (cc, or $CC) on this machine")

@@ -6,7 +6,7 @@ import pytest
 from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
-from rlctl.task.model_faults import find_model_faults
+from rlctl.task.pybullet.model_faults import find_model_faults
 from rlctl_locomotion.biped import ANGLE, STANCE, Biped, Biped3D
 
 BIPEDS = {"biped": Biped, "biped-3d": Biped3D}
@@ -192,7 +192,7 @@ def test_nothing_is_wrong_with_the_models(env):
     assert find_model_faults(env.task.body) == []
     masses = 4.0 + 2 * (0.8 + 0.5 + 0.2)  # [kg]
     body = env.task.body
-    from rlctl.task.bullet import pybullet
+    from rlctl.task.pybullet.library import pybullet
 
     weights = [
         pybullet.getDynamicsInfo(body.id, index, physicsClientId=body.client)[0]

@@ -9,7 +9,7 @@ import pytest
 from rlctl.environments.spec import EnvSpec
 from rlctl.replaying.recorder import Rollout, make_drawable, play_episode
 from rlctl.run.episode import save_episode
-from rlctl.task.bullet import pybullet
+from rlctl.task.pybullet.library import pybullet
 from rlctl_manipulation.reach import JOINT_STEP
 
 ENVS = Path(__file__).with_name("envs.py")

@@ -13,7 +13,7 @@ from rlctl.replaying.mjcf import Shape, ShapeKind, read_shapes
 from rlctl.replaying.recorder import make_drawable, play_episode
 from rlctl.replaying.rrd import write_rrd
 from rlctl.replaying.scene import BodyMotion, SceneReader
-from rlctl.task.bullet import pybullet
+from rlctl.task.pybullet.library import pybullet
 from tests.replaying.conftest import play
 from tests.replaying.reading import column, entities, layout, static
 

@@ -14,7 +14,7 @@ from rlctl.replaying.replay import run_replay
 from rlctl.replaying.report import ReplayResult, show
 from rlctl.replaying.request import ReplayRequest
 from rlctl.run.episode import save_episode
-from rlctl.task.bullet import pybullet
+from rlctl.task.pybullet.library import pybullet
 from tests.replaying.conftest import play
 
 

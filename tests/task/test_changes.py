@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rlctl.task import Box, Event, Sim, Task, events
-from rlctl.task.bullet import pybullet
+from rlctl.task.pybullet.library import pybullet
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
 from rlctl_manipulation.reach import Reach

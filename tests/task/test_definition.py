@@ -10,7 +10,7 @@ from rlctl.errors import TaskError
 from rlctl.task import Box, Task
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import scale_mass
-from rlctl.task.motors import Joints
+from rlctl.task.joints import Joints
 
 
 class Whole(Task):

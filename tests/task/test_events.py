@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rlctl.task import Event, events
-from rlctl.task.bullet import pybullet
+from rlctl.task.pybullet.library import pybullet
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import Range
 from tests.task.tasks import Cart

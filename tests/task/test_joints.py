@@ -10,7 +10,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.exporting.actor import make_metadata
 from rlctl.policy.file import PolicyInfo
-from rlctl.task.motors import Joints
+from rlctl.task.joints import Joints
 
 
 def describe_task(task):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rlctl.task import Sim
-from rlctl.task.bullet import pybullet
-from rlctl.task.model_faults import find_model_faults
+from rlctl.task.pybullet.library import pybullet
+from rlctl.task.pybullet.model_faults import find_model_faults
 from tests.task import models
 
 BOX = '<collision><geometry><box size="0.3 0.04 0.04"/></geometry></collision>'

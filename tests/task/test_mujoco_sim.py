@@ -8,7 +8,7 @@ import pytest
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.task.env import TaskEnv
-from rlctl.task.mujoco_sim import MujocoSim, read_solref
+from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.sim import Sim
 from rlctl_manipulation.peg_insert import SCARA
 from tests.task.tasks import Cart

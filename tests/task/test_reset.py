@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rlctl.task.bullet import pybullet
+from rlctl.task.pybullet.library import pybullet
 from rlctl.task.env import TaskEnv
 from rlctl_manipulation.reach import Reach
 from tests.task.tasks import Cubes, Pile, PileAnew

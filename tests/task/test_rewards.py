@@ -74,7 +74,7 @@ def test_posture():
 
 
 def test_posture_agrees_with_pybullet():
-    from rlctl.task.bullet import pybullet
+    from rlctl.task.pybullet.library import pybullet
 
     for roll, pitch, yaw in np.random.default_rng(0).uniform(-1.5, 1.5, (20, 3)):
         orientation = np.array(pybullet.getQuaternionFromEuler([roll, pitch, yaw]))

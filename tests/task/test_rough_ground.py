@@ -5,7 +5,7 @@ import pytest
 
 from rlctl.errors import TaskError
 from rlctl.task import Sim, rough_heights
-from rlctl.task.bullet import pybullet
+from rlctl.task.pybullet.library import pybullet
 
 
 def test_heights_follow_from_the_seed():

@@ -6,7 +6,7 @@ import pytest
 import rlctl
 from rlctl.errors import RecipeError, TaskError
 from rlctl.task import Sim
-from rlctl.task.bullet import pybullet
+from rlctl.task.pybullet.library import pybullet
 from rlctl.task.env import TaskEnv
 from rlctl_manipulation import reach
 from rlctl_manipulation.reach import Reach

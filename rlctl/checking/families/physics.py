@@ -76,7 +76,7 @@ def _model_faults(env: Any) -> Iterator[ChildMessage]:
     if not is_task(env):
         yield Skipped("RL809", "only the model files of tasks of rlctl are known", applies=False)
         return
-    from rlctl.task.model_faults import find_model_faults
+    from rlctl.task.pybullet.model_faults import find_model_faults
 
     for body in env.unwrapped.sim.bodies.values():
         for fault in find_model_faults(body):

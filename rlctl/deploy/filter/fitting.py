@@ -13,7 +13,7 @@ from rlctl.deploy.filter.limits import JointLimits, Limits
 from rlctl.deploy.filter.observation import ObservationLayout
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RecipeError, UsageError, check_name
-from rlctl.task.motors import Joints
+from rlctl.task.joints import Joints
 
 Array = NDArray[np.float64]
 

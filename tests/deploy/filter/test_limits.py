@@ -6,7 +6,7 @@ from gymnasium import spaces
 from rlctl.deploy import SafetyFilter, read_limits
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.errors import ArtifactError, RecipeError
-from rlctl.task.motors import Joints
+from rlctl.task.joints import Joints
 from tests.deploy.conftest import make_arm, observe_at
 
 GOOD = """

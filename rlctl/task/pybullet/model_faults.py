@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.task.body import Body
-from rlctl.task.bullet import pybullet
+from rlctl.task.pybullet.library import pybullet
 
 _ROUNDING = 1.01  # of values written with a few digits
 _NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"

@@ -5,8 +5,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 from rlctl.errors import TaskError, check_name
-from rlctl.task.bullet import pybullet
-from rlctl.task.motors import Motors
+from rlctl.task.pybullet.library import pybullet
+from rlctl.task.pybullet.motors import Motors
 
 _RAIL = 100.0  # [m]
 _RIGID = 1e12  # [N/m]
@@ -19,13 +19,8 @@ class _Dynamics(NamedTuple):
 
 
 class Properties(Motors):
-    """The part of `Body` whose values events change; a reset restores the values of the built world.
+    """The part of `BulletBody` whose values events change; a reset restores the values of the built world."""
 
-    `links` are names, which may include `base_name`, and `joints` are names; by default all are changed.
-    """
-
-    base_name: str
-    fixed: bool
     _links: dict[str, int]
 
     def __init__(self) -> None:
@@ -96,11 +91,9 @@ class Properties(Motors):
         return [self._part_index(link) for link in links] or list(range(-1, len(self._links)))
 
     def total_mass(self) -> float:
-        """Return the mass of all links as the world was built [kg]."""
         return sum(dynamics.mass for dynamics in self._dynamics.values())
 
     def find_trunk(self) -> str | None:
-        """Return the link that moves through the world: a free base, or a link on a sliding joint longer than 100 m."""
         if not self.fixed:
             return self.base_name
         if not self._links:
@@ -114,7 +107,6 @@ class Properties(Motors):
         return next((name for name, index in self._links.items() if index in drawn), None)
 
     def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:
-        """Set mass and inertia to `factor` times the built world's values, until the next reset."""
         chosen, nominal = self._select_links(links), self._dynamics
         self._changed.add("_dynamics")
         for link in chosen:
@@ -122,18 +114,12 @@ class Properties(Motors):
             self._change(link, mass=mass * factor, localInertiaDiagonal=[element * factor for element in inertia])
 
     def set_friction(self, friction: float, links: Sequence[str] = ()) -> None:
-        """Set the lateral friction, until the next reset."""
         chosen, _ = self._select_links(links), self._dynamics
         self._changed.add("_dynamics")
         for link in chosen:
             self._change(link, lateralFriction=friction)
 
     def set_contact_stiffness(self, stiffness: float, links: Sequence[str] = ()) -> None:
-        """Set the stiffness of a contact point of the links [N/m], until the next reset.
-
-        Contacts are rigid by default. After the first call they stay springs, very stiff ones after a reset, because
-        PyBullet cannot make them rigid again.
-        """
         self._changed.add("_contacts")
         engine = pybullet.getPhysicsEngineParameters(physicsClientId=self.client)
         # With this damping a physics step removes a fifth of the overlap, as in rigid contacts.
@@ -142,17 +128,12 @@ class Properties(Motors):
             self._change(link, contactStiffness=stiffness, contactDamping=damping)
 
     def scale_joint_damping(self, factor: float, joints: Sequence[str] = ()) -> None:
-        """Set the joints' damping to `factor` times the built world's values, until the next reset.
-
-        Raises `TaskError` if all of these are 0, because no factor can change that.
-        """
         nominal, chosen = self._damping, self.find_joints(joints)
         if not any(nominal[index] for index in chosen):
             raise TaskError(f"{self.file.name}: these joints have no damping to scale; use set_joint_damping")
         self._set_damping({index: factor * nominal[index] for index in chosen})
 
     def set_joint_damping(self, damping: float, joints: Sequence[str] = ()) -> None:
-        """Set the joints' damping [N m s/rad or N s/m], until the next reset."""
         self._set_damping(dict.fromkeys(self.find_joints(joints), damping))
 
     def _set_damping(self, values: dict[int, float]) -> None:
@@ -162,7 +143,6 @@ class Properties(Motors):
             self._change(self.joint_indices[index], jointDamping=damping)
 
     def set_color(self, rgb: Sequence[float], links: Sequence[str] = ()) -> None:
-        """Paint the links, until the next reset: red, green, blue in [0, 1]; their opacity does not change."""
         chosen, nominal = self._select_links(links), self._colors
         self._changed.add("_colors")
         for (link, shape), color in nominal.items():

@@ -1,48 +1,16 @@
-"""Motors of a body's joints: position, velocity and torque control, limits; and joints as plain data."""
+"""Motors of a body's joints in PyBullet: position, velocity and torque control, and their limits."""
 
-import dataclasses
 import math
-from collections.abc import Collection, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, check_name
-from rlctl.task.bullet import pybullet
+from rlctl.errors import TaskError
+from rlctl.task.body import Array, Body, Drives
+from rlctl.task.pybullet.library import pybullet
 
-Array = NDArray[np.float64]
 _NUMBER = (int, float, np.number)
-
-
-@dataclasses.dataclass(frozen=True)
-class Joints:
-    """Joints in the order of the action's elements; every other field has one element per joint, or is empty.
-
-    Units: [rad] and [N m] for rotating joints, [m] and [N] for sliding joints.
-    """
-
-    names: Sequence[str]
-    default_positions: Sequence[float] = ()  # start positions; with `action_scale` also the target of action 0
-    action_scale: Sequence[float] = ()  # only if the target of an action is `default_positions + action_scale * action`
-    stiffness: Sequence[float] = ()  # of the position controller that follows the action [N m/rad]
-    damping: Sequence[float] = ()  # of the same controller [N m s/rad]
-    low: Sequence[float] = ()  # lower position limits
-    high: Sequence[float] = ()
-    max_speed: Sequence[float] = ()  # [rad/s or m/s]
-    max_torque: Sequence[float] = ()
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self)[1:]:
-            values = [float(value) for value in getattr(self, field.name)]
-            if values and (len(values) != len(self.names) or not all(map(math.isfinite, values))):
-                raise TaskError(
-                    f"joints: {field.name} must have {len(self.names)} finite values, one per joint, but is "
-                    f"{list(values)}; leave it out if a value is unknown"
-                )
-            object.__setattr__(self, field.name, tuple(values))
-        object.__setattr__(self, "names", tuple(self.names))
 
 
 class _Plan(NamedTuple):
@@ -50,27 +18,17 @@ class _Plan(NamedTuple):
     limits: tuple[object, ...]
     joints: list[int]
     impulses: list[float]  # force of a substep [N m or N]
-    gains: list[float]
+    gains: dict[str, list[float]]
 
 
-class Motors:
-    """The part of `Body` that drives its joints.
-
-    `joints` are names, by default all in `joint_names` order. Arrays have one element per named joint; a limit may
-    also be one number for all. Units: [N m] and [rad/s] for rotating joints, [N] and [m/s] for sliding joints.
-    `MujocoBody` overrides `_command` and `_limit_speeds`, which call PyBullet.
-    """
+class Motors(Body):
+    """The part of `BulletBody` that drives its joints."""
 
     client: int
     id: int
-    file: Path
-    joint_names: list[str]
     joint_indices: list[int]
-    joint_low: Array
-    joint_high: Array
-    joint_max_force: Array
-    joint_max_speed: Array
     _substeps: int
+    _physics_dt: float  # [s], of a substep
 
     def __init__(self) -> None:
         self.motor_strength: Array | None = None
@@ -79,6 +37,8 @@ class Motors:
         self._plans: dict[tuple[str, ...], _Plan] = {}
         self._commanded: list[float] | None = None  # by `set_torques`, of all joints; NaN: the motor's
         self._chosen: set[int] = set()  # joints whose motors the task has set or disabled
+        self.drives: Drives | None = None
+        self._drive_gains: Array = np.zeros((2, 0))  # of position and velocity, shape (2, joints)
 
     def _save_nominal(self) -> None:
         self._built_strength = self.motor_strength
@@ -86,15 +46,6 @@ class Motors:
     def _restore_nominal(self) -> None:
         self.motor_strength = self._built_strength
         self._commanded = None
-
-    def find_joints(self, joints: Collection[str] = ()) -> list[int]:
-        """Return the indices of joints, or of all, in joint arrays; raises `TaskError` for a name that is not there."""
-        for joint in joints:
-            if joint not in self.joint_names:  # checked first because tasks may name joints at every step
-                check_name(joint, self.joint_names, f"{self.file.name} has no joint", TaskError)
-        if not self.joint_names:
-            raise TaskError(f"{self.file.name} has no joints")
-        return [self.joint_names.index(joint) for joint in joints] or list(range(len(self.joint_names)))
 
     def drive_to(
         self,
@@ -105,10 +56,6 @@ class Motors:
         gain: float = 0.1,
         joints: Sequence[str] = (),
     ) -> None:
-        """Set position targets [rad or m]; the default limits of speed and force are those of the model file.
-
-        `gain` is the fraction of the position error that one physics step removes, in (0, 1].
-        """
         # Tuples, because two arrays cannot be compared by `!=`.
         speeds, forces = (
             limit if limit is None or isinstance(limit, _NUMBER) else tuple(limit) for limit in (max_speed, max_force)
@@ -120,9 +67,7 @@ class Motors:
         targets = self._read_values("positions", positions, len(plan.joints))
         self._forget_torques(plan.joints)
         impulses = self._apply_strength(plan.impulses, plan.joints)
-        self._command(
-            plan.joints, "POSITION_CONTROL", targetPositions=targets, forces=impulses, positionGains=plan.gains
-        )
+        self._command(plan.joints, "POSITION_CONTROL", targetPositions=targets, forces=impulses, **plan.gains)
 
     def _plan_motors(
         self,
@@ -132,10 +77,40 @@ class Motors:
         gain: float,
     ) -> _Plan:
         chosen = self.find_joints(joints)
-        given = self.joint_max_speed[chosen] if max_speed is None else max_speed
+        given = (self.joint_max_speed[chosen] if self.drives is None else 0.0) if max_speed is None else max_speed
         self._limit_speeds(chosen, self._read_limits("max_speed", given, len(chosen)))
         impulses = self._motor_impulses(chosen, max_force)
-        return _Plan((max_speed, max_force, gain), chosen, impulses, [gain] * len(chosen))
+        gains = {"positionGains": [gain] * len(chosen)}
+        if self.drives is not None:
+            position, velocity = self._drive_gains[:, chosen].tolist()
+            gains = {"positionGains": position, "velocityGains": velocity}
+        return _Plan((max_speed, max_force, gain), chosen, impulses, gains)
+
+    def set_drives(
+        self,
+        stiffness: float | Sequence[float] | Array,
+        damping: float | Sequence[float] | Array,
+        *,
+        armature: float | Sequence[float] | Array = 0.0,
+    ) -> None:
+        self.drives = Drives(self._spread("stiffness", stiffness), self._spread("damping", damping))
+        self._plans.clear()
+        # PyBullet's motor sets the velocity after a physics step to (1 - b) * velocity + a * error / dt. An implicit
+        # spring and damper on an inertia m gives (m * velocity + dt * stiffness * error) / n with
+        # n = m + dt * damping + dt^2 * stiffness. So a = dt^2 * stiffness / n and b = 1 - m / n, for the inertia m that
+        # the joint moves in the pose of now.
+        inertia = self._joint_inertia() + self._spread("armature", armature)
+        spring = self._physics_dt**2 * self.drives.stiffness
+        total = inertia + self._physics_dt * self.drives.damping + spring
+        self._drive_gains = np.stack([spring / total, 1.0 - inertia / total])
+
+    def _joint_inertia(self) -> Array:
+        """Return the inertia that a torque on each joint moves [kg m^2 or kg], shape (joints,)."""
+        positions = self.joint_positions.tolist()
+        matrix = np.array(pybullet.calculateMassMatrix(self.id, positions, physicsClientId=self.client))
+        free = len(matrix) - len(positions)  # the velocities of a free base come first
+        inertia: Array = 1.0 / np.diag(np.linalg.inv(matrix))[free:]
+        return inertia
 
     def _limit_speeds(self, joints: list[int], speeds: list[float]) -> None:
         # Only the call for one joint takes a speed; the motor keeps it when the call for all sets the targets.
@@ -152,10 +127,6 @@ class Motors:
     def drive_at(
         self, velocities: Array, *, max_force: float | Sequence[float] | None = None, joints: Sequence[str] = ()
     ) -> None:
-        """Set velocity targets [rad/s or m/s]; the default limit of the force is that of the model file.
-
-        A target of 0 brakes the joint with at most that force.
-        """
         chosen = self.find_joints(joints)
         targets = self._read_values("velocities", velocities, len(chosen))
         self._forget_torques(chosen)
@@ -164,7 +135,7 @@ class Motors:
 
     def _motor_impulses(self, joints: list[int], max_force: float | Sequence[float] | None) -> list[float]:
         # PyBullet computes a motor's impulse for the time of a whole step, and applies it in every substep.
-        forces = self.joint_max_force[joints] if max_force is None else max_force
+        forces = self._find_force_limits(joints, None).tolist() if max_force is None else max_force
         return [force / self._substeps for force in self._read_limits("max_force", forces, len(joints))]
 
     def _apply_strength(self, forces: list[float], joints: list[int]) -> list[float]:
@@ -190,18 +161,12 @@ class Motors:
                 self._commanded[joint] = math.nan
 
     def disable_motors(self, joints: Sequence[str] = ()) -> None:
-        """Switch off the motors that PyBullet gives every joint, so that only `set_torques` moves the joints."""
         chosen = self.find_joints(joints)
         self._chosen.update(chosen)
         gains = [0.1] * len(chosen)
         self._command(chosen, "POSITION_CONTROL", forces=[0.0] * len(chosen), positionGains=gains, velocityGains=gains)
 
     def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
-        """Apply `torques` [N m or N] to the joints in all substeps of the next step.
-
-        Disable the motors of these joints first, with `disable_motors`. Raises `TaskError` for a joint whose default
-        motor still holds it in place.
-        """
         chosen = self.find_joints(joints)
         given = self._apply_strength(self._read_values("torques", torques, len(chosen)), chosen)
         if not self._chosen.issuperset(chosen):
@@ -218,7 +183,6 @@ class Motors:
         self._command(chosen, "TORQUE_CONTROL", forces=given)
 
     def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
-        """Scale the force of the joints' motors by `factor`, until the next reset."""
         built = np.ones(len(self.joint_names)) if self._built_strength is None else self._built_strength
         strength = built.copy() if self.motor_strength is None else self.motor_strength.copy()
         indices = self.find_joints(joints)
@@ -226,33 +190,4 @@ class Motors:
         self.motor_strength = strength
 
     def cap_joint_speed(self, speed: float) -> None:
-        """Limit the speed of all joints to `speed` [rad/s or m/s], even under external forces.
-
-        PyBullet has one such limit per body, which also applies to the base of a free body. `Sim.load` sets it for a
-        fixed body to the highest speed limit of the joints in the URDF.
-        """
         pybullet.changeDynamics(self.id, -1, maxJointVelocity=speed, physicsClientId=self.client)
-
-    def describe_joints(
-        self, joints: Sequence[str], *, default_positions: Sequence[float] = (), action_scale: Sequence[float] = ()
-    ) -> Joints:
-        """Return joints with the limits of the model file, for `Task.describe_joints`.
-
-        If a limit is missing, 0 or infinite for one of the joints, it is left out for all of them.
-        """
-        chosen = self.find_joints(joints)
-        low, high = self.joint_low[chosen], self.joint_high[chosen]
-        speed, torque = (
-            limits.tolist() if (limits > 0).all() and np.isfinite(limits).all() else ()
-            for limits in (self.joint_max_speed[chosen], self.joint_max_force[chosen])
-        )
-        bounded = bool((low < high).all() and np.isfinite([low, high]).all())
-        return Joints(
-            names=[self.joint_names[joint] for joint in chosen],
-            default_positions=default_positions,
-            action_scale=action_scale,
-            low=low.tolist() if bounded else (),
-            high=high.tolist() if bounded else (),
-            max_speed=speed,
-            max_torque=torque,
-        )

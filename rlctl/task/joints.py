@@ -1,0 +1,36 @@
+"""`Joints`: the joints that an action moves, as plain data for controllers of real robots."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+from rlctl.errors import TaskError
+
+
+@dataclasses.dataclass(frozen=True)
+class Joints:
+    """Joints in the order of the action's elements; every other field has one element per joint, or is empty.
+
+    Units: [rad] and [N m] for rotating joints, [m] and [N] for sliding joints.
+    """
+
+    names: Sequence[str]
+    default_positions: Sequence[float] = ()  # start positions; with `action_scale` also the target of action 0
+    action_scale: Sequence[float] = ()  # only if the target of an action is `default_positions + action_scale * action`
+    stiffness: Sequence[float] = ()  # of the position controller that follows the action [N m/rad]
+    damping: Sequence[float] = ()  # of the same controller [N m s/rad]
+    low: Sequence[float] = ()  # lower position limits
+    high: Sequence[float] = ()
+    max_speed: Sequence[float] = ()  # [rad/s or m/s]
+    max_torque: Sequence[float] = ()
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self)[1:]:
+            values = [float(value) for value in getattr(self, field.name)]
+            if values and (len(values) != len(self.names) or not all(map(math.isfinite, values))):
+                raise TaskError(
+                    f"joints: {field.name} must have {len(self.names)} finite values, one per joint, but is "
+                    f"{list(values)}; leave it out if a value is unknown"
+                )
+            object.__setattr__(self, field.name, tuple(values))
+        object.__setattr__(self, "names", tuple(self.names))

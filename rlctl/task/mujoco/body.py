@@ -1,0 +1,350 @@
+"""A body of a task's world in MuJoCo."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError, check_name
+from rlctl.task.body import Contacts, MassState, Vector
+from rlctl.task.mujoco.files import ModelFile
+from rlctl.task.mujoco.inverse_kinematics import solve
+from rlctl.task.mujoco.motors import MujocoMotors
+from rlctl.task.mujoco.world import Array, Rows
+from rlctl.task.rotations import rotate
+
+if TYPE_CHECKING:
+    from rlctl.task.mujoco.sim import MujocoSim
+
+XYZW, WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
+"""Indices that reorder MuJoCo's quaternions (w, x, y, z) for rlctl, and back."""
+_RAIL = 100.0  # [m]
+_FAR = 100.0  # [m]
+
+
+class Parts:
+    """The names of a body's links and joints and their numbers in the compiled model, the same for all worlds."""
+
+    def __init__(self, name: str, file: ModelFile, fixed: bool, child: Any, colliding: Sequence[str]) -> None:
+        self.name, self.file, self.fixed = name, file, fixed
+        self.base_name: str = child.worldbody.first_body().name
+        self.terrain: Array | None = None
+        self.own_actuators: list[str] = []
+        """Names of the actuators that an MJCF file contains."""
+        self.colliding = set(colliding)
+        self.geom_links: list[str] = [geom.parent.name for geom in child.geoms]
+        """Name of the link of each geom."""
+        self.moving: set[str] = set()
+        """Links that are not fixed to the world."""
+        self.ancestors: dict[str, set[str]] = {}
+        for link in child.bodies[1:]:  # a parent comes before its children
+            parent = link.parent.name
+            self.ancestors[link.name] = {parent, *self.ancestors.get(parent, set())}
+            if not fixed or link.joints or parent in self.moving:
+                self.moving.add(link.name)
+        hinges = [joint for joint in child.joints if int(joint.type) >= 2]  # sliding and rotating
+        self.joint_names: list[str] = [joint.name for joint in hinges]
+        self.built_friction: dict[str, float] = {}
+        """Lateral friction of links that a task has set in `build`."""
+        self.links: dict[str, int] = {}
+        speeds = [file.max_speed.get(joint, 0.0) for joint in self.joint_names]
+        self.speed_cap = max(speeds) if fixed and speeds and min(speeds) > 0 else math.inf
+        self.drives: tuple[Array, Array, Array] | None = None
+        self.inertia: Array | None = None
+
+    def list_geoms(self) -> list[tuple[int, str]]:
+        """Return number and link of the geoms that collide."""
+        return [(number, link) for number, link in enumerate(self.geom_links) if link in self.colliding]
+
+    def bind(self, model: Any) -> None:
+        """Look up the numbers in a compiled model."""
+        prefix = f"{self.name}/"
+        bodies = {model.body(body).name: body for body in range(model.nbody)}
+        self.links = {name.removeprefix(prefix): body for name, body in bodies.items() if name.startswith(prefix)}
+        self.link_names = {body: name for name, body in self.links.items()}
+        joints = [model.joint(f"{prefix}{joint}").id for joint in self.joint_names]
+        self.positions, self.velocities = _slice(model.jnt_qposadr[joints]), _slice(model.jnt_dofadr[joints])
+        self.motors = _slice([model.actuator(f"{prefix}motor {joint}").id for joint in self.joint_names])
+        limited, limits = model.jnt_limited[joints][:, None], model.jnt_range[joints]
+        self.low, self.high = np.where(limited, limits, (-np.inf, np.inf)).T
+        self.joints = joints
+        self.geoms = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] in self.link_names]
+        self.free: tuple[int, int] | None = None  # where the state of a free base begins, in qpos and qvel
+        for joint in range(model.njnt):
+            if model.jnt_type[joint] == 0 and model.jnt_bodyid[joint] == self.links[self.base_name]:
+                self.free = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+
+
+def _slice(numbers: Any) -> Any:
+    """Return neighbouring numbers as a slice, which is faster than an array and gives views."""
+    numbers = np.asarray(numbers, int)
+    if len(numbers) and (np.diff(numbers) == 1).all():
+        return slice(int(numbers[0]), int(numbers[-1]) + 1)
+    return numbers
+
+
+class MujocoBody(MujocoMotors):
+    """A body in MuJoCo: a view of the arrays of its world, or worlds."""
+
+    engine = "MuJoCo"
+
+    def __init__(self, sim: MujocoSim, parts: Parts) -> None:
+        super().__init__(sim, parts)
+        self.name, self.file, self.fixed = parts.name, parts.file.path, parts.fixed
+        self.base_name, self.terrain = parts.base_name, parts.terrain
+        self.joint_names = parts.joint_names
+        self.joint_max_force, self.joint_max_speed = (
+            np.array([limits.get(joint, 0.0) for joint in parts.joint_names])
+            for limits in (parts.file.max_force, parts.file.max_speed)
+        )
+        if parts.links:
+            self.bind()
+
+    def bind(self) -> None:
+        """Take the numbers of a newly compiled model."""
+        parts = self.parts
+        self.joint_low, self.joint_high = parts.low, parts.high
+        self.link_names = [link for link in parts.links if link != self.base_name]
+        self._base = parts.links[self.base_name]
+        self._positions, self._velocities = parts.positions, parts.velocities
+        self.bind_motors()
+
+    def find_link(self, link: str) -> int:
+        """Return MuJoCo's number of a link or the base; raises `TaskError` for an unknown name."""
+        if link not in self.parts.links:  # checked first because links are read at every step
+            check_name(link, self.parts.links, f"{self.file.name} has no link", TaskError)
+        return self.parts.links[link]
+
+    def _find_links(self, links: Sequence[str]) -> list[int]:
+        return [self.find_link(link) for link in links] or list(self.parts.link_names)
+
+    def find_trunk(self) -> str | None:
+        if not self.fixed:
+            return self.base_name
+        model = self._sim.model
+        if not self.parts.joints:
+            return None
+        first = self.parts.joints[0]
+        endless = not (model.jnt_limited[first] and np.ptp(model.jnt_range[first]) < _RAIL)
+        if int(model.jnt_type[first]) != 2 or not endless:
+            return None
+        return next((link for link in self.link_names if link in self.parts.geom_links), None)
+
+    @property
+    def joint_positions(self) -> Array:
+        positions: Array = self._fields.data("qpos")[..., self._positions].copy()
+        return positions
+
+    @property
+    def joint_velocities(self) -> Array:
+        velocities: Array = self._fields.data("qvel")[..., self._velocities].copy()
+        return velocities
+
+    def link_position(self, link: str) -> Array:
+        position: Array = self._fields.derived("xpos")[..., self.find_link(link), :].copy()
+        return position
+
+    def link_orientation(self, link: str) -> Array:
+        orientation: Array = self._fields.derived("xquat")[..., self.find_link(link), XYZW]
+        return orientation
+
+    @property
+    def base_position(self) -> Array:
+        position: Array = self._fields.derived("xipos")[..., self._base, :].copy()
+        return position
+
+    @property
+    def base_orientation(self) -> Array:
+        # MuJoCo's own inertial frame may have its axes in another order than the file.
+        return self.link_orientation(self.base_name)
+
+    @property
+    def base_velocity(self) -> Array:
+        if self.parts.free is None:
+            return np.zeros((*self._fields.shape, 3))
+        start = self.parts.free[1]
+        velocity = self._fields.data("qvel")[..., start : start + 3]
+        offset = rotate(self.base_orientation, self._fields.model("body_ipos")[..., self._base, :])
+        return velocity + np.cross(self.base_angular_velocity, offset)
+
+    @property
+    def base_angular_velocity(self) -> Array:
+        if self.parts.free is None:
+            return np.zeros((*self._fields.shape, 3))
+        start = self.parts.free[1] + 3
+        # MuJoCo has it in the frame of the base.
+        return rotate(self.base_orientation, self._fields.data("qvel")[..., start : start + 3])
+
+    def mass_state(self, link: str) -> MassState:
+        sim, number, velocity = self._single("mass_state"), self.find_link(link), np.zeros(6)
+        sim.world.refresh()
+        mujoco, data = sim.mujoco, sim.data
+        mujoco.mj_objectVelocity(sim.model, data, mujoco.mjtObj.mjOBJ_BODY, number, velocity, 0)
+        frame = data.xquat[number][XYZW]
+        return MassState(*(tuple(part.tolist()) for part in (data.xipos[number], frame, velocity[3:], velocity[:3])))
+
+    def mass_positions(self, links: Sequence[str]) -> list[Vector]:
+        sim = self._single("mass_positions")
+        sim.world.refresh()
+        positions = sim.data.xipos[[self.find_link(link) for link in links]]
+        return [(x, y, z) for x, y, z in positions.tolist()]
+
+    def _single(self, method: str) -> MujocoSim:
+        """Return the simulation; raises `UsageError` if it has many worlds."""
+        if self._sim.world.count not in (None, 1):
+            self._refuse(f"{method} of many worlds")
+        return self._sim
+
+    def add_force_sensor(self, joint: str) -> None:
+        moved = self.parts.file.moved_by
+        check_name(joint, moved, f"{self.file.name} has no joint", TaskError)
+        self._sim.add_force_sensor(f"{self.name}/{joint}", f"{self.name}/{moved[joint]}")
+
+    def joint_reaction(self, joint: str) -> Array:
+        try:
+            start = int(self._sim.model.sensor(f"{self.name}/{joint}").adr[0])
+        except KeyError:
+            raise TaskError(f"joint {joint!r} has no force sensor: call add_force_sensor({joint!r}) in build") from None
+        reaction: Array = self._fields.data("sensordata")[..., start : start + 6].copy()
+        return reaction
+
+    def links_touching(self, other: Any) -> set[str]:
+        return set(self._list_contacts("links_touching", other)[0])
+
+    def contacts_with(self, other: Any) -> Contacts:
+        links, contacts = self._list_contacts("contacts_with", other)
+        sim, force = self._sim, np.zeros(6)
+        forces = []
+        for contact in contacts:
+            sim.mujoco.mj_contactForce(sim.model, sim.data, contact, force)
+            forces.append(float(force[0]))
+        return Contacts(links, np.array(forces), sim.data.contact.dist[contacts].copy())
+
+    def _list_contacts(self, method: str, other: Any) -> tuple[list[str], list[int]]:
+        """Return the own links of contacts with another body, or with itself, and the numbers of the contacts."""
+        sim, own, others = self._single(method), self.parts.link_names, other.parts.link_names
+        sim.world.refresh()
+        links, contacts = [], []
+        pairs = sim.model.geom_bodyid[sim.data.contact.geom].tolist() if sim.data.ncon else ()
+        for contact, (first, second) in enumerate(pairs):
+            for one, two in ((first, second), (second, first)):
+                if one in own and two in others:
+                    links.append(own[one])
+                    contacts.append(contact)
+        return links, contacts
+
+    def distance_to(self, other: Any, link: str | None = None) -> float:
+        sim = self._single("distance_to")
+        sim.world.refresh()
+        owners = {self.find_link(link)} if link is not None else set(self.parts.link_names)
+        own = [geom for geom in self.parts.geoms if int(sim.model.geom_bodyid[geom]) in owners]
+        ends = np.zeros(6)
+        distances = [
+            sim.mujoco.mj_geomDistance(sim.model, sim.data, one, two, _FAR, ends)
+            for one in own
+            for two in other.parts.geoms
+        ]
+        nearest = min(distances, default=_FAR)
+        return math.inf if nearest >= _FAR else float(nearest)
+
+    def solve_inverse_kinematics(
+        self, link: str, position: Sequence[float] | Array, orientation: Sequence[float] | Array | None = None
+    ) -> Array:
+        sim = self._single("solve_inverse_kinematics")
+        turn = None if orientation is None else np.asarray(orientation, float)[WXYZ]
+        return solve(sim, self.parts, self.find_link(link), np.asarray(position, float), turn)
+
+    def set_base(self, position: Any, orientation: Any = (0.0, 0.0, 0.0, 1.0), *, worlds: Rows = None) -> None:
+        rows: Any = ... if worlds is None else worlds
+        turn = np.asarray(orientation, float)
+        offset = rotate(turn, self._fields.model("body_ipos")[rows][..., self._base, :])
+        origin = np.asarray(position, float) - offset
+        if self.parts.free is None:
+            self._fields.model("body_pos")[rows, self._base, :] = origin
+            self._fields.model("body_quat")[rows, self._base, :] = turn[..., WXYZ]
+        else:
+            start, velocity = self.parts.free
+            self._fields.data("qpos")[rows, start : start + 3] = origin
+            self._fields.data("qpos")[rows, start + 3 : start + 7] = turn[..., WXYZ]
+            self._fields.data("qvel")[rows, velocity : velocity + 6] = 0.0
+        self._fields.touch(worlds)
+
+    def add_velocity(self, velocity: Any) -> None:
+        if self.parts.free is not None:
+            start = self.parts.free[1]
+            self._fields.data("qvel")[..., start : start + 3] += velocity
+            self._fields.touch()
+
+    def set_joints(self, positions: Array, velocities: Array | None = None, *, worlds: Rows = None) -> None:
+        rows: Any = ... if worlds is None else worlds
+        places, speeds = self._fields.data("qpos"), self._fields.data("qvel")
+        shape = places[rows][..., self._positions].shape
+        self._check("positions", positions, shape)
+        if isinstance(self._positions, slice) or worlds is None:
+            places[rows, self._positions] = positions
+            speeds[rows, self._velocities] = 0.0 if velocities is None else velocities
+        else:
+            places[rows[:, None], self._positions] = positions
+            speeds[rows[:, None], self._velocities] = 0.0 if velocities is None else velocities
+        self._fields.touch(worlds)
+
+    def _check(self, name: str, values: Any, shape: tuple[int, ...]) -> None:
+        if np.shape(values) != shape:
+            raise TaskError(
+                f"{self.file.name}: {name} of shape {np.shape(values)}, expected {shape}; joint_names of the body has "
+                "all joints"
+            )
+
+    def set_friction(self, friction: float, links: Sequence[str] = ()) -> None:
+        numbers = self._find_links(links)
+        self._fields.model("friction")[..., numbers] = friction
+        if self._sim.world.batch is None and self._sim.world._saved is None:
+            self.parts.built_friction |= {self.parts.link_names[number]: friction for number in numbers}
+        self._sim.spread_friction()
+
+    def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:
+        numbers, world = self._find_links(links), self._sim.world
+        for name in ("body_mass", "body_inertia"):
+            array = self._fields.model(name)
+            array[..., numbers] if name == "body_mass" else array[..., numbers, :]
+            if name == "body_mass":
+                array[..., numbers] = factor * world.built(name)[numbers]
+            else:
+                array[..., numbers, :] = factor * world.built(name)[numbers]
+        self._fields.touch()
+
+    def total_mass(self) -> float:
+        return float(self._sim.world.built("body_mass")[list(self.parts.link_names)].sum())
+
+    def set_contact_stiffness(self, stiffness: float, links: Sequence[str] = ()) -> None:
+        # MuJoCo's constraint pushes with k * depth / (sum of the inverse masses that the contact moves).
+        sim, numbers = self._sim, self._find_links(links)
+        chosen = np.isin(sim._pair_links, numbers).any(axis=1)
+        inverse_mass = sim.model.body_invweight0[sim._pair_links, 0].sum(axis=1)[chosen]
+        spring = stiffness * inverse_mass
+        self._fields.model("pair_solref")[..., chosen, :] = np.stack([-spring, -2.0 * np.sqrt(spring)], axis=-1)
+        self._fields.touch()
+
+    def scale_joint_damping(self, factor: float, joints: Sequence[str] = ()) -> None:
+        chosen, nominal = self._dofs(joints), self._sim.world.built("dof_damping")
+        if not nominal[chosen].any():
+            raise TaskError(f"{self.file.name}: these joints have no damping to scale; use set_joint_damping")
+        self._fields.model("dof_damping")[..., chosen] = factor * nominal[chosen]
+        self._fields.touch()
+
+    def set_joint_damping(self, damping: float, joints: Sequence[str] = ()) -> None:
+        self._fields.model("dof_damping")[..., self._dofs(joints)] = damping
+        self._fields.touch()
+
+    def _dofs(self, joints: Sequence[str]) -> NDArray[np.int64]:
+        numbers = np.arange(self._sim.model.nv)[self._velocities]
+        return numbers[self.find_joints(joints)]
+
+    def set_color(self, rgb: Sequence[float], links: Sequence[str] = ()) -> None:
+        numbers, bodies = self._find_links(links), self._sim.model.geom_bodyid
+        geoms = [geom for geom in self.parts.geoms if int(bodies[geom]) in numbers]
+        self._fields.model("geom_rgba")[..., geoms, :3] = rgb

@@ -1,0 +1,219 @@
+"""Motors of a body's joints in MuJoCo: its own actuators, so that nothing of Python runs between substeps.
+
+Each joint has an actuator with the force `ctrl + b1 * position + b2 * velocity`, within a range. `drive_to` makes it a
+spring and a damper (b1 = -stiffness, b2 = -damping), `drive_at` a damper, `set_torques` a force.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rlctl.errors import TaskError
+from rlctl.task.body import Array, Body, Drives
+from rlctl.task.mujoco.world import Rows
+
+if TYPE_CHECKING:
+    from rlctl.task.mujoco.body import Parts
+    from rlctl.task.mujoco.sim import MujocoSim
+
+_LAG = 0.1
+"""Part of a joint's velocity that a motor without `set_drives` leaves after a physics step: PyBullet's leaves none."""
+
+
+class _Mode(NamedTuple):
+    # What is written into the model for a kind of command; it stays the same in later calls.
+    key: tuple[object, ...]
+    joints: list[int]
+    motors: Any  # their numbers
+    stiffness: Array
+    damping: Array
+    max_speed: Array | None
+
+
+class MujocoMotors(Body):
+    """The part of `MujocoBody` that drives its joints."""
+
+    def __init__(self, sim: MujocoSim, parts: Parts) -> None:
+        self._sim, self.parts = sim, parts
+        self._fields = sim.fields
+        self._modes: dict[tuple[str, ...], _Mode] = {}
+        self._active: dict[int, object] = {}  # by joint, the mode that is written into the model
+        self._chosen: set[int] = set()
+        self._cap = np.inf
+
+    @property
+    def drives(self) -> Drives | None:  # type: ignore[override]
+        return None if self.parts.drives is None else Drives(*self.parts.drives[:2])
+
+    def bind_motors(self) -> None:
+        """Take the numbers of a newly compiled model."""
+        self._motors = np.arange(self._sim.model.nu)[self.parts.motors]
+        self._modes.clear()
+        self._active.clear()
+        self._cap = self.parts.speed_cap
+        if self.parts.drives is not None:
+            self._sim.model.dof_armature[self.parts.velocities] = self.parts.drives[2]
+
+    def measure_inertia(self) -> None:
+        """Compute the inertia that a torque on each joint moves in the present pose [kg m^2 or kg], shape (joints,)."""
+        sim = self._sim
+        if not self.joint_names:
+            return
+        sim.world.refresh()
+        full = np.zeros((sim.model.nv, sim.model.nv))
+        sim.mujoco.mj_fullM(sim.model, sim.data, full)
+        self.parts.inertia = 1.0 / np.diag(np.linalg.inv(full))[self.parts.velocities]
+
+    def forget_motors(self, worlds: Rows) -> None:
+        """Let nothing drive the joints after a reset, until the next command."""
+        self._active.clear()
+
+    @property
+    def joint_torques(self) -> Array:
+        torques: Array = self._fields.data("actuator_force")[..., self.parts.motors].copy()
+        return torques
+
+    def set_drives(
+        self,
+        stiffness: float | Sequence[float] | Array,
+        damping: float | Sequence[float] | Array,
+        *,
+        armature: float | Sequence[float] | Array = 0.0,
+    ) -> None:
+        given = {"stiffness": stiffness, "damping": damping, "armature": armature}
+        spread = [self._spread(name, value) for name, value in given.items()]
+        self.parts.drives = (spread[0], spread[1], spread[2])
+        self._sim.model.dof_armature[self.parts.velocities] = spread[2]
+        self._modes.clear()
+
+    def drive_to(
+        self,
+        positions: Array,
+        *,
+        max_speed: float | Sequence[float] | None = None,
+        max_force: float | Sequence[float] | None = None,
+        gain: float = 0.1,
+        joints: Sequence[str] = (),
+    ) -> None:
+        mode = self._find_mode("position", joints, max_force, gain, max_speed)
+        targets = self._read(positions, mode)
+        self._write_mode(mode)
+        force = mode.stiffness * targets
+        if mode.max_speed is not None:
+            force = self._limit_approach(mode, targets, force)
+        self._fields.data("ctrl")[..., mode.motors] = force
+
+    def _limit_approach(self, mode: _Mode, targets: Array, force: Array) -> Array:
+        """Drive joints that are far from their target at their top speed instead, as PyBullet's motors do."""
+        assert mode.max_speed is not None
+        error = targets - self._fields.data("qpos")[..., self._positions_of(mode)]
+        far = np.abs(error) * mode.stiffness > mode.max_speed * mode.damping
+        speed = np.minimum(mode.max_speed, np.abs(error) / self._sim._control_dt)
+        biases = self._fields.model("actuator_biasprm")
+        biases[..., mode.motors, 1] = np.where(far, 0.0, -mode.stiffness)
+        result: Array = np.where(far, mode.damping * np.copysign(speed, error), force)
+        return result
+
+    def _positions_of(self, mode: _Mode) -> Any:
+        return np.arange(self._sim.model.nq)[self.parts.positions][mode.joints]
+
+    def drive_at(
+        self, velocities: Array, *, max_force: float | Sequence[float] | None = None, joints: Sequence[str] = ()
+    ) -> None:
+        mode = self._find_mode("velocity", joints, max_force, 0.0, None)
+        targets = self._read(velocities, mode)
+        self._write_mode(mode)
+        self._fields.data("ctrl")[..., mode.motors] = mode.damping * targets
+
+    def disable_motors(self, joints: Sequence[str] = ()) -> None:
+        self._chosen.update(self.find_joints(joints))
+
+    def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
+        mode = self._find_mode("torque", joints, np.inf, 0.0, None)
+        given = self._read(torques, mode)
+        if not self._chosen.issuperset(mode.joints):
+            held = next(self.joint_names[joint] for joint in mode.joints if joint not in self._chosen)
+            raise TaskError(
+                f"set_torques: the motor of {held!r} holds it in place; call disable_motors() in build first"
+            )
+        self._write_mode(mode)
+        self._fields.data("ctrl")[..., mode.motors] = given * self._fields.model("strength")[..., mode.motors]
+
+    def _read(self, values: Any, mode: _Mode) -> Array:
+        array, shape = np.asarray(values, float), (*self._fields.shape, len(mode.joints))
+        if array.shape != shape:
+            raise TaskError(
+                f"{self.file.name}: a command of shape {array.shape} for joints of shape {shape}; joint_names of the "
+                "body has all"
+            )
+        return array
+
+    def _find_mode(self, kind: str, joints: Sequence[str], max_force: Any, gain: float, max_speed: Any) -> _Mode:
+        names = tuple(joints)
+        # Tuples, because two arrays cannot be compared by `!=`.
+        limits = [tuple(limit) if np.ndim(limit) else limit for limit in (max_force, max_speed)]
+        key = (kind, gain, *limits)
+        mode = self._modes.get(names)
+        if mode is None or mode.key != key:
+            mode = self._modes[names] = self._plan(key, kind, joints, max_force, gain, max_speed)
+        return mode
+
+    def _plan(
+        self, key: tuple[object, ...], kind: str, joints: Sequence[str], max_force: Any, gain: float, max_speed: Any
+    ) -> _Mode:
+        chosen = self.find_joints(joints)
+        self._chosen.update(chosen if kind != "torque" else ())
+        numbers = self._motors[chosen]
+        motors = slice(numbers[0], numbers[-1] + 1) if (np.diff(numbers) == 1).all() else numbers
+        if self.parts.inertia is None:
+            self.measure_inertia()
+        assert self.parts.inertia is not None
+        dt, inertia = self._sim.model.opt.timestep, self.parts.inertia[chosen]
+        # v' = v + dt * (ctrl - damping * v') / inertia leaves the part `_LAG` of the old velocity.
+        damping = (1.0 / _LAG - 1.0) * inertia / dt
+        stiffness = gain * (damping + inertia / dt) / dt
+        speed = None
+        if kind == "position":
+            if self.parts.drives is not None:
+                stiffness, damping = (values[chosen] for values in self.parts.drives[:2])
+            default = self.joint_max_speed[chosen] if self.parts.drives is None else np.zeros(len(chosen))
+            given = default if max_speed is None else np.broadcast_to(np.asarray(max_speed, float), len(chosen))
+            speed = np.where(given > 0, given, np.inf) if (given > 0).any() else None
+        elif kind == "torque":
+            damping = np.zeros(len(chosen))
+        force = np.full(len(chosen), 1e9) if kind == "torque" else self._find_force_limits(chosen, max_force)
+        mode = _Mode(key, chosen, motors, stiffness if kind == "position" else 0.0 * damping, damping, speed)
+        self._forces = getattr(self, "_forces", {}) | {id(key): force}
+        return mode
+
+    def _write_mode(self, mode: _Mode) -> None:
+        """Write a kind of command into the model, if it is not there yet."""
+        if all(self._active.get(joint) is mode for joint in mode.joints):
+            return
+        self._active.update(dict.fromkeys(mode.joints, mode))
+        biases, ranges = self._fields.model("actuator_biasprm"), self._fields.model("actuator_forcerange")
+        biases[..., mode.motors, 1], biases[..., mode.motors, 2] = -mode.stiffness, -mode.damping
+        force = self._forces[id(mode.key)] * self._fields.model("strength")[..., mode.motors]
+        ranges[..., mode.motors, 0], ranges[..., mode.motors, 1] = -force, force
+
+    def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
+        motors = self._motors[self.find_joints(joints)]
+        self._fields.model("strength")[..., motors] = factor * self._sim.world.built("strength")[motors]
+        for body in [self, *([self._sim.bodies[self.name]] if self.name in self._sim.bodies else [])]:
+            body._active.clear()
+
+    def cap_joint_speed(self, speed: float) -> None:
+        self.parts.speed_cap = self._cap = speed
+
+    def limit_speeds(self) -> None:
+        """Cut the joints' speeds at the end of a control step; MuJoCo has no such limit."""
+        if self._cap == np.inf:
+            return
+        speeds = self._fields.data("qvel")
+        joints = speeds[..., self.parts.velocities]
+        if np.abs(joints).max(initial=0.0) > self._cap:
+            speeds[..., self.parts.velocities] = np.clip(joints, -self._cap, self._cap)
+            self._fields.touch()

@@ -1,0 +1,39 @@
+"""Pictures of a world in MuJoCo, drawn by OpenGL without a display."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import UsageError, describe_exception
+from rlctl.task.mujoco.world import import_mujoco
+
+
+def draw(
+    model: Any, data: Any, size: tuple[int, int], *, eye: Sequence[float], target: Sequence[float], field_of_view: float
+) -> NDArray[np.uint8]:
+    """Return an RGB image of shape (height, width, 3), seen from `eye` [m] to `target` [m]; z is up.
+
+    `size` is width and height, `field_of_view` is vertical [degrees].
+    """
+    mujoco = import_mujoco()
+    camera, way = mujoco.MjvCamera(), np.subtract(target, eye)
+    camera.type, camera.lookat[:] = mujoco.mjtCamera.mjCAMERA_FREE, target
+    camera.distance = float(np.linalg.norm(way))
+    camera.azimuth = float(np.degrees(np.arctan2(way[1], way[0])))
+    camera.elevation = float(np.degrees(np.arctan2(way[2], np.hypot(way[0], way[1]))))
+    model.vis.global_.fovy = field_of_view
+    model.vis.global_.offwidth, model.vis.global_.offheight = (
+        max(wanted, present)
+        for wanted, present in zip(size, (model.vis.global_.offwidth, model.vis.global_.offheight), strict=True)
+    )
+    try:
+        with mujoco.Renderer(model, size[1], size[0]) as renderer:
+            renderer.update_scene(data, camera)
+            picture: NDArray[np.uint8] = renderer.render()
+    except Exception as error:  # OpenGL raises many kinds
+        raise UsageError(
+            f"MuJoCo cannot draw: {describe_exception(error)}; without a display set MUJOCO_GL=egl (apt: libegl1) or osmesa"
+        ) from None
+    return picture

@@ -1,0 +1,389 @@
+"""The world of a task in MuJoCo: one world, or n worlds of one model for tasks in batches.
+
+Contacts are soft: `solref` [s] is their time constant, at least two physics steps. Only the links of different bodies
+collide, and those of one body that is loaded with `self_collision`; the friction of a contact is the product of the
+frictions of its links, as in PyBullet.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError, UsageError
+from rlctl.task.attachments import Attachment, Joined
+from rlctl.task.model_files import find_model_file
+from rlctl.task.mujoco.body import MujocoBody, Parts
+from rlctl.task.mujoco.files import ModelFile, read_model_file
+from rlctl.task.mujoco.world import Array, Fields, Rows, World
+from rlctl.task.sim import Sim
+
+_RIGID = (0.9999, 0.9999, 0.001, 0.5, 2)  # impedance of constraints: as stiff as PyBullet's
+_WXYZ = [3, 0, 1, 2]
+_GROUND_THICKNESS = 0.5  # [m], of rough ground
+
+
+def read_solref(sim: str) -> float | None:
+    """Return the time constant of contacts [s] in `mujoco:0.01`, 0.02 for `mujoco`, None for `pybullet`.
+
+    Raises `UsageError` for anything else.
+    """
+    engine, _, value = sim.partition(":")
+    if sim == "pybullet":
+        return None
+    try:
+        solref = float(value or 0.02)
+    except ValueError:
+        solref = math.nan
+    if engine != "mujoco" or not 0 < solref < 1:
+        raise UsageError(f"sim {sim!r}: give pybullet, mujoco, or mujoco:SOLREF with 0 < SOLREF < 1 s")
+    return solref
+
+
+class MujocoSim(Sim):
+    """A world in MuJoCo; with `worlds` all arrays of its bodies have a leading axis of so many rows.
+
+    The model is compiled again after every change of its structure, so all of that belongs into `build`.
+    """
+
+    engine = "MuJoCo"
+    bodies: dict[str, MujocoBody]
+
+    def __init__(
+        self, *, control_dt: float, substeps: int, solref: float = 0.02, iterations: int = 50, worlds: int | None = None
+    ) -> None:
+        self.world = World(substeps, worlds)
+        self.mujoco = self.world.mujoco
+        self._control_dt, self._solref, self._iterations = control_dt, solref, iterations
+        self.fields = Fields(self.world)
+        self._single: dict[int, MujocoSim] = {}
+        self.clear()
+
+    def clear(self) -> None:
+        self.bodies = {}
+        self._parts: dict[str, Parts] = {}
+        self._pairs: list[tuple[str, str]] = []  # links whose geoms collide, each as BODY/LINK
+        self._pushes: list[_Push] = []
+        self._spec = self.mujoco.MjSpec()
+        option = self._spec.option
+        option.timestep = self._control_dt / self.world.substeps
+        option.gravity = [0.0, 0.0, -9.81]
+        option.integrator = self.mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # takes the motors' damping implicitly
+        option.cone = self.mujoco.mjtCone.mjCONE_ELLIPTIC
+        option.impratio = 10.0  # otherwise feet that stand slide slowly
+        option.iterations = self._iterations
+        # A world that is no longer finite is an error, not a silent reset.
+        option.disableflags = int(self.mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        model = self._spec.compile()
+        self.world.extra.clear()
+        self.world.set_model(model, self.mujoco.MjData(model))
+        self.fields.forget()
+
+    @property
+    def model(self) -> Any:
+        """MuJoCo's `MjModel`, as it was built."""
+        return self.world.mj_model
+
+    @property
+    def data(self) -> Any:
+        """MuJoCo's `MjData` of a single world."""
+        return self.world.mj_data
+
+    def one(self, world: int) -> MujocoSim:
+        """Return one of the worlds, whose arrays have no leading axis; events act on it."""
+        if self.world.count is None:
+            return self
+        if world not in self._single:
+            one: MujocoSim = object.__new__(MujocoSim)
+            one.__dict__.update(self.__dict__)
+            one.fields = Fields(self.world, world)
+            one.bodies = {name: MujocoBody(one, parts) for name, parts in self._parts.items()}
+            one._pushes = self._pushes  # of all worlds
+            self._single[world] = one
+        return self._single[world]
+
+    def set_gravity(self, gravity: float) -> None:
+        self._spec.option.gravity = self.model.opt.gravity[:] = [0.0, 0.0, -gravity]
+
+    def set_contact_erp(self, erp: float) -> None:
+        # The part of the depth that a physics step removes: a time constant of dt / erp, of at least two steps.
+        self._solref = self._spec.option.timestep * max(2.0, 1.0 / erp)
+
+    def load(
+        self,
+        name: str,
+        file: str | Path,
+        *,
+        position: Sequence[float] = (0.0, 0.0, 0.0),
+        orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+        fixed: bool = False,
+        flags: int = 0,
+        self_collision: bool = False,
+        inertia: Literal["file", "shape"] = "file",
+    ) -> MujocoBody:
+        self._check_new(name)
+        source = read_model_file(find_model_file(file))
+        child = source.spec
+        if inertia == "shape":
+            child.compiler.inertiafromgeom = self.mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+        if source.path.suffix == ".urdf":
+            self._prepare_urdf(child)
+        colliding = [geom.parent.name for geom in child.geoms if geom.contype or geom.conaffinity]
+        for number, geom in enumerate(child.geoms):
+            geom.name = str(number)
+            # Only the pairs of `_add_pairs` collide.
+            geom.contype = geom.conaffinity = 0
+        for joint in child.joints:
+            joint.actfrclimited = False  # the force limits are those of the motors
+        is_urdf = source.path.suffix == ".urdf"
+        free = any(joint.type == self.mujoco.mjtJoint.mjJNT_FREE for joint in child.joints)
+        fixed = (fixed or not any(link.mass > 0 for link in child.bodies)) if is_urdf else not free
+        parts = Parts(name, source, fixed, child, colliding)
+        frame = self._spec.worldbody.add_frame(pos=list(position), quat=[orientation[part] for part in _WXYZ])
+        own = [actuator.name for actuator in child.actuators]
+        self._spec.attach(child, prefix=f"{name}/", frame=frame)
+        if not fixed and is_urdf:
+            self._spec.body(f"{name}/{parts.base_name}").add_freejoint(name=f"{name}/free")
+        self._add_motors(parts, own)
+        for other in self._parts.values():
+            self._add_pairs(parts, other)
+        if self_collision:
+            self._add_own_pairs(parts)
+        return self._add_body(parts)
+
+    def _prepare_urdf(self, child: Any) -> None:
+        for body in child.bodies[1:]:
+            for geom in body.geoms:
+                geom.contype = geom.conaffinity = int(bool(geom.contype or geom.conaffinity))
+
+    def _add_body(self, parts: Parts) -> MujocoBody:
+        self._parts[parts.name] = parts
+        body = self.bodies[parts.name] = MujocoBody(self, parts)
+        self._compile()
+        return body
+
+    def _add_motors(self, parts: Parts, own: list[str]) -> None:
+        """Add a motor to each joint: its force is `ctrl + b1 * position + b2 * velocity`, within a range."""
+        mujoco = self.mujoco
+        parts.own_actuators.extend(own)
+        for joint in parts.joint_names:
+            motor = self._spec.add_actuator(
+                name=f"{parts.name}/motor {joint}", target=f"{parts.name}/{joint}", trntype=mujoco.mjtTrn.mjTRN_JOINT
+            )
+            motor.gainprm[0], motor.biastype = 1.0, mujoco.mjtBias.mjBIAS_AFFINE
+            motor.forcelimited, motor.forcerange = True, [-1e9, 1e9]
+
+    def _add_pairs(self, first: Parts, second: Parts) -> None:
+        for (one, link), (two, other) in itertools.product(first.list_geoms(), second.list_geoms()):
+            if link in first.moving or other in second.moving:
+                self._add_pair(first, one, link, second, two, other)
+
+    def _add_own_pairs(self, parts: Parts) -> None:
+        for (one, link), (two, other) in itertools.combinations(parts.list_geoms(), 2):
+            if link != other and link not in parts.ancestors[other] and other not in parts.ancestors[link]:
+                self._add_pair(parts, one, link, parts, two, other)
+
+    def _add_pair(self, first: Parts, one: int, link: str, second: Parts, two: int, other: str) -> None:
+        spins = first.file.spin.get(link, 0.0) + second.file.spin.get(other, 0.0)
+        self._spec.add_pair(
+            geomname1=f"{first.name}/{one}",
+            geomname2=f"{second.name}/{two}",
+            condim=4 if spins else 3,
+            solref=[self._solref, 1.0],
+        )
+        self._pairs.append((f"{first.name}/{link}", f"{second.name}/{other}"))
+
+    def add_height_field(
+        self, name: str, heights: Array, *, cell: float, color: Sequence[float] = (0.55, 0.6, 0.5)
+    ) -> MujocoBody:
+        self._check_new(name)
+        child, (rows, columns) = self.mujoco.MjSpec(), heights.shape
+        half = [(count - 1) / 2 * cell for count in (rows, columns)]
+        lowest, top = float(heights.min()), float(np.ptp(heights))
+        scaled = (heights - lowest) / (top or 1.0)
+        # MuJoCo's rows run along y.
+        field = dict(size=[*half, top or 1e-3, _GROUND_THICKNESS], nrow=columns, ncol=rows, userdata=scaled.T.ravel())
+        child.add_hfield(name="heights", **field)
+        body = child.worldbody.add_body(name="ground")
+        geom = body.add_geom(type=self.mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="heights", rgba=[*color, 1.0])
+        geom.pos, geom.name, geom.contype, geom.conaffinity = [0.0, 0.0, lowest], "0", 0, 0
+        source = ModelFile(Path("height field"), child, {}, {}, {"ground": 0.5}, {"ground": 0.0}, {})
+        parts = Parts(name, source, True, child, ["ground"])
+        x, y = ((np.arange(count) - (count - 1) / 2) * cell for count in heights.shape)
+        parts.terrain = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1)
+        self._spec.attach(child, prefix=f"{name}/", frame=self._spec.worldbody.add_frame())
+        for other in self._parts.values():
+            self._add_pairs(other, parts)
+        return self._add_body(parts)
+
+    def connect_gear(
+        self, body: Any, driver: str, driven: str, *, ratio: float, max_force: float = 0, stiffness: float = 0
+    ) -> None:
+        body.find_joints([driver, driven])
+        names = {"name1": f"{body.name}/{driven}", "name2": f"{body.name}/{driver}"}
+        self._add_equality(self.mujoco.mjtEq.mjEQ_JOINT, data=[0.0, ratio, *[0.0] * 10], **names)
+
+    def connect_point(self, first: Attachment, second: Attachment, *, max_force: float = 0) -> Joined:
+        return self._connect(self.mujoco.mjtEq.mjEQ_CONNECT, first, second)
+
+    def connect_fixed(self, first: Attachment, second: Attachment, *, max_force: float = 0) -> Joined:
+        return self._connect(self.mujoco.mjtEq.mjEQ_WELD, first, second)
+
+    def _connect(self, kind: Any, first: Attachment, second: Attachment) -> Joined:
+        names = {"name1": self._add_site(first), "name2": self._add_site(second)}
+        self._add_equality(kind, objtype=self.mujoco.mjtObj.mjOBJ_SITE, **names)
+        return Joined(first, second)
+
+    def _add_equality(self, kind: Any, **values: Any) -> None:
+        solref = [2 * self._control_dt / self.world.substeps, 1.0]
+        self._spec.add_equality(type=kind, solref=solref, solimp=_RIGID, **values)
+        self._compile()
+
+    def _add_site(self, end: Attachment) -> str:
+        name, link = f"site {len(self._spec.sites)}", self._spec.body(f"{end.body.name}/{end.link}")
+        origin = link.ipos if end.link == end.body.base_name else np.zeros(3)
+        link.add_site(name=name, pos=origin + end.position, quat=[end.orientation[part] for part in _WXYZ])
+        return name
+
+    def add_force_sensor(self, joint: str, link: str) -> None:
+        """Measure force and torque of a joint at the centre of mass of `link`; both names are "BODY/NAME"."""
+        part, kinds = self._spec.body(link), self.mujoco.mjtSensor
+        part.add_site(name=joint, pos=part.ipos)
+        for name, kind in ((joint, kinds.mjSENS_FORCE), (f"{joint} torque", kinds.mjSENS_TORQUE)):
+            self._spec.add_sensor(name=name, type=kind, objtype=self.mujoco.mjtObj.mjOBJ_SITE, objname=joint)
+        self._compile()
+
+    def _compile(self) -> None:
+        try:
+            model, data = self._spec.recompile(self.world.mj_model, self.world.mj_data)  # keeps the state
+        except ValueError as error:
+            files = ", ".join(str(parts.file.path) for parts in self._parts.values())
+            raise TaskError(f"MuJoCo cannot build the world of {files}: {' '.join(str(error).split())}") from None
+        self._keep_changes(self.world.mj_model, model)
+        self.world.set_model(model, data)
+        self.fields.forget()
+        for parts in self._parts.values():
+            parts.bind(model)
+        self._set_extra(model)
+        for body in self.bodies.values():
+            body.bind()
+        self.spread_friction()
+
+    def _keep_changes(self, before: Any, after: Any) -> None:
+        # What a task has changed in `build` before the last change of structure, by the names of bodies and joints.
+        for body in range(1, before.nbody):
+            number = after.body(before.body(body).name).id
+            for name in ("body_mass", "body_inertia", "body_pos", "body_quat"):
+                getattr(after, name)[number] = getattr(before, name)[body]
+        for actuator in range(before.nu):
+            number = after.actuator(before.actuator(actuator).name).id
+            for name in ("actuator_biasprm", "actuator_forcerange"):
+                getattr(after, name)[number] = getattr(before, name)[actuator]
+
+    def _set_extra(self, model: Any) -> None:
+        links = {f"{name}/{link}": parts for name, parts in self._parts.items() for link in parts.file.friction}
+        friction, spin = np.zeros(model.nbody), np.zeros(model.nbody)
+        for full, parts in links.items():
+            link = full.removeprefix(f"{parts.name}/")
+            number = parts.links.get(link)
+            if number is not None:
+                friction[number] = parts.built_friction.get(link, parts.file.friction[link])
+                spin[number] = parts.file.spin[link]
+        self.world.extra |= {"friction": friction, "spin": spin, "strength": np.ones(model.nu)}
+        numbers = [[model.body(end).id for end in pair] for pair in self._pairs]
+        self._pair_links = np.array(numbers, int).reshape(-1, 2)
+
+    def spread_friction(self) -> None:
+        """Give contacts the product of the frictions of their links, as PyBullet computes it."""
+        if not len(self._pairs):
+            return
+        friction, spin, (one, two) = self.fields.model("friction"), self.fields.model("spin"), self._pair_links.T
+        product = friction[..., one] * friction[..., two]
+        turning = spin[..., one] * friction[..., two] + spin[..., two] * friction[..., one]
+        pairs = self.fields.model("pair_friction")
+        pairs[..., :3] = np.maximum(np.stack([product, product, turning], axis=-1), self.mujoco.mjMINMU)
+        self.fields.touch()
+
+    def step(self, worlds: Rows = None) -> None:
+        if self._pushes:
+            self._apply_pushes()
+        self.world.step(worlds)
+        for body in self.bodies.values():
+            body.limit_speeds()
+
+    def _apply_pushes(self) -> None:
+        forces = self.world.data("xfrc_applied")
+        for push in self._pushes:
+            forces[(push.world, push.link) if self.world.count is not None else push.link] = 0.0
+        self._pushes[:] = [push for push in self._pushes if push.steps > 0]
+        for push in self._pushes:
+            row = (push.world, push.link) if self.world.count is not None else push.link
+            forces[row][:3] += push.force
+            push.steps -= 1
+
+    @property
+    def deepest_contact(self) -> float:
+        self.world.refresh()
+        data = self.data
+        return max(0.0, -float(data.contact.dist.min())) if data.ncon else 0.0
+
+    def save(self) -> None:
+        for body in self.bodies.values():
+            body.measure_inertia()
+        self._single.clear()
+        self.world.save()
+        self.fields.forget()
+        for body in self.bodies.values():
+            body.bind()
+
+    def restore(self, worlds: Rows = None) -> None:
+        rows = None if worlds is None else set(worlds.tolist())
+        self._pushes[:] = [push for push in self._pushes if rows is not None and push.world not in rows]
+        self.world.restore(worlds)
+        for body in self.bodies.values():
+            body.forget_motors(worlds)
+
+    def shift_gravity(self, change: float) -> None:
+        self.fields.model("opt.gravity")[..., 2] = self.world.built("opt.gravity")[2] + change
+        self.fields.touch()
+
+    def push(self, body: str, force: Sequence[float], duration_s: float, link: str | None = None) -> None:
+        pushed = self.body(body)
+        steps = max(1, round(duration_s / self._control_dt))
+        number = pushed.find_link(link or pushed.base_name)  # type: ignore[attr-defined]
+        self._pushes.append(_Push(self.fields._index or 0, number, np.array(force, float), steps))
+
+    def render(
+        self,
+        width: int = 320,
+        height: int = 240,
+        *,
+        eye: Sequence[float] = (1.5, 1.1, 1.1),
+        target: Sequence[float] = (0.2, 0.0, 0.4),
+        up: Sequence[float] = (0.0, 0.0, 1.0),
+        field_of_view: float = 45.0,
+    ) -> NDArray[np.uint8]:
+        from rlctl.task.mujoco.pictures import draw
+
+        if self._iterations and self.world.batch is not None:
+            self._refuse("pictures of many worlds")
+        self.world.refresh()
+        return draw(self.model, self.data, (width, height), eye=eye, target=target, field_of_view=field_of_view)
+
+    def close(self) -> None:
+        with contextlib.suppress(AttributeError):
+            self.world.batch = None
+
+
+class _Push:
+    def __init__(self, world: int, link: int, force: Array, steps: int) -> None:
+        self.world, self.link = world, link
+        self.force = force  # [N], world frame
+        self.steps = steps  # control steps that it still acts

@@ -1,0 +1,237 @@
+"""The model and the state of one world or of many: MuJoCo's arrays by name, steps, resets, what a reset restores."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError, UsageError
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64] | None
+"""Numbers of worlds; None: all."""
+
+_SERIOUS = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_INERTIA", "mjWARN_CNSTRFULL")
+
+
+def import_mujoco() -> Any:
+    """Import MuJoCo; raises `UsageError` where it is missing."""
+    try:
+        import mujoco
+    except ImportError:
+        raise UsageError("sim mujoco needs MuJoCo, which is not installed: pip install mujoco") from None
+    # Its own handler prints, and appends to MUJOCO_LOG.TXT in the current folder; `World` raises for what is serious.
+    mujoco.set_mju_user_warning(lambda text: None)
+    return mujoco
+
+
+class World:
+    """One world of a model, or `count` worlds that `mujoco.batch` steps with one call of C.
+
+    `data(name)` and `model(name)` are arrays of MjData and MjModel: those of one world without `count`; with it they have
+    a leading axis. `extra` are arrays of ours that a reset restores like those of the model. While the model is built
+    (`batch` is None) there is one world, with a leading axis of 1 if `count` is given.
+    """
+
+    def __init__(self, substeps: int, count: int | None = None) -> None:
+        self.mujoco = import_mujoco()
+        self.substeps, self.count = substeps, count
+        self.mj_model: Any
+        self.mj_data: Any
+        self.batch: Any = None
+        self.extra: dict[str, Array] = {}
+        """Arrays by name, without the leading axis of worlds."""
+        self._built: dict[str, Array] = {}  # values of the built world, of arrays that may have changed
+        self._rows: dict[str, Array] = {}  # arrays of `extra` with a row per world
+        self._saved: Array | None = None
+        self._is_fresh = False  # whether all that depends on positions and velocities is up to date
+        self._stale: set[int] = set()  # worlds of a batch for which it is not
+
+    def set_model(self, model: Any, data: Any) -> None:
+        """Use a newly compiled model; there is one world until `save`."""
+        self.mj_model, self.mj_data = model, data
+        self.batch, self._saved, self._is_fresh = None, None, False
+        self._built.clear()
+        self._rows.clear()
+
+    def data(self, name: str) -> Any:
+        """Return an array of MjData; those that are derived are valid after `refresh`."""
+        if self.batch is not None:
+            return self.batch.bind(name)
+        array = getattr(self.mj_data, name)
+        return array if self.count is None else array[None]
+
+    def model(self, name: str) -> Any:
+        """Return an array of MjModel (`opt.gravity` of its options), or of `extra`, with the values of each world.
+
+        Before `save` a change belongs to the built world; later a reset takes it back.
+        """
+        if name not in self._built and self._saved is not None:
+            self._built[name] = self._find(name).copy()
+        if self.batch is not None:
+            if name not in self.extra:
+                return self.batch.expand(name)
+            if name not in self._rows:
+                self._rows[name] = np.repeat(self.extra[name][None], self.batch.nsim, axis=0)
+            return self._rows[name]
+        array = self._find(name)
+        return array if self.count is None else array[None]
+
+    def _find(self, name: str) -> Array:
+        if name in self.extra:
+            return self.extra[name]
+        owner = self.mj_model.opt if name.startswith("opt.") else self.mj_model
+        array: Array = getattr(owner, name.removeprefix("opt."))
+        return array
+
+    def built(self, name: str) -> Array:
+        """Return the values of the built world of an array of `model`, without a leading axis."""
+        return self._built[name] if name in self._built else self._find(name)
+
+    def touch(self, world: Any = None) -> None:
+        """Note that the state, or the model, of a world (index or numbers; None: all) has changed."""
+        if self.batch is None:
+            self._is_fresh = False
+        elif world is None:
+            self._stale.update(range(self.batch.nsim))
+        else:
+            self._stale.update(np.atleast_1d(world).tolist())
+
+    def refresh(self) -> None:
+        """Compute what depends on the present positions and velocities."""
+        if self.batch is None:
+            if not self._is_fresh:
+                self.mujoco.mj_step1(self.mj_model, self.mj_data)
+                self._is_fresh = True
+        elif self._stale:
+            ids = np.array(sorted(self._stale), np.int32)
+            self._stale.clear()
+            self._call("forward", ids, stage=self._velocity_stage)
+
+    @property
+    def _velocity_stage(self) -> int:
+        return int(self.mujoco.mjtStage.mjSTAGE_VEL)
+
+    def _call(self, method: str, ids: Any, **values: Any) -> None:
+        from mujoco.batch import SimulationError
+
+        try:
+            getattr(self.batch, method)(ids, **values)
+        except SimulationError as error:
+            raise WorldError(int(error.ids[0]), f"MuJoCo: {self.batch.error(int(error.ids[0]))}") from None
+
+    def step(self, worlds: Rows = None) -> None:
+        """Take all substeps of a control step; afterwards everything but accelerations and forces is up to date."""
+        if self.batch is not None:
+            ids = None if worlds is None else worlds.astype(np.int32)
+            self._stale.difference_update(range(self.batch.nsim) if worlds is None else worlds.tolist())
+            self._call("step", ids, nstep=self.substeps, stage=self._velocity_stage)
+            if self.batch.warning.any():
+                self._raise_warning()
+            return
+        mujoco, model, data = self.mujoco, self.mj_model, self.mj_data
+        if not self._is_fresh:
+            mujoco.mj_step1(model, data)
+        # The same as `substeps` calls of mj_step, but the last one leaves what is derived up to date.
+        mujoco.mj_step2(model, data)
+        if self.substeps > 1:
+            mujoco.mj_step(model, data, nstep=self.substeps - 1)
+        mujoco.mj_step1(model, data)
+        self._is_fresh = True
+        if data.warning.number.any():
+            self._raise_warning()
+
+    def _raise_warning(self) -> None:
+        rows = self.batch.warning if self.batch is not None else self.mj_data.warning.number[None].copy()
+        kinds = {name: int(getattr(self.mujoco.mjtWarning, name)) for name in _SERIOUS}
+        for name, kind in kinds.items():
+            bad = np.flatnonzero(rows[:, kind])
+            if bad.size:
+                text = {"mjWARN_CNSTRFULL": "too many constraints", "mjWARN_INERTIA": "an inertia is not positive"}
+                raise WorldError(
+                    int(bad[0]), f"MuJoCo: the simulation is unstable ({text.get(name, f'no finite {name[-4:].lower()}')})"
+                )
+        if self.batch is None:
+            self.mj_data.warning.number[:] = 0
+        else:
+            self.batch.warning[:] = 0
+
+    def save(self) -> None:
+        """Save the built world for `restore`, and make `count` copies of it."""
+        mujoco = self.mujoco
+        kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        self._saved = np.empty(mujoco.mj_stateSize(self.mj_model, kind))
+        mujoco.mj_getState(self.mj_model, self.mj_data, self._saved, kind)
+        self._built.clear()
+        if self.count is not None and self.count > 1:
+            from mujoco.batch import Batch
+
+            self.batch = Batch(self.mj_model, self.count, 1)
+            self.batch.state[:] = self._saved
+            self.touch()
+
+    def restore(self, worlds: Rows = None) -> None:
+        """Restore the saved world, or some of the worlds, with the model as it was built; bit for bit."""
+        rows: Any = slice(None) if worlds is None else worlds
+        for name, values in self._built.items():
+            self.model(name)[rows if self.count is not None else ...] = values
+        if self.batch is not None:
+            self.batch.state[rows] = self._saved
+            self.batch.warning[rows] = 0
+        else:
+            mujoco = self.mujoco
+            mujoco.mj_resetData(self.mj_model, self.mj_data)
+            kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+            mujoco.mj_setState(self.mj_model, self.mj_data, self._saved, kind)
+        self.touch(worlds)
+
+
+class WorldError(TaskError):
+    """A world of a batch, by its index, failed."""
+
+    def __init__(self, world: int, message: str) -> None:
+        super().__init__(message)
+        self.world = world
+
+
+class Fields:
+    """The arrays that a body reads and writes: those of all worlds, or of one of them without the leading axis."""
+
+    def __init__(self, world: World, index: int | None = None) -> None:
+        self.world = world
+        self._index = index
+        self._cache: dict[str, Any] = {}
+
+    def forget(self) -> None:
+        """Look the arrays up again: the model has been compiled."""
+        self._cache.clear()
+
+    def data(self, name: str) -> Any:
+        """Return an array of the state; see `World.data`."""
+        array = self._cache.get(name)
+        if array is None:
+            array = self._cache[name] = self._select(self.world.data(name))
+        return array
+
+    def derived(self, name: str) -> Any:
+        """Return an array that is computed from the state, up to date."""
+        self.world.refresh()
+        return self.data(name)
+
+    def model(self, name: str) -> Any:
+        """Return an array of the model, for reading and writing; see `World.model`. Call `touch` after a change."""
+        return self._select(self.world.model(name))
+
+    def _select(self, array: Any) -> Any:
+        return array if self._index is None else array[self._index]
+
+    def touch(self, worlds: Rows = None) -> None:
+        """Note a change of the state or the model."""
+        self.world.touch(self._index if worlds is None else worlds)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The leading axis: (n,) for the worlds of a batch, else ()."""
+        return () if self._index is not None or self.world.count is None else (self.world.count,)
