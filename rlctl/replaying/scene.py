@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rlctl.errors import describe_exception
 from rlctl.replaying.mjcf import Shape, ShapeKind, read_shapes
 from rlctl.task.body import Body
-from rlctl.task.pybullet.library import pybullet
 from rlctl.task.env import TaskEnv
+from rlctl.task.pybullet.library import pybullet
 
 Env = gymnasium.Env[Any, Any]
 Array = NDArray[np.float64]

@@ -13,5 +13,5 @@ from rlctl.task.body import Body as Body
 from rlctl.task.events import Event as Event
 from rlctl.task.joints import Joints as Joints
 from rlctl.task.sim import Sim as Sim
-from rlctl.task.terrain import rough_heights as rough_heights
 from rlctl.task.task import Task as Task
+from rlctl.task.terrain import rough_heights as rough_heights

@@ -210,8 +210,8 @@ class Body:
     ) -> None:
         """Make `drive_to` a spring and a damper, as the position controllers of real robots are. Call it in `build`.
 
-        `stiffness` [N m/rad or N/m], `damping` [N m s/rad or N s/m] and `armature`, the inertia of motor and gears at the
-        joint [kg m^2 or kg], are one number for all joints or one per joint. The torque on a joint is
+        `stiffness` [N m/rad or N/m], `damping` [N m s/rad or N s/m] and `armature`, the inertia of motor and gears at
+        the joint [kg m^2 or kg], are one number for all joints or one per joint. The torque on a joint is
         `stiffness * (target - position) - damping * velocity`, within its force limit.
         """
         self._refuse("set_drives")
@@ -227,8 +227,8 @@ class Body:
     ) -> None:
         """Set position targets [rad or m]; the default limits of speed and force are those of the model file.
 
-        With `set_drives` joints are springs and dampers, without a limit of speed unless `max_speed` is given. Otherwise
-        `gain` is the fraction of the position error that one physics step removes, in (0, 1].
+        With `set_drives` joints are springs and dampers, without a limit of speed unless `max_speed` is given.
+        Otherwise `gain` is the fraction of the position error that one physics step removes, in (0, 1].
         """
         raise NotImplementedError
 
@@ -285,7 +285,8 @@ class Body:
     def set_contact_stiffness(self, stiffness: float, links: Sequence[str] = ()) -> None:
         """Set the stiffness of a contact point of the links [N/m], until the next reset.
 
-        Contacts are rigid by default. In PyBullet they stay springs after the first call, very stiff ones after a reset.
+        Contacts are rigid by default. In PyBullet they stay springs after the first call, very stiff ones after a
+        reset.
         """
         self._refuse("set_contact_stiffness")
 
@@ -331,7 +332,7 @@ class Body:
         )
 
     def _find_force_limits(self, joints: list[int], max_force: Limit) -> Array:
-        """Return the force limits of motors, shape (joints,); raises `TaskError` where neither task nor file has one."""
+        """Return the force limits of motors, shape (joints,); raises `TaskError` if task and file have none."""
         limits = self.joint_max_force[joints] if max_force is None else np.broadcast_to(max_force, len(joints))
         if max_force is None and not limits.all():
             names = [self.joint_names[joint] for joint, limit in zip(joints, limits, strict=True) if limit == 0]

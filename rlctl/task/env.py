@@ -17,6 +17,7 @@ from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_stream
 from rlctl.task.joints import Joints
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.observation import Observation, ObservationFormat
+from rlctl.task.pybullet.sim import BulletSim
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_definition, check_parameters
 
@@ -239,13 +240,13 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 
 
 def _make_world(task: Task, sim: str, render_mode: str | None) -> Sim:
-    if (solref := read_solref(sim)) is None:
-        iterations, gui = task.solver_iterations, render_mode == "human"
-        return Sim(control_dt=task.control_dt, substeps=task.substeps, solver_iterations=iterations, gui=gui)
-    if render_mode is not None:
-        raise UsageError("--sim mujoco draws no pictures and no window; record the episode to see it in 3-D")
-    world: Any = MujocoSim(control_dt=task.control_dt, substeps=task.substeps, solref=solref)
-    return world  # has the methods of Sim; UsageError for those without an equivalent
+    solref, iterations = read_solref(sim), task.solver_iterations
+    if solref is None:
+        gui = render_mode == "human"
+        return BulletSim(control_dt=task.control_dt, substeps=task.substeps, solver_iterations=iterations, gui=gui)
+    if render_mode == "human":
+        raise UsageError("sim mujoco opens no window; record the episode to see it in 3-D")
+    return MujocoSim(control_dt=task.control_dt, substeps=task.substeps, solref=solref, iterations=iterations)
 
 
 def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]:

@@ -52,7 +52,7 @@ class Sim:
         self_collision: bool = False,
         inertia: Literal["file", "shape"] = "file",
     ) -> Body:
-        """Load the body of a URDF, MJCF (`.xml`) or SDF file: a path, or the name of a model of rlctl or `pybullet_data`.
+        """Load the body of a URDF, MJCF (`.xml`) or SDF file: a path, or a name as of `find_model_file`.
 
         `position` [m] and `orientation` of the base's origin, and `fixed`, are for URDF files; other formats contain
         them. `flags` are PyBullet's URDF_* flags. With `self_collision` links collide, except with their ancestors.

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rlctl.recipe import sources
-from rlctl.task.pybullet.library import pybullet
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
+from rlctl.task.pybullet.library import pybullet
 from rlctl_locomotion.robots import Ant, HalfCheetah, Hopper, Humanoid, Walker2D
 
 ROBOTS = {"ant": Ant, "half-cheetah": HalfCheetah, "hopper": Hopper, "walker2d": Walker2D, "humanoid": Humanoid}

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.task import Attachment, Sim
+from rlctl.task import Attachment
+from rlctl.task.pybullet.sim import BulletSim
 from tests.task import models
 
 
 @pytest.fixture
 def sim():
-    sim = Sim(control_dt=1 / 60, substeps=4)
+    sim = BulletSim(control_dt=1 / 60, substeps=4)
     yield sim
     sim.close()
 

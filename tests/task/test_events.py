@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from rlctl.task import Event, events
-from rlctl.task.pybullet.library import pybullet
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import Range
+from rlctl.task.pybullet.library import pybullet
 from tests.task.tasks import Cart
 
 

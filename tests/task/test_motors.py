@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.task import Sim
+from rlctl.task.pybullet.sim import BulletSim
 from tests.task import models
 
 
 @pytest.fixture(params=[1, 4], ids=["1 substep", "4 substeps"])
 def sim(request):
-    sim = Sim(control_dt=1 / 60, substeps=request.param)
+    sim = BulletSim(control_dt=1 / 60, substeps=request.param)
     yield sim
     sim.close()
 
@@ -137,7 +137,7 @@ def test_a_value_too_few_or_too_many(sim, tmp_path):
 
 
 def test_inverse_kinematics(sim):
-    arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+    arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
     home = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])
     arm.set_joints(home)
     wanted = np.array([0.5, 0.2, 0.5])
@@ -151,8 +151,8 @@ def test_inverse_kinematics(sim):
 
 
 def _solve_anew(home, wanted, down):
-    sim = Sim(control_dt=1 / 60, substeps=1)
-    arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+    sim = BulletSim(control_dt=1 / 60, substeps=1)
+    arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
     for start in (home + 0.3, home):  # what was solved before changes nothing
         arm.set_joints(start)
         solution = arm.solve_inverse_kinematics("lbr_iiwa_link_7", wanted, down)

@@ -9,7 +9,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.task.env import TaskEnv
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
-from rlctl.task.sim import Sim
+from rlctl.task.pybullet.sim import BulletSim
 from rlctl_manipulation.peg_insert import SCARA
 from tests.task.tasks import Cart
 
@@ -51,9 +51,9 @@ def test_an_episode_starts_as_in_pybullet_and_repeats_bit_for_bit(task):
 @pytest.fixture
 def weightless_arm():
     sim = MujocoSim(control_dt=1 / 60, substeps=4, solref=0.02)
-    arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+    arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
     sim.model.opt.gravity[:] = 0.0
-    sim.velocity_cap[:] = np.inf
+    arm.cap_joint_speed(np.inf)
     return sim, arm
 
 
@@ -94,7 +94,7 @@ def test_feet_have_the_spinning_friction_of_their_file():
     assert spins[:-2] == pytest.approx(0.0, abs=1e-4)
 
 
-@pytest.mark.parametrize("world", [Sim, MujocoSim])
+@pytest.mark.parametrize("world", [BulletSim, MujocoSim])
 def test_a_force_sensor_measures_what_hangs_from_it(world):
     options = {"solref": 0.02} if world is MujocoSim else {}
     with closing(world(control_dt=1 / 60, substeps=4, **options)) as sim:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rlctl.task.pybullet.library import pybullet
 from rlctl.task.env import TaskEnv
+from rlctl.task.pybullet.library import pybullet
 from rlctl_manipulation.reach import Reach
 from tests.task.tasks import Cubes, Pile, PileAnew
 

@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from rlctl.task.mujoco.body import Parts
     from rlctl.task.mujoco.sim import MujocoSim
 
-_LAG = 0.1
-"""Part of a joint's velocity that a motor without `set_drives` leaves after a physics step: PyBullet's leaves none."""
+_UNLIMITED = 1e9  # [N m or N]
+_USUAL_SPEED = 10.0  # [rad/s or m/s], of joints whose file gives no limit
+_STIFFEST = 10.0
 
 
 class _Mode(NamedTuple):
@@ -65,7 +66,7 @@ class MujocoMotors(Body):
         sim.world.refresh()
         full = np.zeros((sim.model.nv, sim.model.nv))
         sim.mujoco.mj_fullM(sim.model, sim.data, full)
-        self.parts.inertia = 1.0 / np.diag(np.linalg.inv(full))[self.parts.velocities]
+        self.parts.inertia = np.diag(full)[self.parts.velocities].copy()
 
     def forget_motors(self, worlds: Rows) -> None:
         """Let nothing drive the joints after a reset, until the next command."""
@@ -172,9 +173,13 @@ class MujocoMotors(Body):
             self.measure_inertia()
         assert self.parts.inertia is not None
         dt, inertia = self._sim.model.opt.timestep, self.parts.inertia[chosen]
-        # v' = v + dt * (ctrl - damping * v') / inertia leaves the part `_LAG` of the old velocity.
-        damping = (1.0 / _LAG - 1.0) * inertia / dt
-        stiffness = gain * (damping + inertia / dt) / dt
+        force = np.full(len(chosen), _UNLIMITED) if kind == "torque" else self._find_force_limits(chosen, max_force)
+        # PyBullet's motors bring a joint to the wanted velocity in one physics step. The damping inertia / dt removes
+        # half of the difference, more of it more; but a force that its limit cuts was computed from the velocity before
+        # the step, and overshoots unless the limit changes the velocity by more than the joint's top speed.
+        fastest = np.where(self.joint_max_speed[chosen] > 0, self.joint_max_speed[chosen], _USUAL_SPEED)
+        damping = np.clip(force * dt / (inertia * fastest), 1.0, _STIFFEST) * inertia / dt
+        stiffness = gain * damping / dt
         speed = None
         if kind == "position":
             if self.parts.drives is not None:
@@ -184,7 +189,6 @@ class MujocoMotors(Body):
             speed = np.where(given > 0, given, np.inf) if (given > 0).any() else None
         elif kind == "torque":
             damping = np.zeros(len(chosen))
-        force = np.full(len(chosen), 1e9) if kind == "torque" else self._find_force_limits(chosen, max_force)
         mode = _Mode(key, chosen, motors, stiffness if kind == "position" else 0.0 * damping, damping, speed)
         self._forces = getattr(self, "_forces", {}) | {id(key): force}
         return mode

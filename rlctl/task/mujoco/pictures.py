@@ -34,6 +34,7 @@ def draw(
             picture: NDArray[np.uint8] = renderer.render()
     except Exception as error:  # OpenGL raises many kinds
         raise UsageError(
-            f"MuJoCo cannot draw: {describe_exception(error)}; without a display set MUJOCO_GL=egl (apt: libegl1) or osmesa"
+            f"MuJoCo cannot draw: {describe_exception(error)}\n"
+            "without a display set MUJOCO_GL=egl (Debian: libegl1) or MUJOCO_GL=osmesa"
         ) from None
     return picture

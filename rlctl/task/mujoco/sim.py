@@ -209,8 +209,8 @@ class MujocoSim(Sim):
         lowest, top = float(heights.min()), float(np.ptp(heights))
         scaled = (heights - lowest) / (top or 1.0)
         # MuJoCo's rows run along y.
-        field = dict(size=[*half, top or 1e-3, _GROUND_THICKNESS], nrow=columns, ncol=rows, userdata=scaled.T.ravel())
-        child.add_hfield(name="heights", **field)
+        size = [*half, top or 1e-3, _GROUND_THICKNESS]
+        child.add_hfield(name="heights", size=size, nrow=columns, ncol=rows, userdata=scaled.T.ravel())
         body = child.worldbody.add_body(name="ground")
         geom = body.add_geom(type=self.mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="heights", rgba=[*color, 1.0])
         geom.pos, geom.name, geom.contype, geom.conaffinity = [0.0, 0.0, lowest], "0", 0, 0

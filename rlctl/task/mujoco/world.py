@@ -13,7 +13,14 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64] | None
 """Numbers of worlds; None: all."""
 
-_SERIOUS = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_INERTIA", "mjWARN_CNSTRFULL")
+_SERIOUS = {
+    "mjWARN_BADQPOS": "positions are not finite or too large",
+    "mjWARN_BADQVEL": "velocities are not finite or too large",
+    "mjWARN_BADQACC": "accelerations are not finite or too large",
+    "mjWARN_INERTIA": "the inertia matrix is singular",
+    "mjWARN_CNSTRFULL": "too many constraints",
+}
+"""MuJoCo's warnings that are errors, and what they mean."""
 
 
 def import_mujoco() -> Any:
@@ -30,9 +37,9 @@ def import_mujoco() -> Any:
 class World:
     """One world of a model, or `count` worlds that `mujoco.batch` steps with one call of C.
 
-    `data(name)` and `model(name)` are arrays of MjData and MjModel: those of one world without `count`; with it they have
-    a leading axis. `extra` are arrays of ours that a reset restores like those of the model. While the model is built
-    (`batch` is None) there is one world, with a leading axis of 1 if `count` is given.
+    `data(name)` and `model(name)` are arrays of MjData and MjModel: those of one world without `count`; with it they
+    have a leading axis. `extra` are arrays of ours that a reset restores like those of the model. While the model is
+    built (`batch` is None) there is one world, with a leading axis of 1 if `count` is given.
     """
 
     def __init__(self, substeps: int, count: int | None = None) -> None:
@@ -145,14 +152,10 @@ class World:
 
     def _raise_warning(self) -> None:
         rows = self.batch.warning if self.batch is not None else self.mj_data.warning.number[None].copy()
-        kinds = {name: int(getattr(self.mujoco.mjtWarning, name)) for name in _SERIOUS}
-        for name, kind in kinds.items():
-            bad = np.flatnonzero(rows[:, kind])
+        for name, what in _SERIOUS.items():
+            bad = np.flatnonzero(rows[:, int(getattr(self.mujoco.mjtWarning, name))])
             if bad.size:
-                text = {"mjWARN_CNSTRFULL": "too many constraints", "mjWARN_INERTIA": "an inertia is not positive"}
-                raise WorldError(
-                    int(bad[0]), f"MuJoCo: the simulation is unstable ({text.get(name, f'no finite {name[-4:].lower()}')})"
-                )
+                raise WorldError(int(bad[0]), f"MuJoCo: {what}: the simulation is unstable")
         if self.batch is None:
             self.mj_data.warning.number[:] = 0
         else:

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Contacts, MassState, Vector
 from rlctl.task.pybullet.library import pybullet
 from rlctl.task.pybullet.properties import Properties
+
 
 class BulletBody(Properties):
     """A body in PyBullet. Its state is read at most once per control step."""

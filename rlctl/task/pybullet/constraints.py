@@ -1,6 +1,5 @@
 """Constraints between links: gears, points held together, links held at a pose."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from rlctl.errors import TaskError

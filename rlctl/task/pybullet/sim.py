@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
 from rlctl.task.body import Array
+from rlctl.task.model_files import find_model_file
 from rlctl.task.pybullet.body import BulletBody
-from rlctl.task.pybullet.library import check_display, find_model_file, pybullet, pybullet_data, read_complaint
 from rlctl.task.pybullet.constraints import Constraints
+from rlctl.task.pybullet.library import check_display, pybullet, pybullet_data, read_complaint
 
 
 @dataclasses.dataclass
@@ -53,7 +54,7 @@ class BulletSim(Constraints):
         if self.client < 0:
             raise TaskError("PyBullet could not open a window; leave out --gui on a machine without a display")
         self.bodies = {}
-        self._substeps = substeps
+        self._times = control_dt, substeps
         self._settings = {
             "fixedTimeStep": control_dt,
             "numSubSteps": substeps,
@@ -109,7 +110,7 @@ class BulletSim(Constraints):
             fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0  # a base without mass
         else:
             body_id = self._call_loader(path, pybullet.loadURDF, position, orientation, useFixedBase=fixed, flags=flags)
-        body = self.bodies[name] = BulletBody(self.client, self._settings["fixedTimeStep"], self._substeps, name, body_id, path, fixed)
+        body = self.bodies[name] = BulletBody(self.client, *self._times, name, body_id, path, fixed)
         body.inertia_from_file = bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE)
         speeds = body.joint_max_speed
         if path.suffix == ".urdf" and fixed and speeds.size and (speeds > 0).all():
@@ -198,9 +199,9 @@ class BulletSim(Constraints):
         )
         # Bullet puts the middle between the lowest and the highest point at the origin.
         middle = (0.0, 0.0, float(heights.min() + heights.max()) / 2)
-        body_id = pybullet.createMultiBulletBody(0, shape, basePosition=middle, physicsClientId=self.client)
+        body_id = pybullet.createMultiBody(0, shape, basePosition=middle, physicsClientId=self.client)
         pybullet.changeVisualShape(body_id, -1, rgbaColor=(*color, 1), physicsClientId=self.client)
-        body = BulletBody(self.client, self._settings["fixedTimeStep"], self._substeps, name, body_id, Path("height field"), True)
+        body = BulletBody(self.client, *self._times, name, body_id, Path("height field"), True)
         x, y = ((np.arange(count) - (count - 1) / 2) * cell for count in heights.shape)
         body.terrain = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1)
         self.bodies[name] = body
@@ -209,7 +210,7 @@ class BulletSim(Constraints):
     def add_marker(self, position: Sequence[float], radius: float, color: Sequence[float]) -> int:
         sphere, client = pybullet.GEOM_SPHERE, self.client
         shape = pybullet.createVisualShape(sphere, radius=radius, rgbaColor=color, physicsClientId=client)
-        return int(pybullet.createMultiBulletBody(baseVisualShapeIndex=shape, basePosition=position, physicsClientId=client))
+        return int(pybullet.createMultiBody(baseVisualShapeIndex=shape, basePosition=position, physicsClientId=client))
 
     def move_marker(self, marker: int, position: Sequence[float] | Array) -> None:
         pybullet.resetBasePositionAndOrientation(marker, position, (0, 0, 0, 1), physicsClientId=self.client)
