@@ -64,6 +64,14 @@ class TaskError(RlctlError):
     exit_code = 3
 
 
+class WorldFailed(TaskError):
+    """One of the worlds that are simulated together failed; `world` is its index, 0 for a single one."""
+
+    def __init__(self, message: str, world: int = 0, *, details: str | None = None) -> None:
+        super().__init__(message, details=details)
+        self.world = world
+
+
 class PolicyError(TaskError):
     """A policy that is a user's function raised an exception, or returned something that is not an action."""
 

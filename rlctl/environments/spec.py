@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import inspect
 import math
 import os
@@ -19,6 +20,8 @@ from rlctl.storage import validation
 
 if TYPE_CHECKING:
     import gymnasium
+
+    from rlctl.task.batch_env import BatchEnv
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,8 +44,11 @@ class EnvSpec:
     stage: Annotated[int, Ge(0)] = 0  # stage of the curriculum, from 1; 0 without a curriculum
     level: Annotated[float, Ge(0), Le(1)] = 1.0
     """How far ranges written `{from: ..., to: ...}` have widened, from 0 (`from`) to 1 (`to`)."""
-    sim: str = "pybullet"
-    """The physics engine of a task: `pybullet`, `mujoco`, or `mujoco:0.01` with the time constant of contacts [s]."""
+    sim: str = ""
+    """The physics engine of a task: `pybullet`, `mujoco`, or `mujoco:0.01` with the time constant of contacts [s].
+
+    Empty: see `resolve`.
+    """
     named_by: str = dataclasses.field(default="", compare=False)
     """The kind of file that names the task; empty if a user named it. A file may name environments only."""
 
@@ -59,7 +65,8 @@ class EnvSpec:
             env = self._make_task_env(constructor, render_mode)
         else:
             for key in ("reward_weights", "randomize", "events", "level", "sim"):
-                if getattr(self, key) != getattr(EnvSpec(self.task), key):
+                # Files of plain environments that were written before engines could be chosen name PyBullet.
+                if getattr(self, key) not in (getattr(EnvSpec(self.task), key), "pybullet"):
                     raise RecipeError(f"{key}: {self.task} is a plain Gymnasium environment; only tasks have them")
             env = self._make_plain_env(constructor, render_mode)
         try:
@@ -76,6 +83,37 @@ class EnvSpec:
             env.close()
             raise
 
+    def resolve(self) -> EnvSpec:
+        """Return the spec with its engine: PyBullet if it is installed, for a `BatchTask` and otherwise MuJoCo."""
+        if self.sim or not is_task(self.constructor()):
+            return self
+        engine = "mujoco" if self.is_batch or importlib.util.find_spec("pybullet") is None else "pybullet"
+        return dataclasses.replace(self, sim=engine)
+
+    @property
+    def is_batch(self) -> bool:
+        """Whether the task is a `BatchTask`; it is imported."""
+        from rlctl.task.batch import BatchTask
+
+        constructor = self.constructor()
+        return isinstance(constructor, type) and issubclass(constructor, BatchTask)
+
+    def make_batch(self, env: gymnasium.Env[Any, Any], worlds: int) -> BatchEnv | None:
+        """Return so many worlds of a `BatchTask`, of which `env` is one; None for any other environment."""
+        from rlctl.task.batch import OneWorld
+        from rlctl.task.batch_env import BatchEnv
+        from rlctl.task.env import TaskEnv
+
+        single = env.unwrapped
+        if not isinstance(single, TaskEnv) or not isinstance(single.task, OneWorld):  # type: ignore[unreachable]
+            return None
+        if env is not single:
+            raise RecipeError(f"{self.task} is a BatchTask, whose worlds have no frame_stack and no time_feature")
+        constructor: Any = self.constructor()
+        parameters, sim = check_fields(constructor, self.parameters), self.resolve().sim
+        batch: BatchEnv = call_plugin(self.task, lambda: BatchEnv(constructor(**parameters), worlds, single, sim))
+        return batch
+
     def _make_task_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
         from rlctl.task.env import TaskEnv
         from rlctl.task.events import EventSettings
@@ -83,11 +121,11 @@ class EnvSpec:
 
         check_parameters(constructor)
         parameters = check_fields(constructor, self.parameters)
-        weights, events = self.reward_weights, EventSettings(self.randomize, self.events)
+        weights, events, sim = self.reward_weights, EventSettings(self.randomize, self.events), self.resolve().sim
 
         def build() -> TaskEnv:
             task = constructor(**parameters)
-            return TaskEnv(task, render_mode=render_mode, reward_weights=weights, events=events, sim=self.sim)
+            return TaskEnv(task, render_mode=render_mode, reward_weights=weights, events=events, sim=sim)
 
         env: TaskEnv = call_plugin(self.task, build)
         env.set_level(self.level)

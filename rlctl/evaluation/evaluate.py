@@ -21,7 +21,7 @@ from rlctl.policy.players.player import Exploration
 from rlctl.policy.shipped import MeasuredScore
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import Workers, available_cores
+from rlctl.rollout.workers import Workers, count_envs
 from rlctl.run.episode import save_episode
 from rlctl.run.group import Group
 
@@ -94,8 +94,9 @@ def run_evaluation(
 
 
 def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:
-    """Start the workers of a request: by default an environment per core, but no more than episodes."""
-    return Workers(spec, min(request.n_envs or available_cores(), request.episodes), timeout_s=request.env_timeout_s)
+    """Start the workers of a request: by default as many environments as `count_envs`, but no more than episodes."""
+    n_envs = min(request.n_envs or count_envs(spec, request.episodes), request.episodes)
+    return Workers(spec, n_envs, timeout_s=request.env_timeout_s)
 
 
 def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:

@@ -10,7 +10,7 @@ import pydantic
 from pydantic import Field
 
 from rlctl.environments.spec import EnvSpec, merge
-from rlctl.errors import RecipeError, short_repr
+from rlctl.errors import RecipeError, UsageError, short_repr
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS, decide_by
 from rlctl.recipe.hyperparameters import ON_POLICY as ON_POLICY
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
@@ -82,6 +82,8 @@ class Recipe(Section):
 
     task: dict[str, Any] = {}
     """Parameters of the task: the arguments of its constructor."""
+    sim: str | None = Field(None, json_schema_extra=decide_by("pybullet if it is installed, else mujoco"))
+    """Physics engine of a task: pybullet, mujoco, or mujoco:0.01 with the time constant of contacts [s]."""
     reward_weights: dict[str, Number] = {}
     """Weights of reward terms that differ from the task's defaults."""
     randomize: Switch = False
@@ -134,6 +136,18 @@ class Recipe(Section):
             return values
         return model.model_validate(values).model_dump(mode="json", exclude_unset=True)
 
+    @pydantic.field_validator("sim")
+    @classmethod
+    def _check_engine(cls, value: str | None) -> str | None:
+        from rlctl.task.mujoco.sim import read_solref  # few recipes name an engine
+
+        try:
+            if value is not None:
+                read_solref(value)
+        except UsageError as error:
+            raise ValueError(str(error)) from None
+        return value
+
     @pydantic.model_validator(mode="after")
     def _fit_together(self) -> Self:
         dropped = self.algo_kwargs.get("top_quantiles_to_drop_per_net", 0)
@@ -165,8 +179,9 @@ class Recipe(Section):
             self.events,
             self.frame_stack,
             self.time_feature,
+            sim=self.sim or "",
             named_by=named_by,
-        )
+        ).resolve()
         return [
             dataclasses.replace(
                 base,

@@ -60,7 +60,8 @@ def play_episodes(
 ) -> list[Episode]:
     """Play an episode per seed with the workers' policy and return them in the order of `seeds`.
 
-    Each worker plays in its first environment. An episode depends on its seed and the policy only, not on the worker.
+    Each worker plays in its first environment, or in all worlds of a `BatchTask`. An episode depends on its seed and
+    the policy only, not on the worker.
     `watch` is called with the number of finished episodes, several times a second; if it raises, the caller must close
     the workers. Raises `TaskError` if an environment fails, and for an episode that does not end.
     """
@@ -70,18 +71,21 @@ def play_episodes(
     running: dict[int, _Recorder] = {}
     episodes: dict[int, Episode] = {}
 
-    def begin(env: int) -> None:
-        if waiting:
-            index, seed = waiting.pop()
-            running[env] = _Recorder(index, record)
-            play(env, seed)
+    def play(envs: Sequence[int]) -> None:
+        """Continue the episodes of a worker's environments, or begin the next ones in those that have none."""
+        begin = {}
+        for env in envs:
+            if env in running:
+                begin[env] = -1
+            elif waiting:
+                index, begin[env] = waiting.pop()
+                running[env] = _Recorder(index, record)
+        contacts = terms and any(running[env].index < _CONTACTS_MEASURED for env in begin)
+        if begin:
+            workers.start_playing(Play(steps, begin, exploration=exploration, record=terms, contacts=contacts))
 
-    def play(env: int, seed: int) -> None:
-        contacts = terms and running[env].index < _CONTACTS_MEASURED
-        workers.start_playing(Play(steps, {env: seed}, exploration=exploration, record=terms, contacts=contacts))
-
-    for env in workers.first_envs:
-        begin(env)
+    for envs in workers.playable_envs:
+        play(envs)
     while running:
         before = workers.playing
         try:
@@ -92,22 +96,21 @@ def play_episodes(
             raise
         ended = {result.env: result for result in results}
         for worker in sorted(before - workers.playing):
-            env = workers.first_envs[worker]
-            result, recorder = ended.get(env), running[env]
-            recorder.add(workers, env, steps if result is None else result.row + 1)
-            if result is None:
-                if workers.info.max_steps is None and recorder.steps >= MOST_STEPS:
+            envs = workers.playable_envs[worker]
+            for env in [env for env in envs if env in running]:
+                result, recorder = ended.get(env), running[env]
+                recorder.add(workers, env, steps if result is None else result.row + 1)
+                if result is not None:
+                    del running[env]
+                    terminated = bool(workers.arrays.segment.terminated[env, result.row])
+                    episodes[recorder.index] = Episode(result, recorder.finish(), terminated)
+                elif workers.info.max_steps is None and recorder.steps >= MOST_STEPS:
                     raise TaskError(
                         f"task {workers.spec.task!r}: the episode of seed {seeds[recorder.index]} has not ended within "
                         f"{recorder.steps:,} steps, and no time limit is known\n"
                         "wrap it in gymnasium.wrappers.TimeLimit, or return truncated=True after a number of steps"
                     )
-                play(env, -1)
-                continue
-            del running[env]
-            terminated = bool(workers.arrays.segment.terminated[env, result.row])
-            episodes[recorder.index] = Episode(result, recorder.finish(), terminated)
-            begin(env)
+            play(envs)
     watch(len(episodes))
     return [episodes[index] for index in range(len(seeds))]
 

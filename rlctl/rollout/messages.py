@@ -127,6 +127,7 @@ class Answer:
     ended: Sequence[EpisodeResult] = ()  # episodes that ended while a segment was played
     left: Sequence[int] = ()  # environments whose episode ended or failed while its actions were replayed
     info: EnvInfo | None = None  # description of the environments, if it has changed
+    lockstep: bool = False  # whether they are the worlds of a `BatchTask`, which play together
     rewards: NDArray[np.float64] | None = None  # those of `ComputeRewards`, shape (n,)
 
 

@@ -25,9 +25,11 @@ from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.policy.players.named import SERVER, make_player
 from rlctl.policy.players.player import Player
+from rlctl.policy.rows import RowsPolicy
 from rlctl.processes.child_process import write_stderr
 from rlctl.processes.pool import answer_messages
 from rlctl.rollout import messages
+from rlctl.rollout.batch_episodes import BatchEpisodes, Players
 from rlctl.rollout.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
 from rlctl.rollout.running_episode import ObservationWriter, RunningEpisode, compute_rewards
 from rlctl.rollout.seeds import Stream, episode_seed
@@ -43,6 +45,9 @@ class Worker:
         self._job = job
         self._episodes: list[RunningEpisode] = []
         self._player: Player | None = None
+        self._batch: BatchEpisodes | None = None
+        """The worlds of a `BatchTask`; then `_episodes` has one environment that only describes them."""
+        self._players: Players | None = None
         self._states: NDArray[np.float32] | None = None
         self._info: EnvInfo
         self._arrays: SharedArrays
@@ -58,7 +63,7 @@ class Worker:
             case messages.ComputeRewards():
                 return Answer(rewards=compute_rewards(self._episodes[0].env, message.achieved, message.desired))
             case messages.Build():
-                return Answer(info=self._build(message.spec))
+                return Answer(info=self._build(message.spec), lockstep=self._batch is not None)
             case messages.SetEvents():
                 return Answer(info=self._set_events(message))
             case messages.Attach():
@@ -74,7 +79,11 @@ class Worker:
             self.close()
             gc.unfreeze()
             gc.collect()  # environments may hold themselves in cycles
-        envs = [spec.make() for _ in range(self._job.count)]
+        envs = [spec.make()]
+        if (batch := spec.make_batch(envs[0], self._job.count)) is not None:
+            self._batch = BatchEpisodes(batch, self._job.first)
+        else:
+            envs += [spec.make() for _ in range(self._job.count - 1)]
         self._info = describe(envs[0])
         metrics = [name for name, weight in self._info.reward_weights.items() if weight == 0]
         self._episodes = [RunningEpisode(env, self._job.first + index, metrics) for index, env in enumerate(envs)]
@@ -95,6 +104,8 @@ class Worker:
                 raise TypeError(f"{spec.task}: a plain Gymnasium environment has no events")
             env.set_events(EventSettings(spec.randomize, spec.events), added)
             env.set_level(spec.level)
+        if self._batch is not None:
+            self._batch.env.set_events(self._episodes[0].env.unwrapped)
         self._info = describe(self._episodes[0].env)
         return self._info
 
@@ -103,11 +114,19 @@ class Worker:
         self._close_player()
         if message.info is None:
             self._player = _make_player(message.other, self._episodes[0].env)
+            if self._batch is not None:
+                env = self._episodes[0].env
+                self._players = Players(None, [_make_player(message.other, env) for _ in range(self._job.count)])
         else:
             layout = {name: (shape, np.dtype(dtype)) for name, shape, dtype in message.layout}
             tensors = map_arrays(self._job.numbers, layout)
             self._states = tensors.pop("state", None)
-            self._player = PolicyPlayer(PolicyFile(message.info, tensors))
+            policy = PolicyFile(message.info, tensors)
+            self._player = PolicyPlayer(policy)
+            if self._batch is not None and RowsPolicy.supports(policy):
+                self._players = Players(RowsPolicy(policy, self._job.count), [])
+            elif self._batch is not None:
+                self._players = Players(None, [PolicyPlayer(policy) for _ in range(self._job.count)])
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
         from rlctl.deploy.filter.limited_player import LimitedPlayer  # few evaluations need it
@@ -123,6 +142,8 @@ class Worker:
     def _begin_episodes(self, message: messages.BeginEpisodes) -> list[int]:
         """Begin episodes and replay their actions; return the environments whose episode ended or failed."""
         left = []
+        if self._batch is not None:
+            return self._batch.replay(self._arrays, message.episodes)
         for env, (seed, actions) in message.episodes.items():
             episode = self._episodes[env - self._job.first]
             try:
@@ -156,6 +177,10 @@ class Worker:
     def _play(self, message: messages.Play) -> list[EpisodeResult]:
         """Play a segment in some environments, one after the other; return the episodes that ended."""
         ended: list[EpisodeResult] = []
+        if self._batch is not None:
+            assert self._players is not None  # a policy is loaded before anything is played
+            self._players.explore(message.exploration)
+            return self._batch.play(self._arrays, message, self._players)
         self._loaded_player.explore(message.exploration)
         for env, seed in message.begin.items():
             episode = self._episodes[env - self._job.first]
@@ -231,9 +256,10 @@ class Worker:
         self._arrays.inside[episode.index, 1] = -1
 
     def _close_player(self) -> None:
-        if self._player is not None:
-            self._player.close()
-        self._player = None
+        for player in (self._player, self._players):
+            if player is not None:
+                player.close()
+        self._player = self._players = None
 
     def close(self) -> None:
         """Close the environments and the policy."""
@@ -244,6 +270,9 @@ class Worker:
             except BaseException as error:  # its episodes are over
                 write_stderr(f"warning: closing environment {episode.index}: {describe_exception(error)}")
         self._episodes = []
+        if self._batch is not None:
+            self._batch.close()
+        self._batch = None
 
 
 def _list_training_seeds(run_seed: int, env: int, first: int) -> Iterator[int]:

@@ -27,6 +27,7 @@ from rlctl.rollout.shared_arrays import PolicyNumbers, SharedArrays
 
 BUILD_TIMEOUT_S = 300.0
 DEFAULT_TIMEOUT_S = 60.0
+_WORLDS = 64  # worlds of a `BatchTask` per core, that play whole episodes
 
 RecordedActions = tuple[int, NDArray[Any]]  # seed and actions so far of an episode
 
@@ -56,7 +57,6 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         bounds = np.linspace(0, n_envs, n_workers + 1).round().astype(int).tolist()
         self._ranges = list(itertools.pairwise(bounds))
         self._owner = [worker for worker, (low, high) in enumerate(self._ranges) for _ in range(low, high)]
-        self.first_envs = [low for low, _ in self._ranges]  # the first environment of each worker
         self._memories = [anonymous_file(), anonymous_file()]
         arrays, numbers = self._memories
         self._numbers = PolicyNumbers(numbers, n_envs)
@@ -90,6 +90,12 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         """The workers that have not answered yet."""
         return set(self._pool.waiting_for)
 
+    @property
+    def playable_envs(self) -> list[list[int]]:
+        """The environments of each worker that play whole episodes: the first one, or all worlds of a `BatchTask`."""
+        self._wait_until_built()
+        return [list(range(low, high if self._lockstep else low + 1)) for low, high in self._ranges]
+
     def observations(self, rows: Any = slice(None)) -> Observations:
         """Return a copy of the current observations, shape (rows, ...) or a dict of such."""
         return join({key: array[rows].copy() for key, array in self.arrays.observation.items()})
@@ -112,7 +118,8 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
     def _wait_until_built(self) -> None:
         if self._ready:
             return
-        self._info = _info_of(self._wait("being built", max(BUILD_TIMEOUT_S, self.timeout_s)))
+        answers = self._wait("being built", max(BUILD_TIMEOUT_S, self.timeout_s))
+        self._info, self._lockstep = _info_of(answers), answers[0].lockstep
         self._numbers.forget()
         self._ready = True
         self._attach(self._steps)
@@ -269,6 +276,11 @@ def _info_of(answers: Mapping[int, Answer]) -> EnvInfo:
     info = answers[0].info
     assert info is not None  # the answer to Build and SetEvents has it
     return info
+
+
+def count_envs(spec: EnvSpec, episodes: int) -> int:
+    """Return how many environments play a list of episodes: one per core, of a `BatchTask` many worlds per core."""
+    return min(episodes, available_cores() * (_WORLDS if spec.is_batch else 1))
 
 
 def available_cores() -> int:

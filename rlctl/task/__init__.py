@@ -9,6 +9,8 @@ from rlctl.errors import TaskError as TaskError
 from rlctl.task import events as events
 from rlctl.task import rewards as rewards
 from rlctl.task.attachments import Attachment as Attachment
+from rlctl.task.batch import BatchTask as BatchTask
+from rlctl.task.batch import WorldRngs as WorldRngs
 from rlctl.task.body import Body as Body
 from rlctl.task.events import Event as Event
 from rlctl.task.joints import Joints as Joints

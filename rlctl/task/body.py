@@ -79,7 +79,7 @@ class Body:
     """What `set_drives` set; None: `drive_to` uses its `gain`."""
 
     def _refuse(self, what: str) -> NoReturn:
-        raise UsageError(f"{what}: not in {self.engine}; see docs/engines.md")
+        raise UsageError(f"{what}: not in {self.engine}; use the other engine: --sim")
 
     def find_joints(self, joints: Collection[str] = ()) -> list[int]:
         """Return the indices of joints, or of all, in joint arrays; raises `TaskError` for a name that is not there."""

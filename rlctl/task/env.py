@@ -12,6 +12,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from rlctl.errors import RecipeError, TaskError, UsageError, check_name, short_repr
+from rlctl.task.batch import OneWorld, as_single
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
 from rlctl.task.joints import Joints
@@ -40,6 +41,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     ) -> None:
         check_parameters(type(task))
         check_definition(task)
+        task = as_single(task)
         self.task = task
         self.name = type(task).__name__
         # gymnasium.Env has one dict for all environments.
@@ -241,6 +243,11 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 
 def _make_world(task: Task, sim: str, render_mode: str | None) -> Sim:
     solref, iterations = read_solref(sim), task.solver_iterations
+    if isinstance(task, OneWorld):
+        if solref is None:
+            raise UsageError(f"{type(task).__name__} simulates its worlds in MuJoCo: sim: mujoco, or --sim mujoco")
+        dt, substeps = task.control_dt, task.substeps
+        return MujocoSim(control_dt=dt, substeps=substeps, solref=solref, iterations=iterations, worlds=1).one(0)
     if solref is None:
         gui = render_mode == "human"
         return BulletSim(control_dt=task.control_dt, substeps=task.substeps, solver_iterations=iterations, gui=gui)

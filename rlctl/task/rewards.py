@@ -21,8 +21,13 @@ def distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float((x * x + y * y + z * z) ** 0.5)
 
 
-def closeness(distance: float, scale: float) -> float:
+Values = TypeVar("Values", float, NDArray[np.float64])
+
+
+def closeness(distance: Values, scale: float) -> Values:
     """Return exp(-(distance / scale)^2): 1 at distance 0, 1/e at `scale`, and close to 0 far beyond it."""
+    if isinstance(distance, np.ndarray):
+        return np.exp(-((distance / scale) ** 2))
     return math.exp(-((distance / scale) ** 2))
 
 
@@ -33,6 +38,8 @@ def arrival(distance: float, tolerance: float) -> float:
 
 def squared(x: NDArray[np.floating]) -> float:
     """Return the mean of the squared elements: in [0, 1] for an action in [-1, 1], whatever its size."""
+    if x.ndim > 1:
+        return np.square(x).mean(axis=-1)  # type: ignore[return-value]
     return float(x.dot(x)) / x.size
 
 
@@ -115,9 +122,6 @@ def penetration(distances: Array) -> float:
 
 
 Falloff = Literal["gaussian", "linear", "long_tail"]
-
-
-Values = TypeVar("Values", float, NDArray[np.float64])
 
 
 def tolerance(

@@ -27,7 +27,7 @@ class Sim:
     bodies: Mapping[str, Body]
 
     def _refuse(self, what: str) -> NoReturn:
-        raise UsageError(f"{what}: not in {self.engine}; see docs/engines.md")
+        raise UsageError(f"{what}: not in {self.engine}; use the other engine: --sim")
 
     def set_gravity(self, gravity: float) -> None:
         """Set the downward gravity of the built world [m/s^2], by default 9.81. Call it in `build`."""

@@ -75,15 +75,15 @@ class Task:
         """Return what the policy sees, by name; the observation has the same order."""
         raise NotImplementedError
 
-    def rewards(self, action: NDArray[Any]) -> dict[str, float]:
+    def rewards(self, action: NDArray[Any]) -> dict[str, Any]:
         """Return the raw reward terms, by the names of `reward_weights`."""
         raise NotImplementedError
 
-    def is_success(self) -> bool | None:
+    def is_success(self) -> Any:
         """Return whether the goal is reached now; an episode succeeds if it is reached at its end. Optional."""
         return None
 
-    def is_terminated(self) -> bool:
+    def is_terminated(self) -> Any:
         """Return whether the episode ends, for example after a fall; the time limit is not part of it. Optional."""
         return False
 

@@ -268,6 +268,5 @@ def test_the_worst_contacts_are_gated(rlctl):
 def test_what_mujoco_has_not_is_said_before_an_episode_is_played(rlctl):
     pytest.importorskip("mujoco")
     done = rlctl("eval", "kuka-grasp", "--pretrained", "--sim", "mujoco")
-    assert done.returncode == 2
-    file = "kuka_with_gripper2.sdf, which is not a URDF file"
-    assert done.stderr.endswith(f"error: {file}: not in MuJoCo; this task runs in PyBullet only\n")
+    assert done.returncode == 3
+    assert done.stderr.endswith("kuka_with_gripper2.sdf: MuJoCo reads URDF and MJCF (.xml) files\n")

@@ -8,7 +8,8 @@ import numpy as np
 
 from rlctl.policy.layers import Array
 
-_BLOCK = 64  # number of steps whose random numbers are drawn together
+NOISE_BLOCK = 64
+"""Number of steps whose random numbers are drawn together."""
 _STEP_NOISE = 0  # random stream of the noise of steps
 
 
@@ -39,13 +40,21 @@ class Noise:
 
         Steps count from 0.
         """
-        block, row = divmod(step, _BLOCK)
+        block, row = divmod(step, NOISE_BLOCK)
         if block != self._block or seed != self._seed:
             self._seed, self._block = seed, block
-            generator = make_generator(seed, _STEP_NOISE, block)
-            self._normal = generator.standard_normal((_BLOCK, 2, self._size), np.float32)
-            self._uniform = generator.random((_BLOCK, self._size + 1))
+            self._normal, self._uniform = draw_noise(seed, block, self._size)
         return self._normal[row], self._uniform[row]
+
+
+def draw_noise(seed: int, block: int, size: int) -> tuple[Array, Array]:
+    """Return the random numbers of a block of steps of an episode.
+
+    Standard normal ones of shape (NOISE_BLOCK, 2, size), and uniform ones in [0, 1) of shape (NOISE_BLOCK, size + 1).
+    """
+    generator = make_generator(seed, _STEP_NOISE, block)
+    normal = generator.standard_normal((NOISE_BLOCK, 2, size), np.float32)
+    return normal, generator.random((NOISE_BLOCK, size + 1))
 
 
 def make_generator(seed: int, use: int, counter: int) -> np.random.Generator:

@@ -55,6 +55,8 @@ class Parts:
         self.speed_cap = max(speeds) if fixed and speeds and min(speeds) > 0 else math.inf
         self.drives: tuple[Array, Array, Array] | None = None
         self.inertia: Array | None = None
+        self.active: dict[int, object] = {}
+        """By joint, the kind of command that is written into the model."""
 
     def list_geoms(self) -> list[tuple[int, str]]:
         """Return number and link of the geoms that collide."""

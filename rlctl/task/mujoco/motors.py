@@ -31,6 +31,7 @@ class _Mode(NamedTuple):
     motors: Any  # their numbers
     stiffness: Array
     damping: Array
+    force: Array  # its limit [N m or N]
     max_speed: Array | None
 
 
@@ -41,7 +42,6 @@ class MujocoMotors(Body):
         self._sim, self.parts = sim, parts
         self._fields = sim.fields
         self._modes: dict[tuple[str, ...], _Mode] = {}
-        self._active: dict[int, object] = {}  # by joint, the mode that is written into the model
         self._chosen: set[int] = set()
         self._cap = np.inf
 
@@ -53,7 +53,7 @@ class MujocoMotors(Body):
         """Take the numbers of a newly compiled model."""
         self._motors = np.arange(self._sim.model.nu)[self.parts.motors]
         self._modes.clear()
-        self._active.clear()
+        self.parts.active.clear()
         self._cap = self.parts.speed_cap
         if self.parts.drives is not None:
             self._sim.model.dof_armature[self.parts.velocities] = self.parts.drives[2]
@@ -70,7 +70,7 @@ class MujocoMotors(Body):
 
     def forget_motors(self, worlds: Rows) -> None:
         """Let nothing drive the joints after a reset, until the next command."""
-        self._active.clear()
+        self.parts.active.clear()
 
     @property
     def joint_torques(self) -> Array:
@@ -189,25 +189,22 @@ class MujocoMotors(Body):
             speed = np.where(given > 0, given, np.inf) if (given > 0).any() else None
         elif kind == "torque":
             damping = np.zeros(len(chosen))
-        mode = _Mode(key, chosen, motors, stiffness if kind == "position" else 0.0 * damping, damping, speed)
-        self._forces = getattr(self, "_forces", {}) | {id(key): force}
-        return mode
+        return _Mode(key, chosen, motors, stiffness if kind == "position" else 0.0 * damping, damping, force, speed)
 
     def _write_mode(self, mode: _Mode) -> None:
         """Write a kind of command into the model, if it is not there yet."""
-        if all(self._active.get(joint) is mode for joint in mode.joints):
+        if all(self.parts.active.get(joint) is mode for joint in mode.joints):
             return
-        self._active.update(dict.fromkeys(mode.joints, mode))
+        self.parts.active.update(dict.fromkeys(mode.joints, mode))
         biases, ranges = self._fields.model("actuator_biasprm"), self._fields.model("actuator_forcerange")
         biases[..., mode.motors, 1], biases[..., mode.motors, 2] = -mode.stiffness, -mode.damping
-        force = self._forces[id(mode.key)] * self._fields.model("strength")[..., mode.motors]
+        force = mode.force * self._fields.model("strength")[..., mode.motors]
         ranges[..., mode.motors, 0], ranges[..., mode.motors, 1] = -force, force
 
     def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
         motors = self._motors[self.find_joints(joints)]
         self._fields.model("strength")[..., motors] = factor * self._sim.world.built("strength")[motors]
-        for body in [self, *([self._sim.bodies[self.name]] if self.name in self._sim.bodies else [])]:
-            body._active.clear()
+        self.parts.active.clear()
 
     def cap_joint_speed(self, speed: float) -> None:
         self.parts.speed_cap = self._cap = speed

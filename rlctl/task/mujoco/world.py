@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, UsageError
+from rlctl.errors import UsageError, WorldFailed
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64] | None
@@ -21,6 +21,8 @@ _SERIOUS = {
     "mjWARN_CNSTRFULL": "too many constraints",
 }
 """MuJoCo's warnings that are errors, and what they mean."""
+_DERIVED = ("xpos", "xquat", "xipos", "sensordata", "actuator_force")
+"""Arrays that bodies read and the state does not have."""
 
 
 def import_mujoco() -> Any:
@@ -127,7 +129,7 @@ class World:
         try:
             getattr(self.batch, method)(ids, **values)
         except SimulationError as error:
-            raise WorldError(int(error.ids[0]), f"MuJoCo: {self.batch.error(int(error.ids[0]))}") from None
+            raise WorldFailed(f"MuJoCo: {self.batch.error(int(error.ids[0]))}", int(error.ids[0])) from None
 
     def step(self, worlds: Rows = None) -> None:
         """Take all substeps of a control step; afterwards everything but accelerations and forces is up to date."""
@@ -155,7 +157,7 @@ class World:
         for name, what in _SERIOUS.items():
             bad = np.flatnonzero(rows[:, int(getattr(self.mujoco.mjtWarning, name))])
             if bad.size:
-                raise WorldError(int(bad[0]), f"MuJoCo: {what}: the simulation is unstable")
+                raise WorldFailed(f"MuJoCo: {what}: the simulation is unstable", int(bad[0]))
         if self.batch is None:
             self.mj_data.warning.number[:] = 0
         else:
@@ -173,6 +175,8 @@ class World:
 
             self.batch = Batch(self.mj_model, self.count, 1)
             self.batch.state[:] = self._saved
+            for name in _DERIVED:  # one that is bound later is zero until the next call
+                self.batch.bind(name)
             self.touch()
 
     def restore(self, worlds: Rows = None) -> None:
@@ -189,14 +193,6 @@ class World:
             kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_setState(self.mj_model, self.mj_data, self._saved, kind)
         self.touch(worlds)
-
-
-class WorldError(TaskError):
-    """A world of a batch, by its index, failed."""
-
-    def __init__(self, world: int, message: str) -> None:
-        super().__init__(message)
-        self.world = world
 
 
 class Fields:

@@ -154,6 +154,10 @@ class BulletSim(Constraints):
             body._cache.clear()
             body._restore_nominal()
 
+    def body(self, name: str) -> BulletBody:
+        super().body(name)  # raises for an unknown one
+        return self.bodies[name]
+
     def shift_gravity(self, change: float) -> None:
         if self._built_gravity is None:
             engine = pybullet.getPhysicsEngineParameters(physicsClientId=self.client)

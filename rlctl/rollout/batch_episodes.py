@@ -1,0 +1,201 @@
+"""The worlds of a `BatchTask` in a worker: they play their segments in lockstep, with one forward pass per step."""
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from time import perf_counter
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.environments.dict_spaces import SINGLE
+from rlctl.errors import WorldFailed
+from rlctl.policy.players.player import Player
+from rlctl.policy.rows import RowsPolicy
+from rlctl.rollout import messages
+from rlctl.rollout.messages import EpisodeResult, FailedInEpisode
+from rlctl.rollout.seeds import Stream, episode_seed
+from rlctl.rollout.shared_arrays import SharedArrays
+from rlctl.task.batch_env import BatchEnv, BatchStep
+
+Worlds = NDArray[np.int64]
+
+
+class BatchEpisodes:
+    """The running episodes of a `BatchEnv`; world 0 is the environment `first` of all."""
+
+    def __init__(self, env: BatchEnv, first: int) -> None:
+        self.env, self._first = env, first
+        count = env.worlds
+        self.seeds = np.full(count, -1, np.int64)
+        self._return, self._time = np.zeros(count), np.zeros((count, 2))  # of policy and environment [s]
+        self._sums = np.zeros((count, len(env.weights)))
+        self._observation: NDArray[np.float32] | None = None
+        self._weights = np.array([*env.weights.values()])
+
+    def begin(self, arrays: SharedArrays, worlds: Worlds, seeds: Sequence[int]) -> NDArray[np.float32]:
+        """Begin episodes; return their first observations, which are written into the shared arrays too."""
+        self.seeds[worlds] = seeds
+        self._return[worlds] = 0.0
+        self._sums[worlds] = 0.0
+        self._time[worlds] = 0.0
+        inside = arrays.inside[self._first : self._first + self.env.worlds]
+        inside[worlds] = np.stack(
+            [self.seeds[worlds], np.zeros(len(worlds), np.int64), np.full(len(worlds), -1)], axis=1
+        )
+        try:
+            first = self.env.reset(worlds, [int(seed) for seed in seeds])
+        except BaseException as error:  # a plugin may raise anything, SystemExit too
+            self._fail(error, int(worlds[0]))
+        arrays.observation[SINGLE][self._first + worlds] = first
+        inside[worlds, 1] = -1
+        return first
+
+    def replay(self, arrays: SharedArrays, episodes: Mapping[int, tuple[int, NDArray[np.generic]]]) -> list[int]:
+        """Begin episodes and take their recorded actions in lockstep; return the environments whose episode ended."""
+        envs = np.array([*episodes], np.int64) - self._first
+        self.begin(arrays, envs, [seed for seed, _ in episodes.values()])
+        actions = {env - self._first: taken for env, (_, taken) in episodes.items()}
+        left: list[int] = []
+        running, longest = envs, max(len(taken) for taken in actions.values())
+        for step in range(longest):
+            running = np.array([env for env in running.tolist() if step < len(actions[env])], np.int64)
+            if not len(running):
+                break
+            result = self._step(np.stack([actions[env][step] for env in running.tolist()]), running)
+            arrays.observation[SINGLE][self._first + running] = result.observation
+            ended = result.terminated | result.truncated
+            left += running[ended].tolist()
+            running = running[~ended]
+        return [env + self._first for env in left]
+
+    def _step(self, action: NDArray[Any], worlds: Worlds) -> BatchStep:
+        try:
+            result = self.env.step(action, None if len(worlds) == self.env.worlds else worlds)
+        except BaseException as error:  # a plugin may raise anything, SystemExit too
+            self._fail(error, int(worlds[0]))
+        self._return[worlds] += result.reward
+        self._sums[worlds] += result.terms
+        return result
+
+    def _fail(self, error: BaseException, world: int) -> NoReturn:
+        world = error.world if isinstance(error, WorldFailed) else world
+        raise FailedInEpisode(self._first + world, int(self.seeds[world]), int(self.env.step_of[world])) from error
+
+    def play(self, arrays: SharedArrays, asked: messages.Play, players: "Players") -> list[EpisodeResult]:
+        """Play a segment in the environments of `asked.begin`; return the episodes that ended."""
+        envs = np.array(sorted(asked.begin), np.int64)
+        worlds, seeds = envs - self._first, [asked.begin[int(env)] for env in envs]
+        new = np.array([seed >= 0 for seed in seeds])
+        if new.any():
+            self.begin(arrays, worlds[new], [seed for seed in seeds if seed >= 0])
+            players.begin_episodes(worlds[new])
+        following = {env: _list_seeds(asked.run_seed, env, number) for env, number in asked.next_episodes.items()}
+        segment, now = arrays.segment, arrays.segment.observation[SINGLE]
+        now[envs, 0] = arrays.observation[SINGLE][envs]
+        inside = arrays.inside
+        inside[envs, 0] = self.seeds[worlds]
+        players.begin_segment(self.seeds, self.env.step_of, worlds)
+        ended: list[EpisodeResult] = []
+        for row in range(asked.steps):
+            began = perf_counter()
+            stored, action = players.act(now[envs, row], self.seeds[worlds], self.env.step_of[worlds], worlds)
+            acted = perf_counter()
+            segment.stored[envs, row], segment.action[envs, row] = stored, action
+            inside[envs, 1], inside[envs, 2] = self.env.step_of[worlds] + 1, row
+            result = self._step(segment.action[envs, row], worlds)
+            self._time[worlds] += (acted - began) / len(worlds), (perf_counter() - acted) / len(worlds)
+            segment.reward[envs, row] = result.reward
+            segment.terminated[envs, row], segment.truncated[envs, row] = result.terminated, result.truncated
+            if asked.record:
+                segment.terms[envs, row] = result.terms
+            now[envs, row + 1] = result.observation
+            done = result.terminated | result.truncated
+            if done.any():
+                ended += [self._summarize(int(k), int(worlds[k]), row, result) for k in np.flatnonzero(done)]
+                segment.final[SINGLE][envs[done], row] = result.observation[done]
+                if following:
+                    fresh = [next(following[int(env)]) for env in envs[done]]
+                    now[envs[done], row + 1] = self.begin(arrays, worlds[done], fresh)
+                    players.begin_episodes(worlds[done])
+                else:
+                    arrays.observation[SINGLE][envs[done]] = result.observation[done]
+                    envs, worlds = envs[~done], worlds[~done]
+                    if not len(envs):
+                        break
+        arrays.observation[SINGLE][envs] = now[envs, asked.steps]
+        inside[self._first : self._first + self.env.worlds, 1] = -1
+        return ended
+
+    def _summarize(self, k: int, world: int, row: int, result: BatchStep) -> EpisodeResult:
+        steps, sums = int(self.env.step_of[world]), self._sums[world]
+        names = list(self.env.weights)
+        acting, stepping = self._time[world].tolist()
+        last = dict(zip(names, result.terms[k].tolist(), strict=True))
+        return EpisodeResult(
+            self._first + world,
+            int(self.seeds[world]),
+            float(self._return[world]),
+            steps,
+            None if result.success is None else bool(result.success[k]),
+            dict(zip(names, (sums * self._weights).tolist(), strict=True)),
+            last.get("distance"),
+            row,
+            acting=acting / max(acting + stepping, 1e-9),
+            metrics={name: float(sums[index]) / steps for index, name in enumerate(names) if not self._weights[index]},
+        )
+
+    def close(self) -> None:
+        """End the simulation."""
+        self.env.close()
+
+
+class Players:
+    """What chooses the actions of the worlds: one pass for all rows, or a player per world where there is none."""
+
+    def __init__(self, rows: RowsPolicy | None, single: Sequence[Player]) -> None:
+        self._rows, self._single = rows, single
+        self._exploration: Any = None
+
+    def explore(self, exploration: Any) -> None:
+        """Use this exploration from now on."""
+        self._exploration = exploration
+        for player in self._single:
+            player.explore(exploration)
+
+    def begin_segment(self, seeds: Worlds, steps: Worlds, worlds: Worlds) -> None:
+        """Continue the episodes; the policy's weights may have changed."""
+        if self._rows is not None:
+            self._rows.begin_segment()
+        for world in worlds.tolist() if self._single else ():
+            self._single[world].begin_segment(int(seeds[world]), int(steps[world]))
+
+    def begin_episodes(self, worlds: Worlds) -> None:
+        """Forget the recurrent states."""
+        for world in worlds.tolist() if self._single else ():
+            state = self._single[world].state
+            if state is not None:
+                state[:] = 0.0
+
+    def act(
+        self, observations: NDArray[Any], seeds: Worlds, steps: Worlds, worlds: Worlds
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the actions to store, shape (k, elements), and those for the environments, shape (k, ...)."""
+        if self._rows is not None:
+            return self._rows.act(observations, seeds, steps, worlds, self._exploration)
+        chosen = [
+            self._single[world].act(observation, seed, step)
+            for world, observation, seed, step in zip(
+                worlds.tolist(), observations, seeds.tolist(), steps.tolist(), strict=True
+            )
+        ]
+        return np.stack([np.ravel(stored) for stored, _ in chosen]), np.stack([action for _, action in chosen])
+
+    def close(self) -> None:
+        """Release resources."""
+        for player in self._single:
+            player.close()
+
+
+def _list_seeds(run_seed: int, env: int, first: int) -> Iterator[int]:
+    return (episode_seed(run_seed, Stream.TRAIN, env, number) for number in itertools.count(first))

@@ -1,0 +1,132 @@
+"""`BatchTask`: a task for n worlds at once, whose methods take and return arrays with a leading axis."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.task.joints import Joints
+from rlctl.task.sim import Sim
+from rlctl.task.task import Task
+
+Array = NDArray[np.float64]
+
+
+class WorldRngs:
+    """The random generators of the worlds that begin an episode; every draw has a row per world.
+
+    It has the methods of `numpy.random.Generator`: `rng.uniform(-1, 1, 12)` has the shape (worlds, 12). Each row comes
+    from that world's own generator, so that an episode depends on its seed alone.
+    """
+
+    def __init__(self, generators: Sequence[np.random.Generator]) -> None:
+        self._generators = generators
+
+    def __getattr__(self, method: str) -> Callable[..., NDArray[Any]]:
+        if method.startswith("__") or not hasattr(np.random.Generator, method):
+            raise AttributeError(f"numpy.random.Generator has no method {method!r}")
+        return lambda *args, **kwargs: np.array([getattr(rng, method)(*args, **kwargs) for rng in self._generators])
+
+
+class BatchTask(Task):
+    """A task for `worlds` worlds of one model, simulated together in MuJoCo.
+
+    Definition and parameters are those of `Task`. The methods see all worlds: arrays of bodies have the shape
+    (worlds, ...), and so have all that are returned. `build` is called once and builds one world, which is copied.
+    """
+
+    worlds: int
+    """Number of worlds; set before `build`."""
+    per_world: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+    """Attributes that keep a value per world between steps, and the shape of a value: `{"command": (3,), "time": ()}`.
+
+    Each is an array of shape (worlds, ...), 0 at the start of an episode.
+    """
+
+    def reset(self, rng: WorldRngs, worlds: NDArray[np.int64]) -> None:  # type: ignore[override]
+        """Start an episode in `worlds`, shape (k,), and leave the others alone; draws from `rng` have k rows."""
+
+    def act(self, action: NDArray[Any]) -> None:
+        """Set motor targets from actions of shape (worlds, ...) inside `action_space`."""
+        raise NotImplementedError
+
+    def observe(self) -> dict[str, NDArray[np.float64]]:
+        """Return what the policy sees, by name, each of shape (worlds, size)."""
+        raise NotImplementedError
+
+    def rewards(self, action: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """Return the raw reward terms, each of shape (worlds,), by the names of `reward_weights`."""
+        raise NotImplementedError
+
+    def is_success(self) -> Any:
+        """Return whether the goal is reached now, shape (worlds,). Optional."""
+        return None
+
+    def is_terminated(self) -> Any:
+        """Return whether the episode ends, shape (worlds,). Optional."""
+        return np.zeros(self.worlds, bool)
+
+    def markers(self) -> dict[str, NDArray[np.float64]]:
+        """Return points to draw: name -> world positions of shape (worlds, 3) [m]. Optional."""
+        return {}
+
+    def prepare(self, sim: Sim, worlds: int) -> None:
+        """Set the number of worlds and the attributes of `per_world`, and build the world. rlctl calls it."""
+        self.sim, self.worlds = sim, worlds
+        for name, shape in self.per_world.items():
+            setattr(self, name, np.zeros((worlds, *shape)))
+        self.build(sim)
+
+    def clear_kept(self, worlds: NDArray[np.int64]) -> None:
+        """Set the attributes of `per_world` to 0 in some worlds."""
+        for name in self.per_world:
+            getattr(self, name)[worlds] = 0
+
+
+class OneWorld(Task):
+    """A `BatchTask` with one world as a `Task`: without the leading axis."""
+
+    batch: BatchTask
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "batch":
+            raise AttributeError(name)
+        return getattr(self.batch, name)
+
+    def build(self, sim: Sim) -> None:
+        self.batch.prepare(sim.batch, 1)  # type: ignore[attr-defined]  # a `OneWorldSim`
+
+    def reset(self, rng: np.random.Generator) -> None:
+        self.batch.clear_kept(np.zeros(1, np.int64))
+        self.batch.reset(WorldRngs([rng]), np.zeros(1, np.int64))
+
+    def act(self, action: NDArray[Any]) -> None:
+        self.batch.act(np.asarray(action)[None])
+
+    def observe(self) -> dict[str, NDArray[np.float64]]:
+        return {name: values[0] for name, values in self.batch.observe().items()}
+
+    def rewards(self, action: NDArray[Any]) -> dict[str, float]:
+        return {name: float(values[0]) for name, values in self.batch.rewards(np.asarray(action)[None]).items()}
+
+    def is_terminated(self) -> bool:
+        return bool(self.batch.is_terminated()[0])
+
+    def markers(self) -> dict[str, NDArray[np.float64]]:
+        return {name: positions[0] for name, positions in self.batch.markers().items()}
+
+    def describe_joints(self) -> Joints | None:
+        return self.batch.describe_joints()
+
+
+def as_single(task: Task) -> Task:
+    """Return a task for one world: a `BatchTask` without its leading axis, any other as it is."""
+    if not isinstance(task, BatchTask):
+        return task
+    values = {name: getattr(task, name) for name in Task.__annotations__ if hasattr(task, name)}
+    if type(task).is_success is not BatchTask.is_success:
+        values["is_success"] = lambda self: bool(self.batch.is_success()[0])
+    single: Task = type(type(task).__name__, (OneWorld,), values | {"__doc__": type(task).__doc__})()
+    single.batch = task  # type: ignore[attr-defined]
+    return single

@@ -1,0 +1,250 @@
+"""`BatchEnv`: n worlds of a `BatchTask`, stepped together; the same episodes as of one world at a time."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils.seeding import np_random
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError, WorldFailed, short_repr
+from rlctl.task.batch import BatchTask, WorldRngs
+from rlctl.task.env import TaskEnv
+from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
+from rlctl.task.mujoco.sim import MujocoSim, read_solref
+
+Array = NDArray[np.float64]
+Worlds = NDArray[np.int64]
+
+
+class BatchStep(NamedTuple):
+    """What a step of k worlds gave."""
+
+    observation: NDArray[np.float32]  # (k, size)
+    reward: Array  # (k,)
+    terminated: NDArray[np.bool_]  # (k,)
+    truncated: NDArray[np.bool_]  # (k,)
+    terms: Array  # raw reward terms, (k, terms)
+    success: NDArray[np.bool_] | None  # (k,)
+
+
+class BatchEnv:
+    """Worlds of a `BatchTask`; `single` is the environment of one world, which describes spaces and weights.
+
+    An episode depends on its seed and actions only: not on how many worlds there are, nor on what they do.
+    """
+
+    def __init__(self, task: BatchTask, worlds: int, single: TaskEnv, sim: str) -> None:
+        self.task, self.worlds, self.name = task, worlds, single.name
+        self._single = single
+        self._space = single.action_space
+        self.weights = single.reward_weights
+        self.max_steps, self.has_success = single.max_steps, single.has_success
+        if task.observation_layout != "flat" or not isinstance(self._space, spaces.Box):
+            raise TaskError(f"{self.name}: a BatchTask has flat observations and actions in a Box")
+        solref = read_solref(sim)
+        if solref is None:
+            raise TaskError(f"{self.name}: a BatchTask is simulated in MuJoCo only: sim: mujoco")
+        iterations = task.solver_iterations
+        self.sim = MujocoSim(
+            control_dt=task.control_dt, substeps=task.substeps, solref=solref, iterations=iterations, worlds=worlds
+        )
+        self.step_of = np.zeros(worlds, np.int64)
+        """Steps since the start of each world's episode."""
+        self._streams: list[Streams] = [{} for _ in range(worlds)]
+        self._levels = np.ones(worlds)
+        task.prepare(self.sim, worlds)
+        self.sim.save()
+        self.set_events(single)
+        names = single._format.sizes
+        self._sizes, self._names = [names[name] for name in names], list(names)
+        self._ends = np.cumsum(self._sizes)
+        low, high = single.observation_space.low, single.observation_space.high  # type: ignore[attr-defined]
+        self._bounds = (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
+
+    def set_events(self, single: TaskEnv) -> None:
+        """Let the events of `single` act from the next resets on."""
+        self._single = single
+        self._events = single.events
+        self._acting = ActingEvents(self._events, self.task.control_dt)
+        make = (self._events, single._first, self._space, self.task.observation_bounds)
+        self._signals = [Signals(*make) for _ in range(self.worlds)] if self._has_signals() else []
+
+    def _has_signals(self) -> bool:
+        return any(event.event.when in ("observation", "action") for event in self._events.values())
+
+    def reset(self, worlds: Worlds, seeds: Sequence[int]) -> NDArray[np.float32]:
+        """Begin the episodes of `seeds` in `worlds`; return their first observations, shape (k, size)."""
+        self.sim.restore(worlds)
+        self.step_of[worlds] = 0
+        generators = [np_random(int(seed))[0] for seed in seeds]
+        level = self._single.level
+        for world, seed in zip(worlds.tolist(), seeds, strict=True):
+            if self._events:
+                self._streams[world] = seed_streams(self._events, int(seed))
+                self._acting.run("reset", self.sim.one(world), self._streams[world], level)
+            self._levels[world] = level
+        self.task.clear_kept(worlds)
+        self.task.reset(WorldRngs(generators), worlds)
+        self._check_kept("reset")
+        for world in worlds.tolist():
+            if self._events:
+                self._acting.run("start", self.sim.one(world), self._streams[world], level)
+            if self._signals:
+                self._signals[world].begin(self._streams[world], level)
+        return self._observe(worlds)
+
+    def step(self, action: NDArray[Any], worlds: Worlds | None = None) -> BatchStep:
+        """Advance all worlds, or some, by a control step; `action` has a row for each of them, shape (k, ...)."""
+        rows = np.arange(self.worlds) if worlds is None else worlds
+        chosen = self._check_action(action, rows)
+        kept = None if worlds is None else self._copy_kept()
+        acting = chosen
+        if self._signals:
+            acting = np.stack([self._signals[world].act(chosen[k]) for k, world in enumerate(rows.tolist())])
+        self.task.act(acting if worlds is None else self._spread(acting, worlds))
+        self.sim.step(worlds)
+        self.step_of[rows] += 1
+        terminated = self._read_flags("is_terminated")[rows]
+        truncated = ~terminated & (self.step_of[rows] >= self.max_steps)
+        terms = self._read_terms(chosen if worlds is None else self._spread(chosen, worlds))[rows]
+        reward = np.zeros(len(rows))
+        for index, weight in enumerate(self.weights.values()):  # in the order of `TaskEnv`, for the same last bits
+            reward += weight * terms[:, index]
+        self._check_finite(reward, terms, rows)
+        self._run_due(rows)
+        success = self._read_flags("is_success")[rows] if self.has_success else None
+        observation = self._observe(rows)
+        self._check_kept("a step")
+        if kept is not None:
+            self._restore_kept(kept, rows)
+        return BatchStep(observation, reward, terminated, truncated, terms, success)
+
+    def _spread(self, values: NDArray[Any], worlds: Worlds) -> NDArray[Any]:
+        full = np.zeros((self.worlds, *values.shape[1:]), values.dtype)
+        full[worlds] = values
+        return full
+
+    def _copy_kept(self) -> dict[str, Array]:
+        return {name: getattr(self.task, name).copy() for name in self.task.per_world}
+
+    def _restore_kept(self, kept: Mapping[str, Array], stepped: Worlds) -> None:
+        # The task's methods see all worlds, and may have changed what it keeps for those that did not move.
+        still = np.ones(self.worlds, bool)
+        still[stepped] = False
+        for name, values in kept.items():
+            getattr(self.task, name)[still] = values[still]
+
+    def _check_kept(self, when: str) -> None:
+        for name, shape in self.task.per_world.items():
+            value = getattr(self.task, name)
+            if np.shape(value) != (self.worlds, *shape):
+                raise TaskError(
+                    f"{self.name}: after {when} self.{name} has shape {np.shape(value)}; per_world declares "
+                    f"{(self.worlds, *shape)}"
+                )
+
+    def _check_action(self, action: NDArray[Any], rows: Worlds) -> NDArray[Any]:
+        space = self._space
+        assert isinstance(space, spaces.Box)
+        given = np.asarray(action, space.dtype)
+        if given.shape != (len(rows), *space.shape):
+            raise TaskError(f"{self.name}: actions of shape {given.shape}, expected {(len(rows), *space.shape)}")
+        bad = ~np.isfinite(given).reshape(len(rows), -1).all(axis=1)
+        if bad.any():
+            self._fail(rows[bad.argmax()], "action is not finite")
+        clipped: NDArray[Any] = np.minimum(np.maximum(given, space.low), space.high)
+        return clipped
+
+    def _fail(self, world: int, message: str) -> None:
+        raise WorldFailed(f"{self.name}: {message} at step {self.step_of[world]}", int(world))
+
+    def _read_flags(self, method: str) -> NDArray[np.bool_]:
+        flags = np.asarray(getattr(self.task, method)())
+        if flags.shape != (self.worlds,) or flags.dtype != bool:
+            raise TaskError(
+                f"{self.name}: {method}() returned {_describe(flags)}, expected bool of shape ({self.worlds},)"
+            )
+        return flags
+
+    def _read_terms(self, action: NDArray[Any]) -> Array:
+        raw = self.task.rewards(action)
+        if not isinstance(raw, dict) or raw.keys() != self.weights.keys():
+            raise TaskError(
+                f"{self.name}: rewards() returned {short_repr(list(raw))}; reward_weights has {list(self.weights)}"
+            )
+        terms = np.empty((self.worlds, len(self.weights)))
+        for index, name in enumerate(self.weights):
+            value = np.asarray(raw[name])
+            if value.shape != (self.worlds,) or value.dtype.kind not in "fiub":
+                raise TaskError(
+                    f"{self.name}: rewards()[{name!r}] is {_describe(value)}, expected a number per world: shape "
+                    f"({self.worlds},)"
+                )
+            terms[:, index] = value
+        return terms
+
+    def _check_finite(self, reward: Array, terms: Array, rows: Worlds) -> None:
+        bad = ~np.isfinite(reward)
+        if bad.any():
+            row = int(bad.argmax())
+            term = next((name for name, x in zip(self.weights, terms[row], strict=True) if not np.isfinite(x)), "sum")
+            self._fail(rows[row], f"reward term {term!r} is not finite")
+
+    def _run_due(self, rows: Worlds) -> None:
+        if not self._acting.periods:
+            return
+        due = np.any([self.step_of[rows] % period == 0 for period in set(self._acting.periods)], axis=0)
+        for world in rows[due].tolist():
+            step, level = int(self.step_of[world]), float(self._levels[world])
+            self._acting.run_due(step, self.sim.one(world), self._streams[world], level)
+
+    def _observe(self, rows: Worlds) -> NDArray[np.float32]:
+        parts = self.task.observe()
+        if not isinstance(parts, dict) or list(parts) != self._names:
+            raise TaskError(f"{self.name}: observe() returned {short_repr(list(parts))}, at first {self._names}")
+        for name, size in zip(self._names, self._sizes, strict=True):
+            part = np.asarray(parts[name])
+            if part.shape != (self.worlds, size):
+                raise TaskError(
+                    f"{self.name}: observation {name!r} is {_describe(part)}, expected shape {(self.worlds, size)}"
+                )
+        if self._signals:
+            values = self._disturb(parts, rows)
+        else:
+            values = np.concatenate([*parts.values()], axis=1, dtype=np.float32)[rows]
+        bad = ~np.isfinite(values.sum(axis=1))
+        if bad.any():
+            row = int(bad.argmax())
+            name = self._names[int(np.searchsorted(self._ends, (~np.isfinite(values[row])).argmax(), side="right"))]
+            self._fail(rows[row], f"observation {name!r} is not finite")
+        if self._bounds is not None:
+            values = self._clip(values, rows)
+        return values
+
+    def _disturb(self, exact: Mapping[str, Any], rows: Worlds) -> NDArray[np.float32]:
+        """Return observations with noise and delay, as those of one world have them, shape (k, size)."""
+        values = np.empty((len(rows), int(self._ends[-1])), np.float32)
+        for row, world in enumerate(rows.tolist()):
+            parts = self._signals[world].observe({name: part[world] for name, part in exact.items()})
+            np.concatenate([*parts.values()], axis=None, out=values[row], casting="same_kind")
+        return values
+
+    def _clip(self, values: NDArray[np.float32], rows: Worlds) -> NDArray[np.float32]:
+        assert self._bounds is not None
+        clipped = np.minimum(np.maximum(values, self._bounds[0]), self._bounds[1])
+        far = np.abs(clipped - values) > 1e-4
+        if far.any():
+            row, element = np.argwhere(far)[0]
+            name = self._names[int(np.searchsorted(self._ends, element, side="right"))]
+            self._fail(rows[row], f"observation {name!r} is {values[row, element]:g}, outside its bounds,")
+        return clipped
+
+    def close(self) -> None:
+        """End the simulation."""
+        self.sim.close()
+
+
+def _describe(value: NDArray[Any]) -> str:
+    return f"an array of {value.dtype} of shape {value.shape}"
