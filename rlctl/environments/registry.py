@@ -68,9 +68,9 @@ def _list_classes(file: Path) -> list[str]:
 
 
 def is_task(constructor: Any) -> bool:
-    """Return whether a constructor is a `rlctl.task.Task` class."""
-    task_module = sys.modules.get("rlctl.task.task")
-    return task_module is not None and inspect.isclass(constructor) and issubclass(constructor, task_module.Task)
+    """Return whether a constructor is a `Task` or a `BatchTask` of `rlctl.task`."""
+    module = sys.modules.get("rlctl.task.task")
+    return module is not None and inspect.isclass(constructor) and issubclass(constructor, module.TaskDefinition)
 
 
 def find_recipe_file(task: str) -> Path | None:

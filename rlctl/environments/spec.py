@@ -104,14 +104,15 @@ class EnvSpec:
         from rlctl.task.batch_env import BatchEnv
         from rlctl.task.env import TaskEnv
 
-        single = env.unwrapped
-        if not isinstance(single, TaskEnv) or not isinstance(single.task, OneWorld):  # type: ignore[unreachable]
+        single: Any = env.unwrapped
+        if not isinstance(single, TaskEnv) or not isinstance(single.task, OneWorld):
             return None
-        if env is not single:
+        described: TaskEnv = single
+        if env is not described:
             raise RecipeError(f"{self.task} is a BatchTask, whose worlds have no frame_stack and no time_feature")
         constructor: Any = self.constructor()
         parameters, sim = check_fields(constructor, self.parameters), self.resolve().sim
-        batch: BatchEnv = call_plugin(self.task, lambda: BatchEnv(constructor(**parameters), worlds, single, sim))
+        batch: BatchEnv = call_plugin(self.task, lambda: BatchEnv(constructor(**parameters), worlds, described, sim))
         return batch
 
     def _make_task_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:

@@ -112,5 +112,5 @@ def choose_task(request: EvalRequest) -> EnvSpec:
         raise UsageError(f"--policy {request.baseline}: give the task to play: rlctl eval reach --policy zero")
     from rlctl.recipe.sources import resolve_with_stages
 
-    spec = resolve_with_stages(request.run).env_specs(request.run)[-1]
+    spec = resolve_with_stages(request.run).env_specs(request.run)[-1].resolve()
     return request.changes.apply(dataclasses.replace(spec, frame_stack=1, time_feature=False, stage=0))

@@ -82,14 +82,14 @@ class Recipe(Section):
 
     task: dict[str, Any] = {}
     """Parameters of the task: the arguments of its constructor."""
-    sim: str | None = Field(None, json_schema_extra=decide_by("pybullet if it is installed, else mujoco"))
-    """Physics engine of a task: pybullet, mujoco, or mujoco:0.01 with the time constant of contacts [s]."""
     reward_weights: dict[str, Number] = {}
     """Weights of reward terms that differ from the task's defaults."""
     randomize: Switch = False
     """Whether all of the task's events (random changes) act."""
     events: dict[str, dict[str, Any]] = {}
     """Events (random changes) that act, by name, with the parameters that differ from the task's defaults."""
+    sim: str | None = Field(None, json_schema_extra=decide_by("pybullet if it is installed, else mujoco"))
+    """Physics engine of a task: pybullet, mujoco, or mujoco:0.01 with the time constant of contacts [s]."""
     algo: Algorithm = "ppo"
     """The algorithm."""
     algo_kwargs: dict[str, Any] = {}
@@ -181,7 +181,7 @@ class Recipe(Section):
             self.time_feature,
             sim=self.sim or "",
             named_by=named_by,
-        ).resolve()
+        )
         return [
             dataclasses.replace(
                 base,

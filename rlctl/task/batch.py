@@ -6,9 +6,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.errors import TaskError
 from rlctl.task.joints import Joints
 from rlctl.task.sim import Sim
-from rlctl.task.task import Task
+from rlctl.task.task import Task, TaskDefinition
 
 Array = NDArray[np.float64]
 
@@ -29,7 +30,7 @@ class WorldRngs:
         return lambda *args, **kwargs: np.array([getattr(rng, method)(*args, **kwargs) for rng in self._generators])
 
 
-class BatchTask(Task):
+class BatchTask(TaskDefinition):
     """A task for `worlds` worlds of one model, simulated together in MuJoCo.
 
     Definition and parameters are those of `Task`. The methods see all worlds: arrays of bodies have the shape
@@ -44,7 +45,7 @@ class BatchTask(Task):
     Each is an array of shape (worlds, ...), 0 at the start of an episode.
     """
 
-    def reset(self, rng: WorldRngs, worlds: NDArray[np.int64]) -> None:  # type: ignore[override]
+    def reset(self, rng: WorldRngs, worlds: NDArray[np.int64]) -> None:
         """Start an episode in `worlds`, shape (k,), and leave the others alone; draws from `rng` have k rows."""
 
     def act(self, action: NDArray[Any]) -> None:
@@ -120,11 +121,18 @@ class OneWorld(Task):
         return self.batch.describe_joints()
 
 
-def as_single(task: Task) -> Task:
+def _base(method: str) -> Any:
+    return getattr(BatchTask, method)
+
+
+def as_single(task: Task | BatchTask) -> Task:
     """Return a task for one world: a `BatchTask` without its leading axis, any other as it is."""
     if not isinstance(task, BatchTask):
         return task
-    values = {name: getattr(task, name) for name in Task.__annotations__ if hasattr(task, name)}
+    missing = [name for name in ("build", "act", "observe", "rewards") if getattr(type(task), name) is _base(name)]
+    if missing:
+        raise TaskError(f"{type(task).__name__} does not define {', '.join(f'{name}()' for name in missing)}")
+    values = {name: getattr(task, name) for name in TaskDefinition.__annotations__ if hasattr(task, name)}
     if type(task).is_success is not BatchTask.is_success:
         values["is_success"] = lambda self: bool(self.batch.is_success()[0])
     single: Task = type(type(task).__name__, (OneWorld,), values | {"__doc__": type(task).__doc__})()

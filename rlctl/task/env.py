@@ -12,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from rlctl.errors import RecipeError, TaskError, UsageError, check_name, short_repr
-from rlctl.task.batch import OneWorld, as_single
+from rlctl.task.batch import BatchTask, OneWorld, as_single
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
 from rlctl.task.joints import Joints
@@ -32,7 +32,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 
     def __init__(
         self,
-        task: Task,
+        task: Task | BatchTask,
         *,
         render_mode: Literal["human", "rgb_array"] | None = None,
         reward_weights: Mapping[str, float] | None = None,
@@ -40,9 +40,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         sim: str = "pybullet",
     ) -> None:
         check_parameters(type(task))
+        self.task = task = as_single(task)
         check_definition(task)
-        task = as_single(task)
-        self.task = task
         self.name = type(task).__name__
         # gymnasium.Env has one dict for all environments.
         self.metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / task.control_dt)}

@@ -39,7 +39,7 @@ def arrival(distance: float, tolerance: float) -> float:
 def squared(x: NDArray[np.floating]) -> float:
     """Return the mean of the squared elements: in [0, 1] for an action in [-1, 1], whatever its size."""
     if x.ndim > 1:
-        return np.square(x).mean(axis=-1)  # type: ignore[return-value]
+        return np.square(x).mean(axis=-1)
     return float(x.dot(x)) / x.size
 
 

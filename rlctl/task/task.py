@@ -1,4 +1,4 @@
-"""`Task`: what a plugin author writes."""
+"""`Task`: what a plugin author writes, and the definition that it shares with `BatchTask`."""
 
 import dataclasses
 import math
@@ -15,10 +15,10 @@ from rlctl.task.joints import Joints
 from rlctl.task.sim import Sim
 
 
-class Task:
-    """One robot-learning problem: a world, what is observed, what is rewarded.
+class TaskDefinition:
+    """What a `Task` and a `BatchTask` share: the definition of a robot-learning problem.
 
-    Subclass it as a dataclass. Annotated fields are the task's parameters (`--set task.tolerance=0.02`);
+    Subclass one of them as a dataclass. Annotated fields are the task's parameters (`--set task.tolerance=0.02`);
     the attributes below are its definition and are assigned without an annotation.
     """
 
@@ -52,7 +52,7 @@ class Task:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        definition = {name for name, hint in Task.__annotations__.items() if "ClassVar" in str(hint)}
+        definition = {name for name, hint in TaskDefinition.__annotations__.items() if "ClassVar" in str(hint)}
         for name, hint in cls.__dict__.get("__annotations__", {}).items():
             if name in definition and "ClassVar" not in str(hint):
                 raise TaskError(
@@ -63,42 +63,6 @@ class Task:
     def build(self, sim: Sim) -> None:
         """Load the bodies into `sim`. Called once; the world is saved after it."""
         raise NotImplementedError
-
-    def reset(self, rng: np.random.Generator) -> None:
-        """Start an episode in the restored world; take all random numbers from `rng`."""
-
-    def act(self, action: NDArray[Any]) -> None:
-        """Set motor targets from an action that is inside `action_space`."""
-        raise NotImplementedError
-
-    def observe(self) -> dict[str, NDArray[np.float64]]:
-        """Return what the policy sees, by name; the observation has the same order."""
-        raise NotImplementedError
-
-    def rewards(self, action: NDArray[Any]) -> dict[str, Any]:
-        """Return the raw reward terms, by the names of `reward_weights`."""
-        raise NotImplementedError
-
-    def is_success(self) -> Any:
-        """Return whether the goal is reached now; an episode succeeds if it is reached at its end. Optional."""
-        return None
-
-    def is_terminated(self) -> Any:
-        """Return whether the episode ends, for example after a fall; the time limit is not part of it. Optional."""
-        return False
-
-    def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> NDArray[Any]:
-        """Return the rewards, shape (n,), of steps for other desired goals; goals have shape (n, size). Optional.
-
-        Hindsight replay (`her` in a recipe) needs it. Observe `observation`, `achieved_goal` and `desired_goal` in
-        the layout "dict". The result is the weighted sum of `rewards`, computed from the goals only: `info` is empty.
-        Compute along the last axis, so that one pair of goals, shape (size,), gives one number.
-        """
-        raise NotImplementedError
-
-    def markers(self) -> dict[str, NDArray[np.float64]]:
-        """Return points to draw, such as the goal: name -> world position of shape (3,) [m]. Optional."""
-        return {}
 
     def describe_joints(self) -> Joints | None:
         """Return the joints that the action moves, in the action's order, for controllers of the real robot. Optional.
@@ -120,9 +84,49 @@ class Task:
         return max(1, round(self.episode_s / self.control_dt))
 
 
-def check_parameters(task: type[Task]) -> None:
+class Task(TaskDefinition):
+    """One robot-learning problem: a world, what is observed, what is rewarded; see `TaskDefinition`."""
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Start an episode in the restored world; take all random numbers from `rng`."""
+
+    def act(self, action: NDArray[Any]) -> None:
+        """Set motor targets from an action that is inside `action_space`."""
+        raise NotImplementedError
+
+    def observe(self) -> dict[str, NDArray[np.float64]]:
+        """Return what the policy sees, by name; the observation has the same order."""
+        raise NotImplementedError
+
+    def rewards(self, action: NDArray[Any]) -> dict[str, float]:
+        """Return the raw reward terms, by the names of `reward_weights`."""
+        raise NotImplementedError
+
+    def is_success(self) -> bool | None:
+        """Return whether the goal is reached now; an episode succeeds if it is reached at its end. Optional."""
+        return None
+
+    def is_terminated(self) -> bool:
+        """Return whether the episode ends, for example after a fall; the time limit is not part of it. Optional."""
+        return False
+
+    def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> NDArray[Any]:
+        """Return the rewards, shape (n,), of steps for other desired goals; goals have shape (n, size). Optional.
+
+        Hindsight replay (`her` in a recipe) needs it. Observe `observation`, `achieved_goal` and `desired_goal` in
+        the layout "dict". The result is the weighted sum of `rewards`, computed from the goals only: `info` is empty.
+        Compute along the last axis, so that one pair of goals, shape (size,), gives one number.
+        """
+        raise NotImplementedError
+
+    def markers(self) -> dict[str, NDArray[np.float64]]:
+        """Return points to draw, such as the goal: name -> world position of shape (3,) [m]. Optional."""
+        return {}
+
+
+def check_parameters(task: type[TaskDefinition]) -> None:
     """Raise `TaskError` for a class with annotated values that is not a dataclass."""
-    for cls in task.__mro__[: task.__mro__.index(Task)]:
+    for cls in task.__mro__[: task.__mro__.index(TaskDefinition)]:
         hints = {key: hint for key, hint in cls.__dict__.get("__annotations__", {}).items() if key in cls.__dict__}
         parameters = [key for key, hint in hints.items() if "ClassVar" not in str(hint)]
         if parameters and "__dataclass_fields__" not in cls.__dict__:

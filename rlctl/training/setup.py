@@ -45,7 +45,7 @@ _EXPERIMENTS = ("build", "comparisons", "episodes")  # what one child process ca
 def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
     """Open what a training needs; at the end stop its processes, and write an error that ended it to the run."""
     recipe, request = start.recipe, start.request
-    specs = recipe.env_specs(start.task, named_by=RUN if start.run else "")
+    specs = [spec.resolve() for spec in recipe.env_specs(start.task, named_by=RUN if start.run else "")]
     display.phase(f"building {format_count(recipe.n_envs, 'environment')}, importing PyTorch")
     with contextlib.ExitStack() as stack:
         # The workers build their environments, and the check runs, while this process imports torch.

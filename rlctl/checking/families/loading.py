@@ -98,10 +98,12 @@ def _base_class(instance: Instance) -> Iterator[RuleFinding]:
 
 
 def _find_misspelled(author: type) -> Iterator[RuleFinding]:
-    from rlctl.task import Task  # PyBullet comes with it
+    from rlctl.task.batch import BatchTask
+    from rlctl.task.task import Task, TaskDefinition
 
-    meant = {name for name in {*vars(Task), *Task.__annotations__} if not name.startswith("_")}
-    for cls in author.__mro__[: author.__mro__.index(Task)]:
+    known = {*vars(TaskDefinition), *TaskDefinition.__annotations__, *vars(Task), *vars(BatchTask)}
+    meant = {name for name in known if not name.startswith("_")}
+    for cls in author.__mro__[: author.__mro__.index(TaskDefinition)]:
         try:
             words = Counter(re.findall(r"\w+", inspect.getsource(inspect.getmodule(cls) or cls)))
         except (OSError, TypeError):

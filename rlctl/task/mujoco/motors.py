@@ -47,6 +47,7 @@ class MujocoMotors(Body):
 
     @property
     def drives(self) -> Drives | None:  # type: ignore[override]
+        """What `set_drives` set."""
         return None if self.parts.drives is None else Drives(*self.parts.drives[:2])
 
     def bind_motors(self) -> None:

@@ -22,7 +22,7 @@ from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.model_files import find_model_file
 from rlctl.task.mujoco.body import MujocoBody, Parts
 from rlctl.task.mujoco.files import ModelFile, read_model_file
-from rlctl.task.mujoco.world import Array, Fields, Rows, World
+from rlctl.task.mujoco.world import Array, Fields, MujocoWorld, Rows
 from rlctl.task.sim import Sim
 
 _RIGID = (0.9999, 0.9999, 0.001, 0.5, 2)  # impedance of constraints: as stiff as PyBullet's
@@ -60,7 +60,7 @@ class MujocoSim(Sim):
     def __init__(
         self, *, control_dt: float, substeps: int, solref: float = 0.02, iterations: int = 50, worlds: int | None = None
     ) -> None:
-        self.world = World(substeps, worlds)
+        self.world = MujocoWorld(substeps, worlds)
         self.mujoco = self.world.mujoco
         self._control_dt, self._solref, self._iterations = control_dt, solref, iterations
         self.fields = Fields(self.world)
@@ -71,7 +71,7 @@ class MujocoSim(Sim):
         self.bodies = {}
         self._parts: dict[str, Parts] = {}
         self._pairs: list[tuple[str, str]] = []  # links whose geoms collide, each as BODY/LINK
-        self._pushes: list[_Push] = []
+        self._pushes: list[_MujocoPush] = []
         self._spec = self.mujoco.MjSpec()
         option = self._spec.option
         option.timestep = self._control_dt / self.world.substeps
@@ -360,7 +360,7 @@ class MujocoSim(Sim):
         pushed = self.body(body)
         steps = max(1, round(duration_s / self._control_dt))
         number = pushed.find_link(link or pushed.base_name)  # type: ignore[attr-defined]
-        self._pushes.append(_Push(self.fields._index or 0, number, np.array(force, float), steps))
+        self._pushes.append(_MujocoPush(self.fields._index or 0, number, np.array(force, float), steps))
 
     def render(
         self,
@@ -424,7 +424,7 @@ class OneWorldSim(MujocoSim):
         self.batch.close()
 
 
-class _Push:
+class _MujocoPush:
     def __init__(self, world: int, link: int, force: Array, steps: int) -> None:
         self.world, self.link = world, link
         self.force = force  # [N], world frame

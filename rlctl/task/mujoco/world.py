@@ -31,12 +31,13 @@ def import_mujoco() -> Any:
         import mujoco
     except ImportError:
         raise UsageError("sim mujoco needs MuJoCo, which is not installed: pip install mujoco") from None
-    # Its own handler prints, and appends to MUJOCO_LOG.TXT in the current folder; `World` raises for what is serious.
+    # Its own handler prints, and appends to MUJOCO_LOG.TXT in the current folder; `MujocoWorld` raises for
+    # what is serious.
     mujoco.set_mju_user_warning(lambda text: None)
     return mujoco
 
 
-class World:
+class MujocoWorld:
     """One world of a model, or `count` worlds that `mujoco.batch` steps with one call of C.
 
     `data(name)` and `model(name)` are arrays of MjData and MjModel: those of one world without `count`; with it they
@@ -198,7 +199,7 @@ class World:
 class Fields:
     """The arrays that a body reads and writes: those of all worlds, or of one of them without the leading axis."""
 
-    def __init__(self, world: World, index: int | None = None) -> None:
+    def __init__(self, world: MujocoWorld, index: int | None = None) -> None:
         self.world = world
         self._index = index
         self._cache: dict[str, Any] = {}
@@ -208,7 +209,7 @@ class Fields:
         self._cache.clear()
 
     def data(self, name: str) -> Any:
-        """Return an array of the state; see `World.data`."""
+        """Return an array of the state; see `MujocoWorld.data`."""
         array = self._cache.get(name)
         if array is None:
             array = self._cache[name] = self._select(self.world.data(name))
@@ -220,7 +221,7 @@ class Fields:
         return self.data(name)
 
     def model(self, name: str) -> Any:
-        """Return an array of the model, for reading and writing; see `World.model`. Call `touch` after a change."""
+        """Return an array of the model, for reading and writing, as of the world. Call `touch` after a change."""
         return self._select(self.world.model(name))
 
     def _select(self, array: Any) -> Any:
