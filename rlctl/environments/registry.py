@@ -220,7 +220,10 @@ def import_module(task: str, name: str) -> Any:
 
 
 def import_file(task: str, file: Path) -> Any:
-    """Import a file as a module, once. Its folder becomes the last entry of `sys.path`."""
+    """Import a file as a module, once; a file of a package (`__init__.py` next to it) as the package's module.
+
+    The folder above the package and the file's own folder become the last entries of `sys.path`.
+    """
     file = _find_loaded(file.expanduser())
     if not file.is_file():
         raise UsageError(f"task {task!r}: no file {file}")
@@ -228,6 +231,8 @@ def import_file(task: str, file: Path) -> Any:
     for loaded, known in list(sys.modules.items()):
         if getattr(known, "__file__", None) == path and loaded != "__main__":
             return known
+    if in_package := _import_from_package(task, file):
+        return in_package
     append_to_path(str(file.parent))
     name = file.stem
     while name in sys.modules or name in sys.stdlib_module_names:
@@ -244,6 +249,25 @@ def import_file(task: str, file: Path) -> Any:
         sys.modules.pop(name, None)
         raise
     return module
+
+
+def _import_from_package(task: str, file: Path) -> Any:
+    """Import a file as a module of its package; None if it is in none. Raises `UsageError` if the name is taken."""
+    root, names = file.parent, [] if file.name == "__init__.py" else [file.stem]
+    while (root / "__init__.py").is_file() and root.name.isidentifier():
+        root, names = root.parent, [root.name, *names]
+    if root == file.parent or "." in file.stem:
+        return None
+    for folder in (root, file.parent):
+        append_to_path(str(folder))
+    package, name = names[0], ".".join(names)
+    own, found = root / package / "__init__.py", installed.find_module_file(package)
+    if found is None or found.resolve() != own:
+        raise UsageError(
+            f"task {task!r}: {file.name} belongs to the package {own.parent}, but Python imports {package!r} from "
+            f"{found or 'its own modules'}\nrename the folder {package!r}, or delete its __init__.py"
+        )
+    return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
 
 
 def append_to_path(folder: str) -> None:

@@ -237,7 +237,11 @@ def check_fields(task: Any, values: Mapping[str, Any]) -> dict[str, Any]:
         is_text = hints[key] in (int, float) and isinstance(value, bool | str)
         if is_text or (isinstance(value, float) and math.isnan(value)):  # pydantic accepts them as numbers
             raise RecipeError(f"task.{key}: expected a number, got {short_repr(repr(value))}")
-        adapter = pydantic.TypeAdapter(hints[key])
+        try:
+            adapter = pydantic.TypeAdapter(hints[key])
+        except pydantic.errors.PydanticUserError:  # a type of the author's own
+            kind = getattr(hints[key], "__name__", hints[key])
+            raise RecipeError(f"task.{key}: a value of type {kind} cannot be given here, only in Python") from None
         try:
             checked[key] = adapter.validate_python(value)
         except pydantic.ValidationError as error:

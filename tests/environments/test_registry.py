@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,30 @@ def test_a_file_may_import_its_neighbours(write_module):
     assert EnvSpec("there/whole.py:MyEnv").make().gain == 1.0
 
 
+def test_a_file_in_a_package_is_a_module_of_it(write_module, monkeypatch):
+    write_module("there/robots/__init__.py", "from .limits import GAIN\n")
+    write_module("there/robots/limits.py", "GAIN = 3.0\n")
+    write_module("there/robots/arms/__init__.py", "")
+    file = write_module("there/robots/arms/arm.py", f"from ..limits import GAIN\nimport parts\n{textwrap.dedent(ENV)}")
+    write_module("there/robots/arms/parts.py", "")
+    loaded = registry.load("there/robots/arms/arm.py:MyEnv")
+    assert (loaded.__module__, sys.modules["robots.arms.arm"].GAIN) == ("robots.arms.arm", 3.0)
+    assert sys.path[-2:] == [str(file.parents[2]), str(file.parent)]
+    assert registry.load("there/robots/__init__.py:GAIN.hex")() == (3.0).hex()
+    monkeypatch.chdir("there")
+    assert registry.load("robots.arms.arm:MyEnv") is loaded
+
+
+@pytest.mark.parametrize(("package", "taken_from"), [("json", "json/__init__.py"), ("sys", "its own modules")])
+def test_a_package_whose_name_is_taken(write_module, package, taken_from):
+    write_module(f"there/{package}/__init__.py", "")
+    write_module(f"there/{package}/arm.py", ENV)
+    first, second = error(UsageError, f"there/{package}/arm.py:MyEnv").splitlines()
+    assert f"arm.py belongs to the package {Path.cwd() / 'there' / package}, but Python imports {package!r}" in first
+    assert first.endswith(taken_from)
+    assert second == f"rename the folder {package!r}, or delete its __init__.py"
+
+
 def test_files_of_one_name_in_many_folders(write_module):
     for number in range(3):
         write_module(f"v{number}/same.py", ENV.replace("gain=1.0", f"gain={number}"))
@@ -211,6 +236,24 @@ def test_parameters_that_are_not_there(my_env):
 
 def test_parameters_of_another_type():
     assert error(RecipeError, "reach", {"tolerance": "abc"}) == ("task.tolerance: expected a number, got 'abc'")
+
+
+def test_a_parameter_of_a_type_that_no_text_is(write_module):
+    source = """
+        from dataclasses import dataclass
+        from rlctl.task import Task
+
+        class Gripper:
+            pass
+
+        @dataclass
+        class Grasp(Task):
+            gripper: Gripper | None = None
+        """
+    write_module("grasp.py", source)
+    assert error(RecipeError, "grasp.py:Grasp", {"gripper": "wide"}) == (
+        "task.gripper: a value of type grasp.Gripper | None cannot be given here, only in Python"
+    )
 
 
 def test_what_only_tasks_have(my_env):
