@@ -37,6 +37,7 @@ LAYERS = [
     {"output"},
     {"storage"},
     {"errors", "options", "version"},
+    {"missing_packages"},
 ]
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
 MAY_IMPORT_TORCH = {  # besides training/

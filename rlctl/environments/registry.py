@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rlctl import errors
+from rlctl import errors, missing_packages
 from rlctl.environments import installed
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError, did_you_mean
 from rlctl.storage import files
@@ -189,7 +189,8 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
             missing = getattr(error.__cause__, "name", None) or getattr(error, "name", None)
             if missing and missing != task.partition(":")[0]:
                 raise  # the module exists, but one of its own imports does not
-            raise UsageError(f"Gymnasium: {task}: {error}") from None
+            advice = missing_packages.advise_on(missing or "")
+            raise UsageError(f"Gymnasium: {task}: {str(error).rstrip('.')}{advice}") from None
 
     constructor.gymnasium_id = task  # type: ignore[attr-defined]
     return constructor
@@ -206,16 +207,19 @@ def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
         frames = traceback.extract_tb(error.__traceback__)
         own = frames and Path(frames[-1].filename).parent == Path(__file__).parent
         if frames and not own and not frames[-1].filename.startswith("<frozen"):  # a syntax error names its place
-            where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})"
-        reason, details = errors.describe_exception(error), errors.format_plugin_traceback(error) or None
-        raise TaskError(f"task {task!r}: {doing}{reason}{where}", details=details) from error
+            file = Path(frames[-1].filename)
+            name = f"{file.parent.name}/{file.name}" if file.name == "__init__.py" else file.name
+            where = f" ({name}:{frames[-1].lineno})"
+        reason, details = errors.describe_exception(error, where), errors.format_plugin_traceback(error) or None
+        raise TaskError(f"task {task!r}: {doing}{reason}", details=details) from error
 
 
 def import_module(task: str, name: str) -> Any:
     """Import a module that is installed or in the current folder; raises `TaskError` for any exception in it."""
     is_installed = name in sys.modules or installed.find_module_file(name) is not None
     if not is_installed and installed.find_module_file(name, in_current_folder=True) is None:
-        raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
+        advice = missing_packages.advise_on(name)
+        raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}{advice}")
     return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
 
 

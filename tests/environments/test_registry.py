@@ -98,7 +98,7 @@ def test_a_strangers_modules_in_the_current_folder_are_not_run(installed_rlctl, 
     done = installed_rlctl("eval", "reach", "--pretrained", "--episodes", "2", "--n-envs", "2")
     assert (done.returncode, "2 episodes" in done.stdout) == (0, True), done.stderr
     write_module("pendulum.py", "from gymnasium.envs.classic_control import PendulumEnv\n")
-    done = installed_rlctl("check-env", "pendulum:PendulumEnv", "--only", "RL1")
+    done = installed_rlctl("check-env", "pendulum:PendulumEnv", "--select", "RL1")
     assert "current folder" not in done.stderr, done.stderr
 
 
@@ -113,17 +113,17 @@ def test_a_file_may_import_its_neighbours(write_module):
 
 
 def test_a_file_in_a_package_is_a_module_of_it(write_module, monkeypatch):
-    write_module("there/robots/__init__.py", "from .limits import GAIN\n")
-    write_module("there/robots/limits.py", "GAIN = 3.0\n")
-    write_module("there/robots/arms/__init__.py", "")
-    file = write_module("there/robots/arms/arm.py", f"from ..limits import GAIN\nimport parts\n{textwrap.dedent(ENV)}")
-    write_module("there/robots/arms/parts.py", "")
-    loaded = registry.load("there/robots/arms/arm.py:MyEnv")
-    assert (loaded.__module__, sys.modules["robots.arms.arm"].GAIN) == ("robots.arms.arm", 3.0)
+    write_module("there/wheeled/__init__.py", "from .limits import GAIN\n")
+    write_module("there/wheeled/limits.py", "GAIN = 3.0\n")
+    write_module("there/wheeled/arms/__init__.py", "")
+    file = write_module("there/wheeled/arms/arm.py", f"from ..limits import GAIN\nimport parts\n{textwrap.dedent(ENV)}")
+    write_module("there/wheeled/arms/parts.py", "")
+    loaded = registry.load("there/wheeled/arms/arm.py:MyEnv")
+    assert (loaded.__module__, sys.modules["wheeled.arms.arm"].GAIN) == ("wheeled.arms.arm", 3.0)
     assert sys.path[-2:] == [str(file.parents[2]), str(file.parent)]
-    assert registry.load("there/robots/__init__.py:GAIN.hex")() == (3.0).hex()
+    assert registry.load("there/wheeled/__init__.py:GAIN.hex")() == (3.0).hex()
     monkeypatch.chdir("there")
-    assert registry.load("robots.arms.arm:MyEnv") is loaded
+    assert registry.load("wheeled.arms.arm:MyEnv") is loaded
 
 
 @pytest.mark.parametrize(("package", "taken_from"), [("json", "json/__init__.py"), ("sys", "its own modules")])
