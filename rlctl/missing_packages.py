@@ -65,10 +65,6 @@ _LIBRARIES = {"libGL.so": "pip uninstall opencv-python; pip install opencv-pytho
 """What to do where a shared library of the system is missing."""
 
 
-BEFORE = "; "
-"""Comes before the advice: all of it follows a message, in its line."""
-
-
 def advise(error: BaseException | None) -> str:
     """Return "; " and what to install for a module that an exception, or one behind it, misses; empty if unknown."""
     while error is not None:
@@ -77,7 +73,7 @@ def advise(error: BaseException | None) -> str:
         if isinstance(error, ImportError):
             for library, advice in _LIBRARIES.items():
                 if library in str(error):
-                    return f"{BEFORE}{advice}"
+                    return f"; {advice}"
         error = error.__cause__ or error.__context__
     return ""
 
@@ -86,8 +82,14 @@ def advise_on(module: str, importer: str = "") -> str:
     """Return "; " and what to install for a module, which the package `importer` imports; empty if unknown."""
     package = module.partition(".")[0]
     if replaced := _REPLACED.get(importer) or _REPLACED.get(package):
-        return f"{BEFORE}{replaced}"
-    return f"{BEFORE}pip install {shlex.quote(_PACKAGES[package])}" if package in _PACKAGES else ""
+        return f"; {replaced}"
+    return f"; pip install {shlex.quote(_PACKAGES[package])}" if package in _PACKAGES else ""
+
+
+def split(message: str, error: BaseException | None) -> tuple[str, str]:
+    """Return a message without its advice, and the advice alone, which may be empty."""
+    advice = advise(error)
+    return message.removesuffix(advice), advice.removeprefix("; ")
 
 
 def _find_importer(error: ModuleNotFoundError) -> str:

@@ -15,6 +15,7 @@ from rlctl.checking.families import find_rules
 from rlctl.checking.rules import Severity
 from rlctl.environments import registry
 from rlctl.environments.named_task import RUN
+from rlctl.environments.registrations import describe_registrations
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, RecipeError, TaskError
 from rlctl.output import format_count
@@ -58,6 +59,8 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
         learner = _build_learner(start, specs, workers, make_workers, display)
         if start.run is None:
             _warn_of_opposite_weights(specs, display)
+            if registered := describe_registrations(start.task, "train"):
+                display.message(f"{start.task} is {registered}")
         if checked is not None:
             display.phase("checking the environment")
             _refuse_errors(checked.result(), display)

@@ -35,6 +35,7 @@ from rlctl.checking.values import find_assignment, find_author, flatten, is_task
 from rlctl.environments import registry
 from rlctl.environments.dict_spaces import format_space
 from rlctl.environments.info import describe_mujoco_model
+from rlctl.environments.registrations import describe_registrations
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import NoSuchClassError, OldGymError, RecipeError, RlctlError, TaskError, UsageError
 
@@ -66,8 +67,7 @@ def build(context: Context) -> Iterator[ChildMessage]:
 def _explain(context: Context, error: RlctlError) -> RuleFinding:
     cause = error.__cause__
     details = {"traceback": error.details} if error.details else {}
-    advice = missing_packages.advise(cause)
-    message, to_install = str(error).removesuffix(advice), advice.removeprefix(missing_packages.BEFORE)
+    message, to_install = missing_packages.split(str(error), cause)
     if isinstance(error, NoSuchClassError):
         return RuleFinding("RL005", str(error), details)
     missing_modules = [str(e.name) for e in get_causes(cause) if isinstance(e, ModuleNotFoundError)]
@@ -82,7 +82,8 @@ def _explain(context: Context, error: RlctlError) -> RuleFinding:
     if isinstance(cause, TypeError) and missing:
         settings = " ".join(f"--set task.{name}=..." for name in re.findall(r"'(\w+)'", missing[1]))
         fix = f"Give them ({settings}), or give them default values."
-        return RuleFinding("RL006", str(error), details, fix=fix)
+        registered = describe_registrations(context.spec.task, "check-env")
+        return RuleFinding("RL006", message, details, fix=f"{fix} The class is {registered}" if registered else fix)
     is_without_trace = isinstance(error, TaskError) and error.details is None  # a constructor's error has one
     if is_without_trace and not registry.is_task(registry.load(context.spec.task)):
         return RuleFinding("RL003", str(error))
@@ -165,6 +166,7 @@ def _describe_built(instance: Instance) -> Built:
         accepts_options=instance.accepts_options,
         model=describe_mujoco_model(env),
         uses_pybullet=bool(find_clients()),
+        registered=describe_registrations(instance.context.spec.task, "check-env"),
         waivers=_waivers(author),
         file=file,
         line=line,
