@@ -34,6 +34,8 @@ LAYERS = [
     {"hub"},
     {"environments"},
     {"task"},
+    {"library_output"},
+    {"printed_lines"},
     {"output"},
     {"storage"},
     {"errors", "options", "version"},

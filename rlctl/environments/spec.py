@@ -15,6 +15,7 @@ from pydantic import AfterValidator, PlainSerializer
 from rlctl.environments import named_task
 from rlctl.environments.registry import call_plugin, is_task, load, make_slug, may_make_environments
 from rlctl.errors import RecipeError, TaskError, check_name, short_repr
+from rlctl.library_output import print_mujoco_warnings
 from rlctl.storage import validation
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ class EnvSpec:
         if render_mode == "rgb_array" and not os.environ.get("DISPLAY"):
             os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it at import; its default needs a display
         constructor = self.constructor()
+        print_mujoco_warnings()
         if is_task(constructor):
             env = self._make_task_env(constructor, render_mode)
         else:

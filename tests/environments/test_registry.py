@@ -178,15 +178,38 @@ def test_places_that_are_not_there(my_env, tmp_path):
     assert error(UsageError, "my_env.py:MyEnvs") == (
         "my_env.py has no 'MyEnvs'. Did you mean 'MyEnv'? It defines: MyEnv, NoEnv."
     )
-    assert error(UsageError, "your_env.py:E") == f"task 'your_env.py:E': no file {tmp_path / 'your_env.py'}"
+    assert error(UsageError, "sensor.py:E") == f"task 'sensor.py:E': no file {tmp_path / 'sensor.py'}"
     assert error(UsageError, "nowhere.envs:E") == (
         f"task 'nowhere.envs:E': no module 'nowhere.envs' is installed or under {tmp_path}"
     )
-    assert error(UsageError, "my_env.py:number") == "my_env.py:number: number is a int, not a class or a function"
+    assert error(UsageError, "my_env.py:number") == "my_env.py:number: number is of type int, not a class or a function"
     assert error(TaskError, "my_env.py:NoEnv") == (
         "my_env.py:NoEnv: NoEnv is neither a Gymnasium environment (reset, step, spaces) nor "
         "a subclass of rlctl.task.Task"
     )
+
+
+@pytest.mark.parametrize(
+    ("task", "meant"),
+    [
+        ("my_evn.py:MyEnv", "my_env.py:MyEnv"),
+        ("my_evn:MyEnv", "my_env:MyEnv"),
+        ("./my_env:MyEnv", "./my_env.py:MyEnv"),
+        ("my_env.py::MyEnv", "my_env.py:MyEnv"),
+        ("my_env.py MyEnv", "my_env.py:MyEnv"),
+        ("my_env/MyEnv", "my_env.py:MyEnv"),
+        ("package.envs.MyEnv", "package.envs:MyEnv"),
+        ("package/evns.py:MyEnv", "package/envs.py:MyEnv"),
+    ],
+)
+def test_a_task_in_another_form(my_env, write_module, task, meant):
+    write_module("package/__init__.py", "")
+    write_module("package/envs.py", ENV)
+    assert f". Did you mean {meant!r}?" in error(UsageError, task)
+
+
+def test_a_name_without_its_class(my_env):
+    assert error(UsageError, "my_env.py:").endswith("to name a class in my_env.py: my_env.py:MyEnv")
 
 
 def test_a_vectorised_environment_is_named_as_one(my_env, write_module):
