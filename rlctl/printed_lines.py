@@ -25,8 +25,8 @@ _MOST_GROUPS = 3  # of lines that were printed equally often, in one report
 _ESCAPE = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|\][^\x07\x1b]*(?:\x07|\x1b\\)|[@-Z\\-_])")
 _NOISE = ("pybullet build time", "argv[0]=")
 """Lines of PyBullet without content: of its import, and of every connection."""
-_BULLET_HEADS = ("b3Warning[", "b3Error[")
-"""PyBullet's warnings have two lines; the second contains the reason."""
+_BULLET_HEAD = re.compile(r"(b3(?:Warning|Error)\[)(?:[^\],]*/)?([^\]]*\]:)$")
+"""PyBullet's warnings begin with a line, and end without a line break: the next one begins in their last line."""
 
 
 def remove_escape_codes(text: str) -> str:
@@ -73,16 +73,15 @@ class PrintedLines:
                 self._show_new(text)
 
     def open_reader(self) -> "LineReader":
-        """Return a reader of a process's lines, of at most 1000 bytes; it joins PyBullet's warnings of two lines."""
+        """Return a reader of a process's lines, of at most 1000 bytes; it reads PyBullet's warnings whole."""
         head = ""
 
         def receive(text: str) -> None:
             nonlocal head
-            if text.startswith(_BULLET_HEADS):
-                head = f"{text} "
-            else:
-                self.line(head + text)
-                head = ""
+            next_head = _BULLET_HEAD.search(text)
+            if content := text[: next_head.start()] if next_head else text:
+                self.line(head + content)
+            head = f"{next_head[1]}{next_head[2]} " if next_head else ""
 
         return LineReader(receive, MAX_LINE_BYTES)
 
