@@ -68,7 +68,7 @@ class PrintedLines:
         with self._lock:
             self._early.append(text)
             self._write_log()
-            self._counts[text] = count = self._counts.get(text, 0) + 1
+            self._counts[text] = count = self._counts.pop(text, 0) + 1  # the last one printed comes last
             if count == 1:
                 self._show_new(text)
 
@@ -104,6 +104,8 @@ class PrintedLines:
         """Write all lines to a file too, of at most 10 MiB, those so far included. It appears with the first line."""
         with self._lock:
             self._log = file
+            with contextlib.suppress(OSError):  # of a resumed training
+                self._log_bytes = file.stat().st_size
             self._write_log()
 
     def _write_log(self) -> None:
@@ -154,7 +156,7 @@ class PrintedLines:
         try:
             if not self._closed:
                 self._show(text)
-        except (OSError, ValueError):  # closed
+        except (OSError, ValueError, AttributeError):  # closed, or not there
             self._closed = True
 
 

@@ -63,7 +63,10 @@ def test_a_file_has_all_lines_also_those_before_it(tmp_path):
 def test_the_file_is_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(printed_lines, "MAX_LOG_BYTES", 10)
     forward_lines(b"one\ntwo\nthree\nfour\n", file=tmp_path / "printed.log")
-    assert (tmp_path / "printed.log").read_text() == "one\ntwo\nthree\n(more lines are left out)\n"
+    limited = "one\ntwo\nthree\n(more lines are left out)\n"
+    assert (tmp_path / "printed.log").read_text() == limited
+    forward_lines(b"five\n", file=tmp_path / "printed.log")
+    assert (tmp_path / "printed.log").read_text() == limited
 
 
 def test_a_warning_of_pybullet_comes_once_and_whole():

@@ -256,10 +256,12 @@ def _import_from_package(task: str, file: Path) -> Any:
     package, name = names[0], ".".join(names)
     own, found = root / package / "__init__.py", installed.find_module_file(package)
     if found is None or found.resolve() != own:
-        raise UsageError(
-            f"task {task!r}: {file.name} belongs to the package {own.parent}, but Python imports {package!r} from "
-            f"{found or 'its own modules'}\nrename the folder {package!r}, or delete its __init__.py"
-        )
+        fix = f"rename the folder {package!r}, or delete its __init__.py"
+        if found is not None and installed.find_module_file(name) is not None:  # a copy of the package, probably
+            fix = f"name the installed module, {name}:{task.rpartition(':')[2]}; or {fix}"
+        elsewhere = found or "its own modules"
+        problem = f"{file.name} belongs to the package {own.parent}, but Python imports {package!r} from {elsewhere}"
+        raise UsageError(f"task {task!r}: {problem}\n{fix}")
     return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
 
 

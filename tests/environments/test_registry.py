@@ -136,6 +136,14 @@ def test_a_package_whose_name_is_taken(write_module, package, taken_from):
     assert second == f"rename the folder {package!r}, or delete its __init__.py"
 
 
+def test_a_package_that_is_also_installed(write_module):
+    file = write_module("there/gymnasium/spaces/box.py", ENV)
+    for folder in (file.parent, file.parent.parent):
+        (folder / "__init__.py").touch()
+    fix = error(UsageError, "there/gymnasium/spaces/box.py:Box").splitlines()[1]
+    assert fix.startswith("name the installed module, gymnasium.spaces.box:Box; or rename the folder 'gymnasium', or ")
+
+
 def test_files_of_one_name_in_many_folders(write_module):
     for number in range(3):
         write_module(f"v{number}/same.py", ENV.replace("gain=1.0", f"gain={number}"))
