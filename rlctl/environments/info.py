@@ -87,7 +87,8 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
             "joints": task.describe_joints(),
         }
         return validation.build(EnvInfo, values, TaskError, type(task).__name__)
-    return EnvInfo(**common, **describe_model(env), max_steps=find_time_limit(env))
+    values = {**common, **describe_model(env), "max_steps": find_time_limit(env)}
+    return validation.build(EnvInfo, values, TaskError, type(inner).__name__)
 
 
 def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
