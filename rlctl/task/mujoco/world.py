@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import UsageError, WorldFailed
+from rlctl.library_output import print_mujoco_warnings
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64] | None
@@ -31,9 +32,7 @@ def import_mujoco() -> Any:
         import mujoco
     except ImportError:
         raise UsageError("sim mujoco needs MuJoCo, which is not installed: pip install mujoco") from None
-    # Its own handler prints, and appends to MUJOCO_LOG.TXT in the current folder; `MujocoWorld` raises for
-    # what is serious.
-    mujoco.set_mju_user_warning(lambda text: None)
+    print_mujoco_warnings()
     return mujoco
 
 
