@@ -14,7 +14,7 @@ STIFFNESS, DAMPING, ARMATURE = 35.0, 0.7, 0.01  # [N m/rad], [N m s/rad], [kg m^
 START_HEIGHT, HEIGHT, FALLEN = 0.30, 0.28, 0.14  # [m], of the trunk
 LOWEST = np.array([-0.5, -0.4, -0.8])  # commanded velocities forwards and sideways [m/s], and of turning [rad/s]
 HIGHEST = np.array([1.0, 0.4, 0.8])
-SCALE = 0.39  # [m/s] and [rad/s]; so far from the command, tracking is worth 1/e
+SCALE = 0.5  # [m/s] and [rad/s]; so far from the command, tracking is worth 1/e
 DOWN = np.array([0.0, 0.0, -1.0])
 
 

@@ -212,7 +212,9 @@ class Body:
 
         `stiffness` [N m/rad or N/m], `damping` [N m s/rad or N s/m] and `armature`, the inertia of motor and gears at
         the joint [kg m^2 or kg], are one number for all joints or one per joint. The torque on a joint is
-        `stiffness * (target - position) - damping * velocity`, within its force limit.
+        `stiffness * (target - position) - damping * velocity`, within its force limit, computed in every physics step.
+        PyBullet's joints have no armature: it is left out there. Raises `TaskError` for a damping that PyBullet's
+        explicit steps cannot have.
         """
         self._refuse("set_drives")
 

@@ -11,6 +11,7 @@ from rlctl.task.body import Array, Body, Drives
 from rlctl.task.pybullet.library import pybullet
 
 _NUMBER = (int, float, np.number)
+_MOST_DAMPING = 1.5  # of a velocity that an explicit damper may remove in a physics step; it is unstable above 2
 
 
 class _Plan(NamedTuple):
@@ -18,7 +19,7 @@ class _Plan(NamedTuple):
     limits: tuple[object, ...]
     joints: list[int]
     impulses: list[float]  # force of a substep [N m or N]
-    gains: dict[str, list[float]]
+    gains: list[float]
 
 
 class Motors(Body):
@@ -38,7 +39,7 @@ class Motors(Body):
         self._commanded: list[float] | None = None  # by `set_torques`, of all joints; NaN: the motor's
         self._chosen: set[int] = set()  # joints whose motors the task has set or disabled
         self.drives: Drives | None = None
-        self._drive_gains: Array = np.zeros((2, 0))  # of position and velocity, shape (2, joints)
+        self._targets: dict[int, tuple[float, float]] = {}  # of springs: position and limit of the force, by joint
 
     def _save_nominal(self) -> None:
         self._built_strength = self.motor_strength
@@ -46,6 +47,7 @@ class Motors(Body):
     def _restore_nominal(self) -> None:
         self.motor_strength = self._built_strength
         self._commanded = None
+        self._targets.clear()
 
     def drive_to(
         self,
@@ -67,7 +69,13 @@ class Motors(Body):
         targets = self._read_values("positions", positions, len(plan.joints))
         self._forget_torques(plan.joints)
         impulses = self._apply_strength(plan.impulses, plan.joints)
-        self._command(plan.joints, "POSITION_CONTROL", targetPositions=targets, forces=impulses, **plan.gains)
+        if self.drives is not None:
+            pairs = zip(plan.joints, zip(targets, impulses, strict=True), strict=True)
+            self._targets |= dict(pairs)
+            return
+        self._command(
+            plan.joints, "POSITION_CONTROL", targetPositions=targets, forces=impulses, positionGains=plan.gains
+        )
 
     def _plan_motors(
         self,
@@ -77,14 +85,11 @@ class Motors(Body):
         gain: float,
     ) -> _Plan:
         chosen = self.find_joints(joints)
-        given = (self.joint_max_speed[chosen] if self.drives is None else 0.0) if max_speed is None else max_speed
-        self._limit_speeds(chosen, self._read_limits("max_speed", given, len(chosen)))
+        if self.drives is None:  # the call for the speed starts a position motor
+            given = self.joint_max_speed[chosen] if max_speed is None else max_speed
+            self._limit_speeds(chosen, self._read_limits("max_speed", given, len(chosen)))
         impulses = self._motor_impulses(chosen, max_force)
-        gains = {"positionGains": [gain] * len(chosen)}
-        if self.drives is not None:
-            position, velocity = self._drive_gains[:, chosen].tolist()
-            gains = {"positionGains": position, "velocityGains": velocity}
-        return _Plan((max_speed, max_force, gain), chosen, impulses, gains)
+        return _Plan((max_speed, max_force, gain), chosen, impulses, [gain] * len(chosen))
 
     def set_drives(
         self,
@@ -94,23 +99,44 @@ class Motors(Body):
         armature: float | Sequence[float] | Array = 0.0,
     ) -> None:
         self.drives = Drives(self._spread("stiffness", stiffness), self._spread("damping", damping))
-        self._plans.clear()
-        # PyBullet's motor sets the velocity after a physics step to (1 - b) * velocity + a * error / dt. An implicit
-        # spring and damper on an inertia m gives (m * velocity + dt * stiffness * error) / n with
-        # n = m + dt * damping + dt^2 * stiffness. So a = dt^2 * stiffness / n and b = 1 - m / n, for the inertia m that
-        # the joint moves in the pose of now.
-        inertia = self._joint_inertia() + self._spread("armature", armature)
-        spring = self._physics_dt**2 * self.drives.stiffness
-        total = inertia + self._physics_dt * self.drives.damping + spring
-        self._drive_gains = np.stack([spring / total, 1.0 - inertia / total])
+        self._spread("armature", armature)  # raises for what cannot be; PyBullet's joints have none
+        self.disable_motors()
+        self._check_damping(self.drives.damping)
 
-    def _joint_inertia(self) -> Array:
-        """Return the inertia that a torque on each joint moves [kg m^2 or kg], shape (joints,)."""
+    def _check_damping(self, damping: Array) -> None:
+        """Raise `TaskError` for dampers that reverse a velocity in a physics step: in PyBullet they are explicit."""
+        rates, shapes = np.linalg.eig(np.linalg.solve(self._mass_matrix(), np.diag(damping)))
+        fastest = int(np.argmax(rates.real))
+        if (share := float(rates.real[fastest]) * self._physics_dt) > _MOST_DAMPING:
+            joint = int(np.argmax(np.abs(shapes[:, fastest])))
+            raise TaskError(
+                f"{self.file.name}: a damping of {damping[joint]:g} of joint {self.joint_names[joint]!r} is too large "
+                f"for PyBullet's steps of {self._physics_dt:g} s: use {math.ceil(share / _MOST_DAMPING)} times as many "
+                "substeps, or --sim mujoco"
+            )
+
+    def _mass_matrix(self) -> Array:
+        """Return the inertia matrix of the joints in the present pose [kg m^2 or kg], shape (joints, joints)."""
         positions = self.joint_positions.tolist()
         matrix = np.array(pybullet.calculateMassMatrix(self.id, positions, physicsClientId=self.client))
         free = len(matrix) - len(positions)  # the velocities of a free base come first
-        inertia: Array = 1.0 / np.diag(np.linalg.inv(matrix))[free:]
-        return inertia
+        inverse: Array = np.linalg.inv(matrix)[free:, free:]
+        return np.linalg.inv(inverse)
+
+    def apply_drives(self) -> None:
+        """Apply the torques of springs and dampers for one physics step; their targets are those of `drive_to`."""
+        if not self._targets or self.drives is None:
+            return
+        states = pybullet.getJointStates(self.id, self.joint_indices, physicsClientId=self.client)
+        count = len(self.joint_names)
+        torques = [math.nan] * count
+        for joint, (target, limit) in self._targets.items():
+            position, velocity = states[joint][:2]
+            torque = self.drives.stiffness[joint] * (target - position) - self.drives.damping[joint] * velocity
+            torques[joint] = min(max(float(torque), -limit), limit)
+        self._commanded = torques
+        chosen = list(self._targets)
+        self._command(chosen, "TORQUE_CONTROL", forces=[torques[joint] for joint in chosen])
 
     def _limit_speeds(self, joints: list[int], speeds: list[float]) -> None:
         # Only the call for one joint takes a speed; the motor keeps it when the call for all sets the targets.

@@ -65,6 +65,7 @@ class BulletSim(Constraints):
         self._saved: int | None = None
         self._built_gravity: tuple[float, ...] | None = None  # [m/s^2], set while events have changed the gravity
         self._pushes: list[_Push] = []
+        self._driven: list[BulletBody] = []
         self._prepare()
 
     def _prepare(self) -> None:
@@ -125,11 +126,19 @@ class BulletSim(Constraints):
             raise TaskError(f"PyBullet cannot load {path}: {read_complaint(call) or error}") from None
 
     def step(self) -> None:
-        if self._pushes:
-            self._apply_pushes()
-        pybullet.stepSimulation(physicsClientId=self.client)
+        # With springs and dampers the physics steps are taken one by one: they need the state before each.
+        for _ in range(self._times[1] if self._driven else 1):
+            if self._pushes:
+                self._apply_pushes()
+            for body in self._driven:
+                body.apply_drives()
+            pybullet.stepSimulation(physicsClientId=self.client)
         for body in self.bodies.values():
             body._cache.clear()
+        if self._pushes:
+            for push in self._pushes:
+                push.steps -= 1
+            self._pushes = [push for push in self._pushes if push.steps]
 
     @property
     def deepest_contact(self) -> float:
@@ -137,6 +146,12 @@ class BulletSim(Constraints):
         return max((-float(point[8]) for point in points if point[8] < 0.0), default=0.0)
 
     def save(self) -> None:
+        self._driven = [body for body in self.bodies.values() if body.drives is not None]
+        if self._driven:
+            single = self._times[0] / self._times[1]
+            pybullet.setPhysicsEngineParameter(fixedTimeStep=single, numSubSteps=0, physicsClientId=self.client)
+            for body in self.bodies.values():
+                body._substeps = 1  # of a call of stepSimulation
         self._saved = pybullet.saveState(physicsClientId=self.client)
         self._built_gravity = None
         for body in self.bodies.values():
@@ -177,8 +192,6 @@ class BulletSim(Constraints):
             pybullet.applyExternalForce(
                 push.body.id, push.link, push.force, centre, pybullet.WORLD_FRAME, physicsClientId=self.client
             )
-            push.steps -= 1
-        self._pushes = [push for push in self._pushes if push.steps]
 
     def clear(self) -> None:
         pybullet.resetSimulation(physicsClientId=self.client)
