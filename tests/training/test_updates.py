@@ -16,12 +16,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rlctl.environments.dict_spaces import split
 from rlctl.errors import RecipeError
-from rlctl.training.updates import adam, choose_learner
+from rlctl.training.updates import adam
+from rlctl.training.updates.choice import choose_learner
 from rlctl.training.updates.crossq import CrossQUpdate
 from rlctl.training.updates.ppo import PpoUpdate
 from rlctl.training.updates.q_learning import DqnUpdate, Td3Update
-from rlctl.training.updates.sac import SacUpdate
-from rlctl.training.updates.tqc import TqcUpdate
+from rlctl.training.updates.sac import SacUpdate, TqcUpdate
 
 pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 
