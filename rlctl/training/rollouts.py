@@ -193,6 +193,11 @@ class Rollouts(abc.ABC):
         if not self.overlap:
             self.learn()
 
+    def close(self) -> None:
+        """End the learner's processes."""
+        if self._learner is not self.model:
+            self._learner.close()
+
     @abc.abstractmethod
     def start(self) -> None:
         """Let the workers start to play with the current policy."""

@@ -1,7 +1,6 @@
 """Updates whose gradients are computed without autograd: Stable-Baselines3's own, but for rounding."""
 
-import os
-import threading
+import copy
 
 import gymnasium as gym
 import numpy as np
@@ -200,27 +199,21 @@ def test_off_policy_updates_as_sb3(name):
 WIDE = {"network": {"net_arch": [300, 300]}, "batch_size": 128}
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
-@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC, CrossQ])
-def test_wide_networks_are_updated_on_two_cores_to_the_same_bit(algorithm):
+@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC, TD3])
+def test_wide_networks_are_updated_on_all_cores_to_the_same_bit(algorithm, use_cores):
     def train():
         set_random_seed(1)
-        model = make_ppo(**WIDE) if algorithm is PPO else make_off_policy(algorithm, **WIDE)
+        settings = {**WIDE, **({"n_steps": 100} if algorithm is PPO else {})}
+        model = make_ppo(**settings) if algorithm is PPO else make_off_policy(algorithm, **settings)
         learner, arguments = choose_learner(model), {} if algorithm is PPO else {"gradient_steps": 3, "batch_size": 128}
-        before = threading.active_count()
         learner.train(**arguments)
-        return weights(model), threading.active_count() - before
+        learner.close()
+        return weights(model)
 
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(cores)})
-    try:
-        on_one, threads = train()
-    finally:
-        os.sched_setaffinity(0, cores)
-    assert threads == 0
-    on_two, threads = train()
-    assert threads == (1 if len(cores) > 1 else 0)
-    assert all(torch.equal(on_one[name], on_two[name]) for name in on_one)
+    with use_cores(1):
+        on_one = train()
+    on_all = train()
+    assert all(torch.equal(on_one[name], on_all[name]) for name in on_one)
 
 
 def test_what_sb3_updates_itself():
@@ -254,6 +247,33 @@ def test_sb3_cannot_delay_the_actor():
     model.policy_delay = 2
     with pytest.raises(RecipeError, match="policy_delay: supported only for multi-layer perceptrons"):
         choose_learner(model)
+
+
+def train_parts_of_a_vector(make_step):
+    """Do six steps of Adam; after three replace the optimizer's state, as loading a checkpoint does."""
+    set_random_seed(0)
+    vector, gradient = torch.randn(64 * 9 + 64), torch.zeros(64 * 9 + 64)
+    values = []
+    for part, shape in ((slice(0, 64 * 9), (64, 9)), (slice(64 * 9, 64 * 10), (64,))):
+        values.append(torch.nn.Parameter(vector[part].view(shape)))
+        values[-1].grad = gradient[part].view(shape)
+    optimizer = torch.optim.Adam(values, 1e-2, (0.5, 0.9), 1e-5, weight_decay=0.1, fused=True)
+    step = make_step(optimizer, vector.numpy(), gradient.numpy())
+    for number in range(6):
+        if number == 3:
+            optimizer.load_state_dict(copy.deepcopy(optimizer.state_dict()))
+        gradient.normal_()
+        step()
+    state = optimizer.state_dict()["state"]
+    return [*values, *(state[index][name] for index in range(2) for name in ("exp_avg", "exp_avg_sq", "step"))]
+
+
+def test_adam_of_a_vector_is_torchs():
+    with torch.no_grad():
+        theirs = train_parts_of_a_vector(lambda optimizer, *_: optimizer.step)
+        ours = train_parts_of_a_vector(lambda *arguments: adam.VectorAdam(*arguments).step)
+    assert ours[-1] == 6
+    assert all(torch.allclose(one, other, rtol=1e-6, atol=1e-7) for one, other in zip(ours, theirs, strict=True))
 
 
 def test_the_short_step_of_adam_is_torchs():

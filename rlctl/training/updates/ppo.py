@@ -24,9 +24,9 @@ from rlctl.training.updates.ppo_gradients import LOSSES, PpoGradients, PpoSettin
 class PpoUpdate:
     """Updates a PPO model, on the CPU, with multi-layer perceptrons and normally distributed actions."""
 
-    def __init__(self, model: PPO) -> None:
-        self._model: Any = model
-        self._policy: Any = model.policy
+    def __init__(self, model: Any) -> None:
+        self._model = model
+        self._policy = model.policy
         actor, critic = _actor_modules(self._policy), _critic_modules(self._policy)
         settings = PpoSettings(
             rows=model.n_steps * model.n_envs,
@@ -44,6 +44,7 @@ class PpoUpdate:
         largest = min(model.batch_size, settings.rows)
         self._blocks = Blocks(PpoGradients, settings, self._count_blocks(largest))
         self._arrays = self._blocks.arrays
+        self.close = self._blocks.close
         parameters, gradients = (split_vector(self._arrays[name], shapes) for name in ("parameters", "gradient"))
         layers = 2 * len(settings.actor) - 2
         bind_networks([actor], parameters[:layers], gradients[:layers])

@@ -26,7 +26,7 @@ class _QNetworks:
     def __init__(self, kind: type[QGradients], settings: QSettings) -> None:
         self._count = count_blocks(settings.rows, settings.count_weights(), most=OFF_POLICY_BLOCKS)
         self._blocks = Blocks(kind, settings, self._count)
-        self.arrays, self._rows = self._blocks.arrays, settings.rows
+        self.arrays, self.close, self._rows = self._blocks.arrays, self._blocks.close, settings.rows
         self.arrays["count"][...] = self._count
         self._shapes, self._split = settings.list_shapes(), len(settings.list_critic_shapes())
         of_critics = count_floats(settings.list_critic_shapes())
@@ -67,8 +67,16 @@ class DqnUpdate:
         self._model = model
         network = list(model.q_net.q_net)
         sizes = list_sizes(network)
-        settings = QSettings(model.batch_size, sizes[0], 1, sizes, 1, uses_tanh(network))
+        settings = QSettings(
+            rows=model.batch_size,
+            features=sizes[0],
+            actions=1,
+            critic=sizes,
+            critics=1,
+            critic_uses_tanh=uses_tanh(network),
+        )
         self._networks = _QNetworks(DqnGradients, settings)
+        self.close = self._networks.close
         self._networks.bind("parameters", [network])
         self._networks.bind("targets", [model.q_net_target.q_net])
         self._adam = self._networks.make_adam(CRITICS, model.policy.optimizer)
@@ -105,12 +113,18 @@ class Td3Update:
         # The last module of an actor is the tanh that squashes its actions.
         actor, critic = list(model.actor.mu[:-1]), list(model.critic.q_networks[0])
         sizes = list_sizes(actor)
-        count = len(model.critic.q_networks)
         settings = QSettings(
-            *(model.batch_size, sizes[0], sizes[-1]),
-            *(list_sizes(critic), count, uses_tanh(critic), sizes, uses_tanh(actor)),
+            rows=model.batch_size,
+            features=sizes[0],
+            actions=sizes[-1],
+            critic=list_sizes(critic),
+            critics=len(model.critic.q_networks),
+            critic_uses_tanh=uses_tanh(critic),
+            actor=sizes,
+            actor_uses_tanh=uses_tanh(actor),
         )
         self._networks = _QNetworks(Td3Gradients, settings)
+        self.close = self._networks.close
         self._networks.bind("parameters", model.critic.q_networks, [actor])
         self._networks.bind("targets", model.critic_target.q_networks, [model.actor_target.mu[:-1]])
         optimizers = {CRITICS: model.critic.optimizer, ACTOR: model.actor.optimizer}

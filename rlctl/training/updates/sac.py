@@ -49,6 +49,7 @@ class SacUpdate:
         self._count = self._count_blocks(settings)
         self._blocks = Blocks(self.gradients, settings, self._count)
         self._arrays = self._blocks.arrays
+        self.close = self._blocks.close
         self._arrays["numbers"][2] = self._count
         shapes, split = settings.list_shapes(), len(settings.list_critic_shapes())
         of_critics = len(self._arrays["targets"])

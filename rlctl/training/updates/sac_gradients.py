@@ -164,8 +164,7 @@ class TqcGradients(SacGradients):
         # quantile's share if positive, else 1 - share; both sums follow from the slopes' sum and absolute sum.
         # The axes are (estimates, critics, quantiles, batch): sums over the first one are those of long arrays.
         errors = np.ascontiguousarray(target.T)[:, None, None] - np.ascontiguousarray(outputs.swapaxes(1, 2))
-        np.maximum(errors, -1, out=errors)
-        np.minimum(errors, 1, out=errors)
+        np.clip(errors, -1, 1, out=errors)
         total = np.add.reduce(errors, axis=0).swapaxes(1, 2)
         size = np.add.reduce(np.abs(errors, out=errors), axis=0).swapaxes(1, 2)
         count = np.float32(-2 * self._settings.rows * outputs.shape[2] * target.shape[1] * len(outputs))
