@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from rlctl.environments.dict_spaces import split
+from rlctl.environments.dict_spaces import map_parts, split
 from rlctl.errors import RecipeError
 from rlctl.training.updates import adam
 from rlctl.training.updates.choice import choose_learner
@@ -98,6 +98,22 @@ def test_ppo_updates_as_sb3(name):
     assert_same_weights(weights(one), weights(other), before)
     expected, logged = one.logger.name_to_value, other.logger.name_to_value
     assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["tanh", "gSDE, relu, no hidden layer of the critic", "dict"])
+def test_ppo_evaluates_as_sb3(name):
+    model = make_ppo(**PPO_CASES[name])
+    observations, _ = model.policy.obs_to_tensor(split_rows(model.rollout_buffer.observations))
+    actions = model.rollout_buffer.swap_and_flatten(model.rollout_buffer.actions)
+    with torch.no_grad():
+        expected, expected_log_probs, _ = model.policy.evaluate_actions(observations, torch.from_numpy(actions))
+    values, log_probs = PpoUpdate(model).evaluate(observations, actions)
+    np.testing.assert_allclose(values, expected.flatten(), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(log_probs, expected_log_probs, rtol=1e-4, atol=1e-4)
+
+
+def split_rows(observations):
+    return map_parts(lambda rows: rows.swapaxes(0, 1).reshape(-1, *rows.shape[2:]), observations)
 
 
 def make_off_policy(

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.distributions import DiagGaussianDistribution, StateDependentNoiseDistribution
 from stable_baselines3.common.utils import explained_variance
@@ -18,7 +19,7 @@ from rlctl.training.updates.adam import VectorAdam
 from rlctl.training.updates.blocks import Blocks, count_blocks
 from rlctl.training.updates.mlp import bind, bind_networks, is_mlp, list_sizes, uses_tanh
 from rlctl.training.updates.perceptrons import clip_norm, split_vector
-from rlctl.training.updates.ppo_gradients import LOSSES, PpoGradients, PpoSettings
+from rlctl.training.updates.ppo_gradients import DIFFERENTIATE, EVALUATE, LOSSES, PpoGradients, PpoSettings
 
 
 class PpoUpdate:
@@ -67,6 +68,17 @@ class PpoUpdate:
         return bool(plain) and is_mlp(_actor_modules(policy)) and is_mlp(_critic_modules(policy))
 
     @torch.no_grad()
+    def evaluate(self, observations: Any, actions: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the values of a rollout's observations and the log-probabilities of its actions, shape (rows,)."""
+        rows = len(actions)
+        count = self._count_blocks(rows)
+        self._arrays["features"][:] = self._policy.extract_features(observations).numpy()
+        self._arrays["actions"][:] = actions
+        self._arrays["minibatch"][:] = 0, rows, count
+        self._blocks.run(EVALUATE, 2 * count)
+        return self._arrays["values"].copy(), self._arrays["log_probs"].copy()
+
+    @torch.no_grad()
     def train(self) -> None:
         """Update the policy with the rollout in the model's buffer; log what SB3 logs."""
         model, policy = self._model, self._policy
@@ -88,7 +100,7 @@ class PpoUpdate:
                 break
         self._log(logged, clip_range, clip_range_vf)
 
-    def _read_buffer(self) -> np.ndarray[Any, np.dtype[np.float32]]:
+    def _read_buffer(self) -> NDArray[Any]:
         """Write the rollout into the shared arrays, shape (steps * environments, ...) each; return its advantages."""
         buffer = self._model.rollout_buffer
         observations = map_parts(lambda rows: torch.from_numpy(buffer.swap_and_flatten(rows)), buffer.observations)
@@ -96,7 +108,8 @@ class PpoUpdate:
         self._arrays["actions"][:] = buffer.swap_and_flatten(buffer.actions)  # the buffer has the type of the space
         for name in ("values", "log_probs", "returns"):
             self._arrays[name][:] = buffer.swap_and_flatten(getattr(buffer, name)).ravel()
-        return buffer.swap_and_flatten(buffer.advantages).ravel()
+        advantages: NDArray[Any] = buffer.swap_and_flatten(buffer.advantages).ravel()
+        return advantages
 
     def _update(self, first: int, size: int, logged: dict[str, list[float]]) -> bool:
         """Learn from a minibatch; return False without an update if the policy has moved beyond `target_kl`."""
@@ -106,7 +119,7 @@ class PpoUpdate:
             advantages -= advantages.mean()
             advantages /= advantages.std(ddof=1) + np.float32(1e-8)
         self._arrays["minibatch"][:] = first, size, count
-        self._blocks.run(0, 2 * count)
+        self._blocks.run(DIFFERENTIATE, 2 * count)
         losses = dict(zip(LOSSES, (self._arrays["losses"][:count].sum(0) / size).tolist(), strict=True))
         for name, loss in losses.items():
             logged[name].append(loss)

@@ -11,7 +11,9 @@ from rlctl.rollout.shared_arrays import Layout
 from rlctl.training.updates.blocks import MAX_BLOCKS, Arrays, BlockWork, select_block
 from rlctl.training.updates.perceptrons import LOG_SQRT_TAU, Floats, MlpStack, Shapes, list_shapes, split_vector
 
+DIFFERENTIATE, EVALUATE = 0, 1  # phases
 LOSSES = ("policy_gradient_loss", "entropy_loss", "clip_fraction", "approx_kl", "value_loss")
+_ROWS = 1024  # of one forward pass in an evaluation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,27 +62,41 @@ class PpoGradients(BlockWork):
         self._gradients = [(parts[:layers], parts[layers:-1], parts[-1]) for parts in gradients]
 
     def compute(self, phase: int, task: int) -> None:
-        """Set a block's gradients of the minibatch's mean loss, and its sums of what is logged.
-
-        There are two tasks for each block: the actor and the critic.
-        """
+        """Do a phase for a block of the minibatch: two tasks for each block, the actor's and the critic's."""
         block, is_critic = divmod(task, 2)
         first, size, count = self._arrays["minibatch"].tolist()
         rows = select_block(block, count, first, size)
-        (self._differentiate_critic if is_critic else self._differentiate_actor)(block, rows, size)
+        if phase == EVALUATE:
+            (self._evaluate_critic if is_critic else self._evaluate_actor)(rows)
+        else:
+            (self._differentiate_critic if is_critic else self._differentiate_actor)(block, rows, size)
+
+    def _evaluate_actor(self, rows: slice) -> None:
+        """Write the log-probabilities of the rollout's actions."""
+        for part in _split(rows):
+            actor = self._actor.run(self._arrays["features"][None, part], "actor")
+            z = self._arrays["actions"][part] - actor[-1][0]
+            std = self._compute_std(actor)
+            z /= std
+            self._arrays["log_probs"][part] = _compute_log_prob(np.square(z), np.log(std))
+
+    def _evaluate_critic(self, rows: slice) -> None:
+        """Write the values of the rollout's observations."""
+        for part in _split(rows):
+            self._arrays["values"][part] = self._critic.run(self._arrays["features"][None, part], "critic")[-1].ravel()
 
     def _take(self, name: str, rows: slice) -> Floats:
         return self._arrays[name].take(self._arrays["order"][rows], axis=0)
 
     def _differentiate_actor(self, block: int, rows: slice, size: int) -> None:
+        """Set a block's gradients of the minibatch's mean loss, and its sums of what is logged."""
         clip_range = float(self._arrays["clip_ranges"][0])
         actor = self._actor.run(self._take("features", rows)[None], "actor")
         std = self._compute_std(actor)
         z = self._take("actions", rows) - actor[-1][0]
         z /= std
         log_std, squared = np.log(std), np.square(z)
-        log_prob = squared.sum(1) * np.float32(-0.5) - (log_std.sum(-1) + np.float32(LOG_SQRT_TAU * z.shape[1]))
-        log_ratio = log_prob - self._take("log_probs", rows)
+        log_ratio = _compute_log_prob(squared, log_std) - self._take("log_probs", rows)
         ratio = np.exp(log_ratio)
         advantages = self._arrays["advantages"][rows]
         unclipped, clipped = advantages * ratio, advantages * ratio.clip(1 - clip_range, 1 + clip_range)
@@ -131,3 +147,14 @@ class PpoGradients(BlockWork):
         # std^2 = latent^2 @ exp(2 log_std) + epsilon; no gradient flows into the latent values, as in SB3.
         of_variance = np.square(actor[-2][0]).T @ (gradient / np.square(std))
         np.multiply(of_variance, np.exp(2 * self._log_std), out=to_log_std)
+
+
+def _compute_log_prob(squared: Floats, log_std: Floats) -> Floats:
+    """Return the log-probabilities of actions from the squares of their standardized values."""
+    log_prob: Floats = squared.sum(1) * np.float32(-0.5)
+    log_prob -= log_std.sum(-1) + np.float32(LOG_SQRT_TAU * squared.shape[1])
+    return log_prob
+
+
+def _split(rows: slice) -> list[slice]:
+    return [slice(first, min(first + _ROWS, rows.stop)) for first in range(rows.start, rows.stop, _ROWS)]
