@@ -89,7 +89,9 @@ class OnPolicyRollouts(Rollouts):
             mean, var = self._statistics[key]
             normalizer = self.model.get_vec_normalize_env()
             limit = normalizer.clip_obs
-            rows = np.clip((rows - mean) / np.sqrt(var + normalizer.epsilon), -limit, limit).astype(np.float32)
+            normalized = rows - mean
+            normalized /= np.sqrt(var + normalizer.epsilon)
+            rows = np.clip(normalized, -limit, limit, out=normalized).astype(np.float32)
         return to_network_layout(rows, split_space(self.model.observation_space)[key])
 
     def _evaluate_segment(self, observations: Arrays, actions: NDArray[Any], final: Arrays) -> _SegmentValues:

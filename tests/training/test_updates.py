@@ -215,7 +215,7 @@ def test_off_policy_updates_as_sb3(name):
 WIDE = {"network": {"net_arch": [300, 300]}, "batch_size": 128}
 
 
-@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC, TD3])
+@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC, TD3, CrossQ])
 def test_wide_networks_are_updated_on_all_cores_to_the_same_bit(algorithm, use_cores):
     def train():
         set_random_seed(1)

@@ -54,6 +54,12 @@ class MlpStack:
         self._uses_tanh = uses_tanh
         self._buffers: dict[tuple[str, int], list[Floats]] = {}
 
+    def select(self, network: int) -> "MlpStack":
+        """Return a stack of one of the networks; the parameters share memory."""
+        pairs = zip(self._weights, self._biases, strict=True)
+        parameters = [part[network : network + 1] for pair in pairs for part in pair]
+        return MlpStack(parameters, uses_tanh=self._uses_tanh)
+
     def run(self, inputs: Floats, use: str) -> list[Floats]:
         """Return the inputs and the output of each layer. The next run with the same `use` overwrites these arrays."""
         values = [inputs, *self._get_buffers(use, inputs.shape[1])]

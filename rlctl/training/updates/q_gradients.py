@@ -107,8 +107,7 @@ class Td3Gradients(QGradients):
 
     def __init__(self, arrays: Arrays, settings: QSettings) -> None:
         super().__init__(arrays, settings)
-        parameters = split_vector(arrays["parameters"], settings.list_critic_shapes())
-        self._first_critic = MlpStack([part[:1] for part in parameters], uses_tanh=settings.critic_uses_tanh)
+        self._first_critic = self._critics.select(0)
 
     def _differentiate_critics(self, rows: slice, gradients: list[Floats]) -> float:
         arrays, features = self._arrays, self._arrays["next_features"][rows]
