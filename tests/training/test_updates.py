@@ -266,7 +266,7 @@ def test_sb3_cannot_delay_the_actor():
 
 
 def train_parts_of_a_vector(make_step):
-    """Do six steps of Adam; after three replace the optimizer's state, as loading a checkpoint does."""
+    """Do six steps of Adam, the fifth with torch; after three replace the state, as loading a checkpoint does."""
     set_random_seed(0)
     vector, gradient = torch.randn(64 * 9 + 64), torch.zeros(64 * 9 + 64)
     values = []
@@ -279,7 +279,7 @@ def train_parts_of_a_vector(make_step):
         if number == 3:
             optimizer.load_state_dict(copy.deepcopy(optimizer.state_dict()))
         gradient.normal_()
-        step()
+        (optimizer.step if number == 4 else step)()
     state = optimizer.state_dict()["state"]
     return [*values, *(state[index][name] for index in range(2) for name in ("exp_avg", "exp_avg_sq", "step"))]
 

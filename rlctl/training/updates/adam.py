@@ -24,7 +24,8 @@ def step(optimizer: torch.optim.Optimizer) -> None:
 class VectorAdam:
     """Steps of an optimizer whose parameters are all parts of one vector: one call instead of one per parameter.
 
-    The optimizer's state stays complete: its tensors become parts of vectors too, also after a checkpoint is loaded.
+    The optimizer's state stays complete, so its own `step` can be called too: the tensors of the state become parts of
+    vectors, also after a checkpoint is loaded.
     """
 
     def __init__(self, optimizer: torch.optim.Optimizer, vector: Floats, gradient: Floats) -> None:
@@ -32,7 +33,7 @@ class VectorAdam:
         self._vector, self._gradient = torch.from_numpy(vector), torch.from_numpy(gradient)
         self._parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         self._averages = {name: torch.zeros_like(self._vector) for name in ("exp_avg", "exp_avg_sq")}
-        self._steps = torch.zeros(())
+        self._steps = torch.zeros(len(self._parameters))
         self._bound: Any = None  # the state that is known to consist of parts of the vectors
 
     def step(self) -> None:
@@ -46,7 +47,7 @@ class VectorAdam:
         self._steps += 1
         averages, squares = self._averages.values()
         group = self._optimizer.param_groups[0]
-        _run_kernel(group, [self._vector], [self._gradient], [averages], [squares], [self._steps])
+        _run_kernel(group, [self._vector], [self._gradient], [averages], [squares], [self._steps[0]])
 
     def _can_bind(self) -> bool:
         states = [self._optimizer.state[parameter] for parameter in self._parameters]
@@ -59,14 +60,14 @@ class VectorAdam:
         return (parameter.data_ptr() - self._vector.data_ptr()) // self._vector.element_size()
 
     def _bind(self) -> None:
-        for parameter in self._parameters:
+        for index, parameter in enumerate(self._parameters):
             state, first = self._optimizer.state[parameter], self._find(parameter)
             for name, vector in self._averages.items():
                 part = vector[first : first + parameter.numel()].view(parameter.shape)
                 part.copy_(state[name])
                 state[name] = part
-            self._steps.copy_(state["step"])
-            state["step"] = self._steps
+            self._steps[index] = state["step"]
+            state["step"] = self._steps[index]
         self._bound = self._optimizer.state[self._parameters[0]]["exp_avg"]
 
 
