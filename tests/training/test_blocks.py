@@ -78,7 +78,7 @@ def test_blocks_are_all_rows_of_a_minibatch_once():
 
 def compute(kind, settings, cores):
     """Return all arrays after every phase for a minibatch of random numbers in four blocks."""
-    blocks, count = Blocks(kind, settings, 4, cores=cores), 4
+    blocks, count = Blocks(kind, settings, 16, cores=cores), 4
     arrays, rng = blocks.arrays, np.random.default_rng(0)
     for name, array in arrays.items():
         if array.dtype == np.float32 and not name.startswith("gradient"):

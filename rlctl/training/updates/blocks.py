@@ -67,13 +67,13 @@ class BlockWork(abc.ABC):
 
 
 class Blocks:
-    """Computes tasks in this process and, for minibatches of up to `count` blocks, in processes on the other cores.
+    """Computes tasks in this process and, for phases of up to `tasks` of them, in processes on the other cores.
 
     `cores` is how many processes there are, by default one per core. `arrays` has `parameters`, `gradient` and the
     `gradients` of each block, shape (blocks, floats), besides those of the settings.
     """
 
-    def __init__(self, kind: type[BlockWork], settings: BlockSettings, count: int, *, cores: int | None = None) -> None:
+    def __init__(self, kind: type[BlockWork], settings: BlockSettings, tasks: int, *, cores: int | None = None) -> None:
         length = count_floats(settings.list_shapes())
         layout = {**settings.make_layout(), **_make_layout(length)}
         memory = anonymous_file()
@@ -86,7 +86,7 @@ class Blocks:
         descriptors = {"memory": memory, "taken": self._taken.fileno(), "reported": reported.fileno()}
         arguments = {"kind": f"{kind.__module__}:{kind.__name__}", "settings": settings, "layout": layout}
         try:
-            for _ in range(min(cores or available_cores(), _MAX_TASKS) - 1 if count > 1 else 0):
+            for _ in range(min(cores or available_cores(), tasks) - 1):
                 process = ChildProcess(f"{__name__}:main", {**arguments, **descriptors}, pass_fds=descriptors.values())
                 self._processes.append(process)
         except OSError as error:

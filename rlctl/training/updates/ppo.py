@@ -43,7 +43,8 @@ class PpoUpdate:
         shapes = settings.list_shapes()
         self._weights = sum(math.prod(shape) for shape in shapes)
         largest = min(model.batch_size, settings.rows)
-        self._blocks = Blocks(PpoGradients, settings, self._count_blocks(largest))
+        blocks = self._count_blocks(largest)
+        self._blocks = Blocks(PpoGradients, settings, 2 * blocks if blocks > 1 else 1)
         self._arrays = self._blocks.arrays
         self.close = self._blocks.close
         parameters, gradients = (split_vector(self._arrays[name], shapes) for name in ("parameters", "gradient"))
