@@ -13,6 +13,7 @@ from rlctl.environments.dict_spaces import join, split, split_space
 from rlctl.policy.players.player import Exploration
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.training.rollouts import Check, Rollouts, Statistics, to_network_layout
+from rlctl.training.updates.ppo import PpoUpdate
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -88,25 +89,35 @@ class OnPolicyRollouts(Rollouts):
             mean, var = self._statistics[key]
             normalizer = self.model.get_vec_normalize_env()
             limit = normalizer.clip_obs
-            rows = np.clip((rows - mean) / np.sqrt(var + normalizer.epsilon), -limit, limit).astype(np.float32)
+            normalized = rows - mean
+            normalized /= np.sqrt(var + normalizer.epsilon)
+            rows = np.clip(normalized, -limit, limit, out=normalized).astype(np.float32)
         return to_network_layout(rows, split_space(self.model.observation_space)[key])
 
     def _evaluate_segment(self, observations: Arrays, actions: NDArray[Any], final: Arrays) -> _SegmentValues:
         policy, (n_envs, steps) = self.model.policy, actions.shape[:2]
         flat = {key: rows[:, :-1].reshape(n_envs * steps, *rows.shape[2:]) for key, rows in observations.items()}
-        chosen = self._to_actions(actions.reshape(n_envs * steps, -1))
-        parts_of_batches = [
-            policy.evaluate_actions(self._to_tensor(flat, rows), chosen[rows])[:2] for rows in _slices(len(chosen))
-        ]
-        values, log_probs = (
-            torch.cat([part.flatten() for part in parts]).cpu().numpy().reshape(n_envs, steps)
-            for parts in zip(*parts_of_batches, strict=True)
-        )
+        values, log_probs = self._evaluate_actions(flat, actions.reshape(n_envs * steps, -1))
         ends = {key: np.concatenate([rows[:, -1], final[key]]) for key, rows in observations.items()}
         count = len(next(iter(ends.values())))
         parts = [policy.predict_values(self._to_tensor(ends, rows)).flatten() for rows in _slices(count)]
         after: NDArray[np.float32] = torch.cat(parts).cpu().numpy()
-        return _SegmentValues(values, log_probs, after[:n_envs], after[n_envs:])
+        shape = n_envs, steps
+        return _SegmentValues(values.reshape(shape), log_probs.reshape(shape), after[:n_envs], after[n_envs:])
+
+    def _evaluate_actions(self, observations: Arrays, actions: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the values of observations and the log-probabilities of actions, shape (rows,)."""
+        if isinstance(self._learner, PpoUpdate):
+            return self._learner.evaluate(self._to_tensor(observations, slice(None)), actions)
+        policy, chosen = self.model.policy, self._to_actions(actions)
+        parts_of_batches = [
+            policy.evaluate_actions(self._to_tensor(observations, rows), chosen[rows])[:2]
+            for rows in _slices(len(chosen))
+        ]
+        values, log_probs = (
+            torch.cat([part.flatten() for part in parts]).cpu().numpy() for parts in zip(*parts_of_batches, strict=True)
+        )
+        return values, log_probs
 
     def _evaluate_step_by_step(
         self, observations: Arrays, actions: NDArray[Any], starts: NDArray[np.bool_], ended: tuple[Any, Arrays]

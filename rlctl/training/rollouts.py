@@ -25,7 +25,7 @@ from rlctl.rollout.workers import Workers
 from rlctl.training.own_networks import write_graph
 from rlctl.training.snapshot import observation_statistics, pack
 from rlctl.training.status import Progress
-from rlctl.training.updates import choose_learner
+from rlctl.training.updates.choice import choose_learner
 
 
 def _count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[Any]]) -> tuple[int, str]:
@@ -192,6 +192,11 @@ class Rollouts(abc.ABC):
         self.finish(check)
         if not self.overlap:
             self.learn()
+
+    def close(self) -> None:
+        """End the learner's processes."""
+        if self._learner is not self.model:
+            self._learner.close()
 
     @abc.abstractmethod
     def start(self) -> None:

@@ -59,6 +59,7 @@ def set_up(start: Start, display: Display, printed: PrintedLines) -> Iterator[Tr
         from rlctl.training.loop import TrainingLoop
 
         learner = _build_learner(start, specs, workers, make_workers, display)
+        stack.callback(learner.rollouts.close)
         if start.run is None:
             _warn_of_opposite_weights(specs, display)
             if registered := describe_registrations(start.task, "train"):

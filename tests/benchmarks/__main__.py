@@ -59,6 +59,8 @@ ROWS = {
     "sbx-tqc-128": "sbx:tqc_128",
     "sbx-sac-128": "sbx:sac_128",
     "sbx-sac-256": "sbx:sac_256",
+    "learner-ppo": "learner:ppo",
+    "learner-tqc": "learner:tqc",
     "memory": "memory:per_environment",
     "training": "training:whole_training",
     "policy-5cm": "training:policy_at_5_cm",

@@ -28,6 +28,7 @@ NORMALIZED = {"normalize": {"observation": True, "reward": True}}
 STAGES = {
     "stages": [{"task": {"tolerance": 0.5}, "promote": {"success": 0.5, "window": 6}}, {"task": {"tolerance": 0.3}}]
 }
+WIDE = {"policy_kwargs": {"net_arch": [128, 128]}}
 CASES = {
     "ppo": ("Line", settings("ppo")),
     "ppo with gSDE": ("Line", settings("ppo", **SDE)),
@@ -59,6 +60,9 @@ CASES = {
     "dqn": ("Discrete", settings("dqn", algo_kwargs={"target_update_interval": 20})),
     "tqc": ("Line", settings("tqc")),
     "crossq": ("Line", settings("crossq")),
+    # Minibatches of four blocks, 128 rows * 34,000 weights, and of two, 64 / 32 rows.
+    "ppo, blocks": ("Line", settings("ppo", algo_kwargs={"n_steps": 32, "batch_size": 128}, **WIDE)),
+    "tqc, blocks": ("Line", settings("tqc", algo_kwargs={"batch_size": 64}, **WIDE)),
 }
 # A kind of state each: noise matrices, stages, hidden states, whole episodes with their goals and statistics. Killed
 # trainings of plain ppo and sac are in tests/crash.
@@ -134,11 +138,12 @@ def kill_and_resume(train, resume, kill_after, case, device):
     assert_same_run(whole, run)
 
 
+@pytest.mark.parametrize(("case", "steps"), [("ppo", 37), ("ppo, blocks", 37), ("tqc, blocks", 13)])
 @pytest.mark.usefixtures("every_boundary")
-def test_on_one_core_and_resumed_on_all(train, resume, kill_after, use_cores):
-    env, given = CASES["ppo"]
+def test_on_one_core_and_resumed_on_all(train, resume, kill_after, use_cores, case, steps):
+    env, given = CASES[case]
     whole = train(env, given).run
-    undo = kill_after(37)
+    undo = kill_after(steps)
     with use_cores(1):
         assert available_cores() == 1
         with pytest.raises(Killed):

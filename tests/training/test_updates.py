@@ -1,8 +1,5 @@
 """Updates whose gradients are computed without autograd: Stable-Baselines3's own, but for rounding."""
 
-import os
-import threading
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -14,14 +11,13 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from rlctl.environments.dict_spaces import split
+from rlctl.environments.dict_spaces import map_parts, split
 from rlctl.errors import RecipeError
-from rlctl.training.updates import adam, choose_learner
+from rlctl.training.updates.choice import choose_learner
 from rlctl.training.updates.crossq import CrossQUpdate
 from rlctl.training.updates.ppo import PpoUpdate
 from rlctl.training.updates.q_learning import DqnUpdate, Td3Update
-from rlctl.training.updates.sac import SacUpdate
-from rlctl.training.updates.tqc import TqcUpdate
+from rlctl.training.updates.sac import SacUpdate, TqcUpdate
 
 pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 
@@ -99,6 +95,22 @@ def test_ppo_updates_as_sb3(name):
     assert_same_weights(weights(one), weights(other), before)
     expected, logged = one.logger.name_to_value, other.logger.name_to_value
     assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["tanh", "gSDE, relu, no hidden layer of the critic", "dict"])
+def test_ppo_evaluates_as_sb3(name):
+    model = make_ppo(**PPO_CASES[name])
+    observations, _ = model.policy.obs_to_tensor(split_rows(model.rollout_buffer.observations))
+    actions = model.rollout_buffer.swap_and_flatten(model.rollout_buffer.actions)
+    with torch.no_grad():
+        expected, expected_log_probs, _ = model.policy.evaluate_actions(observations, torch.from_numpy(actions))
+    values, log_probs = PpoUpdate(model).evaluate(observations, actions)
+    np.testing.assert_allclose(values, expected.flatten(), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(log_probs, expected_log_probs, rtol=1e-4, atol=1e-4)
+
+
+def split_rows(observations):
+    return map_parts(lambda rows: rows.swapaxes(0, 1).reshape(-1, *rows.shape[2:]), observations)
 
 
 def make_off_policy(
@@ -200,27 +212,21 @@ def test_off_policy_updates_as_sb3(name):
 WIDE = {"network": {"net_arch": [300, 300]}, "batch_size": 128}
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
-@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC, CrossQ])
-def test_wide_networks_are_updated_on_two_cores_to_the_same_bit(algorithm):
+@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC, TD3, CrossQ])
+def test_wide_networks_are_updated_on_all_cores_to_the_same_bit(algorithm, use_cores):
     def train():
         set_random_seed(1)
-        model = make_ppo(**WIDE) if algorithm is PPO else make_off_policy(algorithm, **WIDE)
+        settings = {**WIDE, **({"n_steps": 100} if algorithm is PPO else {})}
+        model = make_ppo(**settings) if algorithm is PPO else make_off_policy(algorithm, **settings)
         learner, arguments = choose_learner(model), {} if algorithm is PPO else {"gradient_steps": 3, "batch_size": 128}
-        before = threading.active_count()
         learner.train(**arguments)
-        return weights(model), threading.active_count() - before
+        learner.close()
+        return weights(model)
 
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(cores)})
-    try:
-        on_one, threads = train()
-    finally:
-        os.sched_setaffinity(0, cores)
-    assert threads == 0
-    on_two, threads = train()
-    assert threads == (1 if len(cores) > 1 else 0)
-    assert all(torch.equal(on_one[name], on_two[name]) for name in on_one)
+    with use_cores(1):
+        on_one = train()
+    on_all = train()
+    assert all(torch.equal(on_one[name], on_all[name]) for name in on_one)
 
 
 def test_what_sb3_updates_itself():
@@ -254,20 +260,3 @@ def test_sb3_cannot_delay_the_actor():
     model.policy_delay = 2
     with pytest.raises(RecipeError, match="policy_delay: supported only for multi-layer perceptrons"):
         choose_learner(model)
-
-
-def test_the_short_step_of_adam_is_torchs():
-    def train(step):
-        set_random_seed(0)
-        values = [torch.nn.Parameter(torch.randn(shape)) for shape in ((64, 9), (64,), ())]
-        unused = torch.nn.Parameter(torch.zeros(2))
-        optimizer = torch.optim.Adam([*values, unused], 1e-2, (0.5, 0.9), 1e-5, weight_decay=0.1, fused=True)
-        for _ in range(5):
-            for value in values:
-                value.grad = torch.randn(value.shape)
-            step(optimizer)
-        return [*values, *(state for value in values for state in optimizer.state[value].values())]
-
-    with torch.no_grad():
-        pairs = list(zip(train(adam.step), train(torch.optim.Adam.step), strict=True))
-    assert all(torch.equal(ours, theirs) for ours, theirs in pairs)

@@ -12,7 +12,8 @@ import numpy as np
 from sb3_contrib.common.torch_layers import BatchRenorm1d
 from torch import nn
 
-from rlctl.training.updates.mlp import Floats, MlpStack, is_mlp, share, share_gradients
+from rlctl.training.updates.mlp import is_mlp, share, share_gradients
+from rlctl.training.updates.perceptrons import Floats, MlpStack
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,19 +102,23 @@ class _Passed(list[Floats]):
         self.normalized: list[_Normalized] = []
 
 
-def choose_stack(modules: Iterable[nn.Module]) -> type[MlpStack] | None:
-    """Return the class that supports these modules; None if none does."""
+def is_normalized(modules: Iterable[nn.Module]) -> bool:
+    """Return whether batch normalization comes before each linear layer."""
+    return all(type(module) is BatchRenorm1d and module.affine for module in list(modules)[::3])
+
+
+def is_supported(modules: Iterable[nn.Module]) -> bool:
+    """Return whether these modules are a perceptron with or without batch normalization."""
     modules = list(modules)
-    if all(type(module) is BatchRenorm1d and module.affine for module in modules[::3]):
-        return NormalizedMlpStack if is_mlp(module for index, module in enumerate(modules) if index % 3) else None
-    return MlpStack if is_mlp(modules) else None
+    return is_mlp(module for index, module in enumerate(modules) if index % 3 or not is_normalized(modules))
 
 
 class NormalizedMlpStack(MlpStack):
     """As `MlpStack`; a run for the use "learning" normalizes by the batch, all others by the running statistics."""
 
-    def __init__(self, networks: Sequence[Iterable[nn.Module]]) -> None:
-        super().__init__(networks)
+    def __init__(self, stack: MlpStack, networks: Sequence[Iterable[nn.Module]]) -> None:
+        """Use the linear layers of `stack`, and the batch normalization in the modules of `networks`."""
+        vars(self).update(vars(stack))
         norms = [[module for module in network if isinstance(module, BatchRenorm1d)] for network in networks]
         self._norms = [_Renorm(row) for row in zip(*norms, strict=True)]
 
@@ -128,12 +133,14 @@ class NormalizedMlpStack(MlpStack):
             values.normalized.append(normalized)
         return values
 
-    def backpropagate(self, values: list[Floats], gradient: Floats, *, latent: Floats | None = None) -> None:
-        """Set the weights' gradients from the outputs' gradient, and from `latent`, of the last layer's inputs."""
+    def backpropagate(
+        self, values: list[Floats], gradient: Floats, gradients: Sequence[Floats], *, latent: Floats | None = None
+    ) -> None:
+        """As `MlpStack.backpropagate`; `latent` is the gradient of the last layer's normalized inputs."""
         assert isinstance(values, _Passed)
-        for index in reversed(range(len(self._layers))):
-            self._set_gradients(index, values[2 * index + 1], gradient)
-            gradient = gradient @ self._layers[index].weight
+        for index in reversed(range(len(self._weights))):
+            self._set_gradients(values[2 * index + 1], gradient, gradients[2 * index : 2 * index + 2])
+            gradient = gradient @ self._weights[index]
             if latent is not None:
                 gradient += latent
                 latent = None
@@ -144,9 +151,9 @@ class NormalizedMlpStack(MlpStack):
     def input_gradient(self, values: list[Floats], gradient: Floats, first: int) -> Floats:
         """Return the gradient of inputs `first` and later, of a run by the running statistics."""
         assert isinstance(values, _Passed)
-        for index in reversed(range(len(self._layers))):
+        for index in reversed(range(len(self._weights))):
             begin = 0 if index else first
-            gradient = gradient @ self._layers[index].weight[:, :, begin:]
+            gradient = gradient @ self._weights[index][:, :, begin:]
             gradient *= (values.normalized[index].factor * self._norms[index].scale)[:, :, begin:]
             if index > 0:
                 self._derive(gradient, values[2 * index])

@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 
 from rlctl.environments.dict_spaces import join, map_parts, split
 from rlctl.training.snapshot import observation_statistics
-from rlctl.training.updates.mlp import Floats
+from rlctl.training.updates.perceptrons import Floats
 
 _Take = Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 

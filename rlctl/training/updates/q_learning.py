@@ -6,16 +6,58 @@ https://arxiv.org/abs/1802.09477.
 """
 
 import collections
-import functools
 from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3 import DDPG, DQN, TD3
 
-from rlctl.training.updates import adam
+from rlctl.training.updates.adam import VectorAdam
 from rlctl.training.updates.batches import Batch, sample_batches
-from rlctl.training.updates.mlp import Floats, MlpStack, SideBySide, clip_norm, is_mlp
+from rlctl.training.updates.blocks import OFF_POLICY_BLOCKS, Blocks, count_blocks
+from rlctl.training.updates.mlp import bind_networks, is_mlp, list_sizes, uses_tanh
+from rlctl.training.updates.perceptrons import clip_norm, count_floats, split_vector
+from rlctl.training.updates.q_gradients import ACTOR, CRITICS, DqnGradients, QGradients, QSettings, Td3Gradients
+
+
+class _QNetworks:
+    """Networks and their targets in shared arrays, and the gradients of minibatches."""
+
+    def __init__(self, kind: type[QGradients], settings: QSettings) -> None:
+        self._count = count_blocks(settings.rows, settings.count_weights(), most=OFF_POLICY_BLOCKS)
+        self._blocks = Blocks(kind, settings, self._count)
+        self.arrays, self.close, self._rows = self._blocks.arrays, self._blocks.close, settings.rows
+        self.arrays["count"][...] = self._count
+        self._shapes, self._split = settings.list_shapes(), len(settings.list_critic_shapes())
+        of_critics = count_floats(settings.list_critic_shapes())
+        self._parts = {CRITICS: slice(0, of_critics), ACTOR: slice(of_critics, len(self.arrays["gradient"]))}
+
+    def bind(self, name: str, critics: Any, actors: Any = ()) -> None:
+        """Make "parameters" or "targets" the memory of these networks."""
+        values, gradients = (split_vector(self.arrays[key], self._shapes) for key in (name, "gradient"))
+        gradients = gradients if name == "parameters" else []
+        bind_networks(critics, values[: self._split], gradients[: self._split])
+        bind_networks(actors, values[self._split :], gradients[self._split :])
+
+    def read(self, batch: Batch) -> None:
+        """Write a minibatch into the shared arrays."""
+        for name in ("features", "next_features", "actions", "rewards", "discounts"):
+            self.arrays[name][:] = getattr(batch, name)
+
+    def differentiate(self, phase: int) -> tuple[Any, float]:
+        """Set the gradients of the critics or of the actor; return them as a vector, and the loss."""
+        self._blocks.run(phase, self._count)
+        gradient = self._blocks.add_gradients(self._count, self._parts[phase])
+        return gradient, float(self.arrays["losses"][: self._count, phase].sum()) / self._rows
+
+    def make_adam(self, phase: int, optimizer: torch.optim.Optimizer) -> VectorAdam:
+        """Return what updates the critics or the actor."""
+        return VectorAdam(optimizer, *(self.arrays[name][self._parts[phase]] for name in ("parameters", "gradient")))
+
+    def follow(self, tau: float) -> None:
+        """Move the targets towards the networks."""
+        targets, parameters = (torch.from_numpy(self.arrays[name]) for name in ("targets", "parameters"))
+        targets.lerp_(parameters, tau)
 
 
 class DqnUpdate:
@@ -23,7 +65,21 @@ class DqnUpdate:
 
     def __init__(self, model: Any) -> None:
         self._model = model
-        self._network, self._target = (MlpStack([net.q_net]) for net in (model.q_net, model.q_net_target))
+        network = list(model.q_net.q_net)
+        sizes = list_sizes(network)
+        settings = QSettings(
+            rows=model.batch_size,
+            features=sizes[0],
+            actions=1,
+            critic=sizes,
+            critics=1,
+            critic_uses_tanh=uses_tanh(network),
+        )
+        self._networks = _QNetworks(DqnGradients, settings)
+        self.close = self._networks.close
+        self._networks.bind("parameters", [network])
+        self._networks.bind("targets", [model.q_net_target.q_net])
+        self._adam = self._networks.make_adam(CRITICS, model.policy.optimizer)
 
     @classmethod
     def supports(cls, model: Any) -> bool:
@@ -42,18 +98,11 @@ class DqnUpdate:
 
     def _update(self, batch: Batch) -> float:
         """Return the loss before the update."""
-        best = self._target.run(batch.next_features[None], "target")[-1][0].max(1, keepdims=True)
-        values = self._network.run(batch.features[None], "learning")
-        actions = batch.actions.astype(np.int64)
-        errors = np.take_along_axis(values[-1][0], actions, 1) - (batch.rewards + batch.discounts * best)
-        to_values = np.zeros_like(values[-1])
-        # The derivative of the Huber loss is the error, clipped to [-1, 1].
-        np.put_along_axis(to_values[0], actions, errors.clip(-1, 1) / np.float32(len(errors)), 1)
-        self._network.backpropagate(values, to_values)
-        clip_norm(self._network.gradients, self._model.max_grad_norm)
-        adam.step(self._model.policy.optimizer)
-        sizes = np.abs(errors)
-        return float(np.where(sizes <= 1, 0.5 * np.square(sizes), sizes - 0.5).mean())
+        self._networks.read(batch)
+        gradient, loss = self._networks.differentiate(CRITICS)
+        clip_norm(gradient, self._model.max_grad_norm)
+        self._adam.step()
+        return loss
 
 
 class Td3Update:
@@ -62,12 +111,24 @@ class Td3Update:
     def __init__(self, model: Any) -> None:
         self._model = model
         # The last module of an actor is the tanh that squashes its actions.
-        self._actor, self._actor_target = (MlpStack([actor.mu[:-1]]) for actor in (model.actor, model.actor_target))
-        self._side_by_side = SideBySide(list(model.critic.q_networks), model.batch_size)
-        self._critics = self._side_by_side.make_stacks(model.critic.q_networks)
-        self._targets = self._side_by_side.make_stacks(model.critic_target.q_networks)
-        self._followed = [values for stack in (*self._critics, self._actor) for values in stack.parameters]
-        self._following = [values for stack in (*self._targets, self._actor_target) for values in stack.parameters]
+        actor, critic = list(model.actor.mu[:-1]), list(model.critic.q_networks[0])
+        sizes = list_sizes(actor)
+        settings = QSettings(
+            rows=model.batch_size,
+            features=sizes[0],
+            actions=sizes[-1],
+            critic=list_sizes(critic),
+            critics=len(model.critic.q_networks),
+            critic_uses_tanh=uses_tanh(critic),
+            actor=sizes,
+            actor_uses_tanh=uses_tanh(actor),
+        )
+        self._networks = _QNetworks(Td3Gradients, settings)
+        self.close = self._networks.close
+        self._networks.bind("parameters", model.critic.q_networks, [actor])
+        self._networks.bind("targets", model.critic_target.q_networks, [model.actor_target.mu[:-1]])
+        optimizers = {CRITICS: model.critic.optimizer, ACTOR: model.actor.optimizer}
+        self._adam = {phase: self._networks.make_adam(phase, optimizer) for phase, optimizer in optimizers.items()}
 
     @classmethod
     def supports(cls, model: Any) -> bool:
@@ -80,53 +141,21 @@ class Td3Update:
     @torch.no_grad()
     def train(self, gradient_steps: int, batch_size: int) -> None:
         """Do `gradient_steps` updates with minibatches of the replay buffer; log what SB3 logs."""
-        model = self._model
+        model, networks = self._model, self._networks
         model._update_learning_rate([model.actor.optimizer, model.critic.optimizer])
         logged: dict[str, list[float]] = collections.defaultdict(list)
         for batch in sample_batches(model, model.actor, gradient_steps, batch_size):
             model._n_updates += 1
-            logged["critic_loss"].append(self._update_critics(batch, self._compute_target(batch)))
+            networks.read(batch)
+            noise = torch.from_numpy(networks.arrays["noise"])
+            noise.normal_(0, model.target_policy_noise)  # torch's generator, as in SB3
+            noise.clamp_(-model.target_noise_clip, model.target_noise_clip)
+            logged["critic_loss"].append(networks.differentiate(CRITICS)[1])
+            self._adam[CRITICS].step()
             if model._n_updates % model.policy_delay == 0:
-                logged["actor_loss"].append(self._update_actor(batch.features))
-                torch._foreach_lerp_(self._following, self._followed, model.tau)
+                logged["actor_loss"].append(networks.differentiate(ACTOR)[1])
+                self._adam[ACTOR].step()
+                networks.follow(model.tau)
         for name, values in logged.items():
             model.logger.record(f"train/{name}", np.mean(values))
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
-
-    def _compute_target(self, batch: Batch) -> Floats:
-        """Return the critics' targets, shape (batch, 1)."""
-        model = self._model
-        noise = np.empty(batch.actions.shape, np.float32)
-        torch.from_numpy(noise).normal_(0, model.target_policy_noise)  # torch's generator, as in SB3
-        noise = noise.clip(-model.target_noise_clip, model.target_noise_clip)
-        action = np.tanh(self._actor_target.run(batch.next_features[None], "target")[-1][0])
-        inputs = np.concatenate([batch.next_features, (action + noise).clip(-1, 1)], 1)[None]
-        passes = self._side_by_side.run([functools.partial(stack.run, inputs, "target") for stack in self._targets])
-        return batch.rewards + batch.discounts * np.concatenate([values[-1] for values in passes]).min(0)
-
-    def _update_critics(self, batch: Batch, target: Floats) -> float:
-        """Return the critics' loss before the update."""
-        inputs = np.concatenate([batch.features, batch.actions], 1)[None]
-
-        def learn(critics: MlpStack) -> float:
-            values = critics.run(inputs, "learning")
-            errors = values[-1] - target
-            critics.backpropagate(values, errors * np.float32(2 / len(target)))
-            return float(np.square(errors).mean((1, 2)).sum())
-
-        losses = self._side_by_side.run([functools.partial(learn, critics) for critics in self._critics])
-        adam.step(self._model.critic.optimizer)
-        return sum(losses)
-
-    def _update_actor(self, features: Floats) -> float:
-        """Return the actor's loss."""
-        passed = self._actor.run(features[None], "learning")
-        action = np.tanh(passed[-1])
-        first = self._critics[0]  # the actor learns from the first critic only
-        values = first.run(np.concatenate([features[None], action], 2), "actor")
-        to_value = np.zeros_like(values[-1])
-        to_value[0] = -1 / len(features)
-        to_action = first.input_gradient(values, to_value, features.shape[1])[:1]
-        self._actor.backpropagate(passed, to_action * (1 - np.square(action)))
-        adam.step(self._model.actor.optimizer)
-        return -float(values[-1][0].mean())

@@ -1,164 +1,117 @@
-"""Updates of SAC without autograd; equal to SB3's `train` except for rounding.
+"""Updates of SAC and TQC without autograd; equal to SB3's and sb3-contrib's `train` except for rounding.
 
-T. Haarnoja et al., Soft Actor-Critic Algorithms and Applications, 2018, https://arxiv.org/abs/1812.05905. The name of a
-gradient is its variable: `to_action` is the gradient of the loss with respect to the action.
+T. Haarnoja et al., Soft Actor-Critic Algorithms and Applications, 2018, https://arxiv.org/abs/1812.05905.
 """
 
 import collections
-import dataclasses
-import functools
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from sb3_contrib import TQC
 from stable_baselines3 import SAC
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution, StateDependentNoiseDistribution
 
 from rlctl.training.updates import adam
-from rlctl.training.updates.batch_norm import choose_stack
+from rlctl.training.updates.adam import VectorAdam
+from rlctl.training.updates.batch_norm import is_supported
 from rlctl.training.updates.batches import Batch, sample_batches
-from rlctl.training.updates.mlp import (
-    LOG_SQRT_TAU,
-    Floats,
-    MlpStack,
-    SideBySide,
-    join_outputs,
-    share_gradients,
-    share_joined,
+from rlctl.training.updates.blocks import OFF_POLICY_BLOCKS, Blocks, count_blocks
+from rlctl.training.updates.mlp import bind, bind_networks, list_sizes, uses_tanh
+from rlctl.training.updates.perceptrons import split_vector
+from rlctl.training.updates.sac_gradients import (
+    ACTOR,
+    ACTOR_LOSS,
+    CRITIC_LOSS,
+    CRITICS,
+    LOG_PROB,
+    SacGradients,
+    SacSettings,
+    TqcGradients,
 )
 
 _LOSS_EVERY = 32  # every so many updates the losses are computed, for the log only
-_LOG_STD_MIN, _LOG_STD_MAX = -20.0, 2.0  # SB3's limits, without gSDE
-
-
-@dataclasses.dataclass(frozen=True)
-class Sample:
-    """Sampled actions of a batch, and the values for their gradients; shape (batch, actions) each."""
-
-    values: list[Floats]  # the outputs of the actor's layers
-    noise: Floats  # added to the mean before tanh
-    std: Floats
-    action: Floats
-    log_prob: Floats  # shape (batch, 1)
-
-
-class SquashedGaussianActor:
-    """A normal distribution, with or without gSDE, of actions that tanh squashes."""
-
-    def __init__(self, actor: Any, side_by_side: SideBySide) -> None:
-        self._actor = actor
-        self._epsilon = float(actor.action_dist.epsilon)
-        self._mean_limit = float(actor.clip_mean) if actor.use_sde and actor.clip_mean > 0 else None
-        modules = _list_modules(actor)
-        if actor.use_sde:
-            networks = [modules]
-            self._log_std_gradient = share_gradients([actor.log_std])[0]
-        else:
-            heads = [modules[-1], actor.log_std]
-            joined = join_outputs(heads)
-            networks = [[*modules[:-1], joined]]
-        self.network = (choose_stack(modules) or MlpStack)(networks)
-        self.network.run_calls = side_by_side.run
-        if not actor.use_sde:
-            share_joined(heads, joined)
-        self._count = modules[-1].out_features
-
-    @staticmethod
-    def supports(actor: Any) -> bool:
-        """Return whether an actor of SB3 can be used so."""
-        distribution = actor.action_dist
-        if isinstance(distribution, StateDependentNoiseDistribution):
-            plain = distribution.full_std and not distribution.use_expln
-        else:
-            plain = type(distribution) is SquashedDiagGaussianDistribution
-        return plain and len(actor.latent_pi) > 0 and choose_stack(_list_modules(actor)) is not None
-
-    def reset_noise(self) -> None:
-        """Draw gSDE's matrix with the numbers that SB3 would draw."""
-        if self._actor.use_sde:
-            std = self._actor.log_std.exp()
-            self._actor.action_dist.exploration_mat = torch.randn(std.shape) * std
-            torch.randn(std.shape)  # of the matrices for parallel exploration, which are not used here
-
-    def sample(self, values: list[Floats]) -> Sample:
-        """Draw actions from what the network's `run` returned for a batch of features."""
-        latent, mean = values[-2][0], values[-1][0, :, : self._count]
-        if self._actor.use_sde:
-            if self._mean_limit is not None:
-                mean = mean.clip(-self._mean_limit, self._mean_limit)
-            noise = latent @ self._actor.action_dist.exploration_mat.numpy()
-            std = np.sqrt(np.square(latent) @ np.exp(2 * self._actor.log_std.numpy()) + self._epsilon)
-            log_std, z = np.log(std), noise / std
-        else:
-            log_std = values[-1][0, :, self._count :].clip(_LOG_STD_MIN, _LOG_STD_MAX)
-            z = np.empty_like(log_std)
-            torch.from_numpy(z).normal_()  # torch's generator, as in SB3
-            std = np.exp(log_std)
-            noise = std * z
-        action = np.tanh(mean + noise)
-        squashing = np.log(1 - np.square(action) + self._epsilon)
-        log_prob = (np.square(z) * -0.5 - log_std - squashing - LOG_SQRT_TAU).sum(1, keepdims=True)
-        return Sample(values, noise, std, action, log_prob)
-
-    def backpropagate(self, sample: Sample, to_action: Floats, to_log_prob: float) -> None:
-        """Set the gradients of the weights from those of sampled actions and of their log-probabilities."""
-        slope = 1 - np.square(sample.action)
-        to_mean = to_action * slope + sample.action * slope / (slope + self._epsilon) * (2 * to_log_prob)
-        outputs = sample.values[-1][0]
-        if self._actor.use_sde:
-            to_latent = self._backpropagate_gsde(sample.values[-2][0], sample, to_mean, to_log_prob)
-            if self._mean_limit is not None:
-                to_mean = to_mean * (np.abs(outputs) < self._mean_limit)
-            self.network.backpropagate(sample.values, to_mean[None], latent=to_latent[None])
-            return
-        log_std = outputs[:, self._count :]
-        within = (log_std >= _LOG_STD_MIN) & (log_std <= _LOG_STD_MAX)
-        to_log_std = (to_mean * sample.noise - np.float32(to_log_prob)) * within
-        self.network.backpropagate(sample.values, np.concatenate([to_mean, to_log_std], 1)[None])
-
-    def _backpropagate_gsde(self, latent: Floats, sample: Sample, to_mean: Floats, to_log_prob: float) -> Floats:
-        """Set the gradient of `log_std`, and return that of the latent values."""
-        # noise = latent @ matrix, where matrix = exp(log_std) * normal numbers, and
-        # std^2 = latent^2 @ exp(2 log_std) + epsilon.
-        matrix, variances = self._actor.action_dist.exploration_mat.numpy(), np.exp(2 * self._actor.log_std.numpy())
-        precision = np.reciprocal(np.square(sample.std))
-        to_noise = to_mean - sample.noise * precision * to_log_prob
-        to_variance = (np.square(sample.noise) * precision - 1) * precision * (0.5 * to_log_prob)
-        np.multiply(latent.T @ to_noise, matrix, out=self._log_std_gradient)
-        self._log_std_gradient += (np.square(latent).T @ to_variance) * variances * 2
-        return to_noise @ matrix.T + latent * (to_variance @ variances.T) * 2
-
-
-def _list_modules(actor: Any) -> list[Any]:
-    mean = actor.mu[0] if isinstance(actor.mu, torch.nn.Sequential) else actor.mu  # gSDE clips it
-    return [*actor.latent_pi, mean]
 
 
 class SacUpdate:
     """Updates a SAC model whose networks are multi-layer perceptrons on the CPU."""
 
     algorithm: ClassVar[Any] = SAC
+    gradients: ClassVar[type[SacGradients]] = SacGradients
     first_update: ClassVar[int] = 0  # the number of the first one, of which every `policy_delay`th updates the actor
+    has_targets: ClassVar[bool] = True
+    noise: ClassVar[tuple[str, ...]] = ("normal", "next_normal")  # in SB3's order of random numbers
 
     def __init__(self, model: Any) -> None:
         self._model = model
         self._policy_delay = getattr(model, "policy_delay", 1)  # SB3's own models have none
-        self._side_by_side = SideBySide(list(model.critic.q_networks), model.batch_size)
-        self._actor = SquashedGaussianActor(model.actor, self._side_by_side)
-        kind = choose_stack(model.critic.q_networks[0]) or MlpStack
-        self._critics = self._side_by_side.make_stacks(model.critic.q_networks, kind)
-        targets = getattr(model, "critic_target", None)  # CrossQ has none
-        self._targets = [] if targets is None else self._side_by_side.make_stacks(targets.q_networks)
-        self._followed = [values for critic in self._critics for values in critic.parameters]
-        self._following = [values for target in self._targets for values in target.parameters]
+        settings = self._read_settings()
+        self._count = self._count_blocks(settings)
+        self._blocks = Blocks(self.gradients, settings, self._count)
+        self._arrays = self._blocks.arrays
+        self.close = self._blocks.close
+        self._arrays["numbers"][2] = self._count
+        shapes, split = settings.list_shapes(), len(settings.list_critic_shapes())
+        of_critics = len(self._arrays["targets"])
+        self._parts = {CRITICS: slice(0, of_critics), ACTOR: slice(of_critics, len(self._arrays["gradient"]))}
+        vectors = self._arrays["parameters"], self._arrays["gradient"]
+        parameters, gradients = (split_vector(vector, shapes) for vector in vectors)
+        bind_networks(model.critic.q_networks, parameters[:split], gradients[:split])
+        self._bind_actor(parameters[split:], gradients[split:])
+        if self.has_targets:
+            targets = split_vector(self._arrays["targets"], settings.list_critic_shapes())
+            bind_networks(model.critic_target.q_networks, targets)
+        optimizers = {CRITICS: model.critic.optimizer, ACTOR: model.actor.optimizer}
+        self._adam = {
+            phase: VectorAdam(optimizers[phase], *(vector[part] for vector in vectors))
+            for phase, part in self._parts.items()
+        }
+
+    def _read_settings(self) -> SacSettings:
+        model, actor = self._model, self._model.actor
+        modules, critic = list_actor_modules(actor), list(model.critic.q_networks[0])
+        sizes, actions = list_sizes(modules), modules[-1].out_features
+        return SacSettings(
+            rows=model.batch_size,
+            actions=actions,
+            actor=sizes if actor.use_sde else (*sizes[:-1], 2 * actions),  # means, then logarithms of deviations
+            actor_uses_tanh=uses_tanh(modules),
+            critic=list_sizes(critic),
+            critic_uses_tanh=uses_tanh(critic),
+            critics=len(model.critic.q_networks),
+            log_std=tuple(actor.log_std.shape) if actor.use_sde else None,
+            epsilon=float(actor.action_dist.epsilon),
+            mean_limit=float(actor.clip_mean) if actor.use_sde and actor.clip_mean > 0 else None,
+            dropped=getattr(model, "top_quantiles_to_drop_per_net", 0) * len(model.critic.q_networks),
+        )
+
+    def _count_blocks(self, settings: SacSettings) -> int:
+        return count_blocks(settings.rows, settings.count_weights(), most=OFF_POLICY_BLOCKS)
+
+    def _bind_actor(self, parameters: list[Any], gradients: list[Any]) -> None:
+        actor, modules = self._model.actor, list_actor_modules(self._model.actor)
+        if actor.use_sde:
+            bind_networks([modules], parameters[:-1], gradients[:-1])
+            bind(actor.log_std, parameters[-1], gradients[-1])
+            return
+        bind_networks([modules[:-1]], parameters[:-2], gradients[:-2])
+        count = modules[-1].out_features
+        for linear, rows in ((modules[-1], slice(0, count)), (actor.log_std, slice(count, 2 * count))):
+            bind(linear.weight, parameters[-2][0, rows], gradients[-2][0, rows])
+            bind(linear.bias, parameters[-1][0, 0, rows], gradients[-1][0, 0, rows])
 
     @classmethod
     def supports(cls, model: Any) -> bool:
         """Return whether this class can update a model; SB3 updates all others."""
         if type(model) is not cls.algorithm:
             return False
-        networks = model.critic.q_networks
-        return SquashedGaussianActor.supports(model.actor) and all(choose_stack(network) for network in networks)
+        actor, distribution = model.actor, model.actor.action_dist
+        if isinstance(distribution, StateDependentNoiseDistribution):
+            plain = distribution.full_std and not distribution.use_expln
+        else:
+            plain = type(distribution) is SquashedDiagGaussianDistribution
+        networks = (list_actor_modules(actor), *model.critic.q_networks)
+        return plain and len(actor.latent_pi) > 0 and all(is_supported(network) for network in networks)
 
     @torch.no_grad()
     def train(self, gradient_steps: int, batch_size: int) -> None:
@@ -167,94 +120,79 @@ class SacUpdate:
         optimizers = (model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer)
         model._update_learning_rate([optimizer for optimizer in optimizers if optimizer is not None])
         logged: dict[str, list[float]] = collections.defaultdict(list)
+        followed = torch.from_numpy(self._arrays["parameters"][self._parts[CRITICS]])
+        following = torch.from_numpy(self._arrays["targets"])
         for step, batch in enumerate(sample_batches(model, model.actor, gradient_steps, batch_size)):
             learns_actor = (model._n_updates + step + self.first_update) % self._policy_delay == 0
             self._update(batch, logged, learns_actor=learns_actor, with_loss=step % _LOSS_EVERY == 0)
-            if self._targets and step % model.target_update_interval == 0:
-                torch._foreach_lerp_(self._following, self._followed, model.tau)
+            if self.has_targets and step % model.target_update_interval == 0:
+                following.lerp_(followed, model.tau)
         model._n_updates += gradient_steps
         for name, values in logged.items():
             model.logger.record(f"train/{name}", np.mean(values))
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
 
     def _update(self, batch: Batch, logged: dict[str, list[float]], *, learns_actor: bool, with_loss: bool) -> None:
-        self._actor.reset_noise()
-        coefficient, sample = self._read_coefficient(), None
-        calls = [functools.partial(self._actor.network.run, batch.next_features[None], "next")]
-        if learns_actor:
-            calls.insert(0, functools.partial(self._actor.network.run, batch.features[None], "learning"))
-        passes = self._side_by_side.run(calls)
-        if learns_actor:
-            sample = self._actor.sample(passes[0])  # before the other: SB3's order of random numbers
-            self._update_coefficient(sample, logged)
-            logged["ent_coef"].append(coefficient)
-        target = self._compute_target(batch, self._actor.sample(passes[-1]), coefficient)
-        outputs = self._update_critics(np.concatenate([batch.features, batch.actions], 1), target)
+        coefficient, arrays = self._read_coefficient(), self._arrays
+        arrays["numbers"][:2] = coefficient, with_loss
+        for name in ("features", "next_features", "actions", "rewards", "discounts"):
+            arrays[name][:] = getattr(batch, name)
+        self._draw_noise(learns_actor=learns_actor)
+        critic_loss = self._differentiate(CRITICS)[CRITIC_LOSS]
+        self._adam[CRITICS].step()
         if with_loss:
-            logged["critic_loss"].append(self._compute_loss(outputs, target))
-        if sample is not None:
-            logged["actor_loss"].append(self._update_actor(batch.features, sample, coefficient))
+            logged["critic_loss"].append(critic_loss)
+        if learns_actor or self.first_update:
+            logged["ent_coef"].append(coefficient)
+        if learns_actor:
+            sums = self._differentiate(ACTOR)
+            self._adam[ACTOR].step()
+            self._update_coefficient(sums[LOG_PROB], logged)
+            logged["actor_loss"].append(sums[ACTOR_LOSS])
+
+    def _differentiate(self, phase: int) -> list[float]:
+        """Set the gradients of the critics or of the actor; return the means over the batch of what is logged."""
+        self._blocks.run(phase, self._count)
+        self._blocks.add_gradients(self._count, self._parts[phase])
+        means: list[float] = (self._arrays["sums"][: self._count].sum(0) / self._model.batch_size).tolist()
+        return means
+
+    def _draw_noise(self, *, learns_actor: bool) -> None:
+        """Draw the numbers that SB3 would draw, from torch's generator."""
+        actor = self._model.actor
+        if actor.use_sde:
+            std = actor.log_std.exp()
+            actor.action_dist.exploration_mat = torch.randn(std.shape) * std
+            torch.randn(std.shape)  # of the matrices for parallel exploration, which are not used here
+            self._arrays["normal"][:] = actor.action_dist.exploration_mat.numpy()
+            return
+        for name in self.noise:
+            if learns_actor or name == "next_normal":
+                torch.from_numpy(self._arrays[name]).normal_()
 
     def _read_coefficient(self) -> float:
         model = self._model
         tensor = model.ent_coef_tensor if model.ent_coef_optimizer is None else model.log_ent_coef.exp()
         return float(tensor.item())
 
-    def _update_coefficient(self, sample: Sample, logged: dict[str, list[float]]) -> None:
+    def _update_coefficient(self, log_prob: float, logged: dict[str, list[float]]) -> None:
         model = self._model
         if model.ent_coef_optimizer is None:
             return
-        missing = -(float(sample.log_prob.mean()) + float(model.target_entropy))
+        missing = -(log_prob + float(model.target_entropy))
         logged["ent_coef_loss"].append(model.log_ent_coef.item() * missing)
         model.log_ent_coef.grad = torch.full_like(model.log_ent_coef, missing)
         adam.step(model.ent_coef_optimizer)
 
-    def _compute_target(self, batch: Batch, sample: Sample, coefficient: float) -> Floats:
-        """Return the critics' targets, shape (batch, estimates)."""
-        inputs = np.concatenate([batch.next_features, sample.action], 1)[None]
-        passes = self._side_by_side.run([functools.partial(stack.run, inputs, "target") for stack in self._targets])
-        estimates = self._choose_estimates(np.concatenate([values[-1] for values in passes]))
-        return batch.rewards + batch.discounts * (estimates - coefficient * sample.log_prob)
 
-    def _update_critics(self, inputs: Floats, target: Floats) -> Floats:
-        """Return the critics' outputs before the update, shape (critics, batch, outputs)."""
+class TqcUpdate(SacUpdate):
+    """Updates a TQC model whose networks are multi-layer perceptrons on the CPU."""
 
-        def learn(index: int) -> Floats:
-            critics = self._critics[index]
-            values = critics.run(inputs[None], "learning")
-            critics.backpropagate(values, self._differentiate_loss(values[-1], target))
-            return values[-1]
+    algorithm: ClassVar[Any] = TQC
+    gradients: ClassVar[type[SacGradients]] = TqcGradients
 
-        outputs = self._side_by_side.run([functools.partial(learn, index) for index in range(len(self._critics))])
-        adam.step(self._model.critic.optimizer)
-        return np.concatenate(outputs)
 
-    def _update_actor(self, features: Floats, sample: Sample, coefficient: float) -> float:
-        """Return the actor's loss."""
-        inputs = np.concatenate([features, sample.action], 1)[None]
-        passes = self._side_by_side.run([functools.partial(critics.run, inputs, "actor") for critics in self._critics])
-        value, to_outputs = self._value(np.concatenate([values[-1] for values in passes]))
-        to_outputs /= -len(value)
-        parts = zip(self._critics, passes, np.split(to_outputs, len(self._critics)), strict=True)
-        size = features.shape[1]
-        calls = [functools.partial(critics.input_gradient, values, part, size) for critics, values, part in parts]
-        to_action = np.concatenate(self._side_by_side.run(calls)).sum(0)
-        self._actor.backpropagate(sample, to_action, coefficient / len(value))
-        adam.step(self._model.actor.optimizer)
-        return float((coefficient * sample.log_prob - value).mean())
-
-    def _choose_estimates(self, outputs: Floats) -> Floats:
-        """Return the target critics' estimates that form the target, shape (batch, estimates)."""
-        return outputs.min(0)
-
-    def _compute_loss(self, outputs: Floats, target: Floats) -> float:
-        return 0.5 * float(np.square(outputs - target).mean((1, 2)).sum())
-
-    def _differentiate_loss(self, outputs: Floats, target: Floats) -> Floats:
-        """Return the gradient of the critics' loss with respect to their outputs, shape (critics, batch, outputs)."""
-        return (outputs - target) / np.float32(outputs.shape[1])
-
-    def _value(self, outputs: Floats) -> tuple[Floats, Floats]:
-        """Return the value from the critics' outputs, shape (batch, 1), and its gradient with respect to them."""
-        to_outputs = (np.arange(len(outputs))[:, None, None] == outputs.argmin(0)).astype(np.float32)
-        return outputs.min(0), to_outputs
+def list_actor_modules(actor: Any) -> list[Any]:
+    """Return the modules of the network that computes the means of the actions."""
+    mean = actor.mu[0] if isinstance(actor.mu, torch.nn.Sequential) else actor.mu  # gSDE clips it
+    return [*actor.latent_pi, mean]
