@@ -120,8 +120,8 @@ class Motors(Body):
         positions = self.joint_positions.tolist()
         matrix = np.array(pybullet.calculateMassMatrix(self.id, positions, physicsClientId=self.client))
         free = len(matrix) - len(positions)  # the velocities of a free base come first
-        inverse: Array = np.linalg.inv(matrix)[free:, free:]
-        return np.linalg.inv(inverse)
+        inertia: Array = np.linalg.inv(np.linalg.inv(matrix)[free:, free:])
+        return inertia
 
     def apply_drives(self) -> None:
         """Apply the torques of springs and dampers for one physics step; their targets are those of `drive_to`."""
