@@ -40,10 +40,20 @@ class Timelines:
         sequence = np.asarray(steps, np.int64)
         indexes = [rr.TimeColumn("step", sequence=sequence)]
         if self.dt is not None:
-            # Rerun truncates floating-point times, so equal times could become rows one nanosecond apart.
-            nanoseconds = np.round(sequence * self.dt * 1e9).astype("timedelta64[ns]")
-            indexes.append(rr.TimeColumn("sim_time", duration=nanoseconds))
+            indexes.append(rr.TimeColumn("sim_time", duration=self._convert(sequence)))
         self.stream.send_columns(entity, indexes, columns)
+
+    def log(self, entity: str, step: int, archetype: rr.AsComponents) -> None:
+        """Log an archetype at a step."""
+        self.stream.set_time("step", sequence=step)
+        if self.dt is not None:
+            self.stream.set_time("sim_time", duration=self._convert(np.int64(step)))
+        self.stream.log(entity, archetype)
+        self.stream.reset_time()
+
+    def _convert(self, steps: Any) -> Any:
+        # Rerun truncates floating-point times, so equal times could become rows one nanosecond apart.
+        return np.round(steps * (self.dt or 0.0) * 1e9).astype("timedelta64[ns]")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,6 +33,10 @@ class Mesh:
 
     vertices: np.ndarray  # [m], shape (vertices, 3)
     triangles: np.ndarray  # indices of vertices, shape (triangles, 3)
+    uvs: np.ndarray | None = (
+        None  # coordinates in the texture from its upper left corner, in [0, 1], shape (vertices, 2)
+    )
+    texture: Path | None = None  # a picture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,3 +130,10 @@ def _between(start: np.ndarray, end: np.ndarray) -> tuple[tuple[float, ...], tup
     direction = along / length if length else np.array([0.0, 0.0, 1.0])
     turn, _ = Rotation.align_vectors([direction], [[0.0, 0.0, 1.0]])  # the shortest one
     return tuple(((start + end) / 2).tolist()), tuple(turn.as_quat().tolist()), length
+
+
+def connect_grid(rows: int, columns: int) -> np.ndarray:
+    """Return the triangles between points of a grid, whose second index goes fastest; shape (triangles, 3)."""
+    corner = np.arange(rows * columns).reshape(rows, columns)[:-1, :-1].ravel()
+    right, above = corner + columns, corner + 1
+    return np.concatenate([np.stack([corner, right, right + 1], 1), np.stack([corner, right + 1, above], 1)])

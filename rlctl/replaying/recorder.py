@@ -6,8 +6,9 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
+import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -16,8 +17,10 @@ from rlctl.environments import dict_spaces, registry
 from rlctl.environments.info import EnvInfo, describe, find_mujoco
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
+from rlctl.replaying.bullet_log import BulletLog, log_calls
+from rlctl.replaying.bullet_scene import TaskReader, WorldsReader
 from rlctl.replaying.mujoco_scene import MujocoReader
-from rlctl.replaying.scene import Camera, Env, Scene, SceneReader, Warn
+from rlctl.replaying.scene import Camera, Env, Scene, Warn
 from rlctl.rollout.messages import format_hint
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode
 from rlctl.task.env import TaskEnv
@@ -57,23 +60,75 @@ class Rollout:
         return len(self.episode.rewards)
 
 
-def make_drawable(spec: EnvSpec, warn: Warn) -> Env:
-    """Build an environment that can be drawn; `warn` receives the reason if there are no pictures."""
-    if registry.is_task(spec.constructor()):
-        return spec.make()  # its bodies are drawn; pictures would be slow and show less
-    try:
-        return spec.make("rgb_array")
-    except RlctlError as error:
-        env = spec.make()  # raises again if drawing was not the reason
-        warn(f"no camera pictures: {str(error).splitlines()[0]}")
-        return env
+class DrawableEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A plain environment whose calls of PyBullet are logged until it is closed."""
+
+    def __init__(self, env: Env, log: BulletLog, stop: contextlib.ExitStack, no_pictures: str = "") -> None:
+        super().__init__(env)
+        self.bullet_log = log
+        self.no_pictures = no_pictures  # why it cannot draw itself; empty if it might
+        self._stop = stop
+
+    def close(self) -> None:
+        """Close the environment."""
+        with self._stop:
+            super().close()
 
 
-def _make_reader(env: Env, warn: Warn) -> SceneReader | MujocoReader | Camera:
+def make_drawable(spec: EnvSpec) -> Env:
+    """Build an environment whose episodes can be drawn."""
+    with contextlib.ExitStack() as stack:
+        log = stack.enter_context(log_calls())
+        reason = ""
+        if registry.is_task(spec.constructor()):
+            return spec.make()  # its bodies are drawn; pictures would be slow and show less
+        try:
+            env = spec.make("rgb_array")
+        except RlctlError as error:
+            env = spec.make()  # raises again if drawing was not the reason
+            reason = str(error).splitlines()[0]
+        if not isinstance(env, gymnasium.Env):  # it has the same methods
+            return env
+        return DrawableEnv(env, log, stack.pop_all(), reason)
+
+
+class _Reader(Protocol):
+    def read(self, step: int) -> None: ...
+
+    def scene(self) -> Scene: ...
+
+
+class _PlainReader:
+    """Reads the bodies of a plain environment in PyBullet; takes pictures of any other."""
+
+    def __init__(self, env: Env, warn: Warn) -> None:
+        self._env = env
+        self._warn = warn
+
+    def read(self, step: int) -> None:
+        if step == 0:  # only now: many environments load their bodies in the first reset
+            self._reader = self._choose()
+        self._reader.read(step)
+
+    def _choose(self) -> _Reader:
+        env = self._env
+        if isinstance(env, DrawableEnv):
+            worlds = WorldsReader(env.bullet_log, self._warn)
+            if worlds.find_bodies():
+                return worlds
+            if env.no_pictures:
+                self._warn(f"no camera pictures: {env.no_pictures}")
+        return Camera(env, self._warn)
+
+    def scene(self) -> Scene:
+        return self._reader.scene()
+
+
+def _make_reader(env: Env, warn: Warn) -> _Reader:
     if find_mujoco(env):
         return MujocoReader(env)
     inner = env.unwrapped
-    return SceneReader(inner) if isinstance(inner, TaskEnv) else Camera(env, warn)
+    return TaskReader(inner) if isinstance(inner, TaskEnv) else _PlainReader(env, warn)
 
 
 class _Step(NamedTuple):

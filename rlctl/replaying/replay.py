@@ -189,7 +189,7 @@ class _PolicySource:
         from rlctl.replaying.rrd import write_rrd
 
         spec, episodes = self.spec, []
-        with closing(make_drawable(spec, print_warning)) as env:
+        with closing(make_drawable(spec)) as env:
             for seed in self.seeds:
                 rollout = play_episode(env, spec, seed, self.begin(env, seed), policy=self.name, draw=print_warning)
                 recording = self._next_recording()

@@ -65,7 +65,7 @@ def record_episode(
     info, spec = episode.info, episode.info.spec
     if info.failure:
         _replay_failed(episode)
-    with closing(make_drawable(spec, warn)) as env:
+    with closing(make_drawable(spec)) as env:
         choose = recorded_actions(episode, env.action_space)
         rollout = play_episode(env, spec, info.seed, choose, policy=info.policy, draw=warn)
     if info.failure:

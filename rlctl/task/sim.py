@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body
-from rlctl.task.bullet import check_display, find_model_file, pybullet, pybullet_data, read_complaint
+from rlctl.task.bullet import check_display, draw_world, find_model_file, pybullet, pybullet_data, read_complaint
 from rlctl.task.constraints import Constraints
 
 
@@ -259,13 +259,7 @@ class Sim(Constraints):
         The camera is at `eye` [m] and looks at `target` [m], with a vertical `field_of_view` [degrees]. It takes 20 to
         40 ms at 320x240.
         """
-        view = pybullet.computeViewMatrix(eye, target, up)
-        projection = pybullet.computeProjectionMatrixFOV(field_of_view, width / height, 0.05, 10.0)
-        image = pybullet.getCameraImage(
-            width, height, view, projection, shadow=0, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=self.client
-        )
-        # PyBullet returns a flat tuple if it was built without numpy.
-        return np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[:, :, :3]
+        return draw_world(self.client, width, height, eye=eye, target=target, up=up, field_of_view=field_of_view)
 
     def close(self) -> None:
         """End the client; a second call does nothing."""

@@ -28,7 +28,7 @@ def strict(monkeypatch):
 def reach(seed: int = 5) -> Rollout:
     """Play an episode of reach that goes straight to the goal, by inverse kinematics."""
     spec = EnvSpec("reach")
-    with closing(make_drawable(spec, print)) as env:
+    with closing(make_drawable(spec)) as env:
         task, sim = env.unwrapped.task, env.unwrapped.sim
 
         def choose(observation, step):
@@ -44,7 +44,7 @@ def reach(seed: int = 5) -> Rollout:
 def play(name: str, *, seed: int = 3, **parameters) -> tuple[Rollout, list[str]]:
     """Play an episode of an environment of envs.py with random actions; returns also the warnings."""
     spec, warnings = EnvSpec(f"{ENVS}:{name}", parameters), []
-    with closing(make_drawable(spec, warnings.append)) as env:
+    with closing(make_drawable(spec)) as env:
         env.action_space.seed(0)
         rollout = play_episode(
             env, spec, seed, lambda o, k: env.action_space.sample(), policy="chance", draw=warnings.append

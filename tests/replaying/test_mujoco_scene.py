@@ -19,7 +19,7 @@ mujoco = pytest.importorskip("mujoco")
 def play_mujoco(task: str, steps: int = 30):
     """Play random actions; return the rollout and the last positions of all bodies that MuJoCo itself computes."""
     spec = EnvSpec(task)
-    with closing(make_drawable(spec, print)) as env:
+    with closing(make_drawable(spec)) as env:
         env.action_space.seed(0)
 
         def choose(observation, step):
@@ -130,7 +130,7 @@ def test_a_trunk_that_moves_is_followed():
 
 def test_a_task_of_rlctl_in_mujoco():
     spec = EnvSpec("quadruped", sim="mujoco")
-    with closing(make_drawable(spec, print)) as env:
+    with closing(make_drawable(spec)) as env:
         zero = np.zeros(env.action_space.shape)
         rollout = play_episode(env, spec, 3, lambda o, step: zero if step < 10 else None, policy="zero", draw=print)
     ground, robot = rollout.scene.bodies
