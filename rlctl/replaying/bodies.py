@@ -187,7 +187,7 @@ def _log_existing(
 def _make_paint(archetype: rr.AsComponents, color: Sequence[float]) -> rr.AsComponents:
     if isinstance(archetype, rr.Mesh3D | rr.Asset3D):
         return type(archetype).from_fields(albedo_factor=_round_color(color))
-    return type(archetype).from_fields(colors=[_round_color(color)])  # type: ignore[attr-defined, no-any-return]
+    return type(archetype).from_fields(colors=[_round_color(color)])  # type: ignore[attr-defined]
 
 
 def _clear(body: BodyMotion, timelines: Timelines) -> None:

@@ -13,12 +13,13 @@ from rlctl.errors import UsageError
 from rlctl.evaluation.players import LoadedPolicy, load_player
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.recipe.sources import parse_changes
-from rlctl.replaying.pictures import check_file, film_episodes, make_filmable, open_window, show_episodes
+from rlctl.replaying.pictures import check_file, film_episodes, open_window, show_episodes
 from rlctl.replaying.recorder import Choose, Rollout, make_drawable, play_episode, recorded_actions
 from rlctl.replaying.report import ReplayedEpisode, ReplayResult
 from rlctl.replaying.reproduce import print_warning, record_episode, verify_episode
 from rlctl.replaying.request import Choice, ReplayRequest
 from rlctl.replaying.scene import Env
+from rlctl.replaying.views import make_filmable
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds

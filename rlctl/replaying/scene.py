@@ -68,7 +68,7 @@ class BodyMotion:
     def list_spans(self) -> list[range]:
         """Return the steps in which the body existed, as ranges without gaps."""
         exists = np.isfinite(self.positions[:, :1]).all(axis=(1, 2))
-        edges = np.flatnonzero(np.diff([False, *exists, False]))
+        edges = np.flatnonzero(np.diff(exists, prepend=False, append=False))
         return [range(first, end) for first, end in edges.reshape(-1, 2).tolist()]
 
 

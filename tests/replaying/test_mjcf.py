@@ -206,7 +206,7 @@ def test_file_that_only_pybullet_reads_costs_a_warning(tmp_path, monkeypatch, na
     def refuse(file):
         raise ValueError(f"{file}: not well-formed")
 
-    monkeypatch.setattr("rlctl.replaying.bullet_scene.read_shapes", refuse)
+    monkeypatch.setattr("rlctl.replaying.bullet_track.read_shapes", refuse)
     warnings = []
     with closing(make_drawable(EnvSpec(name))) as env:
         action = np.zeros(env.action_space.shape, np.float32)
