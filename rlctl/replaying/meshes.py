@@ -1,5 +1,6 @@
 """Mesh files that the Rerun viewer shows differently than PyBullet: COLLADA files, and OBJ files with a texture."""
 
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
@@ -13,6 +14,7 @@ from rlctl.replaying.mjcf import Mesh
 Array = NDArray[np.float64]
 
 
+@functools.lru_cache(maxsize=64)  # of several episodes, and of links with the same file
 def load_mesh(file: Path) -> Mesh | None:
     """Return the mesh of a file; None for a file that the viewer itself shows correctly, or that cannot be read."""
     try:

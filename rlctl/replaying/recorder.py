@@ -92,7 +92,7 @@ def make_drawable(spec: EnvSpec) -> Env:
         return DrawableEnv(env, log, stack.pop_all(), reason)
 
 
-class _Reader(Protocol):
+class _SceneReader(Protocol):
     def read(self, step: int) -> None: ...
 
     def scene(self) -> Scene: ...
@@ -110,7 +110,7 @@ class _PlainReader:
             self._reader = self._choose()
         self._reader.read(step)
 
-    def _choose(self) -> _Reader:
+    def _choose(self) -> _SceneReader:
         env = self._env
         if isinstance(env, DrawableEnv):
             worlds = WorldsReader(env.bullet_log, self._warn)
@@ -124,7 +124,7 @@ class _PlainReader:
         return self._reader.scene()
 
 
-def _make_reader(env: Env, warn: Warn) -> _Reader:
+def _make_reader(env: Env, warn: Warn) -> _SceneReader:
     if find_mujoco(env):
         return MujocoReader(env)
     inner = env.unwrapped

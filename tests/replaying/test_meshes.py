@@ -29,7 +29,7 @@ def test_collada_files_are_placed_by_their_nodes(tmp_path, up, corner):
     (tmp_path / "square.dae").write_text(COLLADA.format(up=up))
     mesh = load_mesh(tmp_path / "square.dae")
     assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
-    # (1, 1, 0): twice as large, a quarter turn about z, 5 upwards, in centimetres; (x, y, z) with y upwards is (x, -z, y).
+    # (1, 1, 0): twice as large, a quarter turn about z, 5 upwards, in centimetres; y upwards: (x, y, z) is (x, -z, y).
     np.testing.assert_allclose(mesh.vertices[2], corner, atol=1e-12)
 
 
