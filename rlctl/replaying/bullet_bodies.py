@@ -87,13 +87,13 @@ class BulletBody:
         """Return the height of the upper face [m] if the body is flat, level and wide; else None."""
         kinds = {getattr(pybullet, name) for name in _FLAT}
         flat = all(shape[2] in kinds or b"plane" in shape[4].lower() for shape in self.visuals)
-        if self.joints or not flat:
+        if self.joints or not self.visuals or not flat:
             return None
         position, orientation = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
         low, high = pybullet.getAABB(self.id, -1, physicsClientId=self.client)
         if min(high[0] - low[0], high[1] - low[1]) < _GROUND_SIZE or max(map(abs, orientation[:2])) > 1e-6:
             return None
-        return float(position[2] if high[2] - low[2] > _ENDLESS else high[2])
+        return float(position[2] + self.visuals[0][5][2] if high[2] - low[2] > _ENDLESS else high[2])
 
 
 def list_body_ids(client: int) -> list[int]:

@@ -23,6 +23,8 @@ _MOST_LINES = 2_000  # of a client; later ones replace the first
 _ARGUMENTS: dict[str, tuple[str, ...]] = {
     "setAdditionalSearchPath": ("path",),
     "loadMJCF": ("mjcfFileName",),
+    "loadURDF": (),
+    "loadSDF": (),
     "createCollisionShape": (),
     "createVisualShape": (),
     "createMultiBody": ("baseMass", "baseCollisionShapeIndex", "baseVisualShapeIndex"),
@@ -57,16 +59,18 @@ class BulletLog:
     """What PyBullet's functions were given since the environment was built."""
 
     def __init__(self) -> None:
-        self.clients_before = frozenset(find_clients())  # they belong to others
+        self.clients_before = frozenset(find_clients())  # they belong to others, unless something is loaded into them
         self.files: dict[Key, Path] = {}  # MJCF files, by client and body
         self.meshes: dict[Key, Mesh] = {}  # by client and body
         self._lines: dict[int, list[DebugLine]] = {}  # by client
+        self._used: set[int] = set()  # clients
         self._folders: dict[int, str] = {}  # where a client searches for files
         self._shapes: dict[tuple[str, int, int], Mesh] = {}  # by function, client and shape
 
     def find_own_clients(self, most: int = MOST_CLIENTS) -> list[int]:
-        """Return the connected clients that were made since then, of those with ids below `most`."""
-        return [client for client in find_clients(most) if client not in self.clients_before]
+        """Return the connected clients that the environment made, or loaded bodies into, of those below `most`."""
+        others = self.clients_before - self._used
+        return [client for client in find_clients(most) if client not in others]
 
     def read_lines(self, client: int) -> list[DebugLine]:
         """Return the debug lines of a step; called once per step."""
@@ -79,6 +83,7 @@ class BulletLog:
     def note(self, name: str, given: Given, result: Any, site: Site) -> None:
         """Note a call that PyBullet accepted."""
         client = int(given.get("physicsClientId", 0))
+        self._used.add(client)
         if name == "setAdditionalSearchPath":
             self._folders[client] = str(given["path"])
         elif name == "loadMJCF":
@@ -99,7 +104,7 @@ class BulletLog:
         elif name == "removeBody":
             self.files.pop((client, given["bodyUniqueId"]), None)
             self.meshes.pop((client, given["bodyUniqueId"]), None)
-        else:
+        elif name in ("removeAllUserDebugItems", "resetSimulation", "disconnect"):
             self._lines.pop(client, None)
             if name != "removeAllUserDebugItems":
                 for known in (self.files, self.meshes):

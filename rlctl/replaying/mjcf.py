@@ -60,7 +60,9 @@ _Defaults = Mapping[str, Mapping[str, str]]  # attributes of geoms, by class
 
 
 def read_shapes(file: Path) -> list[Shape]:
-    """Return the geoms of all bodies of a file; the `link` of a shape is the name of its MJCF body.
+    """Return the geoms of a file; the `link` of a shape is the name of its MJCF body.
+
+    PyBullet makes a body of each geom that belongs to the world, and names its base like the geom.
 
     Raises `ValueError` where the file cannot be read.
     """
@@ -69,7 +71,9 @@ def read_shapes(file: Path) -> list[Shape]:
         group = root.find("default")
         defaults = dict(_defaults(group, {}))
         outermost = _OUTERMOST if group is None else group.get("class", _OUTERMOST)
-        return [shape for body in root.iterfind("worldbody/body") for shape in _of_body(body, defaults, outermost)]
+        of_bodies = [shape for body in root.iterfind("worldbody/body") for shape in _of_body(body, defaults, outermost)]
+        named = [geom for geom in root.iterfind("worldbody/geom") if geom.get("name") and geom.get("type") != "plane"]
+        return of_bodies + [_shape(geom.get("name", ""), _complete(geom, defaults, outermost)) for geom in named]
     except (OSError, ElementTree.ParseError) as error:
         raise ValueError(f"{file}: {error}") from error
 
@@ -88,9 +92,13 @@ def _defaults(group: ElementTree.Element | None, outer: Mapping[str, str]) -> It
 def _of_body(body: ElementTree.Element, defaults: _Defaults, around: str) -> Iterator[Shape]:
     inherited = body.get("childclass", around)
     for geom in body.iterfind("geom"):
-        yield _shape(body.get("name", ""), {**defaults.get(geom.get("class", inherited), {}), **geom.attrib})
+        yield _shape(body.get("name", ""), _complete(geom, defaults, inherited))
     for child in body.iterfind("body"):
         yield from _of_body(child, defaults, inherited)
+
+
+def _complete(geom: ElementTree.Element, defaults: _Defaults, inherited: str) -> Mapping[str, str]:
+    return {**defaults.get(geom.get("class", inherited), {}), **geom.attrib}
 
 
 def _shape(link: str, geom: Mapping[str, str]) -> Shape:

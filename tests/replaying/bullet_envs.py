@@ -1,6 +1,7 @@
 """Plain environments in PyBullet."""
 
 from pathlib import Path
+from typing import ClassVar
 
 import gymnasium
 import numpy as np
@@ -77,13 +78,26 @@ class Workshop(gymnasium.Env):
         self.clients = []
 
 
+class Shared(Workshop):
+    """All instances have one client, which stays connected."""
+
+    connected: ClassVar[list] = []
+
+    def __init__(self):
+        self.worlds, self.clients = 1, self.connected
+
+    def close(self):
+        pass
+
+
 class Crawler(gymnasium.Env):
     """A robot of an MJCF file, on ground of a height field, next to a body that is drawn as a mesh of arrays."""
 
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
     observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
 
-    def __init__(self):
+    def __init__(self, file: str = "mjcf/ant.xml"):
+        self.file = file
         self.bullet = BulletClient(p.DIRECT)
         self.bullet.setAdditionalSearchPath(pybullet_data.getDataPath())
 
@@ -101,7 +115,7 @@ class Crawler(gymnasium.Env):
         self.bullet.createMultiBody(0, -1, tent)
         hidden = self.bullet.createVisualShape(p.GEOM_SPHERE, radius=0.3, rgbaColor=[1, 1, 1, 0])
         self.bullet.createMultiBody(0, -1, hidden)
-        (self.ant,) = self.bullet.loadMJCF("mjcf/ant.xml")
+        self.ant = self.bullet.loadMJCF(self.file)[0]
         return self._observe(), {}
 
     def _observe(self):

@@ -151,6 +151,13 @@ def test_clients_of_others_are_not_drawn():
     p.disconnect(client)
 
 
+def test_a_client_of_all_instances_is_drawn_for_each():
+    for _ in range(2):
+        rollout, warnings = play("Shared", steps=1)
+        assert warnings == []
+        assert [body.name for body in rollout.scene.bodies] == ["plane", "arm"]
+
+
 def test_mjcf_files_and_meshes_of_arrays_are_drawn(tmp_path):
     rollout, warnings = play("Crawler", steps=2)
     write_rrd(tmp_path / "c.rrd", rollout, title="c", warn=warnings.append)
@@ -167,6 +174,15 @@ def test_mjcf_files_and_meshes_of_arrays_are_drawn(tmp_path):
     assert tent.shapes[0].mesh.vertices.max() == 2.0
     assert hidden.shapes == []
     assert len(static(tmp_path / "c.rrd", "/world/body\\ 1/link0/shape_0", "Mesh3D:vertex_positions")) == 4
+
+
+def test_geoms_of_the_world_are_bodies_with_their_names(tmp_path):
+    rollout, _ = play("Crawler", steps=2, file="mjcf/reacher.xml")
+    # fromto="-.3 -.3 .01 .3 -.3 .01": along x.
+    (side,) = find(rollout, "reacher sideS").shapes
+    assert side.position == pytest.approx((0, -0.3, 0.01))
+    np.testing.assert_allclose(np.abs(Rotation.from_quat(side.orientation).apply([0, 0, 1])), [1, 0, 0], atol=1e-9)
+    assert find(rollout, "reacher ground").ground_height == 0.0
 
 
 def test_soft_bodies_cost_a_warning():
