@@ -157,7 +157,8 @@ def log_calls() -> Iterator[BulletLog]:
     It has to be imported before the environment's module, which may import single functions of it.
     """
     if importlib.util.find_spec("pybullet") is not None:
-        pybullet.isNumpyEnabled()
+        with contextlib.suppress(ImportError):  # an environment that needs it will say so
+            pybullet.isNumpyEnabled()
     log = BulletLog()
 
     def replace(name: str, function: Any) -> Any:
