@@ -38,8 +38,8 @@ def draw_scene(scene: Scene, timelines: Timelines, warn: Warn) -> dict[str, tupl
             drawn = draw_shapes(body, timelines, warn)
             if body.trunk is not None:
                 trunk = rr.new_entity_path([body.world, body.name, body.links[body.trunk]]) + "/"
-                if any(entity.startswith(trunk) for entity in drawn):
-                    followed.setdefault(body.world, (next(e for e in drawn if e.startswith(trunk)), body))
+                if parts := [entity for entity in drawn if entity.startswith(trunk)]:
+                    followed.setdefault(body.world, (parts[0], body))
         _draw_path(body, timelines)
     for number, (name, positions) in enumerate(scene.markers.items()):
         _draw_marker(name, positions, _MARKER_COLORS[number % len(_MARKER_COLORS)], timelines)
@@ -127,7 +127,9 @@ def _path_points(body: BodyMotion) -> NDArray[np.float64]:
 
 def shape_centers(body: BodyMotion, link: int) -> NDArray[np.float64]:
     """Return the positions of the shapes of a link [m], world frame, shape (shapes, T + 1, 3)."""
-    turns, position = Rotation.from_quat(body.orientations[:, link]), body.positions[:, link]
+    position, orientations = body.positions[:, link], body.orientations[:, link]
+    exists = np.isfinite(orientations).all(axis=1, keepdims=True)
+    turns = Rotation.from_quat(np.where(exists, orientations, (0.0, 0.0, 0.0, 1.0)))
     centers = [position + turns.apply(shape.position) for shape in body.shapes if shape.link == body.links[link]]
     return np.array(centers, np.float64).reshape(-1, *position.shape)
 

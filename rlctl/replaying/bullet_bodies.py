@@ -6,6 +6,7 @@ the directions of its forces in link frames. Link poses are computed from the jo
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -193,11 +194,24 @@ def read_state(body: BulletBody) -> BodyState:
 def place_links(body: BulletBody, states: Sequence[BodyState]) -> tuple[Array, Array]:
     """Return the link frames of a body in T states: positions [m], shape (T, links, 3), and quaternions, (T, links, 4).
 
-    The same arithmetic as Bullet's btMultiBody::forwardKinematics. A planar joint is at its zero.
+    The same arithmetic as Bullet's btMultiBody::forwardKinematics. A planar joint is at its zero. Rows of states that
+    are not finite, because the simulation diverged, are NaN.
     """
-    bases = np.array([state.base[0] for state in states]), np.array([state.base[1] for state in states])
-    centers, turns = [bases[0]], [Rotation.from_quat(bases[1])]  # of inertial frames
-    inertials = [body.inertial, *(joint.inertial for joint in body.joints)]
+    finite = [row for row, state in enumerate(states) if _is_finite(state)]
+    positions, orientations = (np.full((len(states), len(body.links), size), np.nan) for size in (3, 4))
+    if finite:
+        positions[finite], orientations[finite] = _compute_frames(body, [states[row] for row in finite])
+    return positions, orientations
+
+
+def _is_finite(state: BodyState) -> bool:
+    numbers = itertools.chain(*state.base, *(position for position, _ in state.joints))
+    return all(map(math.isfinite, numbers)) and any(state.base[1])
+
+
+def _compute_frames(body: BulletBody, states: Sequence[BodyState]) -> tuple[Array, Array]:
+    centers = [np.array([state.base[0] for state in states])]  # of inertial frames, in the world
+    turns = [Rotation.from_quat(np.array([state.base[1] for state in states]))]
     for index, joint in enumerate(body.joints):
         parent, turn = joint.parent + 1, Rotation.from_quat(joint.turn).inv()
         offset = Rotation.from_quat(joint.inertial[1]).inv().apply(joint.inertial[0])  # from the pivot to the centre
@@ -212,6 +226,7 @@ def place_links(body: BulletBody, states: Sequence[BodyState]) -> tuple[Array, A
             turn = turn * Rotation.from_quat(np.array([state.joints[index][0] for state in states]))
         turns.append(turns[parent] * turn)
         centers.append(centers[parent] + turns[parent].apply(joint.pivot) + turns[-1].apply(offset + slide))
+    inertials = [body.inertial, *(joint.inertial for joint in body.joints)]
     frames = [turn * Rotation.from_quat(pose[1]).inv() for turn, pose in zip(turns, inertials, strict=True)]
     positions = [center - frame.apply(pose[0]) for center, frame, pose in zip(centers, frames, inertials, strict=True)]
     return np.stack(positions, axis=1), np.stack([frame.as_quat() for frame in frames], axis=1)

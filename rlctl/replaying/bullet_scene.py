@@ -36,6 +36,8 @@ class _Point:
         if self.track is None:
             return position
         motion, body, index = motions[self.track], self.track.body, self.link + 1
+        if not np.isfinite(motion.positions[step, index]).all():  # the simulation diverged
+            return motion.positions[step, index]
         if self.is_inertial:
             center, turn = body.inertial if self.link < 0 else body.joints[self.link].inertial
             position = center + Rotation.from_quat(turn).apply(position)
@@ -51,9 +53,9 @@ class _Chain:
     color: tuple[float, ...]
 
     def place(self, motions: Mapping[Track, BodyMotion], step: int) -> list[Line]:
-        """Return the lines in the world, without those of no length."""
+        """Return the lines in the world, without those of no length or without a place."""
         pairs = itertools.pairwise(point.place(motions, step) for point in self.points)
-        return [Line(start, end, self.color) for start, end in pairs if (start != end).any()]
+        return [Line(start, end, self.color) for start, end in pairs if np.linalg.norm(end - start) > 0]
 
 
 class TaskReader:

@@ -1,5 +1,6 @@
 """Plain environments in PyBullet."""
 
+import math
 from pathlib import Path
 from typing import ClassVar
 
@@ -127,6 +128,21 @@ class Crawler(gymnasium.Env):
 
     def close(self):
         self.bullet.disconnect()
+
+
+class Diverging(Workshop):
+    """A free arm that is nowhere from the fifth step on, in which a constraint holds a cube to it."""
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        self.arm = self.bullet.loadURDF(str(ARM), [0, 0, 1])
+        return observation, info
+
+    def step(self, action):
+        if self.steps == 4:
+            self.bullet.resetBasePositionAndOrientation(self.arm, [math.nan] * 3, [math.nan] * 4)
+        _, _, terminated, truncated, info = super().step(action)
+        return np.zeros(3), 0.0, terminated, truncated, info
 
 
 class Jelly(Crawler):

@@ -135,7 +135,7 @@ def test_each_client_is_a_world(tmp_path):
     rollout, _ = play("Workshop", worlds=2)
     write_rrd(tmp_path / "two.rrd", rollout, title="two", warn=print)
     found = entities(tmp_path / "two.rrd")
-    assert {"/world/arm/tip", "/world\\ 2/arm/tip"} <= found
+    assert {"/world/arm/tip", "/world\\ 2/arm/tip", "/joints/position/world\\ 2/arm"} <= found
     np.testing.assert_allclose(
         rollout.scene.bodies[-1].positions[:, 0], np.tile([1.0, 0, 0], (STEPS + 1, 1)), atol=1e-9
     )
@@ -183,6 +183,15 @@ def test_geoms_of_the_world_are_bodies_with_their_names(tmp_path):
     assert side.position == pytest.approx((0, -0.3, 0.01))
     np.testing.assert_allclose(np.abs(Rotation.from_quat(side.orientation).apply([0, 0, 1])), [1, 0, 0], atol=1e-9)
     assert find(rollout, "reacher ground").ground_height == 0.0
+
+
+def test_a_body_that_diverged_is_drawn_until_then(tmp_path):
+    rollout, _ = play("Diverging")
+    assert find(rollout, "arm (2)").list_spans() == [range(5)]
+    assert [step for step, lines in enumerate(rollout.scene.lines["world", "constraints"]) if lines] == [HELD]
+    write_rrd(tmp_path / "d.rrd", rollout, title="d", warn=print)
+    tip = "/world/arm\\ \\(2\\)/tip"
+    assert column(tmp_path / "d.rrd", tip, "Transform3D:translation")[0].tolist() == [0, 1, 2, 3, 4]
 
 
 def test_soft_bodies_cost_a_warning():
