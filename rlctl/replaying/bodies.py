@@ -3,7 +3,6 @@
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rlctl.replaying.curves import Timelines
 from rlctl.replaying.mjcf import Mesh, Shape, ShapeKind
@@ -108,9 +107,17 @@ def _path_points(body: BodyMotion) -> NDArray[np.float64]:
 
 def shape_centers(body: BodyMotion, link: int) -> NDArray[np.float64]:
     """Return the positions of the shapes of a link [m], world frame, shape (shapes, T + 1, 3)."""
-    turns, position = Rotation.from_quat(body.orientations[:, link]), body.positions[:, link]
-    centers = [position + turns.apply(shape.position) for shape in body.shapes if shape.link == body.links[link]]
+    turns, position = body.orientations[:, link], body.positions[:, link]
+    shapes = [shape for shape in body.shapes if shape.link == body.links[link]]
+    centers = [position + _rotate(turns, np.array(shape.position)) for shape in shapes]
     return np.array(centers, np.float64).reshape(-1, *position.shape)
+
+
+def _rotate(quaternions: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotate a vector by each quaternion (x, y, z, w). SciPy does the same, but its import takes 0.2 s."""
+    axes, scalars = quaternions[:, :3], quaternions[:, 3:]
+    across = 2.0 * np.cross(axes, vector)
+    return vector + scalars * across + np.cross(axes, across)
 
 
 def draw_shapes(body: BodyMotion, timelines: Timelines, warn: Warn) -> list[str]:

@@ -159,16 +159,24 @@ def make_filmable(spec: EnvSpec) -> Env:
 
 
 def film_episodes(
-    path: Path, env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose], *, policy: str
+    path: Path,
+    env: Env,
+    spec: EnvSpec,
+    seeds: Sequence[int],
+    begin: Callable[[int], Choose],
+    *,
+    policy: str,
+    watch: Watch = lambda step: None,
 ) -> tuple[list[Rollout], FilmReport]:
-    """Play an episode per seed and write one film of all of them, atomically."""
+    """Play an episode per seed and write one film of all of them, atomically; `watch` is called after every step."""
     rollouts: list[Rollout] = []
     reports: list[FilmReport] = []
 
     def write(part: Path) -> None:
         film = _Film(env, part)
+        both = _join(watch, film.watch)
         for seed in seeds:
-            rollouts.append(play_episode(env, spec, seed, begin(seed), policy=policy, watch=film.watch))
+            rollouts.append(play_episode(env, spec, seed, begin(seed), policy=policy, watch=both))
             film.pause()
         film.writer.close()
         reports.append(film.report(path))
@@ -262,17 +270,36 @@ def open_window(spec: EnvSpec) -> Env:
     return spec.make("human")
 
 
-def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose]) -> list[Rollout]:
-    """Play an episode per seed in real time; closing PyBullet's window ends the replay without an error."""
+def show_episodes(
+    env: Env,
+    spec: EnvSpec,
+    seeds: Sequence[int],
+    begin: Callable[[int], Choose],
+    *,
+    watch: Watch = lambda step: None,
+) -> list[Rollout]:
+    """Play an episode per seed in real time; closing PyBullet's window ends the replay without an error.
+
+    `watch` is called after every step.
+    """
     shown: list[Rollout] = []
     for seed in seeds:
         try:
-            shown.append(play_episode(env, spec, seed, begin(seed), watch=_wait(find_dt(env) or _DT)))
+            both = _join(watch, _wait(find_dt(env) or _DT))
+            shown.append(play_episode(env, spec, seed, begin(seed), watch=both))
         except TaskError as error:
             if "Not connected to physics server" not in str(error.__cause__):
                 raise
             break
     return shown
+
+
+def _join(*watches: Watch) -> Watch:
+    def watch(step: int) -> None:
+        for one in watches:
+            one(step)
+
+    return watch
 
 
 def _wait(dt: float) -> Watch:

@@ -22,10 +22,19 @@ class ReplayRequest:
     source: Annotated[
         str | None,
         Argument(
-            "A run or policy to roll out, or a recorded episode (.npz).",
-            metavar="[RUN or EPISODE]",
+            "A run or policy to roll out, a recorded episode (.npz), or with --policy a task.",
+            metavar="[RUN or EPISODE or TASK]",
             completes="run",
             default_text="latest",
+        ),
+    ] = None
+    baseline: Annotated[
+        str | None,
+        Option(
+            "Play on a TASK, before any training: zero, random, MODULE:FUNCTION, PATH.py:FUNCTION, or a policy server. "
+            "A function is act(observation) or act(observation, step), and returns an action.",
+            ("--policy",),
+            metavar="POLICY",
         ),
     ] = None
     episodes: Annotated[
