@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -53,17 +53,22 @@ def _list_paths(incomplete: str, pattern: str) -> list[str]:
 _COMPLETIONS = {"task": complete_task, "run": complete_run, "algorithm": complete_algorithm}
 
 
-def command(function: Callable[..., None]) -> Callable[..., None]:
+Panels = Mapping[str, Sequence[str]]
+"""Titles of the panels of a command's help, and the names of the parameters in each."""
+
+
+def command(function: Callable[..., None], panels: Panels = {}) -> Callable[..., None]:
     """Return a function for Typer: the option fields of a dataclass parameter replace the parameter."""
     parameters, requests = [], {}
+    titles = {name: title for title, names in panels.items() for name in names}
     for parameter in inspect.signature(function, eval_str=True).parameters.values():
         if not dataclasses.is_dataclass(parameter.annotation):
-            parameters.append(_make_parameter(parameter.name, parameter.annotation, parameter.default))
+            parameters.append(_make_parameter(parameter.name, parameter.annotation, parameter.default, titles))
             continue
         request: Any = parameter.annotation
         hints = typing.get_type_hints(request, include_extras=True)
         fields = [field for field in dataclasses.fields(request) if _find_option(hints[field.name])]
-        parameters += [_make_parameter(field.name, hints[field.name], _find_default(field)) for field in fields]
+        parameters += [_make_parameter(field.name, hints[field.name], _find_default(field), titles) for field in fields]
         requests[parameter.name] = (request, [field.name for field in fields])
     turned_off = [parameter.name for parameter in parameters if _turns_off(parameter.annotation)]
 
@@ -94,7 +99,7 @@ def _find_default(field: dataclasses.Field[Any]) -> Any:
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
-def _make_parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
+def _make_parameter(name: str, annotation: Any, default: Any, titles: Mapping[str, str]) -> inspect.Parameter:
     if (option := _find_option(annotation)) is not None:
         kind = annotation.__origin__
         default = False if _turns_off(annotation) else default
@@ -106,6 +111,7 @@ def _make_parameter(name: str, annotation: Any, default: Any) -> inspect.Paramet
             min=option.min,
             max=option.max,
             autocompletion=None if option.completes is None else _COMPLETIONS[option.completes],
+            rich_help_panel=titles.get(name),
             show_default=option.default_text or kind is not bool,
         )
         annotation = Annotated[kind, made, option]

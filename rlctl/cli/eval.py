@@ -1,6 +1,7 @@
 """`rlctl eval` and `rlctl replay`."""
 
 import dataclasses
+import functools
 import itertools
 import re
 from collections.abc import Iterable, Iterator
@@ -92,9 +93,19 @@ def _fill_counts(arguments: Iterable[str]) -> Iterator[str]:
             yield "1"
 
 
-@command
+_REPLAY_PANELS = {
+    "What to play": ("baseline", "checkpoint", "pretrained", "task", "verify"),
+    "Which episodes, and how": ("episodes", "worst", "best", "failures", "seed", "settings", "sim"),
+    "Output": ("gui", "output", "video", "json"),
+}
+
+
+@functools.partial(command, panels=_REPLAY_PANELS)
 def replay(request: ReplayRequest, pretrained: Pretrained = False, json: Json = None) -> None:
-    """Show what a policy does: rollouts as Rerun recordings, without a display."""
+    """Show what a policy does, or what a task does before any training: Rerun recordings, without a display.
+
+    A function for --policy is act(observation) or act(observation, step) and returns an action; step counts from 0.
+    """
     from rlctl.replaying.replay import run_replay
     from rlctl.replaying.report import show
 

@@ -31,8 +31,7 @@ class ReplayRequest:
     baseline: Annotated[
         str | None,
         Option(
-            "Play on a TASK, before any training: zero, random, MODULE:FUNCTION, PATH.py:FUNCTION, or a policy server. "
-            "A function is act(observation) or act(observation, step), and returns an action.",
+            "Play a TASK, before any training: zero, random, PATH.py:FUNCTION, MODULE:FUNCTION, or a policy server.",
             ("--policy",),
             metavar="POLICY",
         ),
@@ -49,11 +48,15 @@ class ReplayRequest:
     task: Annotated[str | None, Option("Roll out on this task instead of the one it was trained on.")] = None
     settings: Settings = dataclasses.field(default_factory=list)
     verify: Annotated[Path | None, Option("Replay an episode; exit 1 if any bit differs.", metavar="EPISODE")] = None
-    gui: Annotated[bool, Option("Show PyBullet's window instead of writing a recording.", ("--gui",))] = False
+    gui: Annotated[bool, Option("Show it in a window, live, instead of writing a recording.", ("--gui",))] = False
     sim: Annotated[str | None, Option("Play in MuJoCo instead of PyBullet.", metavar="mujoco[:SOLREF]")] = None
     output: Annotated[
         Path | None,
-        Option("An .rrd file or a folder. Default: episodes/ of the run.", ("--output", "-o"), metavar="PATH"),
+        Option(
+            "An .rrd file or a folder. Default: episodes/ of the run; with --policy ./TASK-POLICY.rrd.",
+            ("--output", "-o"),
+            metavar="PATH",
+        ),
     ] = None
     video: Annotated[Path | None, Option("Write a film instead, .mp4 or .gif.", metavar="FILE")] = None
 

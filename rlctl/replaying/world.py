@@ -14,7 +14,7 @@ TIPPED = 45.0  # [degrees]
 
 
 @dataclasses.dataclass(frozen=True)
-class Joint:
+class JointSummary:
     """A movable joint, and where it was after the reset."""
 
     name: str
@@ -33,14 +33,14 @@ class Joint:
 
 
 @dataclasses.dataclass(frozen=True)
-class Body:
+class BodySummary:
     """A body of the world, as it was built."""
 
     name: str
     mass: float  # [kg]
     links: int  # with the base
     base: Literal["fixed", "free", "rail"]  # rail: it travels on sliding joints without limits
-    joints: list[Joint]
+    joints: list[JointSummary]
 
 
 class Touch(NamedTuple):
@@ -73,7 +73,7 @@ class Pose(NamedTuple):
 class WorldReader(Protocol):
     """Reads a world without changing it."""
 
-    def read_bodies(self) -> list[Body]:
+    def read_bodies(self) -> list[BodySummary]:
         """Return the bodies, and where their joints are."""
 
     def read_poses(self) -> Mapping[str, Pose]:
@@ -103,7 +103,7 @@ class WorldSummary:
     """What was seen in an episode."""
 
     seed: int
-    bodies: list[Body]
+    bodies: list[BodySummary]
     contacts: list[Contact]  # in the order in which they began
     motions: list[Motion]  # of bodies that are not fixed
     dt: float | None  # time between two steps [s]
@@ -118,7 +118,7 @@ class WorldWatch:
 
     def __init__(self, reader: WorldReader, seed: int, dt: float | None) -> None:
         self._reader, self._seed, self._dt = reader, seed, dt
-        self._bodies: list[Body] = []
+        self._bodies: list[BodySummary] = []
         self._contacts: dict[tuple[str, str, str], Contact] = {}
         self._heights: dict[str, list[float]] = {}
         self._uprights: dict[str, list[tuple[float, float, float]]] = {}

@@ -13,8 +13,8 @@ from rlctl.checking.bullet_worlds import ClientCalls, World, WorldBody, find_cli
 from rlctl.environments.info import find_mujoco, joint_name
 from rlctl.replaying.mujoco_scene import find_trunk_joint
 from rlctl.replaying.scene import Env
-from rlctl.replaying.world import Body, Joint, Pose, Touch, WorldReader
-from rlctl.task import body as task_body
+from rlctl.replaying.world import BodySummary, JointSummary, Pose, Touch, WorldReader
+from rlctl.task.body import Body
 from rlctl.task.env import TaskEnv
 
 if TYPE_CHECKING:
@@ -47,14 +47,16 @@ class TaskWorldReader:
         trunks = {body.name: body.find_trunk() for body in self._bodies if body.total_mass() > 0}
         self._trunks = {name: trunk for name, trunk in trunks.items() if trunk is not None}
 
-    def read_bodies(self) -> list[Body]:
+    def read_bodies(self) -> list[BodySummary]:
         """Return the bodies, and where their joints are."""
         return [
-            Body(body.name, body.total_mass(), len(body.link_names) + 1, self._find_base(body), _list_joints(body))
+            BodySummary(
+                body.name, body.total_mass(), len(body.link_names) + 1, self._find_base(body), _list_joints(body)
+            )
             for body in self._bodies
         ]
 
-    def _find_base(self, body: task_body.Body) -> Literal["fixed", "free", "rail"]:
+    def _find_base(self, body: Body) -> Literal["fixed", "free", "rail"]:
         if body.name not in self._trunks:
             return "fixed"
         return "rail" if body.fixed else "free"
@@ -73,11 +75,11 @@ class TaskWorldReader:
                     yield from _find_touches(body, other)
 
 
-def _list_joints(body: task_body.Body) -> list[Joint]:
+def _list_joints(body: Body) -> list[JointSummary]:
     columns = (body.joint_low, body.joint_high, body.joint_positions, body.joint_max_force, body.joint_max_speed)
     rows = zip(body.joint_names, body.joint_units, *(column.tolist() for column in columns), strict=True)
     return [
-        Joint(name, unit, _limit(low), _limit(high), start, _strength(force), _strength(speed))
+        JointSummary(name, unit, _limit(low), _limit(high), start, _strength(force), _strength(speed))
         for name, unit, low, high, start, force, speed in rows
     ]
 
@@ -90,7 +92,7 @@ def _strength(value: float) -> float | None:
     return value if 0 < value < _TORQUE_LIMIT else None
 
 
-def _find_touches(body: task_body.Body, other: task_body.Body) -> Iterator[Touch]:
+def _find_touches(body: Body, other: Body) -> Iterator[Touch]:
     points = body.contacts_with(other)
     for link, force, distance in zip(*points, strict=True):
         if force > 0 or distance <= 0:  # PyBullet lists points up to 2 cm apart
@@ -109,11 +111,11 @@ class ClientWorldReader:
     def _list_bodies(self) -> list[tuple[World, WorldBody]]:
         return [(world, body) for world in self._worlds for body in world.bodies]
 
-    def read_bodies(self) -> list[Body]:
+    def read_bodies(self) -> list[BodySummary]:
         """Return the bodies, and where their joints are."""
         return [self._describe(world, body) for world, body in self._list_bodies()]
 
-    def _describe(self, world: World, body: WorldBody) -> Body:
+    def _describe(self, world: World, body: WorldBody) -> BodySummary:
         p = ClientCalls(world.client)
         mass = sum(p.getDynamicsInfo(body.id, link)[0] for link in range(-1, len(body.links) - 1))
         joints = []
@@ -122,9 +124,9 @@ class ClientWorldReader:
             force, speed = p.getJointInfo(body.id, joint.index)[10:12]
             start = p.getJointState(body.id, joint.index)[0]
             unit: Literal["rad", "m"] = "rad" if joint.is_angle else "m"
-            joints.append(Joint(joint.name, unit, low, high, start, _strength(force), _strength(speed)))
+            joints.append(JointSummary(joint.name, unit, low, high, start, _strength(force), _strength(speed)))
         base: Literal["fixed", "free"] = "free" if body.is_free else "fixed"
-        return Body(self._name(world, body), mass, len(body.links), base, joints)
+        return BodySummary(self._name(world, body), mass, len(body.links), base, joints)
 
     def read_poses(self) -> Mapping[str, Pose]:
         """Return the poses of the bodies that are not fixed, by name."""
@@ -169,13 +171,13 @@ class MujocoWorldReader:
                 trunks.setdefault(int(model.body_rootid[body]), (body, kind))
         return trunks
 
-    def read_bodies(self) -> list[Body]:
+    def read_bodies(self) -> list[BodySummary]:
         """Return the bodies, and where their joints are."""
         model = self._model
-        ground = [Body("world", 0.0, 1, "fixed", [])] if (model.geom_bodyid == 0).any() else []
+        ground = [BodySummary("world", 0.0, 1, "fixed", [])] if (model.geom_bodyid == 0).any() else []
         counts = np.bincount(model.body_rootid, minlength=model.nbody)
         return ground + [
-            Body(
+            BodySummary(
                 self._names[root],
                 float(model.body_subtreemass[root]),
                 int(counts[root]),
@@ -185,7 +187,7 @@ class MujocoWorldReader:
             for root in self._roots
         ]
 
-    def _list_joints(self, root: int) -> list[Joint]:
+    def _list_joints(self, root: int) -> list[JointSummary]:
         import mujoco
 
         model, joints = self._model, []
@@ -197,7 +199,7 @@ class MujocoWorldReader:
             force = float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else None
             unit: Literal["rad", "m"] = "m" if kind == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
             start = float(self._data.qpos[model.jnt_qposadr[joint]])
-            joints.append(Joint(joint_name(model, joint), unit, low, high, start, force))
+            joints.append(JointSummary(joint_name(model, joint), unit, low, high, start, force))
         return joints
 
     def read_poses(self) -> Mapping[str, Pose]:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from rlctl import output
-from rlctl.replaying.world import TIPPED, Contact, Joint, Motion, WorldSummary
+from rlctl.replaying.world import TIPPED, Contact, JointSummary, Motion, WorldSummary
 
 _SHOWN_CONTACTS = 16
 _DEEP = 1e-4  # [m]; smaller overlaps are those of any contact
@@ -22,7 +22,7 @@ def show_world(world: WorldSummary) -> None:
     _print(["body", "joint", "low", "high", "", "at reset", "max force", "max speed"], rows)
     rows = [_format_contact(contact) for contact in world.contacts[:_SHOWN_CONTACTS]]
     _print(["body", "link", "touches", "from step", "mm deep"], rows)
-    for line in _list_findings(world):
+    for line in list_findings(world):
         output.out().print(line)
 
 
@@ -51,7 +51,7 @@ def _format_contact(contact: Contact) -> list[str]:
     return [contact.body, contact.link, other, str(contact.step), overlap]
 
 
-def _format_joint(joint: Joint) -> list[str]:
+def _format_joint(joint: JointSummary) -> list[str]:
     limits = [_format_limit(limit) for limit in (joint.low, joint.high)]
     force = "" if joint.max_force is None else f"{joint.max_force:.4g} {'N m' if joint.unit == 'rad' else 'N'}"
     speed = "" if joint.max_speed is None else f"{joint.max_speed:.4g} {joint.unit}/s"
@@ -64,7 +64,7 @@ def _format_limit(limit: float | None) -> str:
     return f"{limit:.3f}" if abs(limit) < _WIDE else f"{limit:.3g}"
 
 
-def _list_findings(world: WorldSummary) -> Iterator[str]:
+def list_findings(world: WorldSummary) -> Iterator[str]:
     """Yield a line per joint outside its limits and per body that falls, or that there is nothing to report."""
     for body in world.bodies:
         for joint in body.joints:

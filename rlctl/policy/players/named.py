@@ -18,7 +18,6 @@ from rlctl.errors import (
     describe_exception,
     did_you_mean,
     find_plugin_line,
-    format_plugin_traceback,
     short_repr,
 )
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, CPolicy
@@ -62,7 +61,7 @@ def load_function(text: str) -> Act:
 
 
 def _accept_step(function: Callable[..., Any]) -> Act:
-    """Return a function of two arguments; the user's receives the step if it needs, or is able, to."""
+    """Return a function of two arguments; the user's receives the step if it needs two, or has one called `step`."""
     try:
         signature = inspect.signature(function)
     except (ValueError, TypeError):  # not written in Python
@@ -124,8 +123,7 @@ class FunctionPlayer(Player):
             result = self._function(map_parts(np.copy, observation), step)
         except (Exception, SystemExit) as error:
             what = f"{describe_exception(error)}{find_plugin_line(error)}"
-            details = format_plugin_traceback(error) or None
-            raise PolicyError(f"policy {self._name}, step {step}: {what}", details=details) from error
+            raise PolicyError(f"policy {self._name}, step {step}: {what}") from error
         action = self._check(result, step)
         return action, action
 
