@@ -1,4 +1,4 @@
-"""Shows episodes: films (`.mp4` or `.gif`) and pictures without a display, and windows.
+"""Shows episodes as films (`.mp4` or `.gif`) and pictures, without a display.
 
 A task is drawn by PyBullet's software renderer, any other environment by its own `render()`.
 """
@@ -6,8 +6,6 @@ A task is drawn by PyBullet's software renderer, any other environment by its ow
 import contextlib
 import dataclasses
 import fractions
-import os
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,10 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import ArtifactError, RlctlError, TaskError, UsageError, describe_exception, explain_missing_package
-from rlctl.replaying.recorder import Choose, Rollout, Watch, find_dt, play_episode, recorded_actions
+from rlctl.errors import ArtifactError, RlctlError, UsageError, describe_exception, explain_missing_package
+from rlctl.replaying.recorder import (
+    DEFAULT_DT,
+    Choose,
+    Rollout,
+    Watch,
+    find_dt,
+    join_watches,
+    play_episode,
+    recorded_actions,
+)
 from rlctl.replaying.report import FilmReport
 from rlctl.replaying.reproduce import find_difference
 from rlctl.replaying.scene import Env, encode_jpeg, find_bounds
@@ -32,7 +38,6 @@ Picture = NDArray[np.uint8]
 
 _SIZE = {".mp4": (640, 480), ".gif": (400, 300)}  # [pixels], of a film
 _RATE = {".mp4": 30.0, ".gif": 20.0}  # [1/s], at most
-_DT = 1 / 30  # [s] per step, if an environment gives no time
 _PAUSE_S = 0.5  # [s] at the end of each episode
 _STRIP_SIZE = (240, 180)  # [pixels], of a report's pictures
 _EYE_DIRECTION = np.array([1.0, -0.9, 0.55])  # from the right of a robot that looks along x, from above
@@ -174,7 +179,7 @@ def film_episodes(
 
     def write(part: Path) -> None:
         film = _Film(env, part)
-        both = _join(watch, film.watch)
+        both = join_watches(watch, film.watch)
         for seed in seeds:
             rollouts.append(play_episode(env, spec, seed, begin(seed), policy=policy, watch=both))
             film.pause()
@@ -188,7 +193,7 @@ def film_episodes(
 class _Film:
     def __init__(self, env: Env, path: Path) -> None:
         self._view = look_at(env, *_SIZE[path.suffix])
-        dt = find_dt(env) or _DT
+        dt = find_dt(env) or DEFAULT_DT
         self._every = max(1, round(1 / (_RATE[path.suffix] * dt)))
         self._rate = 1 / (dt * self._every)
         self._count, self._seconds = 0, 0.0
@@ -260,55 +265,3 @@ class _Gif:
     def close(self) -> None:
         first, *rest = self._pictures
         first.save(self._path, "GIF", save_all=True, append_images=rest, duration=self._duration, loop=0)
-
-
-def open_window(spec: EnvSpec) -> Env:
-    """Build an environment with a window; raises `UsageError` without a display."""
-    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if sys.platform == "linux" and not display and not registry.is_task(spec.constructor()):
-        raise UsageError("--gui: there is no display, DISPLAY is not set; leave out --gui to write a recording instead")
-    return spec.make("human")
-
-
-def show_episodes(
-    env: Env,
-    spec: EnvSpec,
-    seeds: Sequence[int],
-    begin: Callable[[int], Choose],
-    *,
-    watch: Watch = lambda step: None,
-) -> list[Rollout]:
-    """Play an episode per seed in real time; closing PyBullet's window ends the replay without an error.
-
-    `watch` is called after every step.
-    """
-    shown: list[Rollout] = []
-    for seed in seeds:
-        try:
-            both = _join(watch, _wait(find_dt(env) or _DT))
-            shown.append(play_episode(env, spec, seed, begin(seed), watch=both))
-        except TaskError as error:
-            if "Not connected to physics server" not in str(error.__cause__):
-                raise
-            break
-    return shown
-
-
-def _join(*watches: Watch) -> Watch:
-    def watch(step: int) -> None:
-        for one in watches:
-            one(step)
-
-    return watch
-
-
-def _wait(dt: float) -> Watch:
-    """Return a function that waits after each step of `dt` [s], so that the episode plays in real time."""
-    start: list[float] = []
-
-    def wait(step: int) -> None:
-        if step == 0:
-            start.append(time.monotonic())
-        time.sleep(max(0.0, start[0] + step * dt - time.monotonic()))
-
-    return wait

@@ -26,6 +26,7 @@ from rlctl.version import collect_versions
 Choose = Callable[[Any, int], Any]
 """Returns the action for an observation and the number of steps so far; None ends the episode."""
 Watch = Callable[[int], None]  # called with the number of a step after it; 0 is the reset
+DEFAULT_DT = 1 / 30  # [s] per step, if an environment gives no time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,6 +188,16 @@ def _log_events(step: int, events: Mapping[str, Mapping[str, float]]) -> Iterato
     for name, drawn in events.items():
         values = ", ".join(f"{key} {value:.4g}" for key, value in drawn.items())
         yield LogEntry(step, f"event {name}: {values}", "DEBUG")
+
+
+def join_watches(*watches: Watch) -> Watch:
+    """Return a function that calls several."""
+
+    def watch(step: int) -> None:
+        for call in watches:
+            call(step)
+
+    return watch
 
 
 def find_dt(env: Env) -> float | None:

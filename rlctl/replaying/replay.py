@@ -7,12 +7,13 @@ from pathlib import Path
 
 from rlctl import output
 from rlctl.errors import UsageError
-from rlctl.replaying.pictures import check_file, film_episodes, make_filmable, open_window, show_episodes
+from rlctl.replaying.pictures import check_file, film_episodes, make_filmable
 from rlctl.replaying.recorder import Rollout
 from rlctl.replaying.report import ReplayResult
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.sources import PolicySource, RecordedSource, TaskSource, load_located, summarize
+from rlctl.replaying.window import open_window, show_episodes
 
 _DEFAULTS = ReplayRequest()
 _OF_POLICIES = {"checkpoint": "--checkpoint and --pretrained", "settings": "--set"} | {

@@ -6,11 +6,12 @@ import textwrap
 
 import pytest
 
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import PolicyError, UsageError
-from rlctl.replaying.pictures import show_episodes
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.sources import TaskSource
+from rlctl.replaying.window import open_window, show_episodes
 from rlctl.run.episode import load_episode
 from tests.replaying.conftest import ENVS, as_json
 from tests.replaying.reading import column
@@ -106,6 +107,12 @@ def test_without_a_display_a_window_is_an_error_of_one_line(replay):
         assert done.returncode == 2
         (line,) = done.stderr.splitlines()
         assert "DISPLAY is not set; leave out --gui" in line
+
+
+def test_an_environment_without_a_window(monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":99")
+    with pytest.raises(UsageError, match=r"^--gui: no window: .*:Blind takes no render_mode; leave out --gui"):
+        open_window(EnvSpec(f"{ENVS}:Blind"))
 
 
 def test_an_environment_that_is_not_simulated(tmp_path, capsys):
