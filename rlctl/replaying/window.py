@@ -10,6 +10,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError, TaskError, UsageError
 from rlctl.replaying.recorder import DEFAULT_DT, Choose, Rollout, Watch, find_dt, join_watches, play_episode
 from rlctl.replaying.scene import Env
+from rlctl.task.bullet import pybullet
 
 
 def open_window(spec: EnvSpec) -> Env:
@@ -44,8 +45,8 @@ def show_episodes(
         try:
             both = join_watches(watch, _wait(find_dt(env) or DEFAULT_DT))
             shown.append(play_episode(env, spec, seed, begin(seed), watch=both))
-        except TaskError as error:
-            if "Not connected to physics server" not in str(error.__cause__):
+        except (TaskError, pybullet.error) as error:
+            if "Not connected to physics server" not in str(error.__cause__ or error):
                 raise
             break
     return shown

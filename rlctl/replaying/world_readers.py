@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -130,23 +131,32 @@ class ClientWorldReader:
 
     def read_poses(self) -> Mapping[str, Pose]:
         """Return the poses of the bodies that are not fixed, by name."""
-        return {
-            self._name(world, body): Pose(*ClientCalls(world.client).getBasePositionAndOrientation(body.id))
-            for world, body in self._list_bodies()
-            if body.is_free
-        }
+        poses = {}
+        for world, body in self._list_bodies():
+            p = ClientCalls(world.client)
+            with contextlib.suppress(p.error):  # the environment has removed it, or left its client
+                if body.is_free:
+                    poses[self._name(world, body)] = Pose(*p.getBasePositionAndOrientation(body.id))
+        return poses
 
     def read_touches(self) -> Iterator[Touch]:
         """Yield what the links of bodies with joints, or that are not fixed, touch after the last physics step."""
         for world in self._worlds:
             bodies = {body.id: body for body in world.bodies}
-            for _, one, two, link, other, _, _, _, distance, force, *_ in ClientCalls(world.client).getContactPoints():
+            for _, one, two, link, other, _, _, _, distance, force, *_ in _read_points(world):
                 if one in bodies and two in bodies and (force > 0 or distance <= 0):
                     for body, part, touched in ((bodies[one], link, bodies[two]), (bodies[two], other, bodies[one])):
                         if body.joints or body.is_free:
                             name = body.links[part + 1] or ("base" if part < 0 else f"link {part}")
                             names = self._name(world, body), name, self._name(world, touched)
                             yield Touch(*names, max(0.0, -float(distance)))
+
+
+def _read_points(world: World) -> Any:
+    p = ClientCalls(world.client)
+    with contextlib.suppress(p.error):  # the environment has left its client
+        return p.getContactPoints()
+    return ()
 
 
 class MujocoWorldReader:

@@ -26,6 +26,7 @@ def show_world(world: WorldSummary) -> None:
         output.out().print(line)
 
 
+_DROPPED = ("max speed", "max force", "highest", "lowest", "mm deep")  # on a narrow terminal
 _LEFT = ("body", "base", "joint", "", "link", "touches")  # columns of text
 
 
@@ -34,7 +35,8 @@ def _print(names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     filled = [number for number, _ in enumerate(names) if any(row[number] for row in rows)]
     if rows:
         chosen = [names[number] for number in filled]
-        output.print_table(chosen, [[row[number] for number in filled] for row in rows], left=_LEFT)
+        cells = [[row[number] for number in filled] for row in rows]
+        output.print_table(chosen, cells, left=_LEFT, drop=[name for name in _DROPPED if name in chosen])
         output.out().print()
 
 

@@ -15,6 +15,7 @@ from rlctl.replaying.window import open_window, show_episodes
 from rlctl.run.episode import load_episode
 from tests.replaying.conftest import ENVS, as_json
 from tests.replaying.reading import column
+from tests.runs.test_listing import on_terminal
 
 TUMBLE = f"{ENVS}:Tumble"
 
@@ -45,6 +46,14 @@ def test_it_records_and_reports_without_a_run(replay, tmp_path):
         "without a display, in a browser: rerun --serve-web Tumble-zero.rrd",
     ]
     assert {file.name for file in tmp_path.iterdir()} == {"Tumble-zero.rrd", "Tumble-zero.npz"}
+
+
+def test_a_narrow_terminal_has_fewer_columns(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shown = on_terminal("replay", TUMBLE, "--policy", "zero", columns=60).splitlines()
+    tables = [line for line in shown if line.startswith(("body", "cube  ", "car  "))]
+    assert "max speed" not in "".join(tables)
+    assert max(map(len, tables)) <= 60
 
 
 def test_the_recording_has_the_actions_of_the_function(functions, tmp_path, monkeypatch):

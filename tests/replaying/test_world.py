@@ -132,6 +132,9 @@ def test_a_plain_environment_of_pybullet(write_module):
         class Falling(gymnasium.Env):
             action_space = observation_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
 
+            def __init__(self, removed_at=0):
+                self.removed_at = removed_at
+
             def reset(self, *, seed=None, options=None):
                 self.c = c = p.connect(p.DIRECT)
                 p.setGravity(0, 0, -10, physicsClientId=c)
@@ -144,10 +147,14 @@ def test_a_plain_environment_of_pybullet(write_module):
                     linkParentIndices=[0], linkJointTypes=[p.JOINT_PRISMATIC], linkJointAxis=[[1, 0, 0]],
                     physicsClientId=c,
                 )
+                self.steps = 0
                 return np.zeros(1, np.float32), {}
 
             def step(self, action):
+                self.steps += 1
                 p.stepSimulation(physicsClientId=self.c)
+                if self.steps == self.removed_at:
+                    p.removeBody(1, physicsClientId=self.c)
                 return np.zeros(1, np.float32), 0.0, False, False, {}
 
             def close(self):
@@ -163,6 +170,8 @@ def test_a_plain_environment_of_pybullet(write_module):
     (contact,) = world.contacts
     assert contact.body == ball.name
     assert 45 <= contact.step <= 52
+    removed = look(f"{file}:Falling", removed_at=20)
+    assert motion(removed, ball.name).lowest > 0.2
 
 
 def test_mujoco():
