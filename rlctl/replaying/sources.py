@@ -203,7 +203,8 @@ class TaskSource(_NewEpisodes):
         if self._player is not None:
             self._player.close()
         if self._world is None:
-            output.print_notes(["bodies and joints are unknown: it simulates with neither PyBullet nor MuJoCo"])
+            if episodes:
+                output.print_notes(["bodies and joints are unknown: it simulates with neither PyBullet nor MuJoCo"])
             return result
         return dataclasses.replace(result, world=self._world.summarize())
 

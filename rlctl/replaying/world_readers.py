@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from rlctl.task.sim import Sim
 
-_TORQUE_LIMIT = 1e5  # [N m]; a model with more has no limit
+_NO_LIMIT = 1e5  # [N m, N, rad/s, m/s]; some models write more where a motor has no limit
 
 
 def make_world_reader(env: Env, other_clients: Collection[int] = ()) -> WorldReader | None:
@@ -90,7 +90,7 @@ def _limit(value: float) -> float | None:
 
 
 def _strength(value: float) -> float | None:
-    return value if 0 < value < _TORQUE_LIMIT else None
+    return value if 0 < value < _NO_LIMIT else None
 
 
 def _find_touches(body: Body, other: Body) -> Iterator[Touch]:
