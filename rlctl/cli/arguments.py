@@ -54,22 +54,31 @@ _COMPLETIONS = {"task": complete_task, "run": complete_run, "algorithm": complet
 
 
 Panels = Mapping[str, Sequence[str]]
-"""Titles of the panels of a command's help, and the names of the parameters in each."""
+"""Title of a panel of the help -> names of the parameters in it. Typer puts --help into `Options`, the first one."""
 
 
-def command(function: Callable[..., None], panels: Panels = {}) -> Callable[..., None]:
+def command(function: Callable[..., None]) -> Callable[..., None]:
     """Return a function for Typer: the option fields of a dataclass parameter replace the parameter."""
+    return _make_command(function, {})
+
+
+def command_in_panels(panels: Panels) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator as `command`, whose help shows the options in panels, in this order."""
+    return lambda function: _make_command(function, panels)
+
+
+def _make_command(function: Callable[..., None], panels: Panels) -> Callable[..., None]:
     parameters, requests = [], {}
-    titles = {name: title for title, names in panels.items() for name in names}
     for parameter in inspect.signature(function, eval_str=True).parameters.values():
         if not dataclasses.is_dataclass(parameter.annotation):
-            parameters.append(_make_parameter(parameter.name, parameter.annotation, parameter.default, titles))
+            parameters.append(_make_parameter(parameter.name, parameter.annotation, parameter.default))
             continue
         request: Any = parameter.annotation
         hints = typing.get_type_hints(request, include_extras=True)
         fields = [field for field in dataclasses.fields(request) if _find_option(hints[field.name])]
-        parameters += [_make_parameter(field.name, hints[field.name], _find_default(field), titles) for field in fields]
+        parameters += [_make_parameter(field.name, hints[field.name], _find_default(field)) for field in fields]
         requests[parameter.name] = (request, [field.name for field in fields])
+    parameters = _arrange(parameters, panels)
     turned_off = [parameter.name for parameter in parameters if _turns_off(parameter.annotation)]
 
     def run(**values: Any) -> None:
@@ -83,6 +92,16 @@ def command(function: Callable[..., None], panels: Panels = {}) -> Callable[...,
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
+
+
+def _arrange(parameters: list[inspect.Parameter], panels: Panels) -> list[inspect.Parameter]:
+    """Return arguments first, then options in the order of the panels, each with the title of its own."""
+    titles = {name: title for title, names in panels.items() for name in names}
+    for parameter in parameters:
+        if parameter.name in titles:
+            parameter.annotation.__metadata__[0].rich_help_panel = titles[parameter.name]
+    order = [parameter.name for parameter in parameters if parameter.name not in titles] + list(titles)
+    return sorted(parameters, key=lambda parameter: order.index(parameter.name))
 
 
 def _find_option(annotation: Any) -> Option | None:
@@ -99,7 +118,7 @@ def _find_default(field: dataclasses.Field[Any]) -> Any:
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
-def _make_parameter(name: str, annotation: Any, default: Any, titles: Mapping[str, str]) -> inspect.Parameter:
+def _make_parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
     if (option := _find_option(annotation)) is not None:
         kind = annotation.__origin__
         default = False if _turns_off(annotation) else default
@@ -111,7 +130,6 @@ def _make_parameter(name: str, annotation: Any, default: Any, titles: Mapping[st
             min=option.min,
             max=option.max,
             autocompletion=None if option.completes is None else _COMPLETIONS[option.completes],
-            rich_help_panel=titles.get(name),
             show_default=option.default_text or kind is not bool,
         )
         annotation = Annotated[kind, made, option]

@@ -1,7 +1,6 @@
 """`rlctl eval` and `rlctl replay`."""
 
 import dataclasses
-import functools
 import itertools
 import re
 from collections.abc import Iterable, Iterator
@@ -10,7 +9,7 @@ from typing import Annotated, Any
 
 from typer.core import TyperCommand
 
-from rlctl.cli.arguments import choose_checkpoint, command, parse_changes
+from rlctl.cli.arguments import choose_checkpoint, command, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates
 from rlctl.options import Cluster, Json, On, Option, Pretrained, Settings, Yes
@@ -93,14 +92,14 @@ def _fill_counts(arguments: Iterable[str]) -> Iterator[str]:
             yield "1"
 
 
-_REPLAY_PANELS = {
-    "What to play": ("baseline", "checkpoint", "pretrained", "task", "verify"),
-    "Which episodes, and how": ("episodes", "worst", "best", "failures", "seed", "settings", "sim"),
-    "Output": ("gui", "output", "video", "json"),
-}
-
-
-@functools.partial(command, panels=_REPLAY_PANELS)
+@command_in_panels(
+    {
+        "Options": ["baseline", "checkpoint", "pretrained", "task", "verify"],
+        "Episodes": ["episodes", "worst", "best", "failures", "seed", "settings"],
+        "Where": ["gui", "sim"],
+        "Output": ["output", "video", "json"],
+    }
+)
 def replay(request: ReplayRequest, pretrained: Pretrained = False, json: Json = None) -> None:
     """Show what a policy does, or what a task does before any training: Rerun recordings, without a display.
 
