@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rlctl.replaying.curves import Timelines
 from rlctl.replaying.meshes import load_mesh
 from rlctl.replaying.mjcf import Mesh, Shape, ShapeKind, connect_grid
+from rlctl.replaying.rotations import rotate
 from rlctl.replaying.scene import WORLD, BodyMotion, Line, Scene, Warn
 
 _MARKER_COLORS = [(40, 200, 90), (70, 150, 255), (240, 120, 200), (250, 180, 40)]
@@ -127,10 +127,9 @@ def _path_points(body: BodyMotion) -> NDArray[np.float64]:
 
 def shape_centers(body: BodyMotion, link: int) -> NDArray[np.float64]:
     """Return the positions of the shapes of a link [m], world frame, shape (shapes, T + 1, 3)."""
-    position, orientations = body.positions[:, link], body.orientations[:, link]
-    exists = np.isfinite(orientations).all(axis=1, keepdims=True)
-    turns = Rotation.from_quat(np.where(exists, orientations, (0.0, 0.0, 0.0, 1.0)))
-    centers = [position + turns.apply(shape.position) for shape in body.shapes if shape.link == body.links[link]]
+    turns, position = body.orientations[:, link], body.positions[:, link]
+    shapes = [shape for shape in body.shapes if shape.link == body.links[link]]
+    centers = [position + rotate(turns, shape.position) for shape in shapes]
     return np.array(centers, np.float64).reshape(-1, *position.shape)
 
 

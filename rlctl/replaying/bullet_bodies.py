@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rlctl.checking.bullet_worlds import find_clients
+from rlctl.replaying.rotations import from_axis, invert, multiply, normalize, rotate
 from rlctl.task.bullet import pybullet
 
 Array = NDArray[np.float64]
@@ -211,22 +211,24 @@ def _is_finite(state: BodyState) -> bool:
 
 def _compute_frames(body: BulletBody, states: Sequence[BodyState]) -> tuple[Array, Array]:
     centers = [np.array([state.base[0] for state in states])]  # of inertial frames, in the world
-    turns = [Rotation.from_quat(np.array([state.base[1] for state in states]))]
+    turns = [normalize([state.base[1] for state in states])]
     for index, joint in enumerate(body.joints):
-        parent, turn = joint.parent + 1, Rotation.from_quat(joint.turn).inv()
-        offset = Rotation.from_quat(joint.inertial[1]).inv().apply(joint.inertial[0])  # from the pivot to the centre
+        parent, turn = joint.parent + 1, invert(normalize(joint.turn))
+        offset = rotate(invert(normalize(joint.inertial[1])), joint.inertial[0])  # from the pivot to the centre
         slide = np.zeros((len(states), 3))
         if joint.kind in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC):
-            moved = np.array([state.joints[index][0] for state in states]) * joint.axis
+            moved = np.array([state.joints[index][0] for state in states])
             if joint.kind == pybullet.JOINT_REVOLUTE:
-                turn = turn * Rotation.from_rotvec(moved / np.linalg.norm(joint.axis))  # MJCF axes have any length
+                turn = multiply(turn, from_axis(joint.axis, moved[:, 0]))  # MJCF axes have any length
             else:
-                slide = moved
+                slide = moved * joint.axis
         elif joint.kind == pybullet.JOINT_SPHERICAL:
-            turn = turn * Rotation.from_quat(np.array([state.joints[index][0] for state in states]))
-        turns.append(turns[parent] * turn)
-        centers.append(centers[parent] + turns[parent].apply(joint.pivot) + turns[-1].apply(offset + slide))
+            turn = multiply(turn, normalize([state.joints[index][0] for state in states]))
+        turns.append(multiply(turns[parent], turn))
+        centers.append(centers[parent] + rotate(turns[parent], joint.pivot) + rotate(turns[-1], offset + slide))
     inertials = [body.inertial, *(joint.inertial for joint in body.joints)]
-    frames = [turn * Rotation.from_quat(pose[1]).inv() for turn, pose in zip(turns, inertials, strict=True)]
-    positions = [center - frame.apply(pose[0]) for center, frame, pose in zip(centers, frames, inertials, strict=True)]
-    return np.stack(positions, axis=1), np.stack([frame.as_quat() for frame in frames], axis=1)
+    frames = [multiply(turn, invert(normalize(pose[1]))) for turn, pose in zip(turns, inertials, strict=True)]
+    positions = [
+        center - rotate(frame, pose[0]) for center, frame, pose in zip(centers, frames, inertials, strict=True)
+    ]
+    return np.stack(positions, axis=1), np.stack(frames, axis=1)

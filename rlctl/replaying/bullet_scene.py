@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rlctl.checking.bullet_worlds import MOST_CLIENTS
 from rlctl.replaying.bullet_bodies import BulletBody, list_body_ids, make_unique, read_body, read_visuals
 from rlctl.replaying.bullet_log import BulletLog
 from rlctl.replaying.bullet_track import Key, Track
+from rlctl.replaying.rotations import normalize, rotate
 from rlctl.replaying.scene import WORLD, BodyMotion, Line, Scene, Warn
 from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
@@ -40,8 +40,8 @@ class _Point:
             return motion.positions[step, index]
         if self.is_inertial:
             center, turn = body.inertial if self.link < 0 else body.joints[self.link].inertial
-            position = center + Rotation.from_quat(turn).apply(position)
-        return motion.positions[step, index] + Rotation.from_quat(motion.orientations[step, index]).apply(position)
+            position = center + rotate(normalize(turn), position)
+        return motion.positions[step, index] + rotate(motion.orientations[step, index], position)
 
 
 @dataclasses.dataclass(frozen=True)

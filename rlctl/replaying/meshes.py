@@ -7,9 +7,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rlctl.replaying.mjcf import Mesh
+from rlctl.replaying.rotations import from_axis, rotate
 
 Array = NDArray[np.float64]
 
@@ -80,7 +80,7 @@ def _find_axes(root: ElementTree.Element) -> Array:
     unit, up = root.find("{*}asset/{*}unit"), root.findtext("{*}asset/{*}up_axis", "Y_UP")
     matrix = np.eye(4)
     if up == "Y_UP":
-        matrix[:3, :3] = Rotation.from_euler("x", np.pi / 2).as_matrix()
+        matrix[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
     matrix[:3] *= float(unit.get("meter", 1.0)) if unit is not None else 1.0
     return matrix
 
@@ -110,8 +110,7 @@ def _make_matrix(kind: str, numbers: Array) -> Array:
     elif kind == "scale":
         matrix[:3, :3] = np.diag(numbers)
     else:
-        axis = numbers[:3] / np.linalg.norm(numbers[:3])
-        matrix[:3, :3] = Rotation.from_rotvec(np.radians(numbers[3]) * axis).as_matrix()
+        matrix[:3, :3] = rotate(from_axis(numbers[:3], np.radians(numbers[3])), np.eye(3)).T
     return matrix
 
 

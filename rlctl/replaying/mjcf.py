@@ -7,12 +7,12 @@ PyBullet 3.2 does: `axisangle` is always in radians; `euler`, `zaxis` and `xyaxe
 
 import dataclasses
 import enum
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 
 class ShapeKind(enum.Enum):
@@ -127,7 +127,7 @@ def _orientation(geom: Mapping[str, str]) -> tuple[float, ...]:
         return (*map(float, vector), float(w))
     if turn := _numbers(geom, "axisangle"):
         axis = np.array(turn[:3]) / np.linalg.norm(turn[:3])
-        return tuple(Rotation.from_rotvec(turn[3] * axis).as_quat().tolist())
+        return (*(math.sin(turn[3] / 2) * axis).tolist(), math.cos(turn[3] / 2))
     return (0.0, 0.0, 0.0, 1.0)
 
 
@@ -136,8 +136,10 @@ def _between(start: np.ndarray, end: np.ndarray) -> tuple[tuple[float, ...], tup
     along = end - start
     length = float(np.linalg.norm(along))
     direction = along / length if length else np.array([0.0, 0.0, 1.0])
-    turn, _ = Rotation.align_vectors([direction], [[0.0, 0.0, 1.0]])  # the shortest one
-    return tuple(((start + end) / 2).tolist()), tuple(turn.as_quat().tolist()), length
+    x, y, z = direction.tolist()
+    # The shortest turn from the z axis; half a turn about any horizontal axis if the direction is opposite.
+    turn = np.array([-y, x, 0.0, 1.0 + z]) if z > -1.0 + 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
+    return tuple(((start + end) / 2).tolist()), tuple((turn / np.linalg.norm(turn)).tolist()), length
 
 
 def connect_grid(rows: int, columns: int) -> np.ndarray:

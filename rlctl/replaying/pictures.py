@@ -1,4 +1,4 @@
-"""Shows episodes: films (`.mp4` or `.gif`) and pictures without a display, and windows.
+"""Shows episodes as films (`.mp4` or `.gif`) and pictures, without a display.
 
 A task is drawn by PyBullet's software renderer, any other environment by its own `render()`, or, where it has none, its
 PyBullet world by that renderer.
@@ -7,8 +7,6 @@ PyBullet world by that renderer.
 import contextlib
 import dataclasses
 import fractions
-import os
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,11 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import ArtifactError, TaskError, UsageError, explain_missing_package
+from rlctl.errors import ArtifactError, UsageError, explain_missing_package
 from rlctl.replaying.bullet_camera import Picture
-from rlctl.replaying.recorder import Choose, Rollout, Watch, find_dt, play_episode, recorded_actions
+from rlctl.replaying.recorder import (
+    DEFAULT_DT,
+    Choose,
+    Rollout,
+    Watch,
+    find_dt,
+    join_watches,
+    play_episode,
+    recorded_actions,
+)
 from rlctl.replaying.report import FilmReport
 from rlctl.replaying.reproduce import find_difference
 from rlctl.replaying.scene import Env, encode_jpeg
@@ -31,7 +37,6 @@ from rlctl.task import Sim
 
 _SIZE = {".mp4": (640, 480), ".gif": (400, 300)}  # [pixels], of a film
 _RATE = {".mp4": 30.0, ".gif": 20.0}  # [1/s], at most
-_DT = 1 / 30  # [s] per step, if an environment gives no time
 _PAUSE_S = 0.5  # [s] at the end of each episode
 _STRIP_SIZE = (240, 180)  # [pixels], of a report's pictures
 
@@ -87,16 +92,24 @@ def check_file(path: Path) -> None:
 
 
 def film_episodes(
-    path: Path, env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose], *, policy: str
+    path: Path,
+    env: Env,
+    spec: EnvSpec,
+    seeds: Sequence[int],
+    begin: Callable[[int], Choose],
+    *,
+    policy: str,
+    watch: Watch = lambda step: None,
 ) -> tuple[list[Rollout], FilmReport]:
-    """Play an episode per seed and write one film of all of them, atomically."""
+    """Play an episode per seed and write one film of all of them, atomically; `watch` is called after every step."""
     rollouts: list[Rollout] = []
     reports: list[FilmReport] = []
 
     def write(part: Path) -> None:
         film = _Film(env, part)
+        both = join_watches(watch, film.watch)
         for seed in seeds:
-            rollouts.append(play_episode(env, spec, seed, begin(seed), policy=policy, watch=film.watch))
+            rollouts.append(play_episode(env, spec, seed, begin(seed), policy=policy, watch=both))
             film.pause()
         film.writer.close()
         reports.append(film.report(path))
@@ -108,7 +121,7 @@ def film_episodes(
 class _Film:
     def __init__(self, env: Env, path: Path) -> None:
         self._view = look_at(env, *_SIZE[path.suffix])
-        dt = find_dt(env) or _DT
+        dt = find_dt(env) or DEFAULT_DT
         self._every = max(1, round(1 / (_RATE[path.suffix] * dt)))
         self._rate = 1 / (dt * self._every)
         self._count, self._seconds = 0, 0.0
@@ -186,36 +199,3 @@ class _Gif:
     def close(self) -> None:
         first, *rest = self._pictures
         first.save(self._path, "GIF", save_all=True, append_images=rest, duration=self._duration, loop=0)
-
-
-def open_window(spec: EnvSpec) -> Env:
-    """Build an environment with a window; raises `UsageError` without a display."""
-    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if sys.platform == "linux" and not display and not registry.is_task(spec.constructor()):
-        raise UsageError("--gui: there is no display, DISPLAY is not set; leave out --gui to write a recording instead")
-    return spec.make("human")
-
-
-def show_episodes(env: Env, spec: EnvSpec, seeds: Sequence[int], begin: Callable[[int], Choose]) -> list[Rollout]:
-    """Play an episode per seed in real time; closing PyBullet's window ends the replay without an error."""
-    shown: list[Rollout] = []
-    for seed in seeds:
-        try:
-            shown.append(play_episode(env, spec, seed, begin(seed), watch=_wait(find_dt(env) or _DT)))
-        except TaskError as error:
-            if "Not connected to physics server" not in str(error.__cause__):
-                raise
-            break
-    return shown
-
-
-def _wait(dt: float) -> Watch:
-    """Return a function that waits after each step of `dt` [s], so that the episode plays in real time."""
-    start: list[float] = []
-
-    def wait(step: int) -> None:
-        if step == 0:
-            start.append(time.monotonic())
-        time.sleep(max(0.0, start[0] + step * dt - time.monotonic()))
-
-    return wait

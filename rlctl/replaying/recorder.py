@@ -29,6 +29,7 @@ from rlctl.version import collect_versions
 Choose = Callable[[Any, int], Any]
 """Returns the action for an observation and the number of steps so far; None ends the episode."""
 Watch = Callable[[int], None]  # called with the number of a step after it; 0 is the reset
+DEFAULT_DT = 1 / 30  # [s] per step, if an environment gives no time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,13 +167,13 @@ def play_episode(
     terminated = truncated = False
     with _locate_errors(spec.task, seed, 0):
         observation, info = env.reset(seed=seed)
-        first, drawn = _copy_observation(observation, space), _find_events(info, about)
+        first, drawn = copy_observation(observation, space), _find_events(info, about)
         read(0)
     watch(0)
     while not (terminated or truncated) and (action := choose(observation, len(steps))) is not None:
         with _locate_errors(spec.task, seed, len(steps) + 1):
             observation, reward, terminated, truncated, info = env.step(cast(action))
-            steps.append(_read_step(action, _copy_observation(observation, space), float(reward), info, about))
+            steps.append(_read_step(action, copy_observation(observation, space), float(reward), info, about))
             read(len(steps))
         watch(len(steps))
     end = "terminated" if terminated else "truncated: time limit" if truncated else ""
@@ -233,7 +234,7 @@ def _log_steps(steps: Sequence[_Step], end: str) -> Iterator[LogEntry]:
         if bool(step.success) != held:
             held = not held
             yield LogEntry(number, "goal reached") if held else LogEntry(number, "goal lost", "WARN")
-    yield LogEntry(len(steps), end) if end else LogEntry(len(steps), "no more recorded actions", "WARN")
+    yield LogEntry(len(steps), end) if end else LogEntry(len(steps), "no more actions", "WARN")
     if end and (success := steps[-1].success) is not None:
         yield LogEntry(len(steps), "success") if success else LogEntry(len(steps), "no success", "WARN")
 
@@ -242,6 +243,16 @@ def _log_events(step: int, events: Mapping[str, Mapping[str, float]]) -> Iterato
     for name, drawn in events.items():
         values = ", ".join(f"{key} {value:.4g}" for key, value in drawn.items())
         yield LogEntry(step, f"event {name}: {values}", "DEBUG")
+
+
+def join_watches(*watches: Watch) -> Watch:
+    """Return a function that calls several."""
+
+    def watch(step: int) -> None:
+        for call in watches:
+            call(step)
+
+    return watch
 
 
 def find_dt(env: Env) -> float | None:
@@ -278,7 +289,7 @@ def _locate_errors(task: str, seed: int, step: int) -> Iterator[None]:
         raise TaskError(f"task {task!r}: {what}\n{where}", details=details) from error
 
 
-def _copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
+def copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
     """Copy an observation in the dtype of its space, as recorded episodes have it; some environments reuse theirs.
 
     A Dict inside a Dict becomes keys such as `achieved_goal/kettle`.
@@ -286,7 +297,7 @@ def _copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
     if isinstance(space, spaces.Dict):
         copied: dict[str, Any] = {}
         for key, part in space.spaces.items():
-            parts = dict_spaces.split(_copy_observation(observation[key], part))
+            parts = dict_spaces.split(copy_observation(observation[key], part))
             copied |= {f"{key}/{name}" if name else key: value for name, value in parts.items()}
         return copied
     value = np.array(observation, dtype=space.dtype)
