@@ -138,9 +138,7 @@ def test_an_environment_that_magnifies_rounding_is_verified_by_its_actions(small
 
 @pytest.mark.parametrize("parameters", [{"noise": 0.1}, {"keeps": True}])
 @pytest.mark.parametrize("algo", ["ppo", "recurrent_ppo"])
-def test_an_environment_that_does_not_repeat_its_episodes_is_verified_by_actions(
-    algo, parameters, small, train, write
-):
+def test_an_environment_that_does_not_repeat_its_episodes_is_verified_by_actions(algo, parameters, small, train, write):
     spec = small(**parameters)
     report = export(write(train(algo, spec, steps=0), algo, spec))
     assert report.path.is_file()
