@@ -112,8 +112,10 @@ def _suggest_hindsight(recipe: Recipe, env: EnvInfo, rewards: list[NDArray[np.fl
 def _build_learner(
     start: Start, specs: list[EnvSpec], workers: Workers, make_workers: Callable[..., Workers], display: Display
 ) -> Learner:
+    import torch
+
     from rlctl.policy.torch_policy import pin_threads
-    from rlctl.training.algorithms import build_model
+    from rlctl.training.algorithms import build_on_device
     from rlctl.training.learner import Curriculum, Learner, check_stages
     from rlctl.training.off_policy import OffPolicyRollouts
     from rlctl.training.on_policy import OnPolicyRollouts
@@ -131,7 +133,9 @@ def _build_learner(
     next_eval = 0 if start.is_trained else recipe.eval.every_steps or recipe.total_timesteps
     progress = start.checkpoint.state.progress if start.checkpoint else status.Progress(next_eval)
     env = WorkerVecEnv(workers, recipe.seed)
-    model = build_model(recipe, env, start.request.device)
+    model, line = build_on_device(recipe, env, start.request.device, cuda_available=torch.cuda.is_available())
+    if line is not None:
+        display.message(line)
     rollouts = (OnPolicyRollouts if recipe.algo in ON_POLICY else OffPolicyRollouts)(model, env, recipe, progress)
     rollouts.is_trained = start.is_trained
     if start.source is not None and start.checkpoint is None:
@@ -171,7 +175,7 @@ def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Displa
         display.message(checkpoints.restore(start.checkpoint, start.inexact))
     for warning in checkpoints.cut_back(start.step) if start.run else ():
         display.message(warning)
-    status.write_start(run, start)
+    status.write_start(run, start, str(learner.model.device))
     return checkpoints
 
 
