@@ -9,14 +9,23 @@ from typing import Annotated, Any
 
 from typer.core import TyperCommand
 
-from rlctl.cli.arguments import choose_checkpoint, command, parse_changes
+from rlctl.cli.arguments import choose_checkpoint, command, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates
 from rlctl.options import Cluster, Json, On, Option, Pretrained, Settings, Yes
 from rlctl.replaying.request import ReplayRequest
 
 
-@command
+@command_in_panels(
+    {
+        "Options": ["episodes", "seed", "checkpoint", "pretrained", "baseline", "task", "settings", "stage"],
+        "Gates": ["min_success", "min_success_lower", "min_return"],
+        "Robustness": ["vary", "push", "sim", "yes"],
+        "How": ["deterministic", "limits", "env_timeout_s"],
+        "Where": ["n_envs", "on", "cluster"],
+        "Output": ["record", "json"],
+    }
+)
 def evaluate(
     options: EvalOptions,
     pretrained: Pretrained = False,
