@@ -113,7 +113,7 @@ class Bounds:
         bounds_position = self.bounds_position and not self.is_value and reference is not None
         if self.speed is None and self.change is None and not bounds_position:
             return True
-        x = command - reference if self.is_value else command
+        x = command - reference if self.is_value and reference is not None else command
         least, most = -self._slack_speed, self._slack_speed
         if self._slack_change is not None:
             slowest, fastest = before - self._slack_change, before + self._slack_change
