@@ -16,7 +16,16 @@ from rlctl.options import Cluster, Json, On, Option, Pretrained, Settings, Yes
 from rlctl.replaying.request import ReplayRequest
 
 
-@command
+@command_in_panels(
+    {
+        "Options": ["episodes", "seed", "checkpoint", "pretrained", "baseline", "task", "settings", "stage"],
+        "Gates": ["min_success", "min_success_lower", "min_return"],
+        "Robustness": ["vary", "push", "sim", "yes"],
+        "How": ["deterministic", "limits", "env_timeout_s"],
+        "Where": ["n_envs", "on", "cluster"],
+        "Output": ["record", "json"],
+    }
+)
 def evaluate(
     options: EvalOptions,
     pretrained: Pretrained = False,
