@@ -1,17 +1,19 @@
 """Press: an arm presses on a table with a given force. Shows a force-torque sensor, contact forces and a camera."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from rlctl.task import Attachment, Box, Sim, Task, rewards
 
+FOLDER = Path(__file__).parent
 HAND = "lbr_iiwa_link_7"
 WRIST = "lbr_iiwa_joint_7"
 DOWN = (0.0, 1.0, 0.0, 0.0)  # quaternion: the hand's z axis points to the floor
 PLACE = np.array([0.55, 0.0])  # [m], x and y
-TABLE = 0.2  # [m], height of its top
-PAD = 0.05  # [m], edge of the cube under the hand
+TABLE = 0.2  # [m], height of its top, as in its file
+PAD = 0.05  # [m], edge of the cube under the hand, as in its file
 FLANGE = 0.05  # [m], from the hand's frame to the end of its shape, with a small gap
 STEP = 0.001  # [m], motion of the hand's target per control step at action 1
 LIMIT = 60.0  # [N], more would break the table
@@ -33,16 +35,16 @@ class Press(Task):
     reward_weights = {"gap": -5.0, "pressing": 1.0, "excess_force": -0.1, "penetration": -10.0, "action": -0.01}
 
     def build(self, sim: Sim) -> None:
-        self.table = sim.load("table", "cube.urdf", position=(0.9, 0.0, TABLE - 0.5), fixed=True)
-        self.arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+        self.table = sim.load("table", FOLDER / "table.urdf", position=(0.9, 0.0, 0.0), fixed=True)
+        self.arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
         self.arm.set_joints(np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0]))
         self.start = TABLE + PAD + FLANGE + 0.02  # [m], of the hand: 2 cm above the table
         for _ in range(5):  # each search starts where the last one ended
             self.arm.set_joints(self.solve(self.start))
         self.home = self.arm.joint_positions.copy()
-        # The pad is a body of its own that is held under the hand. The inertia in its file is far too large.
+        # The pad is a body of its own that is held under the hand.
         height = self.arm.link_position(HAND)[2] - FLANGE - PAD / 2
-        self.pad = sim.load("pad", "cube_small.urdf", position=(*PLACE, height), inertia="shape")
+        self.pad = sim.load("pad", FOLDER / "pad.urdf", position=(*PLACE, height))
         under = Attachment(self.arm, HAND, (0.0, 0.0, FLANGE + PAD / 2), DOWN)
         sim.connect_fixed(under, Attachment(self.pad, self.pad.base_name))
         self.arm.add_force_sensor(WRIST)

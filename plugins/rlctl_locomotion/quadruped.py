@@ -79,7 +79,7 @@ class Quadruped(Legged):
         if not 0 <= self.slowest <= self.fastest:
             raise TaskError(f"slowest {self.slowest:g}, fastest {self.fastest:g} m/s: give 0 <= slowest <= fastest")
         self.build_ground(sim)
-        self.body = sim.load("robot", "a1/a1.urdf", position=(0.0, 0.0, HEIGHT))
+        self.body = sim.load("robot", "a1.urdf", position=(0.0, 0.0, HEIGHT))
         self.body.set_friction(1.0)  # times the ground's
         self.joints = self.body.find_joints(JOINTS)  # of all, in the model's order
         self.low, self.high = self.body.joint_low[self.joints], self.body.joint_high[self.joints]

@@ -52,7 +52,7 @@ class Reach(Task):
         """Load the floor and the arm."""
         check_goals(np.array(self.goal_low), np.array(self.goal_high))
         sim.load("plane", "plane.urdf", fixed=True)
-        self.arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+        self.arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
         self.arm.cap_joint_speed(SPEED_LIMIT.max())  # a blow on the floor would turn joints faster than any motor
         self.max_speed, self.max_torque = MAX_SPEED.tolist(), self.arm.joint_max_force.tolist()
 

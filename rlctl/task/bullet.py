@@ -8,18 +8,17 @@ import re
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, UsageError
+from rlctl.errors import UsageError
 
-_INSTALL = (
-    "pip install setuptools && pip install --no-build-isolation" if sys.version_info >= (3, 12) else "pip install"
-)
+_NO_WHEELS = sys.version_info >= (3, 12)
+INSTALL_PYBULLET = f"pip install {'setuptools && pip install --no-build-isolation ' if _NO_WHEELS else ''}pybullet"
+"""The command that installs PyBullet on this version of Python."""
 
 
 class _LazyModule:
@@ -47,7 +46,7 @@ def _import_silently(name: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name != name:
             raise
-        raise UsageError(f"tasks of rlctl need PyBullet, which is not installed: {_INSTALL} pybullet") from None
+        raise UsageError(f"tasks of rlctl need PyBullet, which is not installed: {INSTALL_PYBULLET}") from None
     finally:
         os.dup2(stderr, 2)
         os.close(stderr)
@@ -56,19 +55,6 @@ def _import_silently(name: str) -> ModuleType:
 
 pybullet: Any = _LazyModule("pybullet")
 pybullet_data: Any = _LazyModule("pybullet_data")
-
-
-def find_model_file(file: str | Path) -> Path:
-    """Return the path of a model file, which may be a name in `pybullet_data`; raises `TaskError` if it is missing."""
-    path = Path(file)
-    if not path.is_absolute() and not path.is_file():
-        path = Path(pybullet_data.getDataPath()) / file
-    if not path.is_file():  # PyBullet crashes on a folder
-        raise TaskError(
-            f"model file {str(file)!r} not found: neither under {Path.cwd()} nor in pybullet_data; "
-            f"for a file next to your module: Path(__file__).with_name({path.name!r})"
-        )
-    return path
 
 
 def read_complaint(call: Callable[[], object]) -> str:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, UsageError, check_name
-from rlctl.task.bullet import find_model_file
 from rlctl.task.constraints import Attachment, Joined
+from rlctl.task.model_files import find_model_file
 from rlctl.task.mujoco_body import WXYZ, MujocoBody, refuse
 
 Array = NDArray[np.float64]

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body
-from rlctl.task.bullet import check_display, draw_world, find_model_file, pybullet, pybullet_data, read_complaint
+from rlctl.task.bullet import check_display, draw_world, pybullet, pybullet_data, read_complaint
 from rlctl.task.constraints import Constraints
+from rlctl.task.model_files import find_model_file
 
 
 @dataclasses.dataclass
@@ -90,7 +91,7 @@ class Sim(Constraints):
         self_collision: bool = False,
         inertia: Literal["file", "shape"] = "file",
     ) -> Body:
-        """Load the body of a URDF, MJCF (`.xml`) or SDF file: a path, or a name in `pybullet_data`.
+        """Load the body of a URDF, MJCF (`.xml`) or SDF file: a path, or a name as of `find_model_file`.
 
         `position` [m] and `orientation` of the base's origin, and `fixed`, are for URDF files; other formats contain
         them. `flags` are PyBullet's URDF_* flags. With `self_collision` links collide, except with their ancestors.

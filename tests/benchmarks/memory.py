@@ -21,12 +21,13 @@ for env in envs:
 print(json.dumps((psutil.Process().memory_full_info().uss - before) / {COUNT}))
 """
 WORLDS = f"""
-import json, psutil, pybullet, pybullet_data
+import json, psutil, pybullet
+from rlctl.task.model_files import MODELS
 def build():
     client = pybullet.connect(pybullet.DIRECT)
-    pybullet.setAdditionalSearchPath(pybullet_data.getDataPath(), physicsClientId=client)
+    pybullet.setAdditionalSearchPath(str(MODELS), physicsClientId=client)
     pybullet.loadURDF("plane.urdf", physicsClientId=client)
-    pybullet.loadURDF("kuka_iiwa/model.urdf", useFixedBase=True, physicsClientId=client)
+    pybullet.loadURDF("kuka_iiwa.urdf", useFixedBase=True, physicsClientId=client)
     pybullet.saveState(physicsClientId=client)
     for _ in range(200):
         pybullet.stepSimulation(physicsClientId=client)

@@ -16,7 +16,8 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.policy.players.player import Exploration
 from rlctl.rollout.messages import Play
 from rlctl.rollout.workers import Workers, available_cores
-from rlctl.task.bullet import pybullet, pybullet_data
+from rlctl.task.bullet import pybullet
+from rlctl.task.model_files import MODELS
 from tests.benchmarks.acting import make_policy
 from tests.benchmarks.row import Row, side_by_side
 
@@ -144,10 +145,10 @@ def _time_reset(env: Any, seed: int) -> float:
 def _time_reload(client: int) -> float:
     began = time.perf_counter()
     pybullet.resetSimulation(physicsClientId=client)
-    pybullet.setAdditionalSearchPath(pybullet_data.getDataPath(), physicsClientId=client)
+    pybullet.setAdditionalSearchPath(str(MODELS), physicsClientId=client)
     pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
     pybullet.loadURDF("plane.urdf", physicsClientId=client)
-    pybullet.loadURDF("kuka_iiwa/model.urdf", useFixedBase=True, physicsClientId=client)
+    pybullet.loadURDF("kuka_iiwa.urdf", useFixedBase=True, physicsClientId=client)
     return time.perf_counter() - began
 
 

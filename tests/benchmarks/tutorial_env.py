@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 import rlctl
 from rlctl.task.bullet import pybullet as p
-from rlctl.task.bullet import pybullet_data
+from rlctl.task.model_files import MODELS
 from rlctl_manipulation import reach
 
 JOINTS, HAND = 7, 6  # number of joints; index of the hand's link
@@ -32,7 +32,7 @@ class TutorialReach(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
         p.resetSimulation(physicsClientId=self.client)
-        p.setAdditionalSearchPath(pybullet_data.getDataPath(), physicsClientId=self.client)
+        p.setAdditionalSearchPath(str(MODELS), physicsClientId=self.client)
         p.setGravity(0, 0, -9.81, physicsClientId=self.client)
         p.setTimeStep(self.task.control_dt / self.task.substeps, physicsClientId=self.client)
         # Tutorials leave it at 50; the same physics makes the comparison one of how it is written.
@@ -40,7 +40,7 @@ class TutorialReach(gymnasium.Env[np.ndarray, np.ndarray]):
         p.setPhysicsEngineParameter(numSolverIterations=iterations, physicsClientId=self.client)
         p.loadURDF("plane.urdf", physicsClientId=self.client)
         inertia = p.URDF_USE_INERTIA_FROM_FILE  # as the shipped task; tutorials leave it out
-        self.arm = p.loadURDF("kuka_iiwa/model.urdf", useFixedBase=True, flags=inertia, physicsClientId=self.client)
+        self.arm = p.loadURDF("kuka_iiwa.urdf", useFixedBase=True, flags=inertia, physicsClientId=self.client)
         start = reach.HOME + self.np_random.uniform(-reach.HOME_NOISE, reach.HOME_NOISE, JOINTS)
         p.changeDynamics(self.arm, -1, maxJointVelocity=reach.SPEED_LIMIT.max(), physicsClientId=self.client)
         for joint in range(JOINTS):

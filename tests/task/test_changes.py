@@ -31,7 +31,7 @@ class Arm(Task):
 
     def build(self, sim: Sim) -> None:
         sim.load("plane", "plane.urdf", fixed=True)
-        self.arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+        self.arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
         self.cube = sim.load("cube", "cube_small.urdf", position=(1.0, 1.0, 0.5), inertia="shape")
 
     def reset(self, rng):

@@ -83,7 +83,7 @@ RANGE = "Write [low, high], a number, or {from: [low, high], to: [low, high]}."
         ),
         (
             {"damping": {"joints": ["joint_1"]}},
-            "events.damping: model.urdf has no joint 'joint_1'. Did you mean 'lbr_iiwa_joint_1'? It has: "
+            "events.damping: kuka_iiwa.urdf has no joint 'joint_1'. Did you mean 'lbr_iiwa_joint_1'? It has: "
             + ", ".join(f"lbr_iiwa_joint_{i}" for i in range(1, 8))
             + ".",
         ),

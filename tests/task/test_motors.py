@@ -137,7 +137,7 @@ def test_a_value_too_few_or_too_many(sim, tmp_path):
 
 
 def test_inverse_kinematics(sim):
-    arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+    arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
     home = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])
     arm.set_joints(home)
     wanted = np.array([0.5, 0.2, 0.5])
@@ -152,7 +152,7 @@ def test_inverse_kinematics(sim):
 
 def _solve_anew(home, wanted, down):
     sim = Sim(control_dt=1 / 60, substeps=1)
-    arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+    arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
     for start in (home + 0.3, home):  # what was solved before changes nothing
         arm.set_joints(start)
         solution = arm.solve_inverse_kinematics("lbr_iiwa_link_7", wanted, down)

@@ -51,7 +51,7 @@ def test_an_episode_starts_as_in_pybullet_and_repeats_bit_for_bit(task):
 @pytest.fixture
 def weightless_arm():
     sim = MujocoSim(control_dt=1 / 60, substeps=4, solref=0.02)
-    arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+    arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
     sim.model.opt.gravity[:] = 0.0
     sim.velocity_cap[:] = np.inf
     return sim, arm

@@ -26,7 +26,7 @@ def test_a_model_file_that_is_not_there(sim):
         sim.load("robot", "robot/missing.urdf")
     assert str(caught.value).startswith("model file 'robot/missing.urdf' not found: neither under /")
     assert str(caught.value).endswith(
-        " nor in pybullet_data; for a file next to your module: Path(__file__).with_name('missing.urdf')"
+        ", nor in pybullet_data; for a file next to your module: Path(__file__).with_name('missing.urdf')"
     )
 
 
@@ -62,11 +62,11 @@ def test_two_bodies_of_one_name(sim):
 
 
 def test_names_of_links_and_bodies(sim):
-    arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+    arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
     with pytest.raises(TaskError) as caught:
         arm.link_position("lbr_iiwa_lnk_7")
     assert str(caught.value).startswith(
-        "model.urdf has no link 'lbr_iiwa_lnk_7'. Did you mean 'lbr_iiwa_link_7'? It has: lbr_iiwa_link_1, "
+        "kuka_iiwa.urdf has no link 'lbr_iiwa_lnk_7'. Did you mean 'lbr_iiwa_link_7'? It has: lbr_iiwa_link_1, "
     )
     with pytest.raises(TaskError, match=r"^no body 'amr'\. Did you mean 'arm'\? Loaded: arm\.$"):
         sim.body("amr")
@@ -88,7 +88,7 @@ def test_a_link_called_base_is_not_the_base(sim, tmp_path):
 
 
 def test_joints_are_read_where_they_were_set(sim):
-    arm = sim.load("arm", "kuka_iiwa/model.urdf", fixed=True)
+    arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
     angles = np.linspace(-0.5, 0.5, 7)
     arm.set_joints(angles)
     np.testing.assert_allclose(arm.joint_positions, angles)
