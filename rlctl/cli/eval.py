@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from typer.core import TyperCommand
 
-from rlctl.cli.arguments import choose_checkpoint, command, command_in_panels, parse_changes
+from rlctl.cli.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates
 from rlctl.options import Cluster, Json, On, Option, Pretrained, Settings, Yes
