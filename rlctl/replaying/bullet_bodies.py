@@ -37,6 +37,8 @@ class BulletJoint:
     kind: int  # JOINT_REVOLUTE, JOINT_FIXED, ...
     parent: int  # index of the parent link; -1 is the base
     limits: tuple[float, float]  # [rad or m]; the lower one is above the upper one if there are none
+    max_force: float  # in the model [N m or N]
+    max_speed: float  # in the model [rad/s or m/s]
     axis: tuple[float, ...]  # in the inertial frame of the link
     pivot: tuple[float, ...]  # position in the inertial frame of the parent [m]
     turn: tuple[float, ...]  # quaternion that turns the inertial frame of the parent into that of the link
@@ -58,6 +60,7 @@ class BulletBody:
     links: list[str]  # unique names, the base first: link `i` of PyBullet is `links[i + 1]`
     joints: list[BulletJoint]  # one per link without the base
     inertial: Pose  # inertial frame of the base in its link frame
+    mass: float  # of all links [kg]
     is_fixed: bool  # whether the base is fixed to the world
     is_soft: bool
     signature: tuple[Any, ...]  # of `read_signature`
@@ -126,6 +129,8 @@ def read_body(client: int, body: int) -> BulletBody:
             kind=info[2],
             parent=info[16],
             limits=info[8:10],
+            max_force=info[10],
+            max_speed=info[11],
             axis=info[13],
             pivot=info[14],
             turn=info[15],
@@ -140,6 +145,7 @@ def read_body(client: int, body: int) -> BulletBody:
         links=make_unique(names),
         joints=joints,
         inertial=dynamics[0][_INERTIAL],
+        mass=sum(values[0] for values in dynamics),
         is_fixed=dynamics[0][0] == 0.0,
         is_soft=dynamics[0][_BODY_TYPE] == _SOFT,
         signature=signature,
@@ -153,6 +159,12 @@ def read_bodies(clients: Iterable[int] | None = None) -> list[BulletBody]:
     return [read_body(client, body) for client in chosen for body in list_body_ids(client)]
 
 
+def name_bodies(bodies: Sequence[BulletBody]) -> list[str]:
+    """Return a unique name per body: that of the model, with the base where bodies of a model have different ones."""
+    bases = {name: {body.links[0] for body in bodies if body.name == name} for name in {body.name for body in bodies}}
+    return make_unique([body.name if len(bases[body.name]) == 1 else f"{body.name} {body.links[0]}" for body in bodies])
+
+
 def make_unique(names: Sequence[str]) -> list[str]:
     """Return the names; the second `cube` becomes `cube (2)`."""
     unique: list[str] = []
@@ -160,6 +172,16 @@ def make_unique(names: Sequence[str]) -> list[str]:
         numbered = (f"{name} ({number})" for number in itertools.count(2))
         unique.append(name if name not in unique else next(other for other in numbered if other not in unique))
     return unique
+
+
+def read_pose(body: BulletBody, link: int) -> Pose:
+    """Return the pose of the inertial frame of `links[link]` in the world.
+
+    That of a link which is not the base is from the beginning of the last physics step.
+    """
+    if link == 0:
+        return pybullet.getBasePositionAndOrientation(body.id, physicsClientId=body.client)
+    return pybullet.getLinkState(body.id, link - 1, physicsClientId=body.client)[:2]
 
 
 def find_bounds(bodies: Iterable[BulletBody], points: Sequence[Array] = ()) -> tuple[Array, Array]:

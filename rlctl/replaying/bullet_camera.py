@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.replaying.bullet_bodies import BulletBody, find_bounds, list_body_ids, read_body
+from rlctl.replaying.bullet_bodies import BulletBody, find_bounds, list_body_ids, read_body, read_pose
 from rlctl.replaying.bullet_log import BulletLog
-from rlctl.task.bullet import draw_world, pybullet
+from rlctl.task.bullet import draw_world
 
 Picture = NDArray[np.uint8]
 
@@ -47,12 +47,6 @@ class BulletCamera:
         """Return a picture of the present state, shape (height, width, 3)."""
         if self._followed is not None and self._followed[0].id in list_body_ids(self._client):
             # The height is constant: a gait would shake the film.
-            self._target[:2] = self._find_trunk()[:2]
+            self._target[:2] = read_pose(*self._followed)[0][:2]
         eye, target = (self._target + self._offset).tolist(), self._target.tolist()
         return draw_world(self._client, *self._size, eye=eye, target=target, field_of_view=_FIELD_OF_VIEW)
-
-    def _find_trunk(self) -> tuple[float, ...]:
-        body, link = self._followed  # type: ignore[misc]
-        if link == 0:
-            return pybullet.getBasePositionAndOrientation(body.id, physicsClientId=self._client)[0]
-        return pybullet.getLinkState(body.id, link - 1, physicsClientId=self._client)[0]

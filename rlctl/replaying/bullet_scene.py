@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.bullet_worlds import MOST_CLIENTS
-from rlctl.replaying.bullet_bodies import BulletBody, list_body_ids, make_unique, read_body, read_visuals
+from rlctl.replaying.bullet_bodies import list_body_ids, name_bodies, read_body, read_visuals
 from rlctl.replaying.bullet_log import BulletLog
 from rlctl.replaying.bullet_track import Key, Track
 from rlctl.replaying.rotations import normalize, rotate
@@ -172,7 +172,7 @@ class WorldsReader:
         for number, client in enumerate(clients):
             world = f"{WORLD} {number + 1}" if number else WORLD
             tracks = [track for track in self._tracks if track.body.client == client]
-            for track, name in zip(tracks, _name_bodies([track.body for track in tracks]), strict=True):
+            for track, name in zip(tracks, name_bodies([track.body for track in tracks]), strict=True):
                 motions[track] = track.describe_motion(name, world, len(self._lines))
             for kind, history in (("constraints", self._constraints), ("debug lines", self._lines)):
                 chosen = [[chain for chain in chains if chain.client == client] for chains in history]
@@ -182,9 +182,3 @@ class WorldsReader:
                         for step, chains in enumerate(chosen)
                     ]
         return Scene(list(motions.values()), lines=lines)
-
-
-def _name_bodies(bodies: Sequence[BulletBody]) -> list[str]:
-    """Return a unique name per body: that of the model, with the base where bodies of a model have different ones."""
-    bases = {name: {body.links[0] for body in bodies if body.name == name} for name in {body.name for body in bodies}}
-    return make_unique([body.name if len(bases[body.name]) == 1 else f"{body.name} {body.links[0]}" for body in bodies])

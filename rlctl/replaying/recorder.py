@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -17,8 +16,8 @@ from rlctl.environments import dict_spaces, registry
 from rlctl.environments.info import EnvInfo, describe, find_mujoco
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
-from rlctl.replaying.bullet_log import BulletLog, log_calls
 from rlctl.replaying.bullet_scene import TaskReader, WorldsReader
+from rlctl.replaying.drawable import DrawableEnv
 from rlctl.replaying.mujoco_scene import MujocoReader
 from rlctl.replaying.scene import Camera, Env, Scene, Warn
 from rlctl.rollout.messages import format_hint
@@ -59,38 +58,6 @@ class Rollout:
     def length(self) -> int:
         """Number of steps, T."""
         return len(self.episode.rewards)
-
-
-class DrawableEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """A plain environment whose calls of PyBullet are logged until it is closed."""
-
-    def __init__(self, env: Env, log: BulletLog, stop: contextlib.ExitStack, no_pictures: str = "") -> None:
-        super().__init__(env)
-        self.bullet_log = log
-        self.no_pictures = no_pictures  # why it cannot draw itself; empty if it might
-        self._stop = stop
-
-    def close(self) -> None:
-        """Close the environment."""
-        with self._stop:
-            super().close()
-
-
-def make_drawable(spec: EnvSpec) -> Env:
-    """Build an environment whose episodes can be drawn."""
-    with contextlib.ExitStack() as stack:
-        log = stack.enter_context(log_calls())
-        reason = ""
-        if registry.is_task(spec.constructor()):
-            return spec.make()  # its bodies are drawn; pictures would be slow and show less
-        try:
-            env = spec.make("rgb_array")
-        except RlctlError as error:
-            env = spec.make()  # raises again if drawing was not the reason
-            reason = str(error).splitlines()[0]
-        if not isinstance(env, gymnasium.Env):  # it has the same methods
-            return env
-        return DrawableEnv(env, log, stack.pop_all(), reason)
 
 
 class _SceneReader(Protocol):

@@ -15,12 +15,12 @@ from rlctl.policy.players.named import SERVER
 from rlctl.policy.players.player import Player
 from rlctl.recipe.sources import parse_changes
 from rlctl.replaying.choice import choose_episodes
+from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.recorder import (
     Choose,
     Rollout,
     copy_observation,
     find_dt,
-    make_drawable,
     play_episode,
     recorded_actions,
 )

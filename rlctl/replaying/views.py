@@ -7,7 +7,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, describe_exception
 from rlctl.replaying.bullet_bodies import read_body
 from rlctl.replaying.bullet_camera import BulletCamera, Picture, find_world
-from rlctl.replaying.recorder import DrawableEnv, make_drawable
+from rlctl.replaying.drawable import DrawableEnv, make_drawable
 from rlctl.replaying.scene import Env
 from rlctl.task.env import TaskEnv
 

@@ -1,27 +1,26 @@
-"""Readers of worlds: of a `Task`, of PyBullet clients of a plain environment, of a MuJoCo model."""
+"""Readers of worlds: of bodies in PyBullet, of a MuJoCo model."""
 
 from __future__ import annotations
 
 import contextlib
-import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+import dataclasses
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from rlctl.checking import bullet_worlds
-from rlctl.checking.bullet_worlds import ClientCalls, World, WorldBody, find_clients
+from rlctl.checking.bullet_worlds import MOST_BODIES, WIDEST_RANGE, find_clients
 from rlctl.environments.info import find_mujoco, joint_name
+from rlctl.replaying.bullet_bodies import BulletBody, name_bodies, read_bodies, read_body, read_pose, read_state
 from rlctl.replaying.mujoco_scene import find_trunk_joint
 from rlctl.replaying.scene import Env
 from rlctl.replaying.world import BodySummary, JointSummary, Pose, Touch, WorldReader
 from rlctl.task.body import Body
+from rlctl.task.bullet import pybullet
 from rlctl.task.env import TaskEnv
 
 if TYPE_CHECKING:
     import mujoco
-
-    from rlctl.task.sim import Sim
 
 _NO_LIMIT = 1e5  # [N m, N, rad/s, m/s]; some models write more where a motor has no limit
 
@@ -35,127 +34,95 @@ def make_world_reader(env: Env, other_clients: Collection[int] = ()) -> WorldRea
         return MujocoWorldReader(*simulation)
     inner = env.unwrapped
     if isinstance(inner, TaskEnv):
-        return TaskWorldReader(inner.sim)
+        return BulletWorldReader({name: _read_task_body(body) for name, body in inner.sim.bodies.items()})
     clients = [client for client in find_clients() if client not in other_clients]
-    return ClientWorldReader(clients) if clients else None
+    return BulletWorldReader(_read_clients(clients)) if clients else None
 
 
-class TaskWorldReader:
-    """Reads the world of a `Task` by the methods of its bodies."""
+def _read_task_body(body: Body) -> BulletBody:
+    """Return a body with the mass that it was built with, rather than that of the episode's events."""
+    return dataclasses.replace(read_body(body.client, body.id), mass=body.total_mass())
 
-    def __init__(self, sim: Sim) -> None:
-        self._bodies = list(sim.bodies.values())
-        trunks = {body.name: body.find_trunk() for body in self._bodies if body.total_mass() > 0}
-        self._trunks = {name: trunk for name, trunk in trunks.items() if trunk is not None}
+
+def _read_clients(clients: Sequence[int]) -> dict[str, BulletBody]:
+    """Return at most 20 bodies of each client by unique names, robots and then free bodies first."""
+    named: dict[str, BulletBody] = {}
+    for client in clients:
+        bodies = [body for body in read_bodies([client]) if not body.is_soft]
+        where = f" (client {client})" if len(clients) > 1 else ""
+        pairs = sorted(zip(name_bodies(bodies), bodies, strict=True), key=lambda pair: _rank(pair[1]))
+        named |= {name + where: body for name, body in pairs[:MOST_BODIES]}
+    return named
+
+
+def _rank(body: BulletBody) -> tuple[bool, bool]:
+    return not body.moving, body.is_fixed
+
+
+class BulletWorldReader:
+    """Reads bodies of PyBullet, which have names of the caller's choice."""
+
+    def __init__(self, bodies: Mapping[str, BulletBody]) -> None:
+        self._bodies = bodies
+        self._names = {(body.client, body.id): name for name, body in bodies.items()}
+        links = {name: body.find_trunk() if body.is_fixed else 0 for name, body in bodies.items()}
+        self._trunks = {name: link for name, link in links.items() if link is not None}
 
     def read_bodies(self) -> list[BodySummary]:
         """Return the bodies, and where their joints are."""
         return [
-            BodySummary(
-                body.name, body.total_mass(), len(body.link_names) + 1, self._find_base(body), _list_joints(body)
-            )
-            for body in self._bodies
+            BodySummary(name, body.mass, len(body.links), self._find_base(name), _list_joints(body))
+            for name, body in self._bodies.items()
         ]
 
-    def _find_base(self, body: Body) -> Literal["fixed", "free", "rail"]:
-        if body.name not in self._trunks:
+    def _find_base(self, name: str) -> Literal["fixed", "free", "rail"]:
+        if name not in self._trunks:
             return "fixed"
-        return "rail" if body.fixed else "free"
+        return "rail" if self._bodies[name].is_fixed else "free"
 
     def read_poses(self) -> Mapping[str, Pose]:
         """Return the poses of the bodies that are not fixed, by name."""
-        moving = [body for body in self._bodies if body.name in self._trunks]
-        states = {body.name: body.mass_state(self._trunks[body.name]) for body in moving}
-        return {name: Pose(state.position, state.orientation) for name, state in states.items()}
+        poses = {}
+        for name, link in self._trunks.items():
+            with contextlib.suppress(pybullet.error):  # the environment has removed it, or left its client
+                poses[name] = Pose(*read_pose(self._bodies[name], link))
+        return poses
 
     def read_touches(self) -> Iterator[Touch]:
         """Yield what the links of bodies with joints, or that are not fixed, touch after the last physics step."""
-        for body in self._bodies:
-            if body.joint_names or body.name in self._trunks:
-                for other in self._bodies:
-                    yield from _find_touches(body, other)
+        for client in {body.client for body in self._bodies.values()}:
+            for _, one, two, link, other, _, _, _, distance, force, *_ in _read_points(client):
+                first, second = (self._names.get((client, body)) for body in (one, two))
+                # PyBullet lists points up to 2 cm apart.
+                if first is not None and second is not None and (force > 0 or distance <= 0):
+                    overlap = max(0.0, -float(distance))
+                    yield from self._list_touches(first, link, second, overlap)
+                    yield from self._list_touches(second, other, first, overlap)
+
+    def _list_touches(self, name: str, link: int, other: str, overlap: float) -> Iterator[Touch]:
+        body = self._bodies[name]
+        if body.moving or name in self._trunks:
+            yield Touch(name, body.links[link + 1], other, overlap)
 
 
-def _list_joints(body: Body) -> list[JointSummary]:
-    columns = (body.joint_low, body.joint_high, body.joint_positions, body.joint_max_force, body.joint_max_speed)
-    rows = zip(body.joint_names, body.joint_units, *(column.tolist() for column in columns), strict=True)
-    return [
-        JointSummary(name, unit, _limit(low), _limit(high), start, _strength(force), _strength(speed))
-        for name, unit, low, high, start, force, speed in rows
-    ]
-
-
-def _limit(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _list_joints(body: BulletBody) -> list[JointSummary]:
+    summaries, states = [], read_state(body).joints
+    for index in body.moving:
+        joint = body.joints[index]
+        low, high = joint.limits if 0 <= joint.limits[1] - joint.limits[0] < WIDEST_RANGE else (None, None)
+        unit: Literal["rad", "m"] = "rad" if joint.kind == pybullet.JOINT_REVOLUTE else "m"
+        strengths = _strength(joint.max_force), _strength(joint.max_speed)
+        summaries.append(JointSummary(joint.name, unit, low, high, states[index][0][0], *strengths))
+    return summaries
 
 
 def _strength(value: float) -> float | None:
     return value if 0 < value < _NO_LIMIT else None
 
 
-def _find_touches(body: Body, other: Body) -> Iterator[Touch]:
-    points = body.contacts_with(other)
-    for link, force, distance in zip(*points, strict=True):
-        if force > 0 or distance <= 0:  # PyBullet lists points up to 2 cm apart
-            yield Touch(body.name, link, other.name, max(0.0, -float(distance)))
-
-
-class ClientWorldReader:
-    """Reads the bodies of PyBullet clients."""
-
-    def __init__(self, clients: Iterable[int]) -> None:
-        self._worlds = [bullet_worlds.read_world(client) for client in clients]
-
-    def _name(self, world: World, body: WorldBody) -> str:
-        return body.name if len(self._worlds) == 1 else f"{body.name} (client {world.client})"
-
-    def _list_bodies(self) -> list[tuple[World, WorldBody]]:
-        return [(world, body) for world in self._worlds for body in world.bodies]
-
-    def read_bodies(self) -> list[BodySummary]:
-        """Return the bodies, and where their joints are."""
-        return [self._describe(world, body) for world, body in self._list_bodies()]
-
-    def _describe(self, world: World, body: WorldBody) -> BodySummary:
-        p = ClientCalls(world.client)
-        mass = sum(p.getDynamicsInfo(body.id, link)[0] for link in range(-1, len(body.links) - 1))
-        joints = []
-        for joint in body.joints:
-            low, high = (joint.low, joint.high) if joint.has_limits else (None, None)
-            force, speed = p.getJointInfo(body.id, joint.index)[10:12]
-            start = p.getJointState(body.id, joint.index)[0]
-            unit: Literal["rad", "m"] = "rad" if joint.is_angle else "m"
-            joints.append(JointSummary(joint.name, unit, low, high, start, _strength(force), _strength(speed)))
-        base: Literal["fixed", "free"] = "free" if body.is_free else "fixed"
-        return BodySummary(self._name(world, body), mass, len(body.links), base, joints)
-
-    def read_poses(self) -> Mapping[str, Pose]:
-        """Return the poses of the bodies that are not fixed, by name."""
-        poses = {}
-        for world, body in self._list_bodies():
-            p = ClientCalls(world.client)
-            with contextlib.suppress(p.error):  # the environment has removed it, or left its client
-                if body.is_free:
-                    poses[self._name(world, body)] = Pose(*p.getBasePositionAndOrientation(body.id))
-        return poses
-
-    def read_touches(self) -> Iterator[Touch]:
-        """Yield what the links of bodies with joints, or that are not fixed, touch after the last physics step."""
-        for world in self._worlds:
-            bodies = {body.id: body for body in world.bodies}
-            for _, one, two, link, other, _, _, _, distance, force, *_ in _read_points(world):
-                if one in bodies and two in bodies and (force > 0 or distance <= 0):
-                    for body, part, touched in ((bodies[one], link, bodies[two]), (bodies[two], other, bodies[one])):
-                        if body.joints or body.is_free:
-                            name = body.links[part + 1] or ("base" if part < 0 else f"link {part}")
-                            names = self._name(world, body), name, self._name(world, touched)
-                            yield Touch(*names, max(0.0, -float(distance)))
-
-
-def _read_points(world: World) -> Any:
-    p = ClientCalls(world.client)
-    with contextlib.suppress(p.error):  # the environment has left its client
-        return p.getContactPoints()
+def _read_points(client: int) -> Any:
+    with contextlib.suppress(pybullet.error):  # the environment has left its client
+        return pybullet.getContactPoints(physicsClientId=client)
     return ()
 
 

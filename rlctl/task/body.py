@@ -66,7 +66,6 @@ class Body(Properties):
         movable = [info for info in infos if info[2] in (pybullet.JOINT_REVOLUTE, pybullet.JOINT_PRISMATIC)]
         self.joint_names = [info[1].decode() for info in movable]
         self.joint_indices = [int(info[0]) for info in movable]
-        self.joint_units = ["rad" if info[2] == pybullet.JOINT_REVOLUTE else "m" for info in movable]
         limits = np.array([info[8:10] for info in movable]).reshape(-1, 2)
         # PyBullet gives a joint without limits a lower limit above the upper one.
         self.joint_low, self.joint_high = np.where(limits[:, :1] > limits[:, 1:], (-np.inf, np.inf), limits).T

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.replaying.recorder import Rollout, make_drawable, play_episode
+from rlctl.replaying.drawable import make_drawable
+from rlctl.replaying.recorder import Rollout, play_episode
 from rlctl.run.episode import save_episode
 from rlctl.task.bullet import pybullet
 from rlctl_manipulation.reach import JOINT_STEP

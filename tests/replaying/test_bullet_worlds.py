@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.replaying.bullet_bodies import place_links, read_bodies, read_body, read_state
+from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.mjcf import ShapeKind, read_shapes
 from rlctl.replaying.pictures import take_pictures
-from rlctl.replaying.recorder import Rollout, make_drawable, play_episode
+from rlctl.replaying.recorder import Rollout, play_episode
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.request import ReplayRequest

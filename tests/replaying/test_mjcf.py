@@ -10,8 +10,9 @@ import pytest
 from rlctl.environments.spec import EnvSpec
 from rlctl.replaying.bodies import shape_centers
 from rlctl.replaying.bullet_scene import TaskReader
+from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.mjcf import Shape, ShapeKind, read_shapes
-from rlctl.replaying.recorder import make_drawable, play_episode
+from rlctl.replaying.recorder import play_episode
 from rlctl.replaying.rrd import write_rrd
 from rlctl.replaying.scene import BodyMotion
 from rlctl.task.bullet import pybullet

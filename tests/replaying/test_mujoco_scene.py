@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from rlctl.environments.spec import EnvSpec
+from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.mjcf import ShapeKind
-from rlctl.replaying.recorder import make_drawable, play_episode
+from rlctl.replaying.recorder import play_episode
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.rrd import write_rrd
 from rlctl.run.episode import load_episode, save_episode

@@ -2,6 +2,7 @@
 
 import math
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from rlctl.replaying.world import BodySummary, Contact, JointSummary, Motion, Po
 from rlctl.replaying.world_readers import make_world_reader
 from rlctl.replaying.world_table import list_findings
 from tests.replaying.conftest import ENVS
+
+BULLET_ENVS = Path(__file__).with_name("bullet_envs.py")
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
@@ -172,6 +175,13 @@ def test_a_plain_environment_of_pybullet(write_module):
     assert 45 <= contact.step <= 52
     removed = look(f"{file}:Falling", removed_at=20)
     assert motion(removed, ball.name).lowest > 0.2
+
+
+def test_a_robot_on_rails_in_pybullet():
+    world = look(f"{BULLET_ENVS}:Crawler", file="mjcf/half_cheetah.xml")
+    robot = next(body for body in world.bodies if body.joints)
+    assert (robot.base, robot.joints[0].unit, robot.joints[0].low) == ("rail", "m", None)
+    assert motion(world, robot.name).lowest > 0  # of the torso, not of the frame that the rails begin at
 
 
 def test_mujoco():
