@@ -9,6 +9,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from rlctl.missing_packages import advise
+
 _LONGEST = 400  # [characters] of another library's message
 _MOST_FRAMES = 40  # of a plugin's traceback: an endless recursion has a thousand
 _OURS = Path(__file__).parent
@@ -103,8 +105,11 @@ class Interrupted(RlctlError):
         self.exit_code = 128 + signal_number
 
 
-def describe_exception(error: BaseException) -> str:
-    """Describe any exception in one line of limited length: `RuntimeError: the gripper fell off`."""
+def describe_exception(error: BaseException, where: str = "") -> str:
+    """Describe any exception in one line of limited length: `RuntimeError: the gripper fell off`.
+
+    `where` comes after it, and last what to install for a module that is missing.
+    """
     name = type(error).__name__
     try:
         text = " ".join(str(error).split())
@@ -114,7 +119,7 @@ def describe_exception(error: BaseException) -> str:
         text = f"{text[:_LONGEST]}..."
     # Python decodes file names that are not UTF-8 to surrogates, which cannot be written as UTF-8.
     text = text.encode(errors="backslashreplace").decode()
-    return f"{name}: {text}" if text else name
+    return f"{name}: {text}{where}{advise(error)}" if text else f"{name}{where}"
 
 
 def format_plugin_traceback(error: BaseException) -> str:

@@ -110,7 +110,7 @@ def show_progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
         return
     from rich.progress import Progress
 
-    with Progress(console=err(), transient=True) as progress:
+    with Progress(console=err(), transient=True, redirect_stdout=False) as progress:
         task = progress.add_task(what, total=total)
         yield lambda done: progress.update(task, completed=done)
 
@@ -132,6 +132,15 @@ def print_notes(notes: Iterable[str]) -> None:
     """Print lines to stderr."""
     for note in notes:
         err().print(note, style="dim", soft_wrap=True)  # commands can be copied
+
+
+def show_foreign(text: str) -> None:
+    """Show a line that an environment or a library has printed: dimmed on a terminal, above a progress display."""
+    if sys.stderr.isatty():
+        err().print(text, style="dim", soft_wrap=True)
+    else:
+        sys.stderr.write(f"{text}\n")  # at once: the end of a line that is written later may come after another line
+        sys.stderr.flush()
 
 
 Cells = Sequence["str | Text"]

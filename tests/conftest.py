@@ -39,6 +39,12 @@ def _forked_workers():
     fork_server.close()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _logs_of_sb3(tmp_path_factory):
+    """Collect in one folder what models log that tests train with Stable-Baselines3 alone: a folder each."""
+    os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
+
+
 @pytest.fixture
 def rlctl(tmp_path):
     """Run the command line in a forked process, in `tmp_path`; `path` goes before the installed packages."""

@@ -34,9 +34,12 @@ LAYERS = [
     {"hub"},
     {"environments"},
     {"task"},
+    {"library_output"},
+    {"printed_lines"},
     {"output"},
     {"storage"},
     {"errors", "options", "version"},
+    {"missing_packages"},
 ]
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
 MAY_IMPORT_TORCH = {  # besides training/

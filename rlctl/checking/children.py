@@ -21,7 +21,8 @@ from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finish
 from rlctl.checking.rules import Experiment, NotApplicable, NotJudged, RuleFinding
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.processes.child_process import ChildEndedError, ChildProcess, LineReader, Standstill, anonymous_file
+from rlctl.printed_lines import LineReader, clean
+from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill, anonymous_file
 from rlctl.processes.messages import send
 
 
@@ -97,7 +98,6 @@ def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
 BUILD_TIMEOUT_S = 60.0  # How long importing and building may take, unless a step may take longer
 FIRST_CALLS = 3.0  # So many times longer than others the first reset or step may take: it may compile or load
 IDLE_TIMEOUT_S = 300.0  # outside of the environment: loading libraries [s]
-_PYBULLETS = ("pybullet build time", "argv[")  # printed at import and connection
 
 
 class Child:
@@ -128,7 +128,7 @@ class Child:
         self.standstill = Standstill(lambda: self.progress.read().counter, clock=lambda: read_clock_of(pid))
 
     def _keep(self, line: str, *, counts: bool = False) -> None:
-        if line and not line.startswith(_PYBULLETS):
+        if line := clean(line):
             self.printed += counts
             self.first_line = self.first_line or (line if counts else "")
             self.last_lines.append(line)

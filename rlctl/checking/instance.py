@@ -21,6 +21,7 @@ from rlctl.checking.values import find_leaves, is_task
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError, TaskError
+from rlctl.missing_packages import advise
 from rlctl.version import PACKAGE_FOLDER
 
 _HERE = Path(__file__).parent
@@ -65,7 +66,7 @@ def describe(error: BaseException) -> str:
     where = find_line(error)
     place = f" ({Path(where[0]).name}:{where[1]})" if where else ""
     text = " ".join(str(error).split()) or "no message"
-    return f"{type(error).__name__}: {text}{place}"
+    return f"{type(error).__name__}: {text}{place}{advise(error)}"
 
 
 def find_line(error: BaseException) -> tuple[str, int] | None:

@@ -38,6 +38,7 @@ class Built:
     accepts_options: bool = True
     model: str = ""  # Mass, joints and limits of a model in MuJoCo
     uses_pybullet: bool = False  # Whether a PyBullet client was connected once it was built
+    registered: str = ""  # the ids under which its class is registered with a time limit or arguments, and a command
     waivers: Mapping[str, str] = dataclasses.field(default_factory=dict)  # rule -> reason
     file: str | None = None  # Where its class is written
     line: int | None = None

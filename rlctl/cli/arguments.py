@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlctl import output
+from rlctl.library_output import redirect_stdout
 from rlctl.options import Argument, Option
+from rlctl.printed_lines import collect
 
 if TYPE_CHECKING:
     from rlctl.environments.spec import EnvChanges
@@ -86,7 +88,8 @@ def _make_command(function: Callable[..., None], panels: Panels) -> Callable[...
         values |= {name: not values[name] for name in turned_off}
         for name, (request, fields) in requests.items():
             values[name] = request(**{field: values.pop(field) for field in fields})
-        return function(**values)
+        with collect(), redirect_stdout():
+            return function(**values)
 
     run.__name__, run.__doc__ = function.__name__, function.__doc__
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

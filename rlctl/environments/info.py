@@ -13,7 +13,8 @@ import pydantic
 from gymnasium import spaces
 
 from rlctl.environments.dict_spaces import LARGEST_SPACE, format_space
-from rlctl.errors import ArtifactError, UsageError, short_repr
+from rlctl.errors import ArtifactError, TaskError, UsageError, short_repr
+from rlctl.storage import validation
 from rlctl.task.motors import Joints
 
 if TYPE_CHECKING:
@@ -72,20 +73,22 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
     if isinstance(inner, TaskEnv):
         task, time = inner.task, find_time_feature(env)
         sizes = inner.observation_sizes
-        return EnvInfo(
+        values = {
             **common,
-            observation_sizes=sizes if time is None else time.extend_sizes(sizes),
-            observation_units=dict(task.observation_units),
-            action_meaning=task.action_meaning,
-            control_dt=task.control_dt,
-            reward_weights=inner.reward_weights,
-            events={name: name in inner.events for name in task.events},
-            has_success=inner.has_success,
-            max_steps=inner.max_steps,
-            robot=task.robot,
-            joints=task.describe_joints(),
-        )
-    return EnvInfo(**common, **describe_model(env), max_steps=find_time_limit(env))
+            "observation_sizes": sizes if time is None else time.extend_sizes(sizes),
+            "observation_units": dict(task.observation_units),
+            "action_meaning": task.action_meaning,
+            "control_dt": task.control_dt,
+            "reward_weights": inner.reward_weights,
+            "events": {name: name in inner.events for name in task.events},
+            "has_success": inner.has_success,
+            "max_steps": inner.max_steps,
+            "robot": type(task).robot,
+            "joints": task.describe_joints(),
+        }
+        return validation.build(EnvInfo, values, TaskError, type(task).__name__)
+    values = {**common, **describe_model(env), "max_steps": find_time_limit(env)}
+    return validation.build(EnvInfo, values, TaskError, type(inner).__name__)
 
 
 def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.MjData] | None:

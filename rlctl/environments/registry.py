@@ -4,7 +4,6 @@ A task is written as an installed name (`reach`), `package.module:Class`, `path/
 (`Pendulum-v1`, `package:Env-v0`).
 """
 
-import ast
 import importlib
 import importlib.util
 import inspect
@@ -17,8 +16,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rlctl import errors
-from rlctl.environments import installed
+from rlctl import errors, missing_packages
+from rlctl.environments import installed, suggestions
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError, did_you_mean
 from rlctl.storage import files
 
@@ -40,31 +39,20 @@ def load(task: str) -> Callable[..., Any]:
             append_to_path(os.getcwd())
             import_module(task, package)  # separately, so that an exception is reported as one of the import
         return _load_gymnasium(task)
-    if ":" in task:
+    if ":" in task.rstrip(":"):
         append_to_path(os.getcwd())
         return _load_target(task, task)
-    for file in (Path(os.path.expanduser(task)), Path(f"{task}.py"), Path(f"{task.lower()}.py")):
+    for file in (Path(os.path.expanduser(task.rstrip(":"))), Path(f"{task}.py"), Path(f"{task.lower()}.py")):
         if file.suffix == ".py" and file.is_file():
-            forms = " or ".join(f"{file}:{name}" for name in _list_classes(file)) or f"{file}:CLASS"
+            forms = " or ".join(f"{file}:{name}" for name in suggestions.list_classes(file)) or f"{file}:CLASS"
             raise UsageError(f"no task {task!r} is installed; to name a class in {file}: {forms}")
     if task and Path(task).is_dir():
         forms = f"pip install -e {task} installs a plugin; or name a class: {task}/FILE.py:CLASS"
         raise UsageError(f"{task} is a folder, not a task: {forms}")
     names = [entry.name for entry in installed.list_installed()]
-    listed, close = ", ".join(dict.fromkeys(names)) or "none", did_you_mean(task, names)
-    forms = "Other forms: package.module:Class, path/to/file.py:Class, Pendulum-v1."
-    raise UsageError(f"no task {task!r}.{close} Installed: {listed}. {forms}")
-
-
-def _list_classes(file: Path) -> list[str]:
-    """Return the public classes in a file, without importing it: those that look like tasks, else all."""
-    try:
-        tree = ast.parse(file.read_bytes())
-    except (SyntaxError, ValueError, RecursionError):
-        return []
-    classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and not node.name.startswith("_")]
-    bases = {node.name: " ".join(map(ast.unparse, node.bases)) for node in classes}
-    return [name for name, base in bases.items() if "Task" in base or "Env" in base] or list(bases)
+    listed, close = ", ".join(dict.fromkeys(names)) or "none", suggestions.suggest(task)
+    close, forms = close or f".{did_you_mean(task, names)}", "package.module:Class, path/to/file.py:Class, Pendulum-v1."
+    raise UsageError(f"no task {task!r}{close} Installed: {listed}. Other forms: {forms}")
 
 
 def is_task(constructor: Any) -> bool:
@@ -148,7 +136,8 @@ def _load_target(task: str, target: str) -> Callable[..., Any]:
             raise NoSuchClassError(f"{place} has no {attribute!r}.{close} It defines: {defined}.")
         constructor = getattr(constructor, part)
     if not callable(constructor):
-        raise NoSuchClassError(f"{target}: {attribute} is a {type(constructor).__name__}, not a class or a function")
+        kind = type(constructor).__name__
+        raise NoSuchClassError(f"{target}: {attribute} is of type {kind}, not a class or a function")
     return constructor
 
 
@@ -189,7 +178,8 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
             missing = getattr(error.__cause__, "name", None) or getattr(error, "name", None)
             if missing and missing != task.partition(":")[0]:
                 raise  # the module exists, but one of its own imports does not
-            raise UsageError(f"Gymnasium: {task}: {error}") from None
+            advice = missing_packages.advise_on(missing or "")
+            raise UsageError(f"Gymnasium: {task}: {str(error).rstrip('.')}{advice}") from None
 
     constructor.gymnasium_id = task  # type: ignore[attr-defined]
     return constructor
@@ -206,28 +196,36 @@ def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
         frames = traceback.extract_tb(error.__traceback__)
         own = frames and Path(frames[-1].filename).parent == Path(__file__).parent
         if frames and not own and not frames[-1].filename.startswith("<frozen"):  # a syntax error names its place
-            where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})"
-        reason, details = errors.describe_exception(error), errors.format_plugin_traceback(error) or None
-        raise TaskError(f"task {task!r}: {doing}{reason}{where}", details=details) from error
+            file = Path(frames[-1].filename)
+            name = f"{file.parent.name}/{file.name}" if file.name == "__init__.py" else file.name
+            where = f" ({name}:{frames[-1].lineno})"
+        reason, details = errors.describe_exception(error, where), errors.format_plugin_traceback(error) or None
+        raise TaskError(f"task {task!r}: {doing}{reason}", details=details) from error
 
 
 def import_module(task: str, name: str) -> Any:
     """Import a module that is installed or in the current folder; raises `TaskError` for any exception in it."""
     is_installed = name in sys.modules or installed.find_module_file(name) is not None
     if not is_installed and installed.find_module_file(name, in_current_folder=True) is None:
-        raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}")
+        hint = missing_packages.advise_on(name) or suggestions.suggest(task)
+        raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}{hint}")
     return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
 
 
 def import_file(task: str, file: Path) -> Any:
-    """Import a file as a module, once. Its folder becomes the last entry of `sys.path`."""
+    """Import a file as a module, once; a file of a package (`__init__.py` next to it) as the package's module.
+
+    The folder above the package and the file's own folder become the last entries of `sys.path`.
+    """
     file = _find_loaded(file.expanduser())
     if not file.is_file():
-        raise UsageError(f"task {task!r}: no file {file}")
+        raise UsageError(f"task {task!r}: no file {file}{suggestions.suggest(task)}")
     path = str(file)
     for loaded, known in list(sys.modules.items()):
         if getattr(known, "__file__", None) == path and loaded != "__main__":
             return known
+    if in_package := _import_from_package(task, file):
+        return in_package
     append_to_path(str(file.parent))
     name = file.stem
     while name in sys.modules or name in sys.stdlib_module_names:
@@ -244,6 +242,27 @@ def import_file(task: str, file: Path) -> Any:
         sys.modules.pop(name, None)
         raise
     return module
+
+
+def _import_from_package(task: str, file: Path) -> Any:
+    """Import a file as a module of its package; None if it is in none. Raises `UsageError` if the name is taken."""
+    root, names = file.parent, [] if file.name == "__init__.py" else [file.stem]
+    while (root / "__init__.py").is_file() and root.name.isidentifier():
+        root, names = root.parent, [root.name, *names]
+    if root == file.parent or "." in file.stem:
+        return None
+    for folder in (root, file.parent):
+        append_to_path(str(folder))
+    package, name = names[0], ".".join(names)
+    own, found = root / package / "__init__.py", installed.find_module_file(package)
+    if found is None or found.resolve() != own:
+        fix = f"rename the folder {package!r}, or delete its __init__.py"
+        if found is not None and installed.find_module_file(name) is not None:  # a copy of the package, probably
+            fix = f"name the installed module, {name}:{task.rpartition(':')[2]}; or {fix}"
+        elsewhere = found or "its own modules"
+        problem = f"{file.name} belongs to the package {own.parent}, but Python imports {package!r} from {elsewhere}"
+        raise UsageError(f"task {task!r}: {problem}\n{fix}")
+    return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
 
 
 def append_to_path(folder: str) -> None:

@@ -15,6 +15,7 @@ from pydantic import AfterValidator, PlainSerializer
 from rlctl.environments import named_task
 from rlctl.environments.registry import call_plugin, is_task, load, make_slug, may_make_environments
 from rlctl.errors import RecipeError, TaskError, check_name, short_repr
+from rlctl.library_output import print_mujoco_warnings
 from rlctl.storage import validation
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ class EnvSpec:
         if render_mode == "rgb_array" and not os.environ.get("DISPLAY"):
             os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it at import; its default needs a display
         constructor = self.constructor()
+        print_mujoco_warnings()
         if is_task(constructor):
             env = self._make_task_env(constructor, render_mode)
         else:
@@ -237,7 +239,11 @@ def check_fields(task: Any, values: Mapping[str, Any]) -> dict[str, Any]:
         is_text = hints[key] in (int, float) and isinstance(value, bool | str)
         if is_text or (isinstance(value, float) and math.isnan(value)):  # pydantic accepts them as numbers
             raise RecipeError(f"task.{key}: expected a number, got {short_repr(repr(value))}")
-        adapter = pydantic.TypeAdapter(hints[key])
+        try:
+            adapter = pydantic.TypeAdapter(hints[key])
+        except pydantic.errors.PydanticUserError:  # a type of the author's own
+            kind = getattr(hints[key], "__name__", hints[key])
+            raise RecipeError(f"task.{key}: a value of type {kind} cannot be given here, only in Python") from None
         try:
             checked[key] = adapter.validate_python(value)
         except pydantic.ValidationError as error:

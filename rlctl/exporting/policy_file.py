@@ -7,7 +7,7 @@ from rich.filesize import decimal as format_bytes
 
 from rlctl import output
 from rlctl.environments.registry import identify_task
-from rlctl.errors import UsageError
+from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.evaluate import measure_score
 from rlctl.evaluation.report import describe_score
 from rlctl.evaluation.request import EvalRequest
@@ -17,6 +17,7 @@ from rlctl.policy.players.named import BASELINES
 from rlctl.policy.shipped import Provenance
 from rlctl.run import lookup
 from rlctl.run.lookup import FoundPolicy
+from rlctl.storage import validation
 
 
 def export_actor(request: ExportRequest) -> PolicyFile:
@@ -34,7 +35,8 @@ def export_actor(request: ExportRequest) -> PolicyFile:
     evaluation = EvalRequest(run=str(source.file), episodes=request.episodes)
     score = measure_score(evaluation)
     scores = {name: measure_score(dataclasses.replace(evaluation, baseline=name, spec=spec)) for name in BASELINES}
-    provenance = Provenance(**origin, **identify_task(spec.task), score=score, baselines=scores)
+    content = {**origin, **identify_task(spec.task), "score": score, "baselines": scores}
+    provenance = validation.build(Provenance, content, ArtifactError, f"{source.file}: provenance")
     policy = policy.actor_only().with_info(provenance=provenance)
     policy.write(target)
     return dataclasses.replace(policy, path=target)

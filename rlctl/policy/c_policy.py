@@ -13,7 +13,7 @@ from rlctl.environments.dict_spaces import split, split_space
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.policy import Policy
-from rlctl.storage import files
+from rlctl.storage import untrusted
 
 LIBRARY_SUFFIX = ".so"
 
@@ -53,7 +53,9 @@ class CPolicy(Policy):
     def load(cls, path: Path) -> Self:
         """Load a library with the JSON description next to it; raises `ArtifactError` if it does not load."""
         try:
-            return cls(PolicyInfo.model_validate(files.read_json(path.with_suffix(".json"))), ctypes.CDLL(str(path)))
+            content = untrusted.read_bytes(path.with_suffix(".json"))
+            info = untrusted.parse_model(content, PolicyInfo, path.with_suffix(".json"), "policy")
+            return cls(info, ctypes.CDLL(str(path)))
         except OSError as error:
             raise ArtifactError(f"{path}: the compiled policy does not load: {error}") from None
 

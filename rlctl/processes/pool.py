@@ -8,15 +8,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from rlctl.printed_lines import LineReader, PrintedLines, current
 from rlctl.processes import messages
-from rlctl.processes.child_process import (
-    MAX_LINE_BYTES,
-    ChildEndedError,
-    ChildProcess,
-    LineFilter,
-    LineReader,
-    Standstill,
-)
+from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill
 
 _CHECK_EVERY_S = 0.2
 
@@ -42,7 +36,7 @@ class WorkerException:
 class ProcessPool:
     """One process per set of arguments, which runs `main`. Raises `OSError` if a process cannot be started.
 
-    Printed lines go to `on_output`, from a thread. `read_progress` returns a value that changes whenever an environment
+    `printed` takes their lines, in a thread. `read_progress` returns a value that changes whenever an environment
     begins or ends a call. All processes inherit the descriptors `pass_fds`.
     """
 
@@ -50,24 +44,31 @@ class ProcessPool:
         self,
         main: str,
         arguments: Iterable[Mapping[str, Any]],
-        on_output: Callable[[str], None],
+        printed: PrintedLines | None = None,
         read_progress: Callable[[], bytes] = bytes,
         pass_fds: Sequence[int] = (),
     ) -> None:
         self._read_progress = read_progress
         self.waiting_for: set[int] = set()  # the workers that have not answered yet
         self._processes: list[ChildProcess] = []
-        self._printed = LineFilter(on_output)
-        self._output = LineReader(self._printed.line, MAX_LINE_BYTES)
-        output = self._output.descriptor
+        shared = printed or current()
+        self._printed, self._shares_printed = shared or PrintedLines(), shared is not None
+        self._readers: list[LineReader] = []
         try:
             for job in arguments:
-                self._processes.append(ChildProcess(main, job, stdout=output, stderr=output, pass_fds=pass_fds))
+                self._start(main, job, pass_fds)
         except BaseException:
             self.close(grace_s=0.0)
             raise
+
+    def _start(self, main: str, job: Mapping[str, Any], pass_fds: Sequence[int]) -> None:
+        reader = self._printed.open_reader()  # one per process, so that no line cuts that of another process
+        self._readers.append(reader)
+        pipe = reader.descriptor
+        try:
+            self._processes.append(ChildProcess(main, job, stdout=pipe, stderr=pipe, pass_fds=pass_fds))
         finally:
-            self._output.close_descriptor()
+            reader.close_descriptor()
 
     def send(self, worker: int, message: Any) -> None:
         """Send a message."""
@@ -148,8 +149,12 @@ class ProcessPool:
         self._processes = []
         self.waiting_for = set()
         self._read_progress = bytes  # drops the reference to its owner, and so the owner's shared memory
-        self._output.wait()
-        self._printed.end()
+        for reader in self._readers:
+            reader.wait()
+        self._readers = []
+        self._printed.report_left_out()
+        if not self._shares_printed:
+            self._printed.end()
 
 
 def _make_fault(worker: int, error: ChildEndedError, doing: str) -> WorkerFault:

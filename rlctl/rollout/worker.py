@@ -7,7 +7,6 @@ policy's parameters are in shared memory.
 import contextlib
 import gc
 import itertools
-import sys
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from time import perf_counter
@@ -21,11 +20,12 @@ from rlctl.environments.dict_spaces import SINGLE
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import describe_exception
+from rlctl.library_output import print_whole_lines
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.policy.players.named import SERVER, make_player
 from rlctl.policy.players.player import Player
-from rlctl.processes.child_process import write_stderr
+from rlctl.printed_lines import print_line
 from rlctl.processes.pool import answer_messages
 from rlctl.rollout import messages
 from rlctl.rollout.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
@@ -135,7 +135,7 @@ class Worker:
                     raise
                 # It did not fail the first time, so its state differs now: the environment begins its next episode.
                 left.append(env)
-                write_stderr(f"{failure} when it was replayed")
+                print_line(f"{failure} when it was replayed")
         return left
 
     def _begin(self, episode: RunningEpisode, seed: int) -> None:
@@ -242,7 +242,7 @@ class Worker:
             try:
                 episode.env.close()
             except BaseException as error:  # its episodes are over
-                write_stderr(f"warning: closing environment {episode.index}: {describe_exception(error)}")
+                print_line(f"warning: closing environment {episode.index}: {describe_exception(error)}")
         self._episodes = []
 
 
@@ -261,7 +261,7 @@ def make_player_of(name: str, env: Any) -> Player:
 
 def main(connection: Connection, job: messages.WorkerJob) -> None:
     """Answer messages until the connection closes."""
-    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]  # lines are forwarded at once
+    print_whole_lines()
     worker = Worker(job)
     answer_messages(connection, worker.answer, describe_failure)
     worker.close()

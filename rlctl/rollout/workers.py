@@ -19,7 +19,8 @@ from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
 from rlctl.policy.file import PolicyFile
-from rlctl.processes.child_process import anonymous_file, write_stderr
+from rlctl.printed_lines import PrintedLines
+from rlctl.processes.child_process import anonymous_file
 from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault
 from rlctl.rollout import messages
 from rlctl.rollout.messages import Answer, EpisodeResult, Message, format_hint, make_error
@@ -36,8 +37,8 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
     Building starts at once and the first use waits for it, so that a caller can do its own slow imports in the
     meantime. An error in an environment raises `TaskError` with the episode's seed and step, and so does a worker that
-    dies or does not answer within `timeout_s`. After an error the workers are closed. Lines printed by environments are
-    passed to `on_output`, in a thread, or else written to stderr.
+    dies or does not answer within `timeout_s`. After an error the workers are closed. `printed` takes the
+    lines that environments print; by default each is shown once on stderr.
     """
 
     def __init__(
@@ -47,7 +48,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         *,
         n_workers: int | None = None,
         timeout_s: float = DEFAULT_TIMEOUT_S,
-        on_output: Callable[[str], None] | None = None,
+        printed: PrintedLines | None = None,
     ) -> None:
         self.n_envs = n_envs
         self.timeout_s = timeout_s
@@ -63,7 +64,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         self._steps = 1
         self._ready = False
         jobs = [{"job": messages.WorkerJob(arrays, numbers, low, high - low, n_envs)} for low, high in self._ranges]
-        printed, main = on_output or write_stderr, "rlctl.rollout.worker:main"
+        main = "rlctl.rollout.worker:main"
         try:
             self._pool = ProcessPool(main, jobs, printed, self._read_progress, self._memories)
         except BaseException as error:

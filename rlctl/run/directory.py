@@ -51,6 +51,7 @@ class RunDirectory:
     status_file = _RunPath("run.json")  # status, versions, command line, times
     metrics_file = _RunPath("metrics.csv")  # a row per update
     evals_file = _RunPath("evals.csv")  # a row per evaluation
+    printed_file = _RunPath("printed.log")  # what the environments have printed
     robustness_file = _RunPath("robustness.json")  # what `rlctl eval --vary` or `--push` measured last
     best_policy = _RunPath("policies/best.safetensors")  # the policy of the best evaluation
     last_policy = _RunPath("policies/last.safetensors")  # the policy at the end, or at the last checkpoint

@@ -7,16 +7,17 @@ given, and the closest name.
 import dataclasses
 import json
 import numbers
-from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Annotated, Any, TypeVar
 
 import pydantic
 from annotated_types import GroupedMetadata
 from pydantic_core import PydanticCustomError
 
-from rlctl.errors import did_you_mean, short_repr
+from rlctl.errors import RlctlError, did_you_mean, short_repr
 
 Schema = dict[str, Any]
+_Model = TypeVar("_Model", bound=pydantic.BaseModel)
 Place = tuple[str | int, ...]  # keys and indices that lead to a value
 _MOST_LINES = 3
 _ANY = "any value"
@@ -121,6 +122,14 @@ def explain_invalid(error: pydantic.ValidationError, model: Any, values: Any, la
     problem: Any = error.errors(include_url=False)[0]
     place = _locate(problem, root)
     return explain(problem, place, root, values, key=".".join(map(str, (label, *place) if label else place)))
+
+
+def build(model: type[_Model], values: Mapping[str, Any], error: type[RlctlError], label: str) -> _Model:
+    """Return a model of values that a user's code or file may have caused; raises `error` for invalid ones."""
+    try:
+        return model(**values)
+    except pydantic.ValidationError as problem:
+        raise error(explain_invalid(problem, model, values, label)) from None
 
 
 def _locate(problem: Any, root: Schema) -> Place:

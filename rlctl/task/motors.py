@@ -42,6 +42,8 @@ class Joints:
                     f"{list(values)}; leave it out if a value is unknown"
                 )
             object.__setattr__(self, field.name, tuple(values))
+        if odd := [name for name in self.names if not isinstance(name, str)]:
+            raise TaskError(f"joints: names must be text, not {odd[0]!r}")
         object.__setattr__(self, "names", tuple(self.names))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, UsageError, check_name
+from rlctl.library_output import print_mujoco_warnings
 from rlctl.task.constraints import Attachment, Joined
 from rlctl.task.model_files import find_model_file
 from rlctl.task.mujoco_body import WXYZ, MujocoBody, refuse
@@ -51,6 +52,7 @@ class MujocoSim:
         except ImportError:
             raise UsageError("--sim mujoco needs MuJoCo: pip install mujoco") from None
         self.mujoco = mujoco
+        print_mujoco_warnings()
         self._control_dt, self._substeps, self._solref = control_dt, substeps, solref
         self.clear()
 

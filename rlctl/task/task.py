@@ -22,7 +22,8 @@ class Task:
     the attributes below are its definition and are assigned without an annotation.
     """
 
-    robot: ClassVar[str] = ""
+    robot: Any = ""
+    """Name of the robot, as text in the class. An instance may call its body `self.robot`."""
     control_dt: ClassVar[float] = 1 / 60
     """Time between two actions [s]."""
     substeps: ClassVar[int] = 4
@@ -52,7 +53,7 @@ class Task:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        definition = {name for name, hint in Task.__annotations__.items() if "ClassVar" in str(hint)}
+        definition = {"robot"} | {name for name, hint in Task.__annotations__.items() if "ClassVar" in str(hint)}
         for name, hint in cls.__dict__.get("__annotations__", {}).items():
             if name in definition and "ClassVar" not in str(hint):
                 raise TaskError(
@@ -149,6 +150,12 @@ def check_definition(task: Task) -> None:
             raise TaskError(f"{name}: {key} is {count}; it must be a whole number, at least 1")
     if (layout := task.observation_layout) not in ("flat", "dict"):
         raise TaskError(f"{name}: observation_layout is {layout!r}; it must be 'flat' or 'dict'")
+    for key in ("robot", "action_meaning"):
+        if not isinstance(text := getattr(type(task), key), str):
+            raise TaskError(f"{name}: {key} of the class is {text!r}; it must be text")
+    for key, unit in task.observation_units.items():
+        if not isinstance(key, str) or not isinstance(unit, str):
+            raise TaskError(f"{name}: observation_units has {key!r}: {unit!r}; both must be text")
     for key, bounds in task.observation_bounds.items():
         if np.shape(bounds) != (2,) or not bounds[0] <= bounds[1]:
             raise TaskError(

@@ -111,7 +111,7 @@ def _describe_definition(env: TaskEnv) -> dict[str, Any]:
 
     task = env.task
     return {
-        "robot": task.robot,
+        "robot": type(task).robot,
         "control_dt": task.control_dt,
         "substeps": task.substeps,
         "episode_s": task.episode_s,

@@ -7,6 +7,8 @@ from types import FrameType
 from typing import Any
 
 from rlctl.errors import Interrupted
+from rlctl.library_output import redirect_stdout
+from rlctl.printed_lines import collect
 from rlctl.processes import error_boundary, messages
 
 
@@ -23,7 +25,7 @@ def _train(connection: Connection, content: dict[str, Any]) -> int:
     from rlctl.run.train_request import TrainRequest
     from rlctl.training.signals import HandledSignals
 
-    with HandledSignals(_interrupt):
+    with HandledSignals(_interrupt), collect(), redirect_stdout():
         messages.send(connection, "ready")
         from rlctl.training.request import run_training
 

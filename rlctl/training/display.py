@@ -110,7 +110,7 @@ class Display:
     def message(self, text: str) -> None:
         """Show a warning, or output of an environment; if stderr was closed (`| head`), interrupt the training."""
         try:
-            print(text, file=sys.stderr, flush=True)
+            print(f"{text}\n", end="", file=sys.stderr, flush=True)  # one write: no line of a library comes in between
         except BrokenPipeError:
             with open(os.devnull, "w") as nowhere:
                 os.dup2(nowhere.fileno(), sys.stderr.fileno())
@@ -140,7 +140,7 @@ class LiveDisplay(Display):
         self._terms: dict[str, float] = {}
         self._curves: dict[str, deque[float]] = {name: deque(maxlen=_CURVE) for name in ("success", "return")}
         self._evaluations: list[tuple[int, float | None, float, bool]] = []
-        self._live = Live(self, console=output.err(), refresh_per_second=8, transient=False)
+        self._live = Live(self, console=output.err(), refresh_per_second=8, transient=False, redirect_stdout=False)
 
     def __enter__(self) -> Self:
         self._live.__enter__()

@@ -9,7 +9,7 @@ from typing import Any
 from rlctl import output
 from rlctl.errors import ArtifactError, TaskError
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.processes.child_process import write_stderr
+from rlctl.printed_lines import collect, print_line
 from rlctl.recipe.recipe import Recipe
 from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
@@ -50,7 +50,8 @@ def run_training(request: TrainRequest) -> TrainResult:
         if start.run is not None and start.checkpoint is not None and start.checkpoint.state.progress.done:
             return _report_finished(start, start.run, start.checkpoint.state.progress)
         title = f"{'train' if start.run is None else 'resume'} {start.task} ({start.recipe.algo})"
-        with make_display(title, start.recipe.total_timesteps) as display, set_up(start, display) as training:
+        display = make_display(title, start.recipe.total_timesteps)
+        with display, collect() as printed, set_up(start, display, printed) as training:
             signals.begin(training)
             training.run()
             signals.end()
@@ -69,7 +70,7 @@ def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> Tra
     if run.status().get("status") != "finished":  # killed before the end was written
         status.write_end(run, start.step, progress, best)
     if start.recipe.track is not None:
-        with track(run, start.recipe.track, write_stderr):
+        with track(run, start.recipe.track, print_line):
             pass  # sends what the tracker has not received yet
     _raise_if_evaluations_failed(run, progress)
     note = "this run has finished: nothing to do; to train longer, give -n"

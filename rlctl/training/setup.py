@@ -19,9 +19,11 @@ from rlctl.checking.rules import Severity
 from rlctl.environments import registry
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.named_task import RUN
+from rlctl.environments.registrations import describe_registrations
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, RecipeError, TaskError
 from rlctl.output import format_count
+from rlctl.printed_lines import PrintedLines
 from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import ON_POLICY, Recipe
 from rlctl.rollout.workers import Workers, available_cores
@@ -47,14 +49,15 @@ _EXPERIMENTS = ("build", "comparisons", "episodes")  # what one child process ca
 
 
 @contextlib.contextmanager
-def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
+def set_up(start: Start, display: Display, printed: PrintedLines) -> Iterator[TrainingLoop]:
     """Open what a training needs; at the end stop its processes, and write an error that ended it to the run."""
     recipe, request = start.recipe, start.request
     specs = recipe.env_specs(start.task, named_by=RUN if start.run else "")
     display.phase(f"building {format_count(recipe.n_envs, 'environment')}, importing PyTorch")
     with contextlib.ExitStack() as stack:
+        stack.callback(printed.report)
         # The workers build their environments, and the check runs, while this process imports torch.
-        make_workers = functools.partial(Workers, timeout_s=request.env_timeout_s, on_output=display.message)
+        make_workers = functools.partial(Workers, timeout_s=request.env_timeout_s)
         workers = stack.enter_context(make_workers(specs[start.stage - 1], recipe.n_envs))
         checked = _begin_check(specs[-1], request.env_timeout_s) if request.check and start.run is None else None
         from rlctl.training.evaluator import EvaluationEpisodes, Evaluator
@@ -63,6 +66,8 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
         learner = _build_learner(start, specs, workers, make_workers, display)
         if start.run is None:
             _warn_of_opposite_weights(specs, display)
+            if registered := describe_registrations(start.task, "train"):
+                display.message(f"{start.task} is {registered}")
         rewards: list[NDArray[np.float64]] = []
         if checked is not None:
             display.phase("checking the environment")
@@ -81,6 +86,8 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
         evaluator = Evaluator(learner, episodes, checkpoints, display)
         if start.run is not None:
             evaluator.restore()
+        printed.log_to(run.printed_file)
+        printed.report()
         display.run_folder(run)
         if recipe.track is not None:
             stack.enter_context(track(run, recipe.track, display.message))

@@ -81,7 +81,7 @@ def _run(task, process, experiments):
     """Run experiments of a process, which begins with nothing that an earlier one left."""
     for client in find_clients():  # of an environment that was not closed
         pybullet.disconnect(client)
-    for module in [module for module in sys.modules if module.startswith("broken_")]:
+    for module in [module for module in sys.modules if module.rpartition(".")[2].startswith("broken_")]:
         del sys.modules[module]
     return list(children.run(process, EnvSpec(_path(task)), experiments, SECONDS)) if experiments else []
 

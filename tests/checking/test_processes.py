@@ -39,7 +39,7 @@ def in_root(monkeypatch):
         (f"{BROKEN}:RaisingConstructor", "RL007", "does not find 'robot.urdf', looked for in", "__file__"),
         ("tests/checking/broken_loading.py:NoSearchPath", "RL007", "call setAdditionalSearchPath first", "__file__"),
         (f"{BROKEN}:NeedsArgument", "RL006", "missing 1 required", "(--set task.gain=...)"),
-        (f"{BROKEN}:NUMBER", "RL005", "NUMBER is a int, not a class", "case-sensitive"),
+        (f"{BROKEN}:NUMBER", "RL005", "NUMBER is of type int, not a class", "case-sensitive"),
         (
             f"{BROKEN}:NoEnvironment",
             "RL003",

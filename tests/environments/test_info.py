@@ -2,13 +2,21 @@
 
 import json
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
 
 import rlctl
 from rlctl.environments.info import EnvInfo, describe, space_from_json, space_to_json
-from rlctl.errors import ArtifactError, UsageError
+from rlctl.errors import ArtifactError, TaskError, UsageError
+
+
+def test_a_limit_that_is_no_number_of_steps():
+    env = gymnasium.make("Pendulum-v1").unwrapped
+    env.spec.max_episode_steps = 20.5
+    with pytest.raises(TaskError, match=r"^PendulumEnv.max_steps: expected a whole number or null, got 20.5$"):
+        describe(env)
 
 
 @pytest.mark.parametrize(

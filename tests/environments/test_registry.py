@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -97,7 +98,7 @@ def test_a_strangers_modules_in_the_current_folder_are_not_run(installed_rlctl, 
     done = installed_rlctl("eval", "reach", "--pretrained", "--episodes", "2", "--n-envs", "2")
     assert (done.returncode, "2 episodes" in done.stdout) == (0, True), done.stderr
     write_module("pendulum.py", "from gymnasium.envs.classic_control import PendulumEnv\n")
-    done = installed_rlctl("check-env", "pendulum:PendulumEnv", "--only", "RL1")
+    done = installed_rlctl("check-env", "pendulum:PendulumEnv", "--select", "RL1")
     assert "current folder" not in done.stderr, done.stderr
 
 
@@ -109,6 +110,38 @@ def test_a_file_may_import_its_neighbours(write_module):
     write_module("there/parts.py", ENV)
     write_module("there/whole.py", "from parts import MyEnv\n")
     assert EnvSpec("there/whole.py:MyEnv").make().gain == 1.0
+
+
+def test_a_file_in_a_package_is_a_module_of_it(write_module, monkeypatch):
+    write_module("there/wheeled/__init__.py", "from .limits import GAIN\n")
+    write_module("there/wheeled/limits.py", "GAIN = 3.0\n")
+    write_module("there/wheeled/arms/__init__.py", "")
+    file = write_module("there/wheeled/arms/arm.py", f"from ..limits import GAIN\nimport parts\n{textwrap.dedent(ENV)}")
+    write_module("there/wheeled/arms/parts.py", "")
+    loaded = registry.load("there/wheeled/arms/arm.py:MyEnv")
+    assert (loaded.__module__, sys.modules["wheeled.arms.arm"].GAIN) == ("wheeled.arms.arm", 3.0)
+    assert sys.path[-2:] == [str(file.parents[2]), str(file.parent)]
+    assert registry.load("there/wheeled/__init__.py:GAIN.hex")() == (3.0).hex()
+    monkeypatch.chdir("there")
+    assert registry.load("wheeled.arms.arm:MyEnv") is loaded
+
+
+@pytest.mark.parametrize(("package", "taken_from"), [("json", "json/__init__.py"), ("sys", "its own modules")])
+def test_a_package_whose_name_is_taken(write_module, package, taken_from):
+    write_module(f"there/{package}/__init__.py", "")
+    write_module(f"there/{package}/arm.py", ENV)
+    first, second = error(UsageError, f"there/{package}/arm.py:MyEnv").splitlines()
+    assert f"arm.py belongs to the package {Path.cwd() / 'there' / package}, but Python imports {package!r}" in first
+    assert first.endswith(taken_from)
+    assert second == f"rename the folder {package!r}, or delete its __init__.py"
+
+
+def test_a_package_that_is_also_installed(write_module):
+    file = write_module("there/gymnasium/spaces/box.py", ENV)
+    for folder in (file.parent, file.parent.parent):
+        (folder / "__init__.py").touch()
+    fix = error(UsageError, "there/gymnasium/spaces/box.py:Box").splitlines()[1]
+    assert fix.startswith("name the installed module, gymnasium.spaces.box:Box; or rename the folder 'gymnasium', or ")
 
 
 def test_files_of_one_name_in_many_folders(write_module):
@@ -153,15 +186,38 @@ def test_places_that_are_not_there(my_env, tmp_path):
     assert error(UsageError, "my_env.py:MyEnvs") == (
         "my_env.py has no 'MyEnvs'. Did you mean 'MyEnv'? It defines: MyEnv, NoEnv."
     )
-    assert error(UsageError, "your_env.py:E") == f"task 'your_env.py:E': no file {tmp_path / 'your_env.py'}"
+    assert error(UsageError, "sensor.py:E") == f"task 'sensor.py:E': no file {tmp_path / 'sensor.py'}"
     assert error(UsageError, "nowhere.envs:E") == (
         f"task 'nowhere.envs:E': no module 'nowhere.envs' is installed or under {tmp_path}"
     )
-    assert error(UsageError, "my_env.py:number") == "my_env.py:number: number is a int, not a class or a function"
+    assert error(UsageError, "my_env.py:number") == "my_env.py:number: number is of type int, not a class or a function"
     assert error(TaskError, "my_env.py:NoEnv") == (
         "my_env.py:NoEnv: NoEnv is neither a Gymnasium environment (reset, step, spaces) nor "
         "a subclass of rlctl.task.Task"
     )
+
+
+@pytest.mark.parametrize(
+    ("task", "meant"),
+    [
+        ("my_evn.py:MyEnv", "my_env.py:MyEnv"),
+        ("my_evn:MyEnv", "my_env:MyEnv"),
+        ("./my_env:MyEnv", "./my_env.py:MyEnv"),
+        ("my_env.py::MyEnv", "my_env.py:MyEnv"),
+        ("my_env.py MyEnv", "my_env.py:MyEnv"),
+        ("my_env/MyEnv", "my_env.py:MyEnv"),
+        ("package.envs.MyEnv", "package.envs:MyEnv"),
+        ("package/evns.py:MyEnv", "package/envs.py:MyEnv"),
+    ],
+)
+def test_a_task_in_another_form(my_env, write_module, task, meant):
+    write_module("package/__init__.py", "")
+    write_module("package/envs.py", ENV)
+    assert f". Did you mean {meant!r}?" in error(UsageError, task)
+
+
+def test_a_name_without_its_class(my_env):
+    assert error(UsageError, "my_env.py:").endswith("to name a class in my_env.py: my_env.py:MyEnv")
 
 
 def test_a_vectorised_environment_is_named_as_one(my_env, write_module):
@@ -211,6 +267,24 @@ def test_parameters_that_are_not_there(my_env):
 
 def test_parameters_of_another_type():
     assert error(RecipeError, "reach", {"tolerance": "abc"}) == ("task.tolerance: expected a number, got 'abc'")
+
+
+def test_a_parameter_of_a_type_that_no_text_is(write_module):
+    source = """
+        from dataclasses import dataclass
+        from rlctl.task import Task
+
+        class Gripper:
+            pass
+
+        @dataclass
+        class Grasp(Task):
+            gripper: Gripper | None = None
+        """
+    write_module("grasp.py", source)
+    assert error(RecipeError, "grasp.py:Grasp", {"gripper": "wide"}) == (
+        "task.gripper: a value of type grasp.Gripper | None cannot be given here, only in Python"
+    )
 
 
 def test_what_only_tasks_have(my_env):

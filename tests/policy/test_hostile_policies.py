@@ -12,7 +12,8 @@ from safetensors.numpy import load_file, save
 from rlctl import load_policy
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import RlctlError
+from rlctl.errors import ArtifactError, RlctlError
+from rlctl.policy.c_policy import CPolicy
 from rlctl.policy.file import PolicyFile, PolicyInfo, compute_digest
 from rlctl.policy.torch_policy import TorchPolicy, build_network
 
@@ -211,3 +212,11 @@ def test_a_file_larger_than_memory(tmp_path):
     with path.open("wb") as file:
         file.truncate(2**43)  # 8 TB, and no space on the disk
     assert "too large: it needs 8.8 TB of memory, and " in refused(path)
+
+
+def test_a_compiled_policy_with_a_wrong_description(tmp_path):
+    (tmp_path / "policy.so").write_bytes(b"")
+    description = tmp_path / "policy.json"
+    description.write_text('{"format": 1, "algo": 3}')
+    with pytest.raises(ArtifactError, match=r"policy.json: damaged: algo: expected text, got 3$"):
+        CPolicy.load(tmp_path / "policy.so")

@@ -9,8 +9,9 @@ import time
 
 import pytest
 
+from rlctl.printed_lines import LineReader
 from rlctl.processes import messages
-from rlctl.processes.child_process import ChildEndedError, ChildProcess, LineReader, Standstill
+from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill
 
 HERE = "tests.processes.test_child_process"
 

@@ -13,6 +13,7 @@ import pytest
 from rlctl.environments.dict_spaces import join
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError
+from rlctl.printed_lines import PrintedLines
 from rlctl.rollout.messages import Play
 from rlctl.rollout.workers import Workers
 from rlctl.training.measurements import evaluation_row, training_row
@@ -99,7 +100,7 @@ def test_every_kind_of_space(spec, start, kind):
 
 def test_what_environments_print_is_forwarded_at_once(spec, start, capfd):
     lines = []
-    workers = start(spec("Walk", fault="print"), 1, on_output=lines.append)
+    workers = start(spec("Walk", fault="print"), 1, printed=PrintedLines(lines.append))
     workers.replay_actions({0: still(7, 3)})
     deadline = time.monotonic() + 60
     while len(lines) < 2 and time.monotonic() < deadline:
@@ -129,7 +130,7 @@ def test_workers_import_no_learning_library(spec, start, tmp_path):
         "        return super().reset(**options)\n"
     )
     lines = []
-    workers = start(EnvSpec(f"{module}:Spy"), 1, on_output=lines.append)
+    workers = start(EnvSpec(f"{module}:Spy"), 1, printed=PrintedLines(lines.append))
     workers.reset({0: 0})
     workers.close()
     loaded = set(lines[0].split())

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.task import Box, Task
@@ -103,6 +104,15 @@ def missing(*names: str) -> type[Task]:
             type("Tuple", (Whole,), {"action_space": (-1, 1, 3)}),
             "Tuple does not define action_space: Box(-1.0, 1.0, (7,), np.float32), for example",
         ),
+        (type("Named", (Whole,), {"robot": 3}), "Named: robot of the class is 3; it must be text"),
+        (
+            type("Units", (Whole,), {"observation_units": {"zero": 1.0}}),
+            "Units: observation_units has 'zero': 1.0; both must be text",
+        ),
+        (
+            type("Numbered", (Whole,), {"describe_joints": lambda self: Joints([1])}),
+            "joints: names must be text, not 1",
+        ),
         (
             type("Flat", (Whole,), {"observe": lambda self: np.zeros(2)}),
             "Flat: observe() returned array([0., 0.]), not a dict of values by name: {'speed': ...}",
@@ -146,6 +156,38 @@ def test_what_is_missing_is_named(cls, message):
 @pytest.mark.parametrize("cls", [Whole, Parameters, SpaceFromParameters])
 def test_whole_tasks_are_built(cls):
     TaskEnv(cls()).close()
+
+
+class NamesItsBody(Whole):
+    """The most natural name of the body is also the attribute for the robot's name."""
+
+    robot = "cube on a plane"
+
+    def build(self, sim):
+        self.robot = sim.load("cube", "cube_small.urdf", position=(0, 0, 1))
+
+    def observe(self):
+        return {"height": self.robot.base_position[2:]}
+
+
+def test_a_body_may_be_called_robot():
+    env = TaskEnv(NamesItsBody())
+    assert env.reset(seed=0)[0].tolist() == [1.0]
+    assert describe(env).robot == "cube on a plane"
+    env.close()
+
+
+def test_the_name_of_the_robot_is_not_annotated():
+    with pytest.raises(TaskError, match=r"^Annotated\.robot is annotated, which would make it a parameter"):
+        type("Annotated", (Task,), {"__annotations__": {"robot": str}, "robot": "arm"})
+
+
+def test_an_attribute_of_an_instance_that_cannot_be_described():
+    env = TaskEnv(Whole())
+    env.task.action_meaning = 3
+    with pytest.raises(TaskError, match=r"^Whole\.action_meaning: expected text, got 3$"):
+        describe(env)
+    env.close()
 
 
 def test_a_parameter_of_a_class_that_forgot_it(write_module, tmp_path, monkeypatch):

@@ -153,7 +153,7 @@ def _find_endless(records: Records) -> Iterator[RuleFinding]:
     declared = f"its own limit is {limit}" if limit else "no time limit is known"
     steps = ", ".join(f"{count:,} with {kind} actions" for kind, count in longest.items())
     message = f"no episode ended after so many steps: {steps}; {declared}"
-    yield RuleFinding("RL503", message, {"steps": longest, "expected": limit})
+    yield RuleFinding("RL503", message, {"steps": longest, "expected": limit}, fix=_use_registration(records))
 
 
 @check("RL504", "episodes")
@@ -185,4 +185,12 @@ def _find_no_time_limit(records: Records) -> Iterator[RuleFinding]:
     ends = f"all {len(episodes)} episodes ended with terminated=True, the longest after {max(lengths)} steps"
     evidence = {"episodes": len(episodes), "value": None, "expected": "max_episode_steps", "step": max(lengths)}
     severity = Severity.WARNING if is_continuous and built.truncation == "never" else Severity.INFO
-    yield RuleFinding("RL506", f"no time limit was seen: {why}; {ends}", evidence, severity)
+    message = f"no time limit was seen: {why}; {ends}"
+    yield RuleFinding("RL506", message, evidence, severity, fix=_use_registration(records))
+
+
+def _use_registration(records: Records) -> str:
+    """Return the fix for a class without a time limit that is registered with one; empty for any other."""
+    built = records.require_built()
+    is_limited = built.max_steps is None and "max_episode_steps" in built.registered
+    return f"Use its registration: the class is {built.registered}" if is_limited else ""

@@ -15,6 +15,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl import missing_packages
 from rlctl.checking.bullet_worlds import ClientCalls, find_clients
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import (
@@ -34,6 +35,7 @@ from rlctl.checking.values import find_assignment, find_author, flatten, is_task
 from rlctl.environments import registry
 from rlctl.environments.dict_spaces import format_space
 from rlctl.environments.info import describe_mujoco_model
+from rlctl.environments.registrations import describe_registrations
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import NoSuchClassError, OldGymError, RecipeError, RlctlError, TaskError, UsageError
 
@@ -65,25 +67,27 @@ def build(context: Context) -> Iterator[ChildMessage]:
 def _explain(context: Context, error: RlctlError) -> RuleFinding:
     cause = error.__cause__
     details = {"traceback": error.details} if error.details else {}
+    message, to_install = missing_packages.split(str(error), cause)
     if isinstance(error, NoSuchClassError):
         return RuleFinding("RL005", str(error), details)
     missing_modules = [str(e.name) for e in get_causes(cause) if isinstance(e, ModuleNotFoundError)]
     if isinstance(error, OldGymError) or any(name.partition(".")[0] == "gym" for name in missing_modules):
-        return RuleFinding("RL008", str(error), details)
+        return RuleFinding("RL008", message, details, fix=to_install)
     if (file := find_missing_file(cause)) is not None:
         return _not_found("the constructor", file, error.details)
     where = find_line(cause) if cause is not None else None
     if context.progress.read().call == "load":
-        return RuleFinding("RL001", str(error), details, where=where)
+        return RuleFinding("RL001", message, details, fix=to_install, where=where)
     missing = re.search(r"missing \d+ required .*?arguments?: (.*)", str(cause))
     if isinstance(cause, TypeError) and missing:
         settings = " ".join(f"--set task.{name}=..." for name in re.findall(r"'(\w+)'", missing[1]))
         fix = f"Give them ({settings}), or give them default values."
-        return RuleFinding("RL006", str(error), details, fix=fix)
+        registered = describe_registrations(context.spec.task, "check-env")
+        return RuleFinding("RL006", message, details, fix=f"{fix} The class is {registered}" if registered else fix)
     is_without_trace = isinstance(error, TaskError) and error.details is None  # a constructor's error has one
     if is_without_trace and not registry.is_task(registry.load(context.spec.task)):
         return RuleFinding("RL003", str(error))
-    return RuleFinding("RL002", str(error), details, fix=opengl_fix(str(cause)), where=where)
+    return RuleFinding("RL002", message, details, fix=to_install or opengl_fix(str(cause)), where=where)
 
 
 def _base_class(instance: Instance) -> Iterator[RuleFinding]:
@@ -162,6 +166,7 @@ def _describe_built(instance: Instance) -> Built:
         accepts_options=instance.accepts_options,
         model=describe_mujoco_model(env),
         uses_pybullet=bool(find_clients()),
+        registered=describe_registrations(instance.context.spec.task, "check-env"),
         waivers=_waivers(author),
         file=file,
         line=line,

@@ -12,7 +12,6 @@ from rlctl.deploy.identify.follow import Follower, Unknowns, open_world
 from rlctl.deploy.identify.log import Array, Log
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.processes.child_process import write_stderr
 from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault, answer_messages
 from rlctl.rollout.messages import describe_failure, make_error
 
@@ -69,7 +68,7 @@ Ask = Callable[[Sequence[Follow | FindFit]], list[Any]]
 @contextlib.contextmanager
 def start_search_workers(spec: EnvSpec, log: Log, unknowns: Unknowns, count: int) -> Iterator[Ask]:
     """Start processes that simulate a log; yield a function that asks them, and raises the task's errors."""
-    pool = ProcessPool("rlctl.deploy.identify.search:main", [{}] * count, write_stderr)
+    pool = ProcessPool("rlctl.deploy.identify.search:main", [{}] * count)
 
     def ask(questions: Sequence[Follow | FindFit]) -> list[Any]:
         try:
