@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import importlib.util
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from rlctl.checking.bullet_calls import Replacement, replace_functions
 from rlctl.checking.bullet_worlds import MOST_CLIENTS, find_clients
+from rlctl.errors import UsageError
 from rlctl.replaying.mjcf import Mesh, connect_grid
 from rlctl.task.bullet import pybullet, pybullet_data
 
@@ -156,9 +156,8 @@ def log_calls() -> Iterator[BulletLog]:
 
     It has to be imported before the environment's module, which may import single functions of it.
     """
-    if importlib.util.find_spec("pybullet") is not None:
-        with contextlib.suppress(ImportError):  # an environment that needs it will say so
-            pybullet.isNumpyEnabled()
+    with contextlib.suppress(UsageError, ImportError):  # it is not installed: an environment that needs it will say so
+        pybullet.isNumpyEnabled()
     log = BulletLog()
 
     def replace(name: str, function: Any) -> Any:

@@ -230,15 +230,17 @@ def test_an_episode_is_verified_filmed_and_pictured(workshop, tmp_path):
 def test_links_are_placed_as_pybullet_places_them(file):
     client, rng = p.connect(p.DIRECT), np.random.default_rng(0)
     path = str(DATA / file)
-    bodies = p.loadMJCF(path) if path.endswith("xml") else [p.loadURDF(path, [1, 2, 3], [0, 0.6, 0, 0.8])]
+    pose = [1, 2, 3], [0, 0.6, 0, 0.8]
+    is_mjcf, where = path.endswith("xml"), {"physicsClientId": client}
+    bodies = p.loadMJCF(path, **where) if is_mjcf else [p.loadURDF(path, *pose, **where)]
     for body in (read_body(client, body) for body in bodies):
         for index, joint in enumerate(body.joints):
             if joint.moves:
-                p.resetJointState(body.id, index, rng.uniform(-1, 1))
+                p.resetJointState(body.id, index, rng.uniform(-1, 1), **where)
             elif joint.kind == p.JOINT_SPHERICAL:
-                p.resetJointStateMultiDof(body.id, index, Rotation.random(rng=rng).as_quat().tolist())
+                p.resetJointStateMultiDof(body.id, index, Rotation.random(rng=rng).as_quat().tolist(), **where)
         positions, orientations = place_links(body, [read_state(body)] * 2)
-        states = p.getLinkStates(body.id, range(len(body.joints)), computeForwardKinematics=1) or ()
+        states = p.getLinkStates(body.id, range(len(body.joints)), computeForwardKinematics=1, **where) or ()
         for index, state in enumerate(states, start=1):
             np.testing.assert_allclose(positions[1, index], state[4], atol=1e-7)
             turn = Rotation.from_quat(orientations[1, index]) * Rotation.from_quat(state[5]).inv()
