@@ -140,6 +140,13 @@ def format_plugin_traceback(error: BaseException) -> str:
     return "".join(traceback.format_exception(type(error), error, frames, limit=-_MOST_FRAMES))
 
 
+def find_plugin_line(error: BaseException) -> str:
+    """Return ` (FILE, line N)` of the last line that ran in the first file outside rlctl; empty if there is none."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_plugin_file(frame.filename)]
+    own = [frame for frame in frames if frame.filename == frames[0].filename]
+    return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
+
+
 def _is_plugin_file(file: str) -> bool:
     if file.startswith("<frozen importlib"):
         return False

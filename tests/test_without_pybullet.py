@@ -1,5 +1,6 @@
 """Where PyBullet is not installed, as on Python 3.12 and later, everything but tasks of rlctl works."""
 
+import os
 import subprocess
 import sys
 
@@ -14,7 +15,7 @@ def rlctl_without(tmp_path, monkeypatch):
     for name in ("pybullet", "pybullet_data"):
         (tmp_path / "hidden").mkdir(exist_ok=True)
         (tmp_path / "hidden" / f"{name}.py").write_text(GONE.format(name))
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "hidden"))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "hidden"), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.setenv("NO_COLOR", "1")
 
     def run(*arguments):
@@ -34,6 +35,11 @@ def test_a_task_of_rlctl_names_what_is_missing(rlctl_without, command):
     error = done.stderr.splitlines()[-1]
     assert error.startswith("error: tasks of rlctl need PyBullet, which is not installed: pip install ")
     assert error.endswith(" pybullet")
+
+
+def test_a_gymnasium_environment_is_recorded(rlctl_without):
+    done = rlctl_without("replay", "Pendulum-v1", "--policy", "zero")
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow

@@ -158,14 +158,17 @@ def _read_arguments(frame: FrameType) -> str:
     return "".join(lines).partition("(")[2]
 
 
-class _Replacement:
+class Replacement:
+    """Takes the place of a function of PyBullet."""
+
     @property  # type: ignore[misc]
     def __class__(self) -> type:  # BulletClient adds the client to builtins only
         return types.BuiltinFunctionType
 
 
 @contextlib.contextmanager
-def _replace_functions(replace: Callable[[str, Any], Any]) -> Iterator[None]:
+def replace_functions(replace: Callable[[str, Any], Any]) -> Iterator[None]:
+    """Replace PyBullet's functions inside the `with` block by what `replace` returns for a name and a function."""
     pybullet = sys.modules.get("pybullet")
     members = vars(pybullet) if pybullet else {}
     functions = {name: function for name, function in members.items() if inspect.isbuiltin(function)}
@@ -192,9 +195,9 @@ def record_calls() -> Iterator[BulletCalls]:
                 calls.note_result(name, frame, arguments, keywords, result)
             return result
 
-        return function if NO_CLIENT.fullmatch(name) else type(name, (_Replacement,), {"__call__": call})()
+        return function if NO_CLIENT.fullmatch(name) else type(name, (Replacement,), {"__call__": call})()
 
-    with _replace_functions(replace):
+    with replace_functions(replace):
         yield calls
 
 
@@ -207,6 +210,6 @@ def visible_to_profilers() -> contextlib.AbstractContextManager[None]:
             return function(*arguments, **keywords)
 
         call.__code__ = call.__code__.replace(co_name=name, co_qualname=name)
-        return type(name, (_Replacement,), {"__call__": call})()
+        return type(name, (Replacement,), {"__call__": call})()
 
-    return _replace_functions(replace)
+    return replace_functions(replace)

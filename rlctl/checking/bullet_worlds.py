@@ -46,9 +46,9 @@ class ClientCalls:
         return functools.partial(value, physicsClientId=self._client) if inspect.isbuiltin(value) else value
 
 
-def find_clients() -> list[int]:
-    """Return the ids of the clients that are connected, whoever did it; empty where PyBullet is not loaded."""
-    ids = range(MOST_CLIENTS if "pybullet" in sys.modules else 0)
+def find_clients(most: int = MOST_CLIENTS) -> list[int]:
+    """Return the ids below `most` of the clients that are connected, whoever did it; empty without PyBullet."""
+    ids = range(min(most, MOST_CLIENTS) if "pybullet" in sys.modules else 0)
     return [client for client in ids if ClientCalls(client).getConnectionInfo()["isConnected"]]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -55,8 +55,21 @@ def _list_paths(incomplete: str, pattern: str) -> list[str]:
 _COMPLETIONS = {"task": complete_task, "run": complete_run, "algorithm": complete_algorithm}
 
 
+Panels = Mapping[str, Sequence[str]]
+"""Title of a panel of the help -> names of the parameters in it. Typer puts --help into `Options`, the first one."""
+
+
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Return a function for Typer: the option fields of a dataclass parameter replace the parameter."""
+    return _make_command(function, {})
+
+
+def command_in_panels(panels: Panels) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return a decorator as `command`, whose help shows the options in panels, in this order."""
+    return lambda function: _make_command(function, panels)
+
+
+def _make_command(function: Callable[..., None], panels: Panels) -> Callable[..., None]:
     parameters, requests = [], {}
     for parameter in inspect.signature(function, eval_str=True).parameters.values():
         if not dataclasses.is_dataclass(parameter.annotation):
@@ -67,6 +80,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         fields = [field for field in dataclasses.fields(request) if _find_option(hints[field.name])]
         parameters += [_make_parameter(field.name, hints[field.name], _find_default(field)) for field in fields]
         requests[parameter.name] = (request, [field.name for field in fields])
+    parameters = _arrange(parameters, panels)
     turned_off = [parameter.name for parameter in parameters if _turns_off(parameter.annotation)]
 
     def run(**values: Any) -> None:
@@ -81,6 +95,16 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
+
+
+def _arrange(parameters: list[inspect.Parameter], panels: Panels) -> list[inspect.Parameter]:
+    """Return arguments first, then options in the order of the panels, each with the title of its own."""
+    titles = {name: title for title, names in panels.items() for name in names}
+    for parameter in parameters:
+        if parameter.name in titles:
+            parameter.annotation.__metadata__[0].rich_help_panel = titles[parameter.name]
+    order = [parameter.name for parameter in parameters if parameter.name not in titles] + list(titles)
+    return sorted(parameters, key=lambda parameter: order.index(parameter.name))
 
 
 def _find_option(annotation: Any) -> Option | None:

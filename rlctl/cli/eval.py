@@ -9,14 +9,23 @@ from typing import Annotated, Any
 
 from typer.core import TyperCommand
 
-from rlctl.cli.arguments import choose_checkpoint, command, parse_changes
+from rlctl.cli.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates
 from rlctl.options import Cluster, Json, On, Option, Pretrained, Settings, Yes
 from rlctl.replaying.request import ReplayRequest
 
 
-@command
+@command_in_panels(
+    {
+        "Options": ["episodes", "seed", "checkpoint", "pretrained", "baseline", "task", "settings", "stage"],
+        "Gates": ["min_success", "min_success_lower", "min_return"],
+        "Robustness": ["vary", "push", "sim", "yes"],
+        "How": ["deterministic", "limits", "env_timeout_s"],
+        "Where": ["n_envs", "on", "cluster"],
+        "Output": ["record", "json"],
+    }
+)
 def evaluate(
     options: EvalOptions,
     pretrained: Pretrained = False,
@@ -92,9 +101,19 @@ def _fill_counts(arguments: Iterable[str]) -> Iterator[str]:
             yield "1"
 
 
-@command
+@command_in_panels(
+    {
+        "Options": ["baseline", "checkpoint", "pretrained", "task", "verify"],
+        "Episodes": ["episodes", "worst", "best", "failures", "seed", "settings"],
+        "Where": ["gui", "sim"],
+        "Output": ["output", "video", "json"],
+    }
+)
 def replay(request: ReplayRequest, pretrained: Pretrained = False, json: Json = None) -> None:
-    """Show what a policy does: rollouts as Rerun recordings, without a display."""
+    """Show what a policy does, or what a task does before any training: Rerun recordings, without a display.
+
+    A function for --policy is act(observation) or act(observation, step) and returns an action; step counts from 0.
+    """
     from rlctl.replaying.replay import run_replay
     from rlctl.replaying.report import show
 

@@ -5,12 +5,19 @@ from typing import Annotated, Literal
 
 import typer
 
-from rlctl.cli.arguments import command, parse_changes
+from rlctl.cli.arguments import command, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.options import Argument, EnvTimeout, Json, Option, OptionalTask, Settings, TaskName
 
 
-@command
+@command_in_panels(
+    {
+        "Options": ["settings", "env_timeout"],
+        "Rules": ["select", "ignore", "strict", "baseline"],
+        "Output": ["form", "output", "json"],
+        "Instead of a check": ["list_rules", "explain"],
+    }
+)
 def check_env(
     task: OptionalTask = None,
     settings: Settings = [],

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Annotated, Any
 
-from rlctl.cli.arguments import command
+from rlctl.cli.arguments import command_in_panels
 from rlctl.errors import UsageError
 from rlctl.options import Cluster, Jobs, Json, On, Option, Settings
 from rlctl.run.train_request import TrainRequest
@@ -64,7 +64,15 @@ class TrainFlags(RecipeFlags):
         return merge(settings, {"callbacks": dict.fromkeys(names)}) if names else settings
 
 
-@command
+@command_in_panels(
+    {
+        "Options": ["algo", "total_timesteps", "seed", "seeds", "config", "settings", "stop_success"],
+        "How": ["n_envs", "device", "check", "env_timeout_s", "callback"],
+        "Continue": ["resume", "initial_policy", "demos", "force"],
+        "Where": ["jobs", "on", "cluster", "detach"],
+        "Output": ["root", "record", "track", "json"],
+    }
+)
 def train(
     flags: TrainFlags,
     request: TrainRequest,
@@ -112,7 +120,15 @@ class TuneFlags(RecipeFlags):
     ] = None
 
 
-@command
+@command_in_panels(
+    {
+        "Options": ["algo", "total_timesteps", "seed", "config", "settings", "n_envs"],
+        "Search": ["search", "trials", "metric"],
+        "Continue": ["resume", "storage"],
+        "Where": ["jobs", "on", "cluster"],
+        "Output": ["root", "track", "json"],
+    }
+)
 def tune(
     flags: TuneFlags, request: TuneRequest, jobs: Jobs = None, on: On = None, cluster: Cluster = None, json: Json = None
 ) -> None:

@@ -59,6 +59,13 @@ def split_names(observations: Any, sizes: Mapping[str, int]) -> dict[str, NDArra
     return dict(zip(sizes, np.split(newest, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
 
 
+def is_image(space: spaces.Space[Any]) -> bool:
+    """Return whether a space is of images, as Stable-Baselines3 defines them: uint8 from 0 to 255, three axes."""
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) != 3:
+        return False
+    return bool((space.low == 0).all() and (space.high == 255).all())
+
+
 def format_space(space: Any, longest: int = 100) -> str:
     """Return a space as one line of text; if that is longer than `longest`, only its kind and shape."""
     text = " ".join(str(space).split())

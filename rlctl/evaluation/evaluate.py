@@ -88,9 +88,21 @@ def run_evaluation(
 ) -> Evaluation:
     """Find the policy, play its episodes, and return their statistics; `print_notes` as in `find_player`."""
     if request.baseline is not None:
-        return _evaluate(load_baseline(request), choose_task(request), request, gates)
+        return _evaluate(load_baseline(request.baseline), _choose_task(request), request, gates)
     _, policy, spec = find_player(request, print_notes)
     return _evaluate(policy, spec, request, gates)
+
+
+def _choose_task(request: EvalRequest) -> EnvSpec:
+    name = str(request.baseline)
+    if request.checkpoint != "best" or request.stage is not None or not request.deterministic or request.task:
+        raise UsageError(
+            f"--policy {name} plays a task, not a run: leave out --checkpoint, "
+            "--pretrained, --stage, --stochastic and --task"
+        )
+    if request.spec is not None:
+        return dataclasses.replace(request.spec, frame_stack=1, time_feature=False)
+    return request.changes.apply(choose_task(request.run, name, "eval"))
 
 
 def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:

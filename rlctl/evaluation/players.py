@@ -1,8 +1,9 @@
-"""The players of an evaluation, and the environment that each plays in."""
+"""The players of an evaluation or a replay, and the environment that each plays in."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from rlctl import output
 from rlctl.environments.spec import EnvSpec
@@ -11,6 +12,7 @@ from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import check_playable, load_policy
 from rlctl.policy.players.named import BASELINES, SERVER, load_function
+from rlctl.policy.players.player import Player
 from rlctl.rollout.workers import Workers
 from rlctl.run import lookup
 
@@ -83,15 +85,20 @@ class Baseline:
         """Let workers act with the baseline."""
         workers.set_other_policy(self.name)
 
+    def make_player(self, env: Any) -> Player:
+        """Return a player for an environment in this process."""
+        from rlctl.rollout.worker import make_player_of
 
-def load_baseline(request: EvalRequest) -> Baseline:
-    """Return the baseline of a request; raises `UsageError` if it does not exist, and for options of a run."""
-    name = str(request.baseline)
-    if request.checkpoint != "best" or request.stage is not None or not request.deterministic or request.task:
-        raise UsageError(
-            f"--policy {name} plays a task, not a run: leave out --checkpoint, "
-            "--pretrained, --stage, --stochastic and --task"
-        )
+        return make_player_of(self.name, env)
+
+    @property
+    def title(self) -> str:
+        """The name without folders: `zero`, `policy.py:act`."""
+        return self.name if self.name.startswith(SERVER) else self.name.rpartition("/")[2]
+
+
+def load_baseline(name: str) -> Baseline:
+    """Return the baseline of `--policy`; raises `UsageError` if it does not exist."""
     if name.startswith(SERVER):
         try:
             from rlctl.deploy.server.client import PolicyClient
@@ -104,13 +111,21 @@ def load_baseline(request: EvalRequest) -> Baseline:
     return Baseline(f"{Path(place).expanduser().resolve()}:{function}" if place.endswith(".py") else name)
 
 
-def choose_task(request: EvalRequest) -> EnvSpec:
-    """Return the task of a request as its recipe would train it, in the last stage; observations are not stacked."""
-    if request.spec is not None:
-        return dataclasses.replace(request.spec, frame_stack=1, time_feature=False)
-    if request.run is None:
-        raise UsageError(f"--policy {request.baseline}: give the task to play: rlctl eval reach --policy zero")
+def choose_task(task: str | None, policy: str, command: str) -> EnvSpec:
+    """Return a task as its recipe would train it, in the last stage; observations are not stacked.
+
+    `policy` and `command` are `--policy` and the verb, for errors. Raises `UsageError` for a run or a policy file.
+    """
+    if task is None:
+        raise UsageError(f"--policy {policy}: give the task to play: rlctl {command} reach --policy {policy}")
+    is_file = Path(task).suffix in (".safetensors", ".onnx", ".npz")
+    if is_file or task == "latest" or (Path(task) / "run.json").is_file():
+        what = "a file" if is_file else "a run"
+        raise UsageError(
+            f"--policy {policy} plays a task, and {task} is {what}: leave out --policy, "
+            f"or name its task: rlctl {command} TASK --policy {policy}"
+        )
     from rlctl.recipe.sources import resolve_with_stages
 
-    spec = resolve_with_stages(request.run).env_specs(request.run)[-1].resolve()
-    return request.changes.apply(dataclasses.replace(spec, frame_stack=1, time_feature=False, stage=0))
+    spec = resolve_with_stages(task).env_specs(task)[-1].resolve()
+    return dataclasses.replace(spec, frame_stack=1, time_feature=False, stage=0)

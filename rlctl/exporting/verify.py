@@ -135,6 +135,13 @@ class ClosedLoop:
     mean_return_exported: float
     magnified: bool = False
     """Whether the episodes of the original policy differ as much when the last bits of its weights change."""
+    repeats: bool = True
+    """False if the original policy, played again, had other episodes: then whole episodes cannot be compared."""
+
+    @property
+    def is_conclusive(self) -> bool:
+        """Whether a difference of the episodes would show that the policies differ."""
+        return self.repeats and not self.magnified
 
     @property
     def agrees(self) -> bool:
@@ -160,8 +167,8 @@ def verify(torch_policy: TorchPolicy, exported: Policy, file: Path, workers: Wor
     """Play the same episodes with both policies, and compare their actions on every observation of both.
 
     `file` is the exported file, ONNX or a compiled library. Plays more episodes until enough observations are compared.
-    If all actions agree but the episodes differ, it tests whether the episodes are chaotic. Raises `TaskError` if the
-    environment fails.
+    If all actions agree but the episodes differ, the original policy plays again, to test whether the environment
+    repeats its episodes, and whether they are chaotic. Raises `TaskError` if the environment fails.
     """
     min_observations = _MIN_OBSERVATIONS["onnx" if isinstance(exported, OnnxPolicy) else "c"]
     comparison = Comparison(torch_policy, exported)
@@ -182,23 +189,30 @@ def verify(torch_policy: TorchPolicy, exported: Policy, file: Path, workers: Wor
     comparison.close()
     loop = compare_episodes(expected, actual)
     if comparison.agreement.agrees and not loop.agrees:
-        loop = dataclasses.replace(loop, magnified=_magnifies_rounding(torch_policy.file, workers, expected))
+        repeats = _repeats_episodes(torch_policy.file, workers, expected)
+        magnified = repeats and _magnifies_rounding(torch_policy.file, workers, expected)
+        loop = dataclasses.replace(loop, repeats=repeats, magnified=magnified)
     return comparison.agreement, loop
 
 
+def _repeats_episodes(policy: PolicyFile, workers: Workers, expected: Sequence[Episode]) -> bool:
+    """Return whether the policy has the same episodes when it plays again."""
+    again = _play_again(policy, workers, expected)
+    return again.agrees and again.max_return_difference == 0.0
+
+
 def _magnifies_rounding(policy: PolicyFile, workers: Workers, expected: Sequence[Episode]) -> bool:
-    """Return whether episodes are reproducible but change with the last bits of the policy's weights.
+    """Return whether episodes change with the last bits of the policy's weights.
 
     Contacts cause this within some hundred steps; such episodes cannot show whether two policies are the same.
     """
-    seeds = [episode.result.seed for episode in expected]
-    workers.set_policy(policy)
-    again = compare_episodes(expected, play_episodes(workers, seeds))
-    if again.max_return_difference > 0.0 or not again.agrees:
-        return False
     changed = {name: _change_last_bits(values) for name, values in policy.tensors.items()}
-    workers.set_policy(PolicyFile(policy.info, changed))
-    return not compare_episodes(expected, play_episodes(workers, seeds)).agrees
+    return not _play_again(PolicyFile(policy.info, changed), workers, expected).agrees
+
+
+def _play_again(policy: PolicyFile, workers: Workers, expected: Sequence[Episode]) -> ClosedLoop:
+    workers.set_policy(policy)
+    return compare_episodes(expected, play_episodes(workers, [episode.result.seed for episode in expected]))
 
 
 def _change_last_bits(values: NDArray[Any]) -> NDArray[Any]:

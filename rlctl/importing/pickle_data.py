@@ -7,7 +7,7 @@ calls something, the value is a description of that import or call.
 import dataclasses
 import pickletools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,9 +107,10 @@ _ADDS: dict[str, tuple[int | None, Callable[[Any, list[Any]], None]]] = {
 _IGNORED = frozenset({"PROTO", "FRAME", "READONLY_BUFFER"})
 
 
-def read(content: bytes) -> Any:
+def read(content: bytes | BinaryIO) -> Any:
     """Return the value that a pickle describes, of plain types, `Name`, `Call` and `Persistent`.
 
+    A stream is read to the end of the pickle.
     Raises `NotPlainData` for a damaged pickle, and for instructions that model files do not have.
     """
     machine = _Machine()

@@ -3,9 +3,7 @@
 import base64
 import contextlib
 import dataclasses
-import io
 import json
-import math
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,15 +11,13 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.importing import pickle_data
-from rlctl.importing.pickle_data import Call, Name, NotPlainData, Persistent, read_array, read_dtype, read_plain
+from rlctl.importing.pickle_data import Call, Name, NotPlainData, read_array, read_dtype, read_plain
+from rlctl.importing.tensor_file import LARGEST_MEMBER, read_member, read_tensors
 from rlctl.storage import untrusted
-
-LARGEST_MEMBER = 500_000_000  # limit of the unpacked size of a member of the archive [bytes]
 
 _POLICIES = {
     "stable_baselines3.sac": "sac",
@@ -36,11 +32,8 @@ _POLICIES = {
 _SAME_POLICY = ({"ppo", "a2c"}, {"td3", "ddpg"})
 _ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "SiLU": "silu"}
 _EXTRACTORS = frozenset({"FlattenExtractor", "NatureCNN", "CombinedExtractor"})
-_TRAINING_ONLY = frozenset({"optimizer_class", "optimizer_kwargs"})
-_STORAGES = {
-    "DoubleStorage": "f8", "FloatStorage": "f4", "HalfStorage": "f2", "LongStorage": "i8", "IntStorage": "i4",
-    "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "?",
-}  # fmt: skip
+_NOT_OF_THE_NETWORK = frozenset({"optimizer_class", "optimizer_kwargs", "device"})
+"""Arguments of a policy that do not change what it computes; versions of SB3 before 1.0 write its device."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +65,7 @@ def read_model(path: Path, algo: str | None = None) -> SavedModel:
     other algorithm than the model's.
     """
     with _explain_errors(path, "a model"), untrusted.open_file(path) as file, zipfile.ZipFile(file) as archive:
-        data, policy = json.loads(_read_member(archive, "data")), _read_member(archive, "policy.pth")
+        data, policy = json.loads(read_member(archive, "data")), read_member(archive, "policy.pth")
         if not isinstance(data, dict):
             raise NotPlainData("its data is not a mapping")
         saved_algo = _find_algorithm(data)
@@ -85,7 +78,7 @@ def read_model(path: Path, algo: str | None = None) -> SavedModel:
             policy_kwargs=_read_policy_kwargs(data),
             tensors={f"policy/{name}": values for name, values in read_tensors(policy).items()},
             training_steps=int(data.get("num_timesteps") or 0),
-            version=_read_member(archive, _VERSION).decode().strip() if _VERSION in archive.namelist() else "",
+            version=read_member(archive, _VERSION).decode().strip() if _VERSION in archive.namelist() else "",
         )
 
 
@@ -103,17 +96,6 @@ def _explain_errors(path: Path, what: str) -> Iterator[None]:
 
 
 _VERSION = "_stable_baselines3_version"
-
-
-def _read_member(archive: zipfile.ZipFile, name: str) -> bytes:
-    try:
-        member = archive.getinfo(name)
-    except KeyError:
-        raise NotPlainData(f"no file {name!r} in the archive; it has {', '.join(archive.namelist()[:8])}") from None
-    if member.file_size > LARGEST_MEMBER:
-        raise NotPlainData(f"{name!r} has {member.file_size:,} bytes; the limit is {LARGEST_MEMBER:,}")
-    with archive.open(member) as stream:
-        return stream.read(member.file_size)
 
 
 def _decode(data: Mapping[str, Any], key: str) -> Any:
@@ -141,7 +123,7 @@ def _find_algorithm(data: Mapping[str, Any]) -> str:
 def _read_policy_kwargs(data: Mapping[str, Any]) -> dict[str, Any]:
     kwargs: dict[str, Any] = {"use_sde": True} if data.get("use_sde") else {}
     for key, value in (_decode(data, "policy_kwargs") or {}).items():
-        if key in _TRAINING_ONLY:
+        if key in _NOT_OF_THE_NETWORK:
             continue
         if key == "activation_fn":
             if not isinstance(value, Name) or value.qualname not in _ACTIVATIONS:
@@ -203,41 +185,3 @@ def read_normalization(path: Path) -> SavedNormalization | None:
             for name in ("mean", "var"):
                 tensors[f"normalize/{key}/{name}"] = read_array(values[name]).astype(np.float64)
         return SavedNormalization(list(parts), tensors, float(state["clip_obs"]))
-
-
-def read_tensors(content: bytes) -> dict[str, NDArray[Any]]:
-    """Return the tensors, by name, of a state dict that `torch.save` wrote as a zip archive (torch 1.6 or newer)."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        prefix = next((name[: -len("data.pkl")] for name in archive.namelist() if name.endswith("/data.pkl")), "")
-        if f"{prefix}byteorder" in archive.namelist() and _read_member(archive, f"{prefix}byteorder") != b"little":
-            raise NotPlainData("tensors of a big-endian machine")
-        state = pickle_data.read(_read_member(archive, f"{prefix}data.pkl"))
-        tensors: dict[str, NDArray[Any]] = {}
-        size = 0
-        for name, value in dict(state.items if isinstance(state, Call) else state).items():
-            tensors[str(name)] = _read_tensor(value, archive, prefix)
-            size += tensors[str(name)].nbytes
-            if size > LARGEST_MEMBER:  # many names may share one storage
-                raise NotPlainData(f"tensors of more than {LARGEST_MEMBER:,} bytes")
-        return tensors
-
-
-def _read_tensor(value: Any, archive: zipfile.ZipFile, prefix: str) -> NDArray[Any]:
-    if isinstance(value, Call) and str(value.function) == "torch._utils._rebuild_parameter":
-        value = value.arguments[0]
-    if not isinstance(value, Call) or str(value.function) != "torch._utils._rebuild_tensor_v2":
-        raise NotPlainData(f"{getattr(value, 'function', type(value).__name__)} where a tensor is expected")
-    storage, offset, shape, strides = value.arguments[:4]
-    if not isinstance(storage, Persistent):
-        raise NotPlainData("a tensor without storage")
-    _, kind, key, *_ = storage.content
-    dtype = np.dtype(_STORAGES[kind.qualname])
-    numbers = np.frombuffer(_read_member(archive, f"{prefix}data/{key}"), dtype)
-    last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
-    if min((offset, *shape, *strides), default=0) < 0 or (0 not in shape and last >= numbers.size):
-        raise NotPlainData("a tensor that reads outside its storage")
-    if 0 in shape:
-        return np.zeros(shape, dtype)
-    if math.prod(shape) > numbers.size:  # strides of 0 would repeat numbers
-        raise NotPlainData("a tensor larger than its storage")
-    return as_strided(numbers[offset:], shape, [stride * dtype.itemsize for stride in strides]).copy()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gymnasium import spaces
 
-from rlctl.environments.dict_spaces import split_space
+from rlctl.environments.dict_spaces import is_image, split_space
 from rlctl.errors import UsageError
 from rlctl.policy import layers
 from rlctl.policy.file import ACTOR_CRITIC, DETERMINISTIC, GRAPH, SQUASHED_GAUSSIAN, PolicyFile
@@ -143,7 +143,7 @@ class _Reader:
             sizes = space.n if isinstance(space, spaces.Discrete) else space.nvec
             return [layers.OneHot(f"one_hot/{key}", np.asarray(sizes))]
         result: list[Layer] = [self.normalize[key]] if key in self.normalize else []
-        if not _is_image(space):
+        if not is_image(space):
             return [*result, layers.Flatten("flatten")]
         shape, relu = space.shape or (), Activation("relu")
         # SB3 takes the smallest dimension for the channels.
@@ -191,9 +191,3 @@ class _Reader:
             biases = [self.tensors[bias] for bias in names if bias in self.tensors]
             lstm_layers.append(layers.LstmLayer(of_input, of_hidden, biases))
         return layers.Lstm(name, lstm_layers)
-
-
-def _is_image(space: spaces.Space[object]) -> bool:
-    if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) != 3:
-        return False
-    return bool((space.low == 0).all() and (space.high == 255).all())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import split_names
 from rlctl.replaying.recorder import Rollout
-from rlctl.replaying.scene import Scene, encode_jpeg
+from rlctl.replaying.scene import WORLD, Scene, encode_jpeg
 
 Color = tuple[int, int, int]
 # Distinct on the viewer's dark and light background; the first eight also to colour-blind eyes.
@@ -40,10 +40,20 @@ class Timelines:
         sequence = np.asarray(steps, np.int64)
         indexes = [rr.TimeColumn("step", sequence=sequence)]
         if self.dt is not None:
-            # Rerun truncates floating-point times, so equal times could become rows one nanosecond apart.
-            nanoseconds = np.round(sequence * self.dt * 1e9).astype("timedelta64[ns]")
-            indexes.append(rr.TimeColumn("sim_time", duration=nanoseconds))
+            indexes.append(rr.TimeColumn("sim_time", duration=self._convert(sequence)))
         self.stream.send_columns(entity, indexes, columns)
+
+    def log(self, entity: str, step: int, archetype: rr.AsComponents) -> None:
+        """Log an archetype at a step."""
+        self.stream.set_time("step", sequence=step)
+        if self.dt is not None:
+            self.stream.set_time("sim_time", duration=self._convert(np.int64(step)))
+        self.stream.log(entity, archetype)
+        self.stream.reset_time()
+
+    def _convert(self, steps: Any) -> Any:
+        # Rerun truncates floating-point times, so equal times could become rows one nanosecond apart.
+        return np.round(steps * (self.dt or 0.0) * 1e9).astype("timedelta64[ns]")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,8 +139,9 @@ def _send_joints(scene: Scene, timelines: Timelines) -> list[Plot]:
     for kind, plural in (("position", "positions"), ("velocity", "velocities")) if robots else ():
         curves = [getattr(body, f"joint_{plural}") for body in robots]
         for body, values in zip(robots, curves, strict=True):
-            names = [name if len(robots) == 1 else f"{body.name}/{name}" for name in body.joint_names]
-            _send(timelines, rr.new_entity_path(["joints", kind, body.name]), 0, values, names)
+            path = [body.name] if body.world == WORLD else [body.world, body.name]
+            names = [name if len(robots) == 1 else "/".join([*path, name]) for name in body.joint_names]
+            _send(timelines, rr.new_entity_path(["joints", kind, *path]), 0, values, names)
         plots.append(Plot(f"joint {plural}", f"joints/{kind}", "joints", np.concatenate(curves, axis=1)))
     return plots
 

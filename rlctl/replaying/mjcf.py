@@ -7,12 +7,12 @@ PyBullet 3.2 does: `axisangle` is always in radians; `euler`, `zaxis` and `xyaxe
 
 import dataclasses
 import enum
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 
 class ShapeKind(enum.Enum):
@@ -33,6 +33,10 @@ class Mesh:
 
     vertices: np.ndarray  # [m], shape (vertices, 3)
     triangles: np.ndarray  # indices of vertices, shape (triangles, 3)
+    uvs: np.ndarray | None = (
+        None  # coordinates in the texture from its upper left corner, in [0, 1], shape (vertices, 2)
+    )
+    texture: Path | None = None  # a picture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +60,9 @@ _Defaults = Mapping[str, Mapping[str, str]]  # attributes of geoms, by class
 
 
 def read_shapes(file: Path) -> list[Shape]:
-    """Return the geoms of all bodies of a file; the `link` of a shape is the name of its MJCF body.
+    """Return the geoms of a file; the `link` of a shape is the name of its MJCF body.
+
+    PyBullet makes a body of each geom that belongs to the world, and names its base like the geom.
 
     Raises `ValueError` where the file cannot be read.
     """
@@ -65,7 +71,9 @@ def read_shapes(file: Path) -> list[Shape]:
         group = root.find("default")
         defaults = dict(_defaults(group, {}))
         outermost = _OUTERMOST if group is None else group.get("class", _OUTERMOST)
-        return [shape for body in root.iterfind("worldbody/body") for shape in _of_body(body, defaults, outermost)]
+        of_bodies = [shape for body in root.iterfind("worldbody/body") for shape in _of_body(body, defaults, outermost)]
+        named = [geom for geom in root.iterfind("worldbody/geom") if geom.get("name") and geom.get("type") != "plane"]
+        return of_bodies + [_shape(geom.get("name", ""), _complete(geom, defaults, outermost)) for geom in named]
     except (OSError, ElementTree.ParseError) as error:
         raise ValueError(f"{file}: {error}") from error
 
@@ -84,9 +92,13 @@ def _defaults(group: ElementTree.Element | None, outer: Mapping[str, str]) -> It
 def _of_body(body: ElementTree.Element, defaults: _Defaults, around: str) -> Iterator[Shape]:
     inherited = body.get("childclass", around)
     for geom in body.iterfind("geom"):
-        yield _shape(body.get("name", ""), {**defaults.get(geom.get("class", inherited), {}), **geom.attrib})
+        yield _shape(body.get("name", ""), _complete(geom, defaults, inherited))
     for child in body.iterfind("body"):
         yield from _of_body(child, defaults, inherited)
+
+
+def _complete(geom: ElementTree.Element, defaults: _Defaults, inherited: str) -> Mapping[str, str]:
+    return {**defaults.get(geom.get("class", inherited), {}), **geom.attrib}
 
 
 def _shape(link: str, geom: Mapping[str, str]) -> Shape:
@@ -115,7 +127,7 @@ def _orientation(geom: Mapping[str, str]) -> tuple[float, ...]:
         return (*map(float, vector), float(w))
     if turn := _numbers(geom, "axisangle"):
         axis = np.array(turn[:3]) / np.linalg.norm(turn[:3])
-        return tuple(Rotation.from_rotvec(turn[3] * axis).as_quat().tolist())
+        return (*(math.sin(turn[3] / 2) * axis).tolist(), math.cos(turn[3] / 2))
     return (0.0, 0.0, 0.0, 1.0)
 
 
@@ -124,5 +136,14 @@ def _between(start: np.ndarray, end: np.ndarray) -> tuple[tuple[float, ...], tup
     along = end - start
     length = float(np.linalg.norm(along))
     direction = along / length if length else np.array([0.0, 0.0, 1.0])
-    turn, _ = Rotation.align_vectors([direction], [[0.0, 0.0, 1.0]])  # the shortest one
-    return tuple(((start + end) / 2).tolist()), tuple(turn.as_quat().tolist()), length
+    x, y, z = direction.tolist()
+    # The shortest turn from the z axis; half a turn about any horizontal axis if the direction is opposite.
+    turn = np.array([-y, x, 0.0, 1.0 + z]) if z > -1.0 + 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
+    return tuple(((start + end) / 2).tolist()), tuple((turn / np.linalg.norm(turn)).tolist()), length
+
+
+def connect_grid(rows: int, columns: int) -> np.ndarray:
+    """Return the triangles between points of a grid, whose second index goes fastest; shape (triangles, 3)."""
+    corner = np.arange(rows * columns).reshape(rows, columns)[:-1, :-1].ravel()
+    right, above = corner + columns, corner + 1
+    return np.concatenate([np.stack([corner, right, right + 1], 1), np.stack([corner, right + 1, above], 1)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,13 +109,21 @@ def _find_box(model: mujoco.MjModel, geoms: list[int], centers: Array) -> tuple[
     return ((middle - radii).min(axis=0), (middle + radii).max(axis=0)) if geoms else (-np.ones(3), np.ones(3))
 
 
+def find_trunk_joint(model: mujoco.MjModel, joint: int) -> Literal["free", "rail"] | None:
+    """Return `free` for a free joint, `rail` for a sliding joint without limits, and None for any other."""
+    kind = int(model.jnt_type[joint])
+    if kind == _enum("mjtJoint", "mjJNT_FREE"):
+        return "free"
+    endless = kind == _enum("mjtJoint", "mjJNT_SLIDE") and not 0 < np.ptp(model.jnt_range[joint]) < _RAIL
+    return "rail" if endless else None
+
+
 def _find_trunk(model: mujoco.MjModel, positions: Array) -> int | None:
     """Return the first body that travels on a free joint, or on a sliding joint without limits."""
-    free, slide = _enum("mjtJoint", "mjJNT_FREE"), _enum("mjtJoint", "mjJNT_SLIDE")
     for joint in range(model.njnt):
-        kind, body = int(model.jnt_type[joint]), int(model.jnt_bodyid[joint])
-        endless = kind == slide and not 0 < np.ptp(model.jnt_range[joint]) < _RAIL
-        if (kind == free or endless) and np.ptp(positions[:, body], axis=0).max() >= _SHORTEST_PATH:
+        body = int(model.jnt_bodyid[joint])
+        travels = np.ptp(positions[:, body], axis=0).max() >= _SHORTEST_PATH
+        if travels and find_trunk_joint(model, joint) is not None:
             return body
     return None
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from gymnasium import spaces
@@ -16,8 +16,10 @@ from rlctl.environments import dict_spaces, registry
 from rlctl.environments.info import EnvInfo, describe, find_mujoco
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
+from rlctl.replaying.bullet_scene import TaskReader, WorldsReader
+from rlctl.replaying.drawable import DrawableEnv
 from rlctl.replaying.mujoco_scene import MujocoReader
-from rlctl.replaying.scene import Camera, Env, Scene, SceneReader, Warn
+from rlctl.replaying.scene import Camera, Env, Scene, Warn
 from rlctl.rollout.messages import format_hint
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode
 from rlctl.task.env import TaskEnv
@@ -26,6 +28,7 @@ from rlctl.version import collect_versions
 Choose = Callable[[Any, int], Any]
 """Returns the action for an observation and the number of steps so far; None ends the episode."""
 Watch = Callable[[int], None]  # called with the number of a step after it; 0 is the reset
+DEFAULT_DT = 1 / 30  # [s] per step, if an environment gives no time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,23 +60,43 @@ class Rollout:
         return len(self.episode.rewards)
 
 
-def make_drawable(spec: EnvSpec, warn: Warn) -> Env:
-    """Build an environment that can be drawn; `warn` receives the reason if there are no pictures."""
-    if registry.is_task(spec.constructor()):
-        return spec.make()  # its bodies are drawn; pictures would be slow and show less
-    try:
-        return spec.make("rgb_array")
-    except RlctlError as error:
-        env = spec.make()  # raises again if drawing was not the reason
-        warn(f"no camera pictures: {str(error).splitlines()[0]}")
-        return env
+class _SceneReader(Protocol):
+    def read(self, step: int) -> None: ...
+
+    def scene(self) -> Scene: ...
 
 
-def _make_reader(env: Env, warn: Warn) -> SceneReader | MujocoReader | Camera:
+class _PlainReader:
+    """Reads the bodies of a plain environment in PyBullet; takes pictures of any other."""
+
+    def __init__(self, env: Env, warn: Warn) -> None:
+        self._env = env
+        self._warn = warn
+
+    def read(self, step: int) -> None:
+        if step == 0:  # only now: many environments load their bodies in the first reset
+            self._reader = self._choose()
+        self._reader.read(step)
+
+    def _choose(self) -> _SceneReader:
+        env = self._env
+        if isinstance(env, DrawableEnv):
+            worlds = WorldsReader(env.bullet_log, self._warn)
+            if worlds.find_bodies():
+                return worlds
+            if env.no_pictures:
+                self._warn(f"no camera pictures: {env.no_pictures}")
+        return Camera(env, self._warn)
+
+    def scene(self) -> Scene:
+        return self._reader.scene()
+
+
+def _make_reader(env: Env, warn: Warn) -> _SceneReader:
     if find_mujoco(env):
         return MujocoReader(env)
     inner = env.unwrapped
-    return SceneReader(inner) if isinstance(inner, TaskEnv) else Camera(env, warn)
+    return TaskReader(inner) if isinstance(inner, TaskEnv) else _PlainReader(env, warn)
 
 
 class _Step(NamedTuple):
@@ -111,13 +134,13 @@ def play_episode(
     terminated = truncated = False
     with _locate_errors(spec.task, seed, 0):
         observation, info = env.reset(seed=seed)
-        first, drawn = _copy_observation(observation, space), _find_events(info, about)
+        first, drawn = copy_observation(observation, space), _find_events(info, about)
         read(0)
     watch(0)
     while not (terminated or truncated) and (action := choose(observation, len(steps))) is not None:
         with _locate_errors(spec.task, seed, len(steps) + 1):
             observation, reward, terminated, truncated, info = env.step(cast(action))
-            steps.append(_read_step(action, _copy_observation(observation, space), float(reward), info, about))
+            steps.append(_read_step(action, copy_observation(observation, space), float(reward), info, about))
             read(len(steps))
         watch(len(steps))
     end = "terminated" if terminated else "truncated: time limit" if truncated else ""
@@ -178,7 +201,7 @@ def _log_steps(steps: Sequence[_Step], end: str) -> Iterator[LogEntry]:
         if bool(step.success) != held:
             held = not held
             yield LogEntry(number, "goal reached") if held else LogEntry(number, "goal lost", "WARN")
-    yield LogEntry(len(steps), end) if end else LogEntry(len(steps), "no more recorded actions", "WARN")
+    yield LogEntry(len(steps), end) if end else LogEntry(len(steps), "no more actions", "WARN")
     if end and (success := steps[-1].success) is not None:
         yield LogEntry(len(steps), "success") if success else LogEntry(len(steps), "no success", "WARN")
 
@@ -187,6 +210,16 @@ def _log_events(step: int, events: Mapping[str, Mapping[str, float]]) -> Iterato
     for name, drawn in events.items():
         values = ", ".join(f"{key} {value:.4g}" for key, value in drawn.items())
         yield LogEntry(step, f"event {name}: {values}", "DEBUG")
+
+
+def join_watches(*watches: Watch) -> Watch:
+    """Return a function that calls several."""
+
+    def watch(step: int) -> None:
+        for call in watches:
+            call(step)
+
+    return watch
 
 
 def find_dt(env: Env) -> float | None:
@@ -223,7 +256,7 @@ def _locate_errors(task: str, seed: int, step: int) -> Iterator[None]:
         raise TaskError(f"task {task!r}: {what}\n{where}", details=details) from error
 
 
-def _copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
+def copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
     """Copy an observation in the dtype of its space, as recorded episodes have it; some environments reuse theirs.
 
     A Dict inside a Dict becomes keys such as `achieved_goal/kettle`.
@@ -231,7 +264,7 @@ def _copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
     if isinstance(space, spaces.Dict):
         copied: dict[str, Any] = {}
         for key, part in space.spaces.items():
-            parts = dict_spaces.split(_copy_observation(observation[key], part))
+            parts = dict_spaces.split(copy_observation(observation[key], part))
             copied |= {f"{key}/{name}" if name else key: value for name, value in parts.items()}
         return copied
     value = np.array(observation, dtype=space.dtype)

@@ -10,6 +10,8 @@ from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.errors import AnswerIsNo
 from rlctl.replaying.reproduce import Verification
+from rlctl.replaying.world import WorldSummary
+from rlctl.replaying.world_table import show_world
 from rlctl.version import collect_versions
 
 
@@ -49,6 +51,7 @@ class ReplayResult:
     policy_file: str = ""  # path and description of the policy; empty for a recorded episode
     choice: str = ""  # how the episodes were chosen by outcome; empty if they were not
     film: FilmReport | None = None
+    world: WorldSummary | None = None  # of the first episode of a named policy, where it can be read
 
     def check(self) -> None:
         """Raise `AnswerIsNo` if a recorded episode could not be reproduced."""
@@ -69,6 +72,8 @@ def show(result: ReplayResult, json: str | None) -> None:
     out.print(f"{result.task}: {parts}" if parts else result.task)
     if result.choice:
         out.print(result.choice)
+    if result.world is not None:
+        show_world(result.world)
     for episode in result.episodes:
         out.print(_format_episode(episode))
     if film := result.film:
@@ -117,6 +122,8 @@ def as_json(result: ReplayResult) -> dict[str, Any]:
         "versions": collect_versions(),
     }
     content |= {name: value for name in ("choice", "film") if (value := getattr(result, name))}
+    if result.world is not None:
+        content["world"] = result.world.as_json()
     if (verification := result.verification) is not None:
         versions = verification.other_versions.items()
         content["verification"] = {

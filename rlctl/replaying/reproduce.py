@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from rlctl import output
 from rlctl.environments.dict_spaces import Observations, split
 from rlctl.errors import UsageError
-from rlctl.replaying.recorder import Rollout, current_versions, make_drawable, play_episode, recorded_actions
+from rlctl.replaying.drawable import make_drawable
+from rlctl.replaying.recorder import Rollout, current_versions, play_episode, recorded_actions
 from rlctl.replaying.scene import Warn
 from rlctl.rollout.workers import Workers
 from rlctl.run.episode import RecordedEpisode
@@ -65,7 +66,7 @@ def record_episode(
     info, spec = episode.info, episode.info.spec
     if info.failure:
         _replay_failed(episode)
-    with closing(make_drawable(spec, warn)) as env:
+    with closing(make_drawable(spec)) as env:
         choose = recorded_actions(episode, env.action_space)
         rollout = play_episode(env, spec, info.seed, choose, policy=info.policy, draw=warn)
     if info.failure:

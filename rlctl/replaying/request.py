@@ -22,10 +22,18 @@ class ReplayRequest:
     source: Annotated[
         str | None,
         Argument(
-            "A run or policy to roll out, or a recorded episode (.npz).",
-            metavar="[RUN or EPISODE]",
+            "A run or policy to roll out, a recorded episode (.npz), or with --policy a task.",
+            metavar="[RUN or EPISODE or TASK]",
             completes="run",
             default_text="latest",
+        ),
+    ] = None
+    baseline: Annotated[
+        str | None,
+        Option(
+            "Play a TASK, before any training: zero, random, PATH.py:FUNCTION, MODULE:FUNCTION, or a policy server.",
+            ("--policy",),
+            metavar="POLICY",
         ),
     ] = None
     episodes: Annotated[
@@ -40,11 +48,15 @@ class ReplayRequest:
     task: Annotated[str | None, Option("Roll out on this task instead of the one it was trained on.")] = None
     settings: Settings = dataclasses.field(default_factory=list)
     verify: Annotated[Path | None, Option("Replay an episode; exit 1 if any bit differs.", metavar="EPISODE")] = None
-    gui: Annotated[bool, Option("Show PyBullet's window instead of writing a recording.", ("--gui",))] = False
+    gui: Annotated[bool, Option("Show it in a window, live, instead of writing a recording.", ("--gui",))] = False
     sim: Annotated[str | None, Option("Play in MuJoCo instead of PyBullet.", metavar="mujoco[:SOLREF]")] = None
     output: Annotated[
         Path | None,
-        Option("An .rrd file or a folder. Default: episodes/ of the run.", ("--output", "-o"), metavar="PATH"),
+        Option(
+            "An .rrd file or a folder. Default: episodes/ of the run; with --policy ./TASK-POLICY.rrd.",
+            ("--output", "-o"),
+            metavar="PATH",
+        ),
     ] = None
     video: Annotated[Path | None, Option("Write a film instead, .mp4 or .gif.", metavar="FILE")] = None
 

@@ -20,7 +20,7 @@ from rlctl.replaying.scene import BodyMotion, Scene, Warn
 from rlctl.run.episode import RecordedEpisode
 from rlctl.storage import files
 
-Followed = tuple[str, BodyMotion] | None  # what the camera follows: an entity, and its body
+Followed = dict[str, tuple[str, BodyMotion]]  # what the camera of a world follows: an entity, and its body
 
 _LEVEL_COLORS = {"INFO": 0x3D7DD8FF, "WARN": 0xC06A00FF, "DEBUG": 0x787878FF}  # readable on white and on black
 _EYE_DIRECTION = np.array([1.0, 0.75, 0.5])  # from the front left, looking down
@@ -108,8 +108,8 @@ def _layout(rollout: Rollout, plots: Sequence[Plot], timeline: str, followed: Fo
     """Return the layout: the world on the left, its numbers on the right; the camera follows `followed`."""
     scene = rollout.scene
     left: list[rrb.Container | rrb.View] = []
-    if scene.bodies or scene.markers:
-        left.append(_world(scene, followed))
+    if worlds := [_world(scene, world, followed) for world in scene.worlds()]:
+        left.append(rrb.Tabs(*worlds) if len(worlds) > 1 else worlds[0])
     if scene.pictures:
         left.append(rrb.Spatial2DView(name="camera", origin="/camera"))
     left += [rrb.Spatial2DView(name=plot.title, origin=f"/{plot.entity}") for plot in plots if plot.kind == "image"]
@@ -143,9 +143,9 @@ def _arrange_plot(plot: Plot) -> rrb.TimeSeriesView:
     )
 
 
-def _world(scene: Scene, followed: Followed) -> rrb.Spatial3DView:
-    entity, body = followed or (None, None)
-    low, high = bounds(scene) if body is None else body.box
+def _world(scene: Scene, world: str, followed: Followed) -> rrb.Spatial3DView:
+    entity, body = followed.get(world, (None, None))
+    low, high = bounds(scene, world) if body is None else body.box
     center, size = (low + high) / 2, float(np.linalg.norm(high - low))
     distance = max(1.0, 1.15 * size)
     if body is not None:
@@ -155,11 +155,12 @@ def _world(scene: Scene, followed: Followed) -> rrb.Spatial3DView:
     eye = center + distance * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
     start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     so_far = [rrb.VisibleTimeRange(name, start=start, end=end) for name in ("step", "sim_time")]
-    paths = [rr.new_entity_path(["world", "paths", body.name]) for body in scene.robots()]
+    robots = [body for body in scene.bodies if body.has_path and body.world == world]
+    paths = [rr.new_entity_path([world, "paths", body.name]) for body in robots]
     return rrb.Spatial3DView(
-        name="world",
+        name=world,
         origin="/",
-        contents=["/world/**"],
+        contents=[f"{rr.new_entity_path([world])}/**"],
         overrides={path: rrb.VisibleTimeRanges(so_far) for path in paths},
         eye_controls=rrb.EyeControls3D(position=eye, look_target=center, eye_up=(0, 0, 1), tracking_entity=entity),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.25, plane=rr.components.Plane3D.XY),

@@ -113,10 +113,10 @@ class Worker:
         self._states = None
         self._close_player()
         if message.info is None:
-            self._player = _make_player(message.other, self._episodes[0].env)
+            self._player = make_player_of(message.other, self._episodes[0].env)
             if self._batch is not None:
                 env = self._episodes[0].env
-                self._players = Players(None, [_make_player(message.other, env) for _ in range(self._job.count)])
+                self._players = Players(None, [make_player_of(message.other, env) for _ in range(self._job.count)])
         else:
             layout = {name: (shape, np.dtype(dtype)) for name, shape, dtype in message.layout}
             tensors = map_arrays(self._job.numbers, layout)
@@ -279,7 +279,8 @@ def _list_training_seeds(run_seed: int, env: int, first: int) -> Iterator[int]:
     return (episode_seed(run_seed, Stream.TRAIN, env, number) for number in itertools.count(first))
 
 
-def _make_player(name: str, env: Any) -> Player:
+def make_player_of(name: str, env: Any) -> Player:
+    """Return the player of a policy server (`ws://...`), or of any other name as `make_player` does."""
     if not name.startswith(SERVER):
         return make_player(name, env.action_space)
     from rlctl.deploy.server.client import RemotePlayer  # only here: it imports aiohttp

@@ -86,6 +86,8 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
         raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}{shipped}")
     names = {folder.name for folder in root.glob("*/")} | {folder.name for folder in installed.list_installed()}
     hint = did_you_mean(text, sorted(names)) or " All runs: rlctl runs"
+    if ":" in text:  # a task that is named by its file or module
+        hint = f" To see it before a training: rlctl replay {text} --policy zero"
     raise ArtifactError(f"no run {text!r}: neither a folder nor a task with a run.{hint}")
 
 

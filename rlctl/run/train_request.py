@@ -36,7 +36,7 @@ class TrainRequest:
     config: Config = None
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Keys of the recipe and their values, nested as in a recipe; they override `config`."""
-    device: Annotated[str, Option("cpu, cuda, or auto.")] = "cpu"
+    device: Annotated[str, Option("cpu, cuda, or auto: the faster one for this network.")] = "cpu"
     record: Annotated[int, Option("Write the last N evaluation episodes as .rrd.", metavar="N", min=0)] = 0
     check: Annotated[bool, Option("Train without checking the environment first.", ("/--no-check",))] = True
     force: Annotated[bool, Option("Resume a run even if its task has changed.", ("--force",))] = False

@@ -18,7 +18,7 @@ from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_stream
 from rlctl.task.joints import Joints
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.observation import Observation, ObservationFormat
-from rlctl.task.pybullet.sim import BulletSim
+from rlctl.task.pybullet.sim import PybulletSim
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_definition, check_parameters
 
@@ -249,7 +249,7 @@ def _make_world(task: Task, sim: str, render_mode: str | None) -> Sim:
         return MujocoSim(control_dt=dt, substeps=substeps, solref=solref, iterations=iterations, worlds=1).one(0)
     if solref is None:
         gui = render_mode == "human"
-        return BulletSim(control_dt=task.control_dt, substeps=task.substeps, solver_iterations=iterations, gui=gui)
+        return PybulletSim(control_dt=task.control_dt, substeps=task.substeps, solver_iterations=iterations, gui=gui)
     if render_mode == "human":
         raise UsageError("sim mujoco opens no window; record the episode to see it in 3-D")
     return MujocoSim(control_dt=task.control_dt, substeps=task.substeps, solref=solref, iterations=iterations)

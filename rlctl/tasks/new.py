@@ -80,6 +80,7 @@ def show(plugin: NewPlugin, json: str | None) -> None:
     )
     out.print("next:")
     for command in (
+        f"rlctl replay {plugin.target} --policy zero",
         f"rlctl check-env {plugin.target}",
         f'pip install -e "{plugin.folder}[test]"',
         f"rlctl train {plugin.name}",

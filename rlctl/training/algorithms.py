@@ -18,6 +18,7 @@ from rlctl.policy.own_modules import import_named
 from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
 from rlctl.recipe.recipe import ON_POLICY, NormalizeSettings, Recipe
 from rlctl.storage.untrusted import measure_free_memory
+from rlctl.training.device import describe_device, find_fastest
 from rlctl.training.off_policy import replay_arguments
 from rlctl.training.own_networks import check_policy_class, write_graph
 from rlctl.training.rollouts import WorkerVecEnv
@@ -28,6 +29,21 @@ _FLOAT32 = 4  # [bytes]
 _USABLE_SHARE = 0.9  # of the free memory; the environments need memory too
 _DELAYED_BY_US = frozenset({"sac", "tqc"})  # algorithms whose `policy_delay` Stable-Baselines3 does not have
 _CONTINUOUS = frozenset({"sac", "td3", "ddpg", "tqc", "crossq"})
+
+
+def build_on_device(
+    recipe: Recipe, env: WorkerVecEnv, requested: str, *, cuda_available: bool
+) -> tuple[BaseAlgorithm, str | None]:
+    """Build the model of a recipe on the device of `--device`, for `auto` on the faster one.
+
+    Also returns a line about the choice; None if there is none. Raises `RecipeError` as `build_model`.
+    """
+    model = build_model(recipe, env, "cpu" if requested == "auto" else requested)
+    shapes = [tuple(parameter.shape) for parameter in model.policy.parameters()]
+    fastest, reason = find_fastest(shapes, cuda_available=cuda_available)
+    if requested == "auto" and fastest != "cpu":
+        model = build_model(recipe, env, fastest)
+    return model, describe_device(requested, fastest, reason, cuda_available=cuda_available)
 
 
 def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm:

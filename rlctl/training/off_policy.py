@@ -8,9 +8,7 @@ SB3's buffer does it; the current stage computes the rewards of exchanged goals,
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.her import HerReplayBuffer
 
 from rlctl.environments.dict_spaces import join, split_space
@@ -18,6 +16,7 @@ from rlctl.environments.info import EnvInfo
 from rlctl.errors import RecipeError
 from rlctl.policy.file import DETERMINISTIC
 from rlctl.policy.players.player import Exploration
+from rlctl.recipe.hindsight import find_problem
 from rlctl.recipe.recipe import Hindsight, Recipe
 from rlctl.training.rollouts import Check, Rollouts, WorkerVecEnv, to_network_layout
 from rlctl.training.status import Progress
@@ -89,17 +88,13 @@ class OffPolicyRollouts(Rollouts):
                 self.rehearse(updates)
 
 
-_KEYS = ("observation", "achieved_goal", "desired_goal")
 _LEARNING_STARTS = 100  # SB3's own default, of every algorithm
 
 
 def replay_arguments(recipe: Recipe, her: Hindsight, env: EnvInfo) -> dict[str, Any]:
     """Return SB3's arguments for the replay buffer; raises `RecipeError` for what hindsight excludes."""
-    _check_goals(env)
-    if recipe.reward_weights or any(stage.reward_weights for stage in recipe.stages):
-        raise RecipeError("her: compute_reward does not use the recipe's reward_weights; remove her or reward_weights")
-    if recipe.algo_kwargs.get("n_steps", 1) != 1:
-        raise RecipeError("algo_kwargs.n_steps: hindsight does not support n-step returns; remove her or n_steps")
+    if problem := find_problem(recipe, env):
+        raise RecipeError(problem)
     steps, size = (env.max_steps or 0) * recipe.n_envs, int(recipe.algo_kwargs["buffer_size"])
     if size < min(2 * steps, recipe.total_timesteps):
         raise RecipeError(_no_room(size, recipe.n_envs, f"{2 * steps} is enough"))
@@ -108,25 +103,6 @@ def replay_arguments(recipe: Recipe, her: Hindsight, env: EnvInfo) -> dict[str, 
         "replay_buffer_kwargs": her.model_dump(),
         "learning_starts": max(_LEARNING_STARTS, steps),
     }
-
-
-def _check_goals(env: EnvInfo) -> None:
-    space = env.spaces()[0]
-    parts = space.spaces if isinstance(space, spaces.Dict) else {}
-    missing = [f"{key} in its observation" for key in _KEYS if key not in parts]
-    if not env.has_compute_reward:
-        missing.append("compute_reward")
-    if missing:
-        raise RecipeError(
-            f"her: this environment has no {', no '.join(missing)}; hindsight needs a Dict observation of "
-            f"{', '.join(_KEYS)}, and compute_reward(achieved_goal, desired_goal, info)"
-        )
-    achieved, desired = parts["achieved_goal"], parts["desired_goal"]
-    if achieved.shape != desired.shape or not isinstance(desired, spaces.Box) or is_image_space(desired):
-        raise RecipeError(
-            f"her: achieved_goal is {achieved}, desired_goal {desired}: hindsight replaces one by the other, so "
-            "both must be a Box of the same shape, not an image"
-        )
 
 
 def _no_room(size: int, n_envs: int, advice: str) -> str:

@@ -10,17 +10,22 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rlctl.checking.check import CheckReport, check
 from rlctl.checking.families import find_rules
 from rlctl.checking.rules import Severity
 from rlctl.environments import registry
+from rlctl.environments.info import EnvInfo
 from rlctl.environments.named_task import RUN
 from rlctl.environments.registrations import describe_registrations
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, RecipeError, TaskError
 from rlctl.output import format_count
 from rlctl.printed_lines import PrintedLines
-from rlctl.recipe.recipe import ON_POLICY
+from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
+from rlctl.recipe.recipe import ON_POLICY, Recipe
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory
@@ -64,9 +69,13 @@ def set_up(start: Start, display: Display, printed: PrintedLines) -> Iterator[Tr
             _warn_of_opposite_weights(specs, display)
             if registered := describe_registrations(start.task, "train"):
                 display.message(f"{start.task} is {registered}")
+        rewards: list[NDArray[np.float64]] = []
         if checked is not None:
             display.phase("checking the environment")
-            _refuse_errors(checked.result(), display)
+            _refuse_errors(report := checked.result(), display)
+            rewards = [trajectory.rewards for trajectory in report.records.trajectories]
+        if start.run is None:
+            _suggest_hindsight(recipe, workers.info, rewards, display)
         run = start.run or directory.create(start.task, recipe.seed, request.root)
         lock = start.lock or stack.enter_context(run.lock())
         if not lock.keeps_out:
@@ -100,11 +109,21 @@ def _warn_of_opposite_weights(specs: list[EnvSpec], display: Display) -> None:
             display.message(f"warning: reward_weights.{name}: {weight:g} has the opposite sign of {task_own}")
 
 
+def _suggest_hindsight(recipe: Recipe, env: EnvInfo, rewards: list[NDArray[np.float64]], display: Display) -> None:
+    options, is_sparse = suggest_hindsight(recipe, env), has_sparse_reward(rewards)
+    if options is None or is_sparse is False:
+        return
+    what = "goals and a sparse reward" if is_sparse else "goals, perhaps with a sparse reward"
+    display.message(f"hint: this environment has {what}; it is learned faster with hindsight: add {options}")
+
+
 def _build_learner(
     start: Start, specs: list[EnvSpec], workers: Workers, make_workers: Callable[..., Workers], display: Display
 ) -> Learner:
+    import torch
+
     from rlctl.policy.torch_policy import pin_threads
-    from rlctl.training.algorithms import build_model
+    from rlctl.training.algorithms import build_on_device
     from rlctl.training.learner import Curriculum, Learner, check_stages
     from rlctl.training.off_policy import OffPolicyRollouts
     from rlctl.training.on_policy import OnPolicyRollouts
@@ -122,7 +141,9 @@ def _build_learner(
     next_eval = 0 if start.is_trained else recipe.eval.every_steps or recipe.total_timesteps
     progress = start.checkpoint.state.progress if start.checkpoint else status.Progress(next_eval)
     env = WorkerVecEnv(workers, recipe.seed)
-    model = build_model(recipe, env, start.request.device)
+    model, line = build_on_device(recipe, env, start.request.device, cuda_available=torch.cuda.is_available())
+    if line is not None:
+        display.message(line)
     rollouts = (OnPolicyRollouts if recipe.algo in ON_POLICY else OffPolicyRollouts)(model, env, recipe, progress)
     rollouts.is_trained = start.is_trained
     if start.source is not None and start.checkpoint is None:
@@ -162,7 +183,7 @@ def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Displa
         display.message(checkpoints.restore(start.checkpoint, start.inexact))
     for warning in checkpoints.cut_back(start.step) if start.run else ():
         display.message(warning)
-    status.write_start(run, start)
+    status.write_start(run, start, str(learner.model.device))
     return checkpoints
 
 

@@ -53,8 +53,8 @@ class Progress:
     """Success (0 or 1; None if not reported) or return of the stage's last episodes, as its promotion rule needs."""
 
 
-def write_start(run: RunDirectory, start: Start) -> None:
-    """Write the recipe and the status `running`."""
+def write_start(run: RunDirectory, start: Start, device: str) -> None:
+    """Write the recipe, the status `running`, and the device on which the network learns."""
     recipe = start.recipe
     run.write_recipe(recipe)
     changes: dict[str, Any] = {
@@ -66,7 +66,7 @@ def write_start(run: RunDirectory, start: Start) -> None:
         "algo": recipe.algo,
         "seed": recipe.seed,
         "recipe_changes": find_recipe_changes(start.task, recipe),
-        "device": start.request.device,
+        "device": device,
         "versions": collect_versions(),
         "git_commit": find_git_commit(),
         "command": ["rlctl", *sys.argv[1:]],

@@ -1,6 +1,7 @@
 """Options of the command line from the fields of a request."""
 
 import dataclasses
+import inspect
 from pathlib import Path
 from typing import Annotated
 
@@ -8,7 +9,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from rlctl.cli.arguments import command
+from rlctl.cli import COMMANDS
+from rlctl.cli.arguments import command, command_in_panels
 from rlctl.options import Argument, Option
 
 
@@ -64,3 +66,43 @@ def test_what_a_field_does_not_take_and_help(app):
     assert "--no-check" in shown
     assert "--check" not in shown
     assert "limits" not in shown
+
+
+def test_help_in_panels():
+    @command_in_panels({"Options": ["tries"], "How": ["loud", "check"], "Output": ["folder"]})
+    def pick(request: Picking, loud: Annotated[bool, Option("Print twice.", ("--loud",))] = False) -> None:
+        """Pick."""
+        print(request, loud)
+
+    app = typer.Typer()
+    app.command()(pick)
+    shown = CliRunner().invoke(app, ["--help"], terminal_width=100).output
+    order = [
+        "Arguments",
+        "What to pick.",
+        "─ Options",
+        "Names.",
+        "How often.",
+        "─ How",
+        "--loud",
+        "--no-check",
+        "─ Output",
+        "--output",
+    ]
+    places = [shown.index(text) for text in order]
+    assert places == sorted(places)
+    result = CliRunner().invoke(app, ["--loud", "cup", "--tries", "7"])
+    assert result.output == f"{Picking('cup', tries=7)} True\n"
+
+
+@pytest.mark.parametrize("name", ["train", "tune", "eval", "check-env"])
+def test_every_option_is_in_a_panel(name):
+    parameters = inspect.signature(COMMANDS[name]).parameters.values()
+    panels = {
+        parameter.name: parameter.annotation.__metadata__[0].rich_help_panel
+        for parameter in parameters
+        if not isinstance(parameter.annotation.__metadata__[1], Argument)
+    }
+    assert [name for name, panel in panels.items() if panel is None] == []
+    assert next(iter(panels.values())) == "Options"
+    assert len(set(panels.values())) >= 4

@@ -35,25 +35,28 @@ ACTIONS = {
 class Small(gymnasium.Env):
     """A point that actions push around; it is rewarded for its place, and `noise` moves it by chance nobody seeded.
 
-    With a `factor` far above 1 a difference in the last bits of an action grows to another episode.
+    With a `factor` far above 1 a difference in the last bits of an action grows to another episode. With `keeps` an
+    episode begins with the last push of the one before.
     """
 
-    def __init__(self, observation="vector", action="box", noise=0.0, factor=0.0):
+    def __init__(self, observation="vector", action="box", noise=0.0, factor=0.0, keeps=False):
         self.observation_space = OBSERVATIONS[observation]
         self.action_space = ACTIONS[action]
         self.noise = noise
         self.factor = factor
+        self.keeps = keeps
+        self.push = np.zeros(3)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.place = self.np_random.normal(size=3)
+        self.place = self.np_random.normal(size=3) + (self.push if self.keeps else 0.0)
         self.steps = 0
         return self._observe(self.observation_space), {}
 
     def step(self, action):
-        push = np.resize(np.asarray(action, np.float64), 3)
+        self.push = np.resize(np.asarray(action, np.float64), 3)
         before = np.sin(self.factor * self.place) if self.factor else self.place
-        self.place = 0.9 * before + 0.1 * np.sin(push) + self.noise * np.random.default_rng().normal(size=3)
+        self.place = 0.9 * before + 0.1 * np.sin(self.push) + self.noise * np.random.default_rng().normal(size=3)
         self.steps += 1
         return self._observe(self.observation_space), float(self.place.sum()), False, self.steps == 20, {}
 

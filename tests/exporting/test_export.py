@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import onnx
 import pytest
+import torch
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
@@ -96,9 +97,19 @@ def test_run_gets_it_into_its_exports(small, train, write, tmp_path, monkeypatch
         export_policy(ExportRequest(str(policies.parent), ("onnx",), "best", None))
 
 
+def write_policy_of_rounding_errors(train, write, spec):
+    """Write a policy whose actions are sums of large numbers that cancel: the order of the additions decides them."""
+    model = train("ppo", spec, steps=0, policy_kwargs={"net_arch": [256]})
+    hidden, outputs = model.policy.mlp_extractor.policy_net[0], model.policy.action_net
+    order = torch.randperm(256, generator=torch.Generator().manual_seed(0))
+    positive, negative = order[:128], order[128:]
+    hidden.weight.data[negative], hidden.bias.data[negative] = hidden.weight.data[positive], hidden.bias.data[positive]
+    outputs.weight.data[:, positive], outputs.weight.data[:, negative] = 1e6, -1e6
+    return write(model, "ppo", spec)
+
+
 def test_not_verified_is_not_kept(small, train, write, tmp_path):
-    spec = small(noise=0.1)  # no two episodes are alike, so closed loops differ
-    path = write(train("ppo", spec, steps=0), "ppo", spec)
+    path = write_policy_of_rounding_errors(train, write, small())
     target = tmp_path / "out" / "policy.onnx"
     target.parent.mkdir()
     target.write_bytes(b"former")
@@ -106,9 +117,9 @@ def test_not_verified_is_not_kept(small, train, write, tmp_path):
         export(path, target)
     first, agreement, loop = str(raised.value).splitlines()
     assert first.startswith(f"{target}: ")
-    assert "all actions agree, but the episodes differ" in first
-    assert agreement.startswith("max |difference| ")
-    assert "20 episodes: same length in 20, return within " in loop
+    assert first.endswith(f"it does not act as {path} does")
+    assert "actions beyond the limit" in agreement
+    assert loop.startswith("20 episodes: ")
     assert [file.name for file in target.parent.iterdir()] == ["policy.onnx"]
     assert target.read_bytes() == b"former"
 
@@ -123,6 +134,27 @@ def test_an_environment_that_magnifies_rounding_is_verified_by_its_actions(small
     assert text.endswith(
         "; the episodes are chaotic: a change in the last bits makes the original policy differ as much"
     )
+
+
+@pytest.mark.parametrize("parameters", [{"noise": 0.1}, {"keeps": True}])
+@pytest.mark.parametrize("algo", ["ppo", "recurrent_ppo"])
+def test_an_environment_that_does_not_repeat_its_episodes_is_verified_by_actions(algo, parameters, small, train, write):
+    spec = small(**parameters)
+    report = export(write(train(algo, spec, steps=0), algo, spec))
+    assert report.path.is_file()
+    assert report.agreement.agrees
+    assert not report.closed_loop.repeats
+    assert not report.closed_loop.magnified
+    expected = "cannot be compared: the environment does not repeat its own episodes (check-env)"
+    assert ("closed loop", expected) in report.list_rows()
+    assert report.as_json()["verified"] is True
+    assert report.as_json()["closed_loop"]["repeats"] is False
+
+
+def test_other_actions_are_noticed_where_episodes_do_not_repeat(small, train, write):
+    path = write_policy_of_rounding_errors(train, write, small(noise=0.1))
+    with pytest.raises(AnswerIsNo, match="it does not act as"):
+        export(path)
 
 
 def test_other_weights_are_noticed(small, train, write, tmp_path):
@@ -255,8 +287,7 @@ def test_command_line(rlctl, small, train, write, tmp_path):
 
 
 def test_command_line_when_the_answer_is_no(rlctl, small, train, write, tmp_path):
-    spec = small(noise=0.1)
-    path = write(train("ppo", spec, steps=0), "ppo", spec)
+    path = write_policy_of_rounding_errors(train, write, small())
     done = rlctl("export", path.name, "--onnx", cwd=tmp_path)
     assert done.returncode == 1
     assert done.stdout == ""

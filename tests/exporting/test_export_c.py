@@ -128,6 +128,15 @@ def test_export_is_verified(algo, frames, small, train, write, tmp_path):
     assert ("frames[9]" in header) == (frames == 3)
 
 
+@needs_compiler
+def test_an_environment_that_does_not_repeat_its_episodes_is_verified_by_actions(small, train, write):
+    spec = small(keeps=True)
+    (report,) = export_policy(ExportRequest(str(write(train("ppo", spec, steps=0), "ppo", spec)), ("c",), "best", None))
+    assert report.path.is_file()
+    assert report.as_json()["verified"] is True
+    assert not report.closed_loop.repeats
+
+
 def test_without_a_compiler_it_is_not_verified(small, train, write, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     path = write(train("ppo", small(), steps=0), "ppo", small())

@@ -153,6 +153,17 @@ def test_a_call_that_is_not_on_the_list_is_refused_and_not_made(save, tmp_path):
     assert not proof.exists()
 
 
+def test_a_device_is_not_needed(save):
+    _, _, request = save("sac")
+    original = import_model(**request)
+    for kwargs in ({"device": torch.device("cuda", 1)}, {"device": torch.device("cpu"), "log_std_init": -2}):
+        edit_data(request["file"], policy_kwargs=serialized(kwargs), device=serialized(torch.device("cuda")))
+        imported = import_model(**request)
+        assert "device" not in imported.info.policy_kwargs
+        for name, values in original.tensors.items():
+            np.testing.assert_array_equal(imported.tensors[name], values)
+
+
 def test_other_files_are_refused(save, tmp_path, monkeypatch):
     _, _, request = save()
     for name, content in {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.task.pybullet.sim import BulletSim
+from rlctl.task.pybullet.sim import PybulletSim
 
 ONE_LEG = """<mujoco model="leg"><worldbody><body name="torso" pos="0 0 2">
   <geom type="sphere" size="0.1"/>
@@ -15,7 +15,7 @@ ONE_LEG = """<mujoco model="leg"><worldbody><body name="torso" pos="0 0 2">
 
 @pytest.fixture
 def sim():
-    sim = BulletSim(control_dt=0.0165, substeps=4, solver_iterations=5)
+    sim = PybulletSim(control_dt=0.0165, substeps=4, solver_iterations=5)
     yield sim
     sim.close()
 

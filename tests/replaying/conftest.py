@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.replaying.recorder import Rollout, make_drawable, play_episode
+from rlctl.replaying.drawable import make_drawable
+from rlctl.replaying.recorder import Rollout, play_episode
 from rlctl.run.episode import save_episode
 from rlctl.task.pybullet.library import pybullet
 from rlctl_manipulation.reach import JOINT_STEP
@@ -28,7 +29,7 @@ def strict(monkeypatch):
 def reach(seed: int = 5) -> Rollout:
     """Play an episode of reach that goes straight to the goal, by inverse kinematics."""
     spec = EnvSpec("reach")
-    with closing(make_drawable(spec, print)) as env:
+    with closing(make_drawable(spec)) as env:
         task, sim = env.unwrapped.task, env.unwrapped.sim
 
         def choose(observation, step):
@@ -44,7 +45,7 @@ def reach(seed: int = 5) -> Rollout:
 def play(name: str, *, seed: int = 3, **parameters) -> tuple[Rollout, list[str]]:
     """Play an episode of an environment of envs.py with random actions; returns also the warnings."""
     spec, warnings = EnvSpec(f"{ENVS}:{name}", parameters), []
-    with closing(make_drawable(spec, warnings.append)) as env:
+    with closing(make_drawable(spec)) as env:
         env.action_space.seed(0)
         rollout = play_episode(
             env, spec, seed, lambda o, k: env.action_space.sample(), policy="chance", draw=warnings.append

@@ -7,7 +7,8 @@ from rlctl.cli import build_app
 from rlctl.errors import UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
-from rlctl.replaying.replay import run_replay, select
+from rlctl.replaying.choice import select
+from rlctl.replaying.replay import run_replay
 from rlctl.replaying.request import Choice, ReplayRequest
 from rlctl.rollout.messages import EpisodeResult
 

@@ -9,10 +9,12 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.replaying.bodies import shape_centers
+from rlctl.replaying.bullet_scene import TaskReader
+from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.mjcf import Shape, ShapeKind, read_shapes
-from rlctl.replaying.recorder import make_drawable, play_episode
+from rlctl.replaying.recorder import play_episode
 from rlctl.replaying.rrd import write_rrd
-from rlctl.replaying.scene import BodyMotion, SceneReader
+from rlctl.replaying.scene import BodyMotion
 from rlctl.task.pybullet.library import pybullet
 from tests.replaying.conftest import play
 from tests.replaying.reading import column, entities, layout, static
@@ -43,7 +45,7 @@ def distance(point, low, high, radius):
 
 
 def look(env) -> BodyMotion:
-    reader = SceneReader(env.unwrapped)
+    reader = TaskReader(env.unwrapped)
     reader.read(0)
     return next(body for body in reader.scene().bodies if body.name == "robot")
 
@@ -120,7 +122,7 @@ def recordings(tmp_path_factory):
     folder, made = tmp_path_factory.mktemp("mjcf"), {}
     for name in ("ant", "humanoid", "hopper"):
         spec, warnings = EnvSpec(name, {}), []
-        with closing(make_drawable(spec, warnings.append)) as env:
+        with closing(make_drawable(spec)) as env:
             env.action_space.seed(0)
             actions = iter([env.action_space.sample() for _ in range(1000)])
             rollout = play_episode(env, spec, 3, lambda o, k, a=actions: next(a), policy="chance", draw=warnings.append)
@@ -205,9 +207,9 @@ def test_file_that_only_pybullet_reads_costs_a_warning(tmp_path, monkeypatch, na
     def refuse(file):
         raise ValueError(f"{file}: not well-formed")
 
-    monkeypatch.setattr("rlctl.replaying.scene.read_shapes", refuse)
+    monkeypatch.setattr("rlctl.replaying.bullet_track.read_shapes", refuse)
     warnings = []
-    with closing(make_drawable(EnvSpec(name), warnings.append)) as env:
+    with closing(make_drawable(EnvSpec(name))) as env:
         action = np.zeros(env.action_space.shape, np.float32)
         rollout = play_episode(env, EnvSpec(name), 3, lambda o, k: action, policy="none", draw=warnings.append)
     write_rrd(tmp_path / "r.rrd", rollout, title=name, warn=warnings.append)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from rlctl.environments.spec import EnvSpec
+from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.mjcf import ShapeKind
-from rlctl.replaying.recorder import make_drawable, play_episode
+from rlctl.replaying.recorder import play_episode
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.rrd import write_rrd
 from rlctl.run.episode import load_episode, save_episode
@@ -19,7 +20,7 @@ mujoco = pytest.importorskip("mujoco")
 def play_mujoco(task: str, steps: int = 30):
     """Play random actions; return the rollout and the last positions of all bodies that MuJoCo itself computes."""
     spec = EnvSpec(task)
-    with closing(make_drawable(spec, print)) as env:
+    with closing(make_drawable(spec)) as env:
         env.action_space.seed(0)
 
         def choose(observation, step):
@@ -130,7 +131,7 @@ def test_a_trunk_that_moves_is_followed():
 
 def test_a_task_of_rlctl_in_mujoco():
     spec = EnvSpec("quadruped", sim="mujoco")
-    with closing(make_drawable(spec, print)) as env:
+    with closing(make_drawable(spec)) as env:
         zero = np.zeros(env.action_space.shape)
         rollout = play_episode(env, spec, 3, lambda o, step: zero if step < 10 else None, policy="zero", draw=print)
     ground, robot = rollout.scene.bodies

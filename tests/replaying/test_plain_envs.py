@@ -5,7 +5,8 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.replaying.recorder import make_drawable, play_episode
+from rlctl.replaying.drawable import make_drawable
+from rlctl.replaying.recorder import play_episode
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.rrd import write_rrd
 from rlctl.run.episode import load_episode, save_episode
@@ -49,7 +50,7 @@ def test_a_dict_inside_a_dict_has_curves_and_is_verified(tmp_path):
 def test_an_episode_without_steps_has_a_recording(tmp_path):
     """Of an episode that failed at its reset there are no actions; mended, it is replayed up to there."""
     spec = EnvSpec(f"{ENVS}:Pixels")
-    with closing(make_drawable(spec, print)) as env:
+    with closing(make_drawable(spec)) as env:
         rollout = play_episode(env, spec, 3, lambda observation, step: None, draw=print)
     assert column(write(rollout, tmp_path), "/observation/count")[0].tolist() == [0]
 
@@ -85,7 +86,7 @@ def test_missing_pictures_cost_a_warning_and_nothing_else_is_missing(name, param
 @pytest.mark.parametrize("task", ["Pendulum-v1", "CartPole-v1"])
 def test_gymnasium_environments(task, tmp_path):
     spec = EnvSpec(task)
-    with closing(make_drawable(spec, print)) as env:
+    with closing(make_drawable(spec)) as env:
         env.action_space.seed(0)
         rollout = play_episode(env, spec, 1, lambda o, k: env.action_space.sample(), policy="", draw=print)
     _, observations = column(write(rollout, tmp_path), "/observation")

@@ -244,6 +244,60 @@ def test_stage_of_a_training_that_goes_on_is_no_finding(write_training, stage, s
     assert diagnose(write_training({"stage": stage}, recipe={"stages": stages}, status=status)) == []
 
 
+PLACE = spaces.Box(-1.0, 1.0, (2,), np.float32)
+GOALS = ENV.model_copy(
+    update={
+        "observation_space": space_to_json(
+            spaces.Dict({"observation": PLACE, "achieved_goal": PLACE, "desired_goal": PLACE})
+        ),
+        "observation_sizes": {},
+        "reward_weights": {},
+        "has_compute_reward": True,
+    }
+)
+
+
+def reward_goals(rewards):
+    """Return an episode of a goal environment with these rewards."""
+    observations = {name: np.zeros((101, 2), np.float32) for name in ("observation", "achieved_goal", "desired_goal")}
+    info = EpisodeInfo(spec=EnvSpec("reach"), seed=1, total_reward=float(rewards.sum()), term_names=[])
+    return RecordedEpisode(SMOOTH.astype(np.float32), observations, rewards, np.zeros((100, 0)), info)
+
+
+SPARSE = reward_goals(-1.0 * (np.arange(100) < 90))
+DENSE = reward_goals(-np.linspace(1, 0, 100))
+
+
+@pytest.mark.parametrize(
+    ("algo", "options"),
+    [("sac", "--algo sac --set her={}"), ("td3", "--algo td3 --set her={}"), ("ppo", "--algo sac --set her={}")],
+)
+@pytest.mark.parametrize("episodes", [[SPARSE], []])
+def test_goals_that_were_trained_without_hindsight_are_found(write_training, algo, options, episodes):
+    recipe = {"algo": algo, "algo_kwargs": {}}
+    run = write_training({"success": 0.05}, recipe=recipe, env=GOALS, episodes=episodes)
+    (finding,) = (finding for finding in diagnose(run) if finding.id == "Q14")
+    assert finding.grade == Grade.WARNING
+    assert f"rlctl train reach {options}" in finding.evidence[0]
+    assert "success at most 5.0%" in finding.evidence
+
+
+@pytest.mark.parametrize(
+    ("metrics", "more"),
+    [
+        ({}, {}),  # succeeds
+        ({"success": 0.05}, {"episodes": [DENSE]}),
+        ({"success": 0.05}, {"recipe": {"algo": "sac", "algo_kwargs": {}, "her": {}}}),
+        ({"success": 0.05}, {"recipe": {"algo": "sac", "algo_kwargs": {}, "reward_weights": {"alive": 2.0}}}),
+        ({"success": 0.05}, {"env": GOALS.model_copy(update={"has_compute_reward": False})}),
+        ({"success": 0.05}, {"env": ENV}),
+    ],
+)
+def test_hindsight_is_suggested_only_where_it_fits(write_training, metrics, more):
+    arguments = {"recipe": {"algo": "sac", "algo_kwargs": {}}, "env": GOALS, "episodes": [SPARSE], **more}
+    assert "Q14" not in ids(write_training(metrics, **arguments))
+
+
 def test_motion_that_no_robot_makes_is_found(write_training):
     flight = np.zeros((101, 3), np.float32)
     flight[:, 0] = 10.0 * np.arange(101)  # 10 m in 0.05 s are 200 m/s
@@ -309,7 +363,7 @@ def test_every_sign_of_a_finding_exists():
 
     named = {name.removeprefix("not ") for each in _texts()["findings"] for when in each["when"] for name in when}
     assert named <= set(list_signs())
-    assert {each["id"] for each in _texts()["findings"]} == {f"Q{number}" for number in range(1, 14)}
+    assert {each["id"] for each in _texts()["findings"]} == {f"Q{number}" for number in range(1, 15)}
 
 
 def test_damaged_run_is_not_an_error(write_training):

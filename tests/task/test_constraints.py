@@ -5,13 +5,13 @@ import pytest
 
 from rlctl.errors import TaskError
 from rlctl.task import Attachment
-from rlctl.task.pybullet.sim import BulletSim
+from rlctl.task.pybullet.sim import PybulletSim
 from tests.task import models
 
 
 @pytest.fixture
 def sim():
-    sim = BulletSim(control_dt=1 / 60, substeps=4)
+    sim = PybulletSim(control_dt=1 / 60, substeps=4)
     yield sim
     sim.close()
 

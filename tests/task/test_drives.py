@@ -7,12 +7,12 @@ import pytest
 
 from rlctl.errors import TaskError
 from rlctl.task.mujoco.sim import MujocoSim
-from rlctl.task.pybullet.sim import BulletSim
+from rlctl.task.pybullet.sim import PybulletSim
 
 pytest.importorskip("mujoco")
 STIFFNESS = [300.0, 300.0, 300.0, 300.0, 5.0, 5.0, 0.5]  # [N m/rad]
 DAMPING = [5.0, 5.0, 2.0, 2.0, 0.1, 0.1, 0.01]  # [N m s/rad]
-ENGINES = [BulletSim, MujocoSim]
+ENGINES = [PybulletSim, MujocoSim]
 
 
 def answer_a_step(engine, substeps=10):
@@ -78,7 +78,7 @@ def test_a_stiffness_that_cannot_be(engine, stiffness):
 
 
 def test_a_damping_that_explicit_steps_cannot_have():
-    with closing(BulletSim(control_dt=0.02, substeps=1)) as sim:
+    with closing(PybulletSim(control_dt=0.02, substeps=1)) as sim:
         arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
         with pytest.raises(TaskError, match=r"PyBullet's steps of 0.02 s: use \d+ times as many substeps"):
             arm.set_drives(300.0, 100.0)

@@ -5,7 +5,7 @@ import pytest
 
 from rlctl.task.pybullet.library import pybullet
 from rlctl.task.pybullet.model_faults import find_model_faults
-from rlctl.task.pybullet.sim import BulletSim
+from rlctl.task.pybullet.sim import PybulletSim
 from tests.task import models
 
 BOX = '<collision><geometry><box size="0.3 0.04 0.04"/></geometry></collision>'
@@ -13,7 +13,7 @@ BOX = '<collision><geometry><box size="0.3 0.04 0.04"/></geometry></collision>'
 
 @pytest.fixture
 def sim():
-    sim = BulletSim(control_dt=1 / 60, substeps=4)
+    sim = PybulletSim(control_dt=1 / 60, substeps=4)
     yield sim
     sim.close()
 

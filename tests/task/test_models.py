@@ -9,7 +9,7 @@ import pytest
 from rlctl.errors import TaskError
 from rlctl.task.model_files import MODELS, find_model_file
 from rlctl.task.pybullet.library import pybullet
-from rlctl.task.pybullet.sim import BulletSim
+from rlctl.task.pybullet.sim import PybulletSim
 from rlctl_locomotion import quadruped
 from rlctl_manipulation import reach
 
@@ -19,7 +19,7 @@ THEIRS = {"plane.urdf": "plane.urdf", "kuka_iiwa.urdf": "kuka_iiwa/model.urdf", 
 
 @pytest.fixture
 def sim():
-    sim = BulletSim(control_dt=1 / 60, substeps=4)
+    sim = PybulletSim(control_dt=1 / 60, substeps=4)
     yield sim
     sim.close()
 

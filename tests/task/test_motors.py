@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.task.pybullet.sim import BulletSim
+from rlctl.task.pybullet.sim import PybulletSim
 from tests.task import models
 
 
 @pytest.fixture(params=[1, 4], ids=["1 substep", "4 substeps"])
 def sim(request):
-    sim = BulletSim(control_dt=1 / 60, substeps=request.param)
+    sim = PybulletSim(control_dt=1 / 60, substeps=request.param)
     yield sim
     sim.close()
 
@@ -151,7 +151,7 @@ def test_inverse_kinematics(sim):
 
 
 def _solve_anew(home, wanted, down):
-    sim = BulletSim(control_dt=1 / 60, substeps=1)
+    sim = PybulletSim(control_dt=1 / 60, substeps=1)
     arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
     for start in (home + 0.3, home):  # what was solved before changes nothing
         arm.set_joints(start)

@@ -9,7 +9,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
 from rlctl.task.env import TaskEnv
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
-from rlctl.task.pybullet.sim import BulletSim
+from rlctl.task.pybullet.sim import PybulletSim
 from rlctl_manipulation.peg_insert import SCARA
 from tests.task.tasks import Cart
 
@@ -108,7 +108,7 @@ def test_feet_have_the_spinning_friction_of_their_file():
     assert spins[:-2] == pytest.approx(0.0, abs=1e-4)
 
 
-@pytest.mark.parametrize("world", [BulletSim, MujocoSim])
+@pytest.mark.parametrize("world", [PybulletSim, MujocoSim])
 def test_a_force_sensor_measures_what_hangs_from_it(world):
     options = {"solref": 0.02} if world is MujocoSim else {}
     with closing(world(control_dt=1 / 60, substeps=4, **options)) as sim:

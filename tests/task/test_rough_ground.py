@@ -6,7 +6,7 @@ import pytest
 from rlctl.errors import TaskError
 from rlctl.task import rough_heights
 from rlctl.task.pybullet.library import pybullet
-from rlctl.task.pybullet.sim import BulletSim
+from rlctl.task.pybullet.sim import PybulletSim
 
 
 def test_heights_follow_from_the_seed():
@@ -35,7 +35,7 @@ def test_mistakes():
 
 
 def test_heights_are_where_they_should_be():
-    sim = BulletSim(control_dt=1 / 60, substeps=4)
+    sim = PybulletSim(control_dt=1 / 60, substeps=4)
     heights = rough_heights(0, size=(4, 2), cell=0.1, roughness=0.2)
     ground = sim.add_height_field("ground", heights, cell=0.1)
     assert ground.fixed

@@ -7,7 +7,7 @@ import rlctl
 from rlctl.errors import RecipeError, TaskError
 from rlctl.task.env import TaskEnv
 from rlctl.task.pybullet.library import pybullet
-from rlctl.task.pybullet.sim import BulletSim
+from rlctl.task.pybullet.sim import PybulletSim
 from rlctl_manipulation import reach
 from rlctl_manipulation.reach import Reach
 from tests.task import models
@@ -16,7 +16,7 @@ from tests.task.tasks import Slider
 
 @pytest.fixture
 def sim():
-    sim = BulletSim(control_dt=1 / 60, substeps=4)
+    sim = PybulletSim(control_dt=1 / 60, substeps=4)
     yield sim
     sim.close()
 

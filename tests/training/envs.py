@@ -179,6 +179,17 @@ class Plane(gymnasium.Env):
         return self._observation(), reached - 1.0, False, self.steps >= self.limit, {"is_success": reached}
 
 
+class Shaped(Plane):
+    """The same, with a dense reward: the distance to the goal, negative."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -np.linalg.norm(achieved_goal - desired_goal, axis=-1)
+
+    def step(self, action):
+        observation, _, terminated, truncated, info = super().step(action)
+        return observation, float(self.compute_reward(self.place, self.goal, info)), terminated, truncated, info
+
+
 class Corridor(Plane):
     """The same, with four actions: a step to each side."""
 

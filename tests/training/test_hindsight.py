@@ -147,6 +147,33 @@ def test_learning_starts_by_which_every_first_episode_is_over():
     assert replay_arguments(recipe, recipe.her, goals(max_steps=None))["learning_starts"] == 100
 
 
+@pytest.mark.parametrize(
+    ("env", "settings", "check", "expected"),
+    [
+        (
+            "Plane",
+            {},
+            True,
+            "goals and a sparse reward; it is learned faster with hindsight: add --algo sac --set her={}",
+        ),
+        (
+            "Plane",
+            {},
+            False,
+            "goals, perhaps with a sparse reward; it is learned faster with hindsight: add --algo sac",
+        ),
+        ("Plane", {**SMALL_HER, "algo_kwargs": {**FAST, "learning_starts": 1000}}, False, None),
+        ("Shaped", {}, True, None),
+        ("Line", {}, False, None),
+    ],
+)
+def test_a_training_with_goals_suggests_hindsight(train, small_ppo, capsys, env, settings, check, expected):
+    train(env, {**(settings or small_ppo), "total_timesteps": 64, "eval": {"episodes": 1}}, check=check)
+    hints = [line for line in capsys.readouterr().err.splitlines() if line.startswith("hint: ")]
+    assert len(hints) == (expected is not None)
+    assert all(expected in hint for hint in hints)
+
+
 def goals(max_steps=None) -> EnvInfo:
     env = Plane()
     return EnvInfo(

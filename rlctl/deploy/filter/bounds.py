@@ -45,8 +45,9 @@ class Bounds:
         self._ends = np.array([self.position[1], -self.position[0]])
         unlimited = np.full(len(self.names), np.inf)
         speed = unlimited if self.speed is None else self.speed
+        self._slowest = -speed
         self._most = speed if self.is_value else np.minimum(speed, self.high)
-        self._least = -speed if self.is_value else np.maximum(-speed, self.low)
+        self._least = self._slowest if self.is_value else np.maximum(-speed, self.low)
         change = unlimited if self.change is None else self.change
         limited = np.isfinite(change)
         s = np.where(limited, change, 1.0)
@@ -54,8 +55,20 @@ class Bounds:
         self._per_square, self._per_step = np.where(limited, 0.5 / s, 0.0), np.where(limited, 0.5, 1.0)
         margin = np.where(limited, s / 8.0, 0.0)
         self._quick_low, self._quick_high = -self._ends[1] + margin, self._ends[0] - margin
-        self._all, self._unlimited = b"\x01" * len(self.names), unlimited
+        # From positions between these even the fastest motion clearly leaves room.
+        fastest = np.maximum(np.abs(self._least), np.abs(self._most))
+        with np.errstate(invalid="ignore", over="ignore"):
+            farthest = fastest * (fastest * self._per_square + self._per_step)
+            low, high = self._quick_low + farthest, self._quick_high - farthest
+        self._middle_low, self._middle_high = np.where(
+            low <= high, (low, high), [[np.inf], [-np.inf]]
+        )  # none is between
+        self._all = b"\x01" * len(self.names)
+        # The last check allows rounding. This is the part of it that is the same for all commands.
         self._slack = self.precision * np.abs(self.offset) + self.resolution
+        self._slack_speed = speed + self._slack
+        self._slack_change = None if self.change is None else self.change + self._slack
+        self._slack_position = self.position[0] - self._slack, self.position[1] + self._slack
         self._slack_low = self.low - self.precision * np.abs(self.low) - self._slack
         self._slack_high = self.high + self.precision * np.abs(self.high) + self._slack
 
@@ -64,13 +77,14 @@ class Bounds:
 
         `before` is the motion of the last step, `reference` the position after it; None if positions are not bounded.
         """
-        if self._keeps_all(x, before, reference):
+        reach = None if self.change is None else (before - self.change, before + self.change)
+        if self._keeps_all(x, reach, reference):
             return x
         # In order of importance: the last limit wins.
-        if self.change is not None:
-            x = _clip(x, before - self.change, before + self.change, "acceleration", on_limit)
+        if reach is not None:
+            x = _clip(x, *reach, "acceleration", on_limit)
         if self.speed is not None:
-            x = _clip(x, -self.speed, self.speed, self.speed_name, on_limit)
+            x = _clip(x, self._slowest, self.speed, self.speed_name, on_limit)
         if not self.is_value:
             x = _clip(x, self.low, self.high, "action", on_limit)
         if self.bounds_position and reference is not None and not self._keeps_position(x, reference):
@@ -99,36 +113,43 @@ class Bounds:
         bounds_position = self.bounds_position and not self.is_value and reference is not None
         if self.speed is None and self.change is None and not bounds_position:
             return True
-        x, least, most = command, -self._unlimited, self._unlimited
-        slack = self.precision * np.abs(command) + self._slack
+        x = command - reference if self.is_value and reference is not None else command
+        least, most = -self._slack_speed, self._slack_speed
+        if self._slack_change is not None:
+            slowest, fastest = before - self._slack_change, before + self._slack_change
+            if not self.is_value:  # a robot pushed past its bounds may brake faster
+                slowest, fastest = np.minimum(slowest, -self._slack), np.maximum(fastest, self._slack)
+            least, most = np.maximum(least, slowest), np.minimum(most, fastest)
+        if bounds_position:
+            low, high = self._slack_position
+            least = np.maximum(least, np.minimum(low - reference, -self._slack))
+            most = np.minimum(most, np.maximum(high - reference, self._slack))
+        if self._is_between(x, least, most):
+            return True
+        slack = self.precision * np.abs(command)
         if reference is not None:
             slack += self.precision * np.abs(reference)
-            x = command - reference if self.is_value else command
-        if self.change is not None:
-            least, most = before - self.change, before + self.change
-            if not self.is_value:  # a robot pushed past its bounds may brake faster
-                least, most = np.minimum(least, 0.0), np.maximum(most, 0.0)
-        if self.speed is not None:
-            least, most = np.maximum(least, -self.speed), np.minimum(most, self.speed)
-        if bounds_position:
-            least = np.maximum(least, np.minimum(self.position[0] - reference, 0.0))
-            most = np.minimum(most, np.maximum(self.position[1] - reference, 0.0))
         return self._is_between(x, least - slack, most + slack)
 
     def _is_between(self, x: Array, low: Array, high: Array) -> bool:
         return bool(((low <= x) & (x <= high)).tobytes() == self._all)
 
-    def _keeps_all(self, x: Array, before: Array, reference: Array | None) -> bool:
-        """Return whether a motion clearly keeps all limits: a fast check, which most motions pass."""
+    def _keeps_all(self, x: Array, reach: tuple[Array, Array] | None, reference: Array | None) -> bool:
+        """Return whether a motion clearly keeps all limits: a fast check, which most motions pass.
+
+        `reach` has the least and the largest motion that the limit of its change allows.
+        """
         low, high = self._least, self._most
-        if self.change is not None:
-            low, high = np.maximum(low, before - self.change), np.minimum(high, before + self.change)
+        if reach is not None:
+            low, high = np.maximum(low, reach[0]), np.minimum(high, reach[1])
         if np.minimum(np.maximum(x, low), high).tobytes() != x.tobytes():
             return False
         return not self.bounds_position or reference is None or self._keeps_position(x, reference)
 
     def _keeps_position(self, x: Array, reference: Array) -> bool:
-        """Return whether there is clearly room to brake after a motion."""
+        """Return whether there is clearly room to brake after a motion that keeps the limit of speed."""
+        if np.minimum(np.maximum(reference, self._middle_low), self._middle_high).tobytes() == reference.tobytes():
+            return True
         end = x if self.change is None else x * (np.abs(x) * self._per_square + self._per_step)
         end = end + reference
         return bool(np.minimum(np.maximum(end, self._quick_low), self._quick_high).tobytes() == end.tobytes())
@@ -147,10 +168,9 @@ class Bounds:
         if self.change is None:
             return distance
         s = self.change
-        with np.errstate(invalid="ignore", over="ignore"):
-            n = np.ceil((np.sqrt(1.0 + 8.0 * distance / s) - 1.0) * 0.5)
-            np.maximum(n, 1.0, out=n)
-            room = distance / n + 0.5 * s * (n - 1.0)
+        n = np.ceil((np.sqrt(1.0 + 8.0 * distance / s) - 1.0) * 0.5)
+        np.maximum(n, 1.0, out=n)
+        room = distance / n + 0.5 * s * (n - 1.0)
         # No bound on the change, or none on the position.
         return np.where(np.isfinite(room), room, distance)
 

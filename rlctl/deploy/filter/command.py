@@ -159,7 +159,7 @@ class Command:
             x = bounds.bound(target - reference, before, reference, self._note)
             command = np.minimum(np.maximum(reference + x, bounds.low), bounds.high)
         action = self._as_action(command)
-        if not self._keeps_limits(action) and self._space.dtype.kind != "f":
+        if self._space.dtype.kind != "f" and not self._keeps_limits(action):
             # The nearest whole action may be beyond a limit; the next one towards the present command is not.
             present = self._zeros if not bounds.is_value else self._safe if reference is None else reference
             action = self._as_action(command, np.where(command > present, -1, 1))

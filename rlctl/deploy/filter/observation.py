@@ -14,6 +14,7 @@ from rlctl.errors import RecipeError, check_name, did_you_mean, short_repr
 
 Array = NDArray[Any]
 
+_FLOAT64_SIZE = 8  # [bytes]
 WHOLE = "observation"  # name of an observation whose parts have no names
 
 
@@ -79,11 +80,16 @@ class ObservationLayout:
 
 def read_numbers(values: Any) -> NDArray[np.float64]:
     """Return a flat float64 copy of real numbers; raises `ObservationError` for everything else."""
+    array = _read_array(values, "a value")
+    if array.itemsize <= _FLOAT64_SIZE:  # no number is too large; entering `errstate` takes longer than the conversion
+        return array.astype(np.float64).ravel()
     with np.errstate(over="ignore"):  # numbers too large for float64 become infinite
-        return _read_array(values, "a value").astype(np.float64).ravel()
+        return array.astype(np.float64).ravel()
 
 
 def _read_array(values: Any, name: str) -> Array:
+    if type(values) is np.ndarray and values.dtype.kind in "biuf":
+        return values
     try:
         array = np.asarray(values)
     except Exception:  # lists of different lengths; an object's own conversion, such as a tensor's on a GPU

@@ -158,7 +158,8 @@ class SafetyFilter:
         if observation is None:
             return self.fail("missing")
         try:
-            values, (age,) = self.layout.flatten(observation), read_numbers(age_s)
+            values = self.layout.flatten(observation)
+            (age,) = (age_s,) if type(age_s) is float else read_numbers(age_s)  # most calls need no array
         except ValueError as error:  # no numbers, or an age that is not one number
             return self.fail("invalid observation", short_repr(str(error), 200))
         self._observed = True

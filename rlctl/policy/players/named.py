@@ -1,5 +1,6 @@
 """Players by name: zero and random actions, a function that a user writes, an exported file."""
 
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlctl.environments import registry
-from rlctl.environments.dict_spaces import map_parts
+from rlctl.environments.dict_spaces import format_space, map_parts
 from rlctl.errors import (
     NoSuchClassError,
     PolicyError,
@@ -16,7 +17,7 @@ from rlctl.errors import (
     UsageError,
     describe_exception,
     did_you_mean,
-    format_plugin_traceback,
+    find_plugin_line,
     short_repr,
 )
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, CPolicy
@@ -37,22 +38,47 @@ def make_player(name: str, space: spaces.Space[Any]) -> Player:
     return FunctionPlayer(name, space) if ":" in Path(name).name else ExportedPlayer(name)
 
 
-def load_function(text: str) -> Callable[..., Any]:
-    """Import `module:function` or `path/to/file.py:function`, a function from an observation to an action.
+Act = Callable[[Any, int], Any]
+"""A user's function: from an observation and the number of steps so far to an action."""
 
-    Raises `UsageError` for text without a function, `TaskError` for a file whose import fails.
+
+def load_function(text: str) -> Act:
+    """Import `module:function` or `path/to/file.py:function`: `act(observation)` or `act(observation, step)`.
+
+    Raises `UsageError` for text without such a function, `TaskError` for a file whose import fails.
     """
     if ":" not in text:
         close = did_you_mean(text, BASELINES)
         raise UsageError(f"--policy {text}: give zero, random, MODULE:FUNCTION or PATH.py:FUNCTION.{close}")
     try:
-        return registry.load(text)
+        return _accept_step(registry.load(text))
     except NoSuchClassError:
         place, _, name = text.rpartition(":")
         raise UsageError(f"--policy {text}: {place} has no function {name!r}") from None
     except RlctlError as error:
-        problem = str(error).removeprefix(f"task {text!r}: ")
+        problem = str(error).removeprefix(f"task {text!r}: ").removeprefix(f"--policy {text}: ")
         raise type(error)(f"--policy {text}: {problem}", details=error.details) from None
+
+
+def _accept_step(function: Callable[..., Any]) -> Act:
+    """Return a function of two arguments; the user's receives the step if it needs two, or has one called `step`."""
+    try:
+        signature = inspect.signature(function)
+    except (ValueError, TypeError):  # not written in Python
+        return lambda observation, step: function(observation)
+    if "step" not in signature.parameters and _takes(signature, 1):
+        return lambda observation, step: function(observation)
+    if _takes(signature, 2):
+        return function
+    raise UsageError(f"its parameters are {signature}; write (observation) or (observation, step)")
+
+
+def _takes(signature: inspect.Signature, count: int) -> bool:
+    try:
+        signature.bind(*range(count))
+    except TypeError:
+        return False
+    return True
 
 
 class ZeroPlayer(Player):
@@ -94,25 +120,28 @@ class FunctionPlayer(Player):
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
         """Call the function; raises `PolicyError` if it raises, or if it returns no action of the space."""
         try:
-            result = self._function(map_parts(np.copy, observation))
-        except Exception as error:
-            details = format_plugin_traceback(error) or None
-            raise PolicyError(f"policy {self._name}: {describe_exception(error)}", details=details) from error
-        action = self._check(result)
+            result = self._function(map_parts(np.copy, observation), step)
+        except (Exception, SystemExit) as error:
+            what = f"{describe_exception(error)}{find_plugin_line(error)}"
+            raise PolicyError(f"policy {self._name}, step {step}: {what}") from error
+        action = self._check(result, step)
         return action, action
 
-    def _check(self, result: Any) -> Any:
-        space = self._space
+    def _check(self, result: Any, step: int) -> Any:
+        space, shape = self._space, self._space.shape or ()
         try:
             action = np.asarray(result, space.dtype)
         except (ValueError, TypeError):
-            action = np.zeros(0)
-        if action.shape == (space.shape or ()) and result is not None:
-            if isinstance(space, spaces.Box) and np.isfinite(action).all():
+            action = None
+        returned = f"returned {short_repr(result)}"
+        if action is not None and result is not None:
+            if action.shape != shape:
+                returned = f"returned shape {action.shape}, expected {shape}: {short_repr(result)}"
+            elif isinstance(space, spaces.Box) and np.isfinite(action).all():
                 return np.clip(action, space.low, space.high)
-            if space.contains(action if space.shape else action[()]):
+            elif space.contains(action if space.shape else action[()]):
                 return action
-        raise PolicyError(f"policy {self._name}: it returned {short_repr(result)}, the action space is {space}")
+        raise PolicyError(f"policy {self._name}, step {step}: it {returned}; the action space is {format_space(space)}")
 
 
 class ExportedPlayer(Player):

@@ -1,10 +1,13 @@
 """Signs in the values logged after updates, in the use of time and in the end of a run. Functions as in `signs`."""
 
+import shlex
 from typing import NamedTuple
 
 import numpy as np
 
 from rlctl.output import format_count
+from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
+from rlctl.recipe.recipe import Recipe
 from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
 
 _MOST_NORMALIZED_REWARD = 10.0  # where SB3's `VecNormalize` clips
@@ -212,3 +215,13 @@ def stage_never_succeeds(run: History) -> str | None:
     if not isinstance(total, int | float) or spent < 0.4 * total or success.values[success.steps >= began].any():
         return None
     return f"no episode succeeded in stage {stage:.0f} of {run.stage_count}, which has taken {spent:,.0f} steps"
+
+
+def goals_without_hindsight(run: History) -> str | None:
+    """The environment has goals and a sparse reward, and was trained without hindsight replay."""
+    if run.env is None or not run.recipe or has_sparse_reward([episode.rewards for episode in run.episodes]) is False:
+        return None
+    if (options := suggest_hindsight(Recipe.model_validate(run.recipe), run.env)) is None:
+        return None
+    task = shlex.quote(str(run.status.get("task", "TASK")))
+    return f"achieved_goal, desired_goal and compute_reward, but no hindsight: rlctl train {task} {options}"

@@ -12,6 +12,7 @@ _LEAST_RETURNS = 6
 _LEAST_EVALUATIONS = 4
 _NEVER = 0.02  # success rate
 _BY_CHANCE = 0.1  # success rate
+_HALF = 0.5  # success rate
 
 
 def flat(run: History) -> str | None:
@@ -70,6 +71,14 @@ def never_succeeds(run: History) -> str | None:
     """Success is reported, but hardly any episode succeeds."""
     curves = [curve for curve in run.successes if len(curve)]
     if not curves or run.progress < 0.5 or (best := max(float(curve.values.max()) for curve in curves)) > _NEVER:
+        return None
+    return f"success at most {best:.1%}"
+
+
+def seldom_succeeds(run: History) -> str | None:
+    """Success is reported, and fewer than half of the episodes succeed at best."""
+    curves = [curve for curve in run.successes if len(curve)]
+    if not curves or run.progress < 0.5 or (best := max(float(curve.values.max()) for curve in curves)) >= _HALF:
         return None
     return f"success at most {best:.1%}"
 

@@ -11,11 +11,19 @@ from rlctl.task.mujoco.world import import_mujoco
 
 
 def draw(
-    model: Any, data: Any, size: tuple[int, int], *, eye: Sequence[float], target: Sequence[float], field_of_view: float
+    model: Any,
+    data: Any,
+    size: tuple[int, int],
+    markers: Sequence[tuple[Any, float, Any]] = (),
+    *,
+    eye: Sequence[float],
+    target: Sequence[float],
+    field_of_view: float,
 ) -> NDArray[np.uint8]:
     """Return an RGB image of shape (height, width, 3), seen from `eye` [m] to `target` [m]; z is up.
 
-    `size` is width and height, `field_of_view` is vertical [degrees].
+    `size` is width and height, `field_of_view` is vertical [degrees]. `markers` are spheres: position [m], radius
+    [m] and colour.
     """
     mujoco = import_mujoco()
     camera, way = mujoco.MjvCamera(), np.subtract(target, eye)
@@ -31,6 +39,13 @@ def draw(
     try:
         with mujoco.Renderer(model, size[1], size[0]) as renderer:
             renderer.update_scene(data, camera)
+            for position, radius, color in markers:
+                geom = renderer.scene.geoms[renderer.scene.ngeom]
+                sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+                mujoco.mjv_initGeom(
+                    geom, sphere, np.full(3, radius), position, np.eye(3).ravel(), color.astype(np.float32)
+                )
+                renderer.scene.ngeom += 1
             picture: NDArray[np.uint8] = renderer.render()
     except Exception as error:  # OpenGL raises many kinds
         raise UsageError(

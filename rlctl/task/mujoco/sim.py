@@ -72,6 +72,7 @@ class MujocoSim(Sim):
         self._parts: dict[str, Parts] = {}
         self._pairs: list[tuple[str, str]] = []  # links whose geoms collide, each as BODY/LINK
         self._pushes: list[_MujocoPush] = []
+        self._markers: list[tuple[Array, float, Array]] = []  # position [m], radius [m] and colour
         self._spec = self.mujoco.MjSpec()
         option = self._spec.option
         option.timestep = self._control_dt / self.world.substeps
@@ -362,6 +363,13 @@ class MujocoSim(Sim):
         number = pushed.find_link(link or pushed.base_name)  # type: ignore[attr-defined]
         self._pushes.append(_MujocoPush(self.fields._index or 0, number, np.array(force, float), steps))
 
+    def add_marker(self, position: Sequence[float], radius: float, color: Sequence[float]) -> int:
+        self._markers.append((np.array(position, float), radius, np.array(color, float)))
+        return len(self._markers) - 1
+
+    def move_marker(self, marker: int, position: Sequence[float] | Array) -> None:
+        self._markers[marker][0][:] = position
+
     def render(
         self,
         width: int = 320,
@@ -377,7 +385,8 @@ class MujocoSim(Sim):
         if self.world.batch is not None:
             self._refuse("pictures of many worlds")
         self.world.refresh()
-        return draw(self.model, self.data, (width, height), eye=eye, target=target, field_of_view=field_of_view)
+        view = {"eye": eye, "target": target, "field_of_view": field_of_view}
+        return draw(self.model, self.data, (width, height), self._markers, **view)  # type: ignore[arg-type]
 
     def close(self) -> None:
         with contextlib.suppress(AttributeError):

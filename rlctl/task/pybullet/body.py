@@ -13,7 +13,7 @@ from rlctl.task.pybullet.library import pybullet
 from rlctl.task.pybullet.properties import Properties
 
 
-class BulletBody(Properties):
+class PybulletBody(Properties):
     """A body in PyBullet. Its state is read at most once per control step."""
 
     engine = "PyBullet"
@@ -138,7 +138,7 @@ class BulletBody(Properties):
         states = pybullet.getLinkStates(self.id, numbers, physicsClientId=self.client) or ()
         return [state[0] for state in states]
 
-    def links_touching(self, other: "BulletBody") -> set[str]:
+    def links_touching(self, other: "PybulletBody") -> set[str]:
         points = self._contact_points()
         # Each point lists this body first; a contact of the body with itself is listed once for both links.
         numbers = {point[3] for point in points if point[2] == other.id}
@@ -146,14 +146,14 @@ class BulletBody(Properties):
             numbers |= {point[4] for point in points if point[2] == self.id}
         return {self._all_names[number] for number in numbers}  # the base, -1, is the last name
 
-    def contacts_with(self, other: "BulletBody") -> Contacts:
+    def contacts_with(self, other: "PybulletBody") -> Contacts:
         points = [point for point in self._contact_points() if point[2] == other.id]
         names = [self._all_names[point[3]] for point in points]
         # PyBullet divides a substep's impulse by the time of the whole step.
         forces = np.array([point[9] for point in points]) * self._substeps
         return Contacts(names, forces, np.array([point[8] for point in points]))
 
-    def distance_to(self, other: "BulletBody", link: str | None = None) -> float:
+    def distance_to(self, other: "PybulletBody", link: str | None = None) -> float:
         index = {} if link is None else {"linkIndexA": self._part_index(link)}
         points = pybullet.getClosestPoints(self.id, other.id, 100.0, **index, physicsClientId=self.client)
         return min((float(point[8]) for point in points), default=math.inf)

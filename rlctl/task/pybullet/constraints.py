@@ -4,7 +4,7 @@ from typing import Any
 
 from rlctl.errors import TaskError
 from rlctl.task.attachments import Attachment, Joined, Point
-from rlctl.task.pybullet.body import BulletBody
+from rlctl.task.pybullet.body import PybulletBody
 from rlctl.task.pybullet.library import pybullet
 from rlctl.task.sim import Sim
 
@@ -12,7 +12,7 @@ _APART = 0.01  # [m]; frames farther apart would jump together and make the worl
 
 
 class Constraints(Sim):
-    """The part of `BulletSim` that connects links.
+    """The part of `PybulletSim` that connects links.
 
     A constraint is not exact: with physics steps of 1/240 s a free body of any mass hangs 1.2 mm too low. The error is
     proportional to the square of the step.
@@ -68,7 +68,7 @@ class Constraints(Sim):
 def _find_inertial_frame(end: Attachment) -> tuple[int, int, Point, Point]:
     """Return PyBullet's numbers of body and link, and the frame relative to the link's centre of mass."""
     body = end.body
-    assert isinstance(body, BulletBody)  # bodies of one world are of one engine
+    assert isinstance(body, PybulletBody)  # bodies of one world are of one engine
     index = body._part_index(end.link)
     if index < 0:
         return body.id, index, end.position, end.orientation

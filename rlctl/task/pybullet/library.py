@@ -1,4 +1,4 @@
-"""Imports PyBullet on first use, and reads the errors that it prints."""
+"""Imports PyBullet on first use, reads the errors that it prints, and draws its worlds."""
 
 import contextlib
 import ctypes
@@ -7,9 +7,12 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.errors import UsageError
 
@@ -70,6 +73,26 @@ def read_complaint(call: Callable[[], object]) -> str:
         file.seek(0)
         text = file.read().decode(errors="replace")
     return " ".join(re.sub(r"b3(Error|Warning)\[.*\]:", " ", text).split())
+
+
+def draw_world(
+    client: int,
+    width: int,
+    height: int,
+    *,
+    eye: Sequence[float],
+    target: Sequence[float],
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+    field_of_view: float,
+) -> NDArray[np.uint8]:
+    """Draw a client's world as `Sim.render` does."""
+    view = pybullet.computeViewMatrix(eye, target, up)
+    projection = pybullet.computeProjectionMatrixFOV(field_of_view, width / height, 0.05, 10.0)
+    image = pybullet.getCameraImage(
+        width, height, view, projection, shadow=0, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=client
+    )
+    # PyBullet returns a flat tuple if it was built without numpy.
+    return np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[:, :, :3]
 
 
 def check_display() -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.task.body import Body
-from rlctl.task.pybullet.body import BulletBody
+from rlctl.task.pybullet.body import PybulletBody
 from rlctl.task.pybullet.library import pybullet
 
 _ROUNDING = 1.01  # of values written with a few digits
@@ -22,7 +22,7 @@ def find_model_faults(body: Body) -> list[str]:
     A link without `<inertial>` weighs 1 kg in PyBullet. Principal moments [kg m^2] are positive, none exceeds the sum
     of the others, and none exceeds mass x size^2, where size [m] is the diagonal of the link's collision shape.
     """
-    if not isinstance(body, BulletBody) or body.file.suffix != ".urdf":
+    if not isinstance(body, PybulletBody) or body.file.suffix != ".urdf":
         return []
     try:
         root = ElementTree.fromstring(body.file.read_bytes().strip())
@@ -32,7 +32,7 @@ def find_model_faults(body: Body) -> list[str]:
     return [f"{body.file.name}, {place}: {fault}" for place, fault in faults]
 
 
-def _find_faults(body: BulletBody, root: ElementTree.Element) -> Iterator[tuple[str, str]]:
+def _find_faults(body: PybulletBody, root: ElementTree.Element) -> Iterator[tuple[str, str]]:
     for link in root.findall("link"):
         name = link.get("name", "")
         place = f"link {name!r}"
@@ -76,7 +76,7 @@ def _find_text(owner: ElementTree.Element, inertia_used: bool = True) -> str:
     return ""
 
 
-def _judge_inertia(body: BulletBody, index: int, inertial: ElementTree.Element) -> str:
+def _judge_inertia(body: PybulletBody, index: int, inertial: ElementTree.Element) -> str:
     mass = float(inertial.find("mass").get("value", 0))  # type: ignore[union-attr]
     element = inertial.find("inertia")
     if mass == 0 or element is None:

@@ -23,7 +23,7 @@ class _Plan(NamedTuple):
 
 
 class Motors(Body):
-    """The part of `BulletBody` that drives its joints."""
+    """The part of `PybulletBody` that drives its joints."""
 
     client: int
     id: int

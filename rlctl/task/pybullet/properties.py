@@ -19,7 +19,7 @@ class _Dynamics(NamedTuple):
 
 
 class Properties(Motors):
-    """The part of `BulletBody` whose values events change; a reset restores the values of the built world."""
+    """The part of `PybulletBody` whose values events change; a reset restores the values of the built world."""
 
     _links: dict[str, int]
 

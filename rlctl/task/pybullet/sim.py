@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError
 from rlctl.task.body import Array
 from rlctl.task.model_files import find_model_file
-from rlctl.task.pybullet.body import BulletBody
+from rlctl.task.pybullet.body import PybulletBody
 from rlctl.task.pybullet.constraints import Constraints
-from rlctl.task.pybullet.library import check_display, pybullet, pybullet_data, read_complaint
+from rlctl.task.pybullet.library import check_display, draw_world, pybullet, pybullet_data, read_complaint
 
 
 @dataclasses.dataclass
 class _Push:
-    body: BulletBody
+    body: PybulletBody
     link: int
     force: Sequence[float]  # [N], world frame
     steps: int  # control steps that it still acts
@@ -38,14 +38,14 @@ def _check_joint_names(path: Path) -> None:
             raise TaskError(f"{path}: {names.count(name)} joints are called {name!r}; give each its own name")
 
 
-class BulletSim(Constraints):
+class PybulletSim(Constraints):
     """A PyBullet world of its own.
 
     One call of PyBullet simulates `control_dt` [s] in `substeps` physics steps, so that a force acts in all of them.
     """
 
     engine = "PyBullet"
-    bodies: dict[str, BulletBody]
+    bodies: dict[str, PybulletBody]
 
     def __init__(self, *, control_dt: float, substeps: int, solver_iterations: int = 50, gui: bool = False) -> None:
         if gui:
@@ -65,7 +65,7 @@ class BulletSim(Constraints):
         self._saved: int | None = None
         self._built_gravity: tuple[float, ...] | None = None  # [m/s^2], set while events have changed the gravity
         self._pushes: list[_Push] = []
-        self._driven: list[BulletBody] = []
+        self._driven: list[PybulletBody] = []
         self._prepare()
 
     def _prepare(self) -> None:
@@ -90,7 +90,7 @@ class BulletSim(Constraints):
         flags: int = 0,
         self_collision: bool = False,
         inertia: Literal["file", "shape"] = "file",
-    ) -> BulletBody:
+    ) -> PybulletBody:
         self._check_new(name)
         path = find_model_file(file)
         if path.suffix == ".urdf":
@@ -111,7 +111,7 @@ class BulletSim(Constraints):
             fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0  # a base without mass
         else:
             body_id = self._call_loader(path, pybullet.loadURDF, position, orientation, useFixedBase=fixed, flags=flags)
-        body = self.bodies[name] = BulletBody(self.client, *self._times, name, body_id, path, fixed)
+        body = self.bodies[name] = PybulletBody(self.client, *self._times, name, body_id, path, fixed)
         body.inertia_from_file = bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE)
         speeds = body.joint_max_speed
         if path.suffix == ".urdf" and fixed and speeds.size and (speeds > 0).all():
@@ -169,7 +169,7 @@ class BulletSim(Constraints):
             body._cache.clear()
             body._restore_nominal()
 
-    def body(self, name: str) -> BulletBody:
+    def body(self, name: str) -> PybulletBody:
         super().body(name)  # raises for an unknown one
         return self.bodies[name]
 
@@ -202,7 +202,7 @@ class BulletSim(Constraints):
 
     def add_height_field(
         self, name: str, heights: Array, *, cell: float, color: Sequence[float] = (0.55, 0.6, 0.5)
-    ) -> BulletBody:
+    ) -> PybulletBody:
         self._check_new(name)
         rows, columns = heights.shape
         shape = pybullet.createCollisionShape(
@@ -218,7 +218,7 @@ class BulletSim(Constraints):
         middle = (0.0, 0.0, float(heights.min() + heights.max()) / 2)
         body_id = pybullet.createMultiBody(0, shape, basePosition=middle, physicsClientId=self.client)
         pybullet.changeVisualShape(body_id, -1, rgbaColor=(*color, 1), physicsClientId=self.client)
-        body = BulletBody(self.client, *self._times, name, body_id, Path("height field"), True)
+        body = PybulletBody(self.client, *self._times, name, body_id, Path("height field"), True)
         x, y = ((np.arange(count) - (count - 1) / 2) * cell for count in heights.shape)
         body.terrain = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1)
         self.bodies[name] = body
@@ -247,13 +247,7 @@ class BulletSim(Constraints):
         The camera is at `eye` [m] and looks at `target` [m], with a vertical `field_of_view` [degrees]. It takes 20 to
         40 ms at 320x240.
         """
-        view = pybullet.computeViewMatrix(eye, target, up)
-        projection = pybullet.computeProjectionMatrixFOV(field_of_view, width / height, 0.05, 10.0)
-        image = pybullet.getCameraImage(
-            width, height, view, projection, shadow=0, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=self.client
-        )
-        # PyBullet returns a flat tuple if it was built without numpy.
-        return np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[:, :, :3]
+        return draw_world(self.client, width, height, eye=eye, target=target, up=up, field_of_view=field_of_view)
 
     def close(self) -> None:
         if self.client >= 0 and pybullet.isConnected(physicsClientId=self.client):

@@ -18,7 +18,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.processes.child_process import ChildProcess, anonymous_file, write_stderr
+from rlctl.printed_lines import print_line
+from rlctl.processes.child_process import ChildProcess, anonymous_file
 from rlctl.rollout.shared_arrays import Layout, map_arrays
 from rlctl.rollout.workers import available_cores
 from rlctl.training.updates.perceptrons import Floats, Shapes, count_floats
@@ -90,7 +91,7 @@ class Blocks:
                 process = ChildProcess(f"{__name__}:main", {**arguments, **descriptors}, pass_fds=descriptors.values())
                 self._processes.append(process)
         except OSError as error:
-            write_stderr(f"updates use fewer cores: a process cannot be started: {error.strerror or error}")
+            print_line(f"updates use fewer cores: a process cannot be started: {error.strerror or error}")
         os.close(memory)
         self.close = weakref.finalize(self, _close, self._processes, ends)
         """Ends the processes; this process computes all tasks from then on. A second call does nothing."""
@@ -121,7 +122,7 @@ class Blocks:
             except TimeoutError:
                 ended = [process for process in self._processes if process.process.poll() is not None]
                 if ended:
-                    write_stderr(f"updates continue on one core: a process {ended[0].describe_end()}")
+                    print_line(f"updates continue on one core: a process {ended[0].describe_end()}")
                     self.close()
                     return False
         return True

@@ -20,6 +20,12 @@ FUNCTIONS = """
     def raises(observation): raise KeyError("hand")
     def changes(observation): observation[:] = 9.0; return [0.0, 0.0]
     def seven(observation): return np.ones(7)
+    def of_step(observation, step): return [step / 10, 0.0]
+    def of_time(observation, time): return [time / 10, 0.0]
+    def of_optional_step(observation, step=9): return [step / 10, 0.0]
+    def with_gain(observation, gain=0.25): return [gain, 0.0]
+    def of_three(a, b, c): return [0.0, 0.0]
+    def leaves(observation): raise SystemExit(2)
 """
 
 
@@ -28,8 +34,8 @@ def functions(write_module):
     return write_module("functions.py", FUNCTIONS)
 
 
-def act(name, space, observation=None):
-    return make_player(str(name), space).act(np.zeros(3) if observation is None else observation, 1, 0)[1]
+def act(name, space, observation=None, step=0):
+    return make_player(str(name), space).act(np.zeros(3) if observation is None else observation, 1, step)[1]
 
 
 def test_zero():
@@ -52,18 +58,38 @@ def test_a_function_acts_within_the_space(functions):
 
 
 @pytest.mark.parametrize(
+    ("name", "first"), [("of_step", 0.5), ("of_time", 0.5), ("of_optional_step", 0.5), ("with_gain", 0.25)]
+)
+def test_a_function_may_take_the_step(functions, name, first):
+    assert act(f"{functions}:{name}", BOX, step=5).tolist() == [first, 0.0]
+
+
+def test_a_function_of_three_arguments_is_refused_at_once(functions):
+    with pytest.raises(
+        UsageError, match=r"its parameters are \(a, b, c\); write \(observation\) or \(observation, step\)"
+    ):
+        load_function(f"{functions}:of_three")
+
+
+@pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("of_another_shape", r"it returned \[1.0\], the action space is Box\(-1.0, 1.0, \(2,\), float32\)"),
-        ("nothing", "it returned None, the action space is Box"),
-        ("not_a_number", r"it returned \[nan, 0.0\], the action space is Box"),
-        ("raises", "KeyError: 'hand'"),
+        (
+            "of_another_shape",
+            r"it returned shape \(1,\), expected \(2,\): \[1.0\]; the action space is Box\(-1.0, 1.0, \(2,\)",
+        ),
+        ("nothing", "it returned None; the action space is Box"),
+        ("not_a_number", r"it returned \[nan, 0.0\]; the action space is Box"),
+        ("raises", r"KeyError: 'hand' \(functions.py, line 7\)$"),
+        ("leaves", r"SystemExit: 2 \(functions.py, line 15\)$"),
     ],
 )
 def test_what_a_function_does_wrong(functions, name, message):
-    with pytest.raises(PolicyError, match=rf"^policy functions.py:{name}: {message}") as caught:
-        act(f"{functions}:{name}", BOX)
+    with pytest.raises(PolicyError, match=rf"^policy functions.py:{name}, step 4: {message}") as caught:
+        act(f"{functions}:{name}", BOX, step=4)
     assert caught.value.exit_code == 3
+    assert "\n" not in str(caught.value)
+    assert caught.value.details is None  # no traceback: the line is in the message
 
 
 def test_a_discrete_action_is_one_of_the_space(functions):
@@ -106,3 +132,7 @@ def test_what_a_baseline_does_not_take():
         run_evaluation(EvalRequest("reach", baseline="zero", checkpoint="pretrained"))
     with pytest.raises(UsageError, match="give the task to play: rlctl eval reach --policy zero"):
         run_evaluation(EvalRequest(None, baseline="zero"))
+    with pytest.raises(
+        UsageError, match=r"plays a task, and best\.onnx is a file: leave out --policy, or name its task"
+    ):
+        run_evaluation(EvalRequest("best.onnx", baseline="zero"))

@@ -1,0 +1,241 @@
+"""Where the episodes of a replay come from: a recorded episode, the policy of a run, or a task and a named policy."""
+
+import dataclasses
+from contextlib import closing
+from pathlib import Path
+
+from rlctl import output
+from rlctl.checking.bullet_worlds import find_clients
+from rlctl.environments.info import describe
+from rlctl.environments.registry import make_slug
+from rlctl.environments.spec import EnvChanges, EnvSpec
+from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, load_baseline, load_player
+from rlctl.policy.numpy_policy import load_policy
+from rlctl.policy.players.named import SERVER
+from rlctl.policy.players.player import Player
+from rlctl.recipe.sources import parse_changes
+from rlctl.replaying.choice import choose_episodes
+from rlctl.replaying.drawable import make_drawable
+from rlctl.replaying.recorder import (
+    Choose,
+    Rollout,
+    copy_observation,
+    find_dt,
+    play_episode,
+    recorded_actions,
+)
+from rlctl.replaying.report import ReplayedEpisode, ReplayResult
+from rlctl.replaying.reproduce import print_warning, record_episode
+from rlctl.replaying.request import ReplayRequest
+from rlctl.replaying.scene import Env
+from rlctl.replaying.world import WorldWatch
+from rlctl.replaying.world_readers import make_world_reader
+from rlctl.rollout.seeds import Stream, episode_seeds
+from rlctl.run.directory import RunDirectory, refuse_links_out
+from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
+from rlctl.run.lookup import find_owner, find_policy, locate_task
+
+_EPISODES_TO_CHOOSE_FROM = 100
+_LONGEST = 1000  # [steps], of an episode without a known time limit
+
+
+class RecordedSource:
+    """A recorded episode."""
+
+    def __init__(self, path: Path, output: Path | None) -> None:
+        self._path, self._output = path, output
+        self._episode = load_located(path)
+        info = self._episode.info
+        self.spec, self.seeds, self.name = info.spec, [info.seed], info.policy
+
+    def begin(self, env: Env, seed: int) -> Choose:
+        """Return a function that chooses the recorded actions."""
+        return recorded_actions(self._episode, env.action_space, self._path)
+
+    def watch(self, step: int) -> None:
+        """Do nothing after a step."""
+
+    def record(self) -> list[ReplayedEpisode]:
+        """Write the recording next to the episode, or to `--output`."""
+        recording = self._path.with_suffix(".rrd")
+        if self._output is not None:
+            recording = self._output if self._output.suffix == ".rrd" else self._output / recording.name
+        title = f"{self.spec.task} / episode {self._path.stem}"
+        return [summarize(record_episode(self._episode, recording, title=title), recording, self._path)]
+
+    def report(self, episodes: list[ReplayedEpisode]) -> ReplayResult:
+        """Return the result."""
+        return ReplayResult(self.spec.task, self.name, episodes)
+
+
+class _NewEpisodes:
+    """New episodes of a policy, chosen by their outcome or by their seeds."""
+
+    name: str  # of the policy, in the recording
+    described: str  # the policy, for the result
+
+    def __init__(self, request: ReplayRequest, spec: EnvSpec, player: LoadedPolicy | Baseline) -> None:
+        self._output, self.spec = request.output, spec
+        self._chosen: dict[int, float] = {}  # returns of the chosen episodes, by seed
+        self._choice = ""
+        if request.choice is not None:
+            episodes = request.episodes or _EPISODES_TO_CHOOSE_FROM
+            results, self._choice = choose_episodes(player, self.spec, episodes, request.seed, request.choice)
+            self._chosen = {result.seed: result.total_reward for result in results}
+            self.seeds = list(self._chosen)
+        else:
+            self.seeds = episode_seeds(request.seed, Stream.REPLAY, request.episodes or 1)
+
+    def begin(self, env: Env, seed: int) -> Choose:
+        """Return the function that chooses the actions of an episode."""
+        raise NotImplementedError
+
+    def watch(self, step: int) -> None:
+        """Look at the world after a step."""
+
+    def record(self) -> list[ReplayedEpisode]:
+        """Write each episode and its recording."""
+        from rlctl.replaying.rrd import write_rrd
+
+        spec, episodes = self.spec, []
+        with closing(make_drawable(spec)) as env:
+            for number, seed in enumerate(self.seeds):
+                choose = self.begin(env, seed)
+                rollout = play_episode(env, spec, seed, choose, policy=self.name, draw=print_warning, watch=self.watch)
+                recording = self._choose_recording(number)
+                episode = recording.with_suffix(".npz")
+                save_episode(episode, rollout.episode)
+                title, several = f"{spec.task} / episode {recording.stem}", len(self.seeds) > 1
+                write_rrd(recording, rollout, title=title, warn=print_warning, several=several)
+                episodes.append(summarize(rollout, recording, episode))
+        return episodes
+
+    def report(self, episodes: list[ReplayedEpisode]) -> ReplayResult:
+        """Return the result; print a warning for an episode whose return has changed since it was chosen."""
+        for episode in episodes:
+            before = self._chosen.get(episode.seed, episode.total_reward)
+            if before != episode.total_reward:
+                returns = f"the return is {episode.total_reward:.6g}, but was {before:.6g} when the episode was chosen"
+                advice = f"the environment may not be deterministic: rlctl check-env {self.spec.task}"
+                print_warning(f"warning: seed {episode.seed}: {returns}; {advice}")
+        return ReplayResult(self.spec.task, self.name, episodes, policy_file=self.described, choice=self._choice)
+
+    def _choose_recording(self, number: int) -> Path:
+        """Return `--output`, or the next number in that folder, or the default for the episode of a number."""
+        if self._output is None:
+            return self._default_recording(number)
+        if self._output.suffix == ".rrd":
+            return self._output
+        numbers = [int(file.stem) for file in self._output.glob("*.*") if file.stem.isdecimal()]
+        following = max(numbers, default=-1) + 1
+        return self._output / RunDirectory(self._output).episode_file(following).with_suffix(".rrd").name
+
+    def _default_recording(self, number: int) -> Path:
+        raise NotImplementedError
+
+
+class PolicySource(_NewEpisodes):
+    """New episodes of the policy of a run, or of a policy file."""
+
+    def __init__(self, request: ReplayRequest) -> None:
+        policy = find_policy(request.source, request.checkpoint)
+        output.print_notes(policy.notes)
+        self._file, self._run = policy.file, policy.run
+        self._policy = load_policy(self._file)
+        info = self._policy.info
+        spec = policy.locate(info.derive_spec(request.task, _read_changes(request)))
+        self.name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
+        self.described = f"{self._file} ({info.algo}, step {info.training_steps:,})"
+        super().__init__(request, _choose_sim(spec, request), load_player(self._file, deterministic=True))
+
+    def begin(self, env: Env, seed: int) -> Choose:
+        """Return the function that chooses the actions of an episode."""
+        self._policy.info.check_fits(describe(env), self._file)
+        self._policy.reset()
+        return lambda observation, step: self._policy.predict(observation)
+
+    def _default_recording(self, number: int) -> Path:
+        """Return the next number in the run, or (without a run) in ./episodes."""
+        if self._run is not None:
+            refuse_links_out(self._run.path)
+        owner = self._run or RunDirectory(Path())
+        return owner.episode_file(owner.next_episode_number()).with_suffix(".rrd")
+
+
+class TaskSource(_NewEpisodes):
+    """Episodes of a task with zero or random actions, or a user's function; the world of the first is summarised."""
+
+    def __init__(self, request: ReplayRequest, policy: str) -> None:
+        spec = _read_changes(request).apply(choose_task(request.source, policy, "replay"))
+        self._baseline = load_baseline(policy)
+        self.name = self.described = self._baseline.title
+        self._other_clients = find_clients()
+        self._player: Player | None = None
+        self._world: WorldWatch | None = None
+        super().__init__(request, _choose_sim(spec, request), self._baseline)
+
+    def begin(self, env: Env, seed: int) -> Choose:
+        """Return the function that chooses the actions of an episode."""
+        self._env, self._seed = env, seed
+        player = self._player = self._player or self._baseline.make_player(env)
+        longest = _LONGEST if describe(env).max_steps is None else None
+
+        def choose(observation: object, step: int) -> object:
+            if step == longest:
+                print_warning(f"seed {seed}: cut after {_LONGEST:,} steps, because no time limit is known")
+                return None
+            return player.act(copy_observation(observation, env.observation_space), seed, step)[1]
+
+        return choose
+
+    def watch(self, step: int) -> None:
+        """Read the world of the first episode after a step."""
+        if self._seed != self.seeds[0]:
+            return
+        if step == 0 and (reader := make_world_reader(self._env, self._other_clients)) is not None:
+            self._world = WorldWatch(reader, self._seed, find_dt(self._env))
+        if self._world is not None:
+            self._world.read(step)
+
+    def report(self, episodes: list[ReplayedEpisode]) -> ReplayResult:
+        """Return the result, with what was seen of the world."""
+        result = super().report(episodes)
+        if self._player is not None:
+            self._player.close()
+        if self._world is None:
+            if episodes:
+                output.print_notes(["bodies and joints are unknown: it simulates with neither PyBullet nor MuJoCo"])
+            return result
+        return dataclasses.replace(result, world=self._world.summarize())
+
+    def _default_recording(self, number: int) -> Path:
+        """Return `./TASK-POLICY.rrd`, which the next look replaces; `-2`, `-3` for further episodes."""
+        policy = "server" if self.name.startswith(SERVER) else make_slug(self.name)
+        count = f"-{number + 1}" if number else ""
+        return Path(f"{make_slug(self.spec.task)}-{policy}{count}.rrd")
+
+
+def load_located(path: Path) -> RecordedEpisode:
+    """Read an episode, with the absolute path of its task's file."""
+    episode = load_episode(path)
+    spec = dataclasses.replace(episode.info.spec, task=locate_task(episode.info.spec.task, find_owner(path)))
+    return dataclasses.replace(episode, info=episode.info.model_copy(update={"spec": spec}))
+
+
+def _read_changes(request: ReplayRequest) -> EnvChanges:
+    changes = parse_changes(request.settings) if request.settings else EnvChanges()
+    if request.sim is None:
+        return changes
+    # As `rlctl eval --sim`: without the recipe's events, which may be PyBullet's only.
+    return dataclasses.replace(changes, randomize=bool(changes.randomize))
+
+
+def _choose_sim(spec: EnvSpec, request: ReplayRequest) -> EnvSpec:
+    return spec if request.sim is None else dataclasses.replace(spec, sim=request.sim)
+
+
+def summarize(rollout: Rollout, recording: Path | None = None, episode: Path | None = None) -> ReplayedEpisode:
+    """Return the episode of a rollout for the result."""
+    info = rollout.episode.info
+    outcome = info.seed, rollout.length, info.total_reward, info.success
+    return ReplayedEpisode(*outcome, rollout.env.events, recording, episode)

@@ -1,0 +1,114 @@
+"""Where the pictures of an environment come from: a camera in its PyBullet world, or the environment itself."""
+
+import numpy as np
+
+from rlctl.environments import registry
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import UsageError, describe_exception
+from rlctl.replaying.bullet_bodies import read_body
+from rlctl.replaying.bullet_camera import EYE_DIRECTION, BulletCamera, Picture, find_world
+from rlctl.replaying.drawable import DrawableEnv, make_drawable
+from rlctl.replaying.scene import Env
+from rlctl.task.env import TaskEnv
+from rlctl.task.pybullet.sim import PybulletSim
+
+
+def make_filmable(spec: EnvSpec) -> Env:
+    """Build an environment for pictures; raises `UsageError` if it is known to make none."""
+    return spec.make("rgb_array") if registry.is_task(spec.constructor()) else make_drawable(spec)
+
+
+class _PlainView:
+    """A plain environment: its own pictures, or else a camera in its PyBullet world."""
+
+    def __init__(self, env: Env, size: tuple[int, int]) -> None:
+        self._env = env
+        self._size = size
+        self._reason = env.no_pictures if isinstance(env, DrawableEnv) else ""
+
+    def begin(self) -> None:
+        """Prepare for a new episode."""
+        self._camera = self._place_camera() if self._reason else None
+        if self._reason and self._camera is None:
+            raise UsageError(self._reason)
+
+    def draw(self) -> Picture:
+        """Return a picture of the present state, shape (height, width, 3)."""
+        if self._camera is None:
+            try:
+                return self._render()
+            except UsageError as error:
+                self._reason = str(error)
+                self._camera = self._place_camera()
+                if self._camera is None:
+                    raise
+        return self._camera.draw()
+
+    def _place_camera(self) -> BulletCamera | None:
+        bodies = find_world(self._env.bullet_log) if isinstance(self._env, DrawableEnv) else []
+        return BulletCamera(bodies, (), self._size) if bodies else None
+
+    def _render(self) -> Picture:
+        try:
+            picture = np.asarray(self._env.render())
+        except Exception as error:  # missing pygame, no OpenGL
+            raise UsageError(f"the environment's render() raised {describe_exception(error)}") from None
+        if picture.ndim != 3 or picture.shape[2] != 3:
+            raise UsageError(f"the environment's render() returned {picture.dtype} of shape {picture.shape}")
+        height, width = (size - size % 2 for size in picture.shape[:2])  # encoders need even sizes
+        return np.ascontiguousarray(picture[:height, :width].astype(np.uint8))
+
+
+class _TaskView:
+    """A camera in a task's PyBullet world."""
+
+    def __init__(self, env: TaskEnv, size: tuple[int, int]) -> None:
+        self._env = env
+        self._size = size
+
+    def begin(self) -> None:
+        sim, markers = self._env.sim, self._env.task.markers()
+        assert isinstance(sim, PybulletSim)  # `look_at` asks
+        bodies = [read_body(sim.client, body.id) for body in sim.bodies.values()]
+        self._camera = BulletCamera(bodies, [np.asarray(position) for position in markers.values()], self._size)
+
+    def draw(self) -> Picture:
+        self._env.move_markers()
+        return self._camera.draw()
+
+
+class _MujocoTaskView:
+    """A camera in a task's MuJoCo world, which follows the first body with a free base."""
+
+    def __init__(self, env: TaskEnv, size: tuple[int, int]) -> None:
+        self._env = env
+        self._size = size
+
+    def begin(self) -> None:
+        bodies = [body for body in self._env.sim.bodies.values() if body.link_names]
+        self._followed = next((body for body in bodies if not body.fixed), None)
+        shown = [self._followed] if self._followed is not None else bodies
+        points = [body.link_position(link) for body in shown for link in body.link_names]
+        points += [np.asarray(position) for position in self._env.task.markers().values()]
+        low, high = (np.min(points, axis=0), np.max(points, axis=0)) if points else (-np.ones(3), np.ones(3))
+        self._target = (low + high) / 2
+        distance = max(1.5, 2.5 * float(np.linalg.norm(high - low)))
+        self._offset = distance * EYE_DIRECTION / np.linalg.norm(EYE_DIRECTION)
+
+    def draw(self) -> Picture:
+        self._env.move_markers()
+        if self._followed is not None:
+            self._target[:2] = self._followed.base_position[:2]  # the height is constant: a gait would shake the film
+        eye, target = (self._target + self._offset).tolist(), self._target.tolist()
+        return self._env.sim.render(*self._size, eye=eye, target=target)
+
+
+def look_at(env: Env, width: int, height: int) -> _TaskView | _MujocoTaskView | _PlainView:
+    """Return the view of an environment: a camera in its task's world, or a plain environment's own pictures.
+
+    Pictures of a camera have `width` and `height` [pixels].
+    """
+    inner, size = env.unwrapped, (width, height)
+    if not isinstance(inner, TaskEnv):
+        return _PlainView(env, size)
+    return _TaskView(inner, size) if isinstance(inner.sim, PybulletSim) else _MujocoTaskView(inner, size)
