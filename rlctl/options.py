@@ -40,6 +40,10 @@ Pretrained = Annotated[bool, Option("The policy that ships with the task.", ("--
 Settings = Annotated[
     list[str], Option("Set a key, e.g. task.tolerance=0.02, randomize=true.", ("--set",), metavar="KEY=VALUE")
 ]
+Sim = Annotated[
+    str | None,
+    Option("Physics engine of a task; default: PyBullet if it is installed.", metavar="pybullet|mujoco[:SOLREF]"),
+]
 EpisodeSeed = Annotated[int, Option("Seed of the list of episodes.", min=0)]
 Json = Annotated[str | None, Option("Also write the result as JSON; - writes only JSON, to stdout.", metavar="FILE")]
 Yes = Annotated[bool, Option("Do not ask.", ("--yes",))]

@@ -152,10 +152,11 @@ def choose_checkpoint(checkpoint: str, pretrained: bool) -> str:
     return PRETRAINED
 
 
-def parse_changes(settings: list[str]) -> EnvChanges:
-    """Read the `--set` options of a command that changes an environment."""
+def parse_changes(settings: list[str], sim: str | None = None) -> EnvChanges:
+    """Read the `--set` options and the engine of a command that changes an environment."""
     from rlctl.environments.spec import UNCHANGED
 
+    settings = settings if sim is None else [*settings, f"sim={sim}"]
     if not settings:
         return UNCHANGED
     from rlctl.recipe.sources import parse_changes  # takes a quarter of a second

@@ -7,7 +7,7 @@ from typing import Annotated
 from rlctl.cli.arguments import choose_checkpoint, command, parse_changes
 from rlctl.deploy.server.request import ServeRequest
 from rlctl.errors import UsageError
-from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName, Settings, TaskName
+from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName, Settings, Sim, TaskName
 
 
 @command
@@ -20,6 +20,7 @@ def serve(
         bool, Option("Play the task through the server in simulation, and print the scores.", ("--self-test",))
     ] = False,
     episodes: Annotated[int, Option("Episodes of the self-test.", min=1, max=1_000_000)] = 100,
+    sim: Sim = None,
     json: Json = None,
 ) -> None:
     """Serve a policy to robots: WebSocket and HTTP, with limits, watchdog, log and a live page."""
@@ -36,7 +37,10 @@ def serve(
         from rlctl.evaluation.request import EvalRequest
 
         server = make_server(policy.file, dataclasses.replace(request, port=0, watchdog=False))
-        result = test.run_self_test(server, EvalRequest(str(policy.file), episodes=episodes, limits=request.limits))
+        result = test.run_self_test(
+            server,
+            EvalRequest(str(policy.file), episodes=episodes, limits=request.limits, changes=parse_changes([], sim)),
+        )
         test.show(result, json)
         return result.check()
 
@@ -66,6 +70,7 @@ def identify(
     ] = [],
     seconds: Annotated[float, Option("Length of the trajectory of --excite [s].", min=1.0, max=3600.0)] = 10.0,
     settings: Settings = [],
+    sim: Sim = None,
     seed: Annotated[int, Option("Seed of the search, or of the trajectory.", min=0)] = 0,
     json: Json = None,
 ) -> None:
@@ -75,7 +80,7 @@ def identify(
     from rlctl.deploy.identify.identify import identify, show
     from rlctl.environments.spec import EnvSpec
 
-    spec = parse_changes(settings).apply(EnvSpec(task))
+    spec = parse_changes(settings, sim).apply(EnvSpec(task))
     if excite is not None and log is None:
         show_excitation(write_excitation(spec, excite, seconds=seconds, seed=seed), json)
         return

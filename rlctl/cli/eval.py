@@ -44,7 +44,11 @@ def evaluate(
     ] = [],
     push: Annotated[bool, Option("Find the smallest push at which the policy fails.", ("--push",))] = False,
     sim: Annotated[
-        str | None, Option("Play in MuJoCo too, with soft, medium and stiff contacts.", metavar="mujoco[:SOLREF]")
+        str | None,
+        Option(
+            "Play in another engine: MuJoCo with soft, medium and stiff contacts, or PyBullet.",
+            metavar="mujoco[:SOLREF]|pybullet",
+        ),
     ] = None,
     yes: Yes = False,
     on: On = None,
@@ -59,7 +63,10 @@ def evaluate(
 
     gates = Gates(min_success, min_success_lower, min_return)
     chosen = dataclasses.replace(options, checkpoint=choose_checkpoint(options.checkpoint, pretrained))
-    request = EvalRequest(**vars(chosen), changes=parse_changes(settings))
+    # Another engine than MuJoCo, and a policy without a file, have no range of contacts: they are played only there.
+    only = sim if sim == "pybullet" or options.baseline is not None else None
+    sim = None if only is not None else sim
+    request = EvalRequest(**vars(chosen), changes=parse_changes(settings, only))
     if on is not None and not vary and sim is None:
         raise UsageError("--on needs a robustness map: give --vary or --sim too")
     if vary or push or sim is not None:

@@ -6,7 +6,7 @@ from typing import Annotated
 from rlctl.cli.arguments import choose_checkpoint, command
 from rlctl.errors import UsageError
 from rlctl.exporting.request import DatasetFormat, ExportRequest, Format
-from rlctl.options import Argument, Checkpoint, Json, Option, Pretrained, RunName
+from rlctl.options import Argument, Checkpoint, Json, Option, Pretrained, RunName, Sim
 
 
 @command
@@ -25,6 +25,7 @@ def export(
     episodes: Annotated[int, Option("Episodes of the dataset.", min=1)] = 100,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,
+    sim: Sim = None,
     output: Annotated[
         Path | None,
         Option(
@@ -38,7 +39,7 @@ def export(
     if policy is not None and (output is not None or onnx or c):
         raise UsageError("--policy FILE writes only that file: leave out --output, --onnx and --c")
     formats: tuple[Format, ...] = ("onnx", "c") if onnx and c else ("c",) if c else ("onnx",)
-    request = ExportRequest(run, formats, checkpoint, output, policy, episodes, dataset)
+    request = ExportRequest(run, formats, checkpoint, output, policy, episodes, dataset, sim)
     if dataset is not None:
         if onnx or c or policy is not None:
             raise UsageError("--dataset writes only a dataset: leave out --onnx, --c and --policy")

@@ -7,12 +7,12 @@ import typer
 
 from rlctl.cli.arguments import command, command_in_panels, parse_changes
 from rlctl.errors import UsageError
-from rlctl.options import Argument, EnvTimeout, Json, Option, OptionalTask, Settings, TaskName
+from rlctl.options import Argument, EnvTimeout, Json, Option, OptionalTask, Settings, Sim, TaskName
 
 
 @command_in_panels(
     {
-        "Options": ["settings", "env_timeout"],
+        "Options": ["settings", "sim", "env_timeout"],
         "Rules": ["select", "ignore", "strict", "baseline"],
         "Output": ["form", "output", "json"],
         "Instead of a check": ["list_rules", "explain"],
@@ -21,6 +21,7 @@ from rlctl.options import Argument, EnvTimeout, Json, Option, OptionalTask, Sett
 def check_env(
     task: OptionalTask = None,
     settings: Settings = [],
+    sim: Sim = None,
     select: Annotated[list[str], Option("Check only these rules: RL3,RL501.", metavar="RULES")] = [],
     ignore: Annotated[list[str], Option("Skip these rules: RL106.", metavar="RULES")] = [],
     strict: Annotated[bool, Option("Exit 1 for warnings too.", ("--strict",))] = False,
@@ -62,7 +63,7 @@ def check_env(
     if json == "-" and (form or output):
         raise UsageError("--json - prints only JSON: leave out --format and -o, or give --json a file")
     known = set() if baseline is None else read_baseline(Path(baseline))
-    spec = parse_changes(settings).apply(EnvSpec(task))
+    spec = parse_changes(settings, sim).apply(EnvSpec(task))
     report = check(spec, rules=choose_rules(select, ignore), strict=strict, env_timeout_s=env_timeout)
     report.subtract(known)
     formats.show_crashes(report)

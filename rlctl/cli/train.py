@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from rlctl.cli.arguments import command_in_panels
 from rlctl.errors import UsageError
-from rlctl.options import Cluster, Jobs, Json, On, Option, Settings
+from rlctl.options import Cluster, Jobs, Json, On, Option, Settings, Sim
 from rlctl.run.train_request import TrainRequest
 from rlctl.tuning.tune_request import TuneRequest
 
@@ -23,6 +23,7 @@ class RecipeFlags:
         str | None, Option("Environment steps; 1e6 is fine.", ("--total-timesteps", "-n"), metavar="STEPS")
     ] = None
     n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1)] = None
+    sim: Sim = None
     track: Annotated[str | None, Option("Also send the run to wandb, mlflow or trackio.", metavar="TRACKER")] = None
 
     def merge(self) -> dict[str, Any]:
@@ -67,7 +68,7 @@ class TrainFlags(RecipeFlags):
 @command_in_panels(
     {
         "Options": ["algo", "total_timesteps", "seed", "seeds", "config", "settings", "stop_success"],
-        "How": ["n_envs", "device", "check", "env_timeout_s", "callback"],
+        "How": ["sim", "n_envs", "device", "check", "env_timeout_s", "callback"],
         "Continue": ["resume", "initial_policy", "demos", "force"],
         "Where": ["jobs", "on", "cluster", "detach"],
         "Output": ["root", "record", "track", "json"],
@@ -122,7 +123,7 @@ class TuneFlags(RecipeFlags):
 
 @command_in_panels(
     {
-        "Options": ["algo", "total_timesteps", "seed", "config", "settings", "n_envs"],
+        "Options": ["algo", "total_timesteps", "seed", "config", "settings", "sim", "n_envs"],
         "Search": ["search", "trials", "metric"],
         "Continue": ["resume", "storage"],
         "Where": ["jobs", "on", "cluster"],

@@ -171,6 +171,7 @@ class EnvChanges:
     randomize: bool | None = None
     """True: all events act. False: only those in `events`, and those the task enables itself. None: unchanged."""
     events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    sim: str = ""  # physics engine; empty: unchanged
 
     def apply(self, spec: EnvSpec) -> EnvSpec:
         """Return `spec` with the changes applied."""
@@ -180,6 +181,7 @@ class EnvChanges:
             reward_weights=merge(spec.reward_weights, self.reward_weights),
             randomize=spec.randomize if self.randomize is None else self.randomize,
             events=merge({} if self.randomize is False else spec.events, self.events),
+            sim=self.sim or spec.sim,
         )
 
     def __bool__(self) -> bool:

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 from rlctl import output
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.exporting.request import ExportRequest
-from rlctl.exporting.verify import MAX_DIFFERENCE, Agreement, ClosedLoop, Latency, measure_latency, verify
+from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, Latency, measure_latency, verify
 from rlctl.hub import store
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import check_playable
 from rlctl.policy.own_modules import KEYS, import_named
 from rlctl.policy.policy import Policy
 from rlctl.policy.shipped import PRETRAINED
-from rlctl.rollout.workers import Workers, available_cores
+from rlctl.rollout.workers import Workers, count_envs
 from rlctl.run import lookup
 from rlctl.run.directory import refuse_links_out
 from rlctl.run.lookup import FoundPolicy
@@ -151,10 +151,10 @@ def export_policy(request: ExportRequest) -> list[ExportReport]:
             refuse_links_out(source.run.path)
         folder = Path() if request.checkpoint == PRETRAINED else source.file.parent
         target = source.run.onnx_file if source.run else folder / source.file.name
-    return _export(source, [target.with_suffix(f".{name}") for name in formats])
+    return _export(source, [target.with_suffix(f".{name}") for name in formats], request.sim)
 
 
-def _export(source: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
+def _export(source: FoundPolicy, targets: list[Path], sim: str | None) -> list[ExportReport]:
     policy = check_playable(PolicyFile.read(source.file))
     info = policy.info
     has_own = any(isinstance(info.policy_kwargs.get(key), dict) for key in KEYS)
@@ -162,7 +162,8 @@ def _export(source: FoundPolicy, targets: list[Path]) -> list[ExportReport]:
         # The user's run names the classes. A downloaded run has a recipe that others wrote.
         import_named(source.run.recipe().policy_kwargs)
     # The environments are built while torch is imported.
-    with Workers(source.locate(info.spec), available_cores()) as workers:
+    spec = source.locate(info.spec if sim is None else dataclasses.replace(info.spec, sim=sim))
+    with Workers(spec, count_envs(spec, EPISODES)) as workers:
         from rlctl.exporting.actor import build
         from rlctl.exporting.c_source import write_c
         from rlctl.policy.torch_policy import TorchPolicy, pin_threads

@@ -23,6 +23,8 @@ class ExportRequest:
     episodes: int = 100  # episodes of that measurement, or of a dataset
     dataset: DatasetFormat | None = None  # write a dataset of episodes instead; `output` is its folder
 
+    sim: str | None = None  # engine of the episodes that are compared; default: that of the training
+
     def __post_init__(self) -> None:
         if self.policy is not None and self.policy.suffix != ".safetensors":
             raise UsageError(f"--policy {self.policy}: the name of a policy file ends in .safetensors")

@@ -19,7 +19,7 @@ _DEEPEST_KEY = 20
 _FEWEST_EVALUATIONS = 5
 _WITH_UNIT = re.compile(r"([\d.]+)([kKmM])")
 _DEFAULT_ROLLOUT = 4096  # [steps], all environments together
-_OF_THE_ENVIRONMENT = ("task", "reward_weights", "randomize", "events")
+_OF_THE_ENVIRONMENT = ("task", "reward_weights", "randomize", "events", "sim")
 _OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "n_envs", "total_timesteps")
 
 
@@ -150,11 +150,11 @@ def check_changes(values: Mapping[str, Any], source: str) -> EnvChanges:
     """Check changes of an environment, given as keys of a recipe; raises `RecipeError` for any other key."""
     for key in values:
         if key not in _OF_THE_ENVIRONMENT:
-            can = "task.NAME, reward_weights.NAME, randomize and events.NAME can be set here"
+            can = "task.NAME, reward_weights.NAME, randomize, events.NAME and sim can be set here"
             raise RecipeError(f"{source} {key}: only {can}.{did_you_mean(key, _OF_THE_ENVIRONMENT)}")
     recipe = validate(values, source)
     randomize = recipe.randomize if "randomize" in values else None
-    return EnvChanges(recipe.task, recipe.reward_weights, randomize, recipe.events)
+    return EnvChanges(recipe.task, recipe.reward_weights, randomize, recipe.events, recipe.sim or "")
 
 
 def merge_flags(settings: list[str], **flags: Any) -> dict[str, Any]:
