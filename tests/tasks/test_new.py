@@ -12,7 +12,7 @@ from rlctl.errors import UsageError
 from rlctl.tasks import new
 from tests import fork_server
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 FILES = {
     "README.md",
     "pyproject.toml",
