@@ -56,7 +56,7 @@ class Sim:
 
         `position` [m] and `orientation` of the base's origin, and `fixed`, are for URDF files; other formats contain
         them. `flags` are PyBullet's URDF_* flags. With `self_collision` links collide, except with their ancestors.
-        `inertia="shape"` is for a URDF whose inertias are wrong (see `rlctl.task.pybullet.model_faults`): the engine
+        `inertia="shape"` is for a URDF whose inertias are wrong (see `rlctl.task.model_faults`): the engine
         computes them from the collision shapes and the file's masses.
         """
         self._refuse("load")

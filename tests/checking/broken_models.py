@@ -40,7 +40,7 @@ class CartTask(Task):
 
 
 @dataclass
-class TipOfAKilogram(CartTask):
+class TipWithoutInertial(CartTask):
     """The tip has no <inertial>."""
 
     file = CART.with_name("cart_without_inertial.urdf")

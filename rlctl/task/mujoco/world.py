@@ -22,7 +22,7 @@ _SERIOUS = {
     "mjWARN_CNSTRFULL": "too many constraints",
 }
 """MuJoCo's warnings that are errors, and what they mean."""
-_DERIVED = ("xpos", "xquat", "xipos", "sensordata", "actuator_force")
+_DERIVED = ("xpos", "xquat", "xipos", "sensordata", "actuator_force", "qfrc_actuator")
 """Arrays that bodies read and the state does not have."""
 
 
@@ -187,6 +187,7 @@ class MujocoWorld:
         if self.batch is not None:
             self.batch.state[rows] = self._saved
             self.batch.warning[rows] = 0
+            self.batch.bind("sensordata")[rows] = 0.0  # forces and accelerations are of the last step
         else:
             mujoco = self.mujoco
             mujoco.mj_resetData(self.mj_model, self.mj_data)

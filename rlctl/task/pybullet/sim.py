@@ -3,10 +3,8 @@
 Quaternions are (x, y, z, w), as in PyBullet. The state of a body is read at most once per control step.
 """
 
-import contextlib
 import dataclasses
 import functools
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +18,8 @@ from rlctl.task.model_files import find_model_file
 from rlctl.task.pybullet.body import BulletBody
 from rlctl.task.pybullet.constraints import Constraints
 from rlctl.task.pybullet.library import check_display, pybullet, pybullet_data, read_complaint
+from rlctl.task.pybullet.temporary_files import write_temporary
+from rlctl.task.urdf import read_urdf
 
 
 @dataclasses.dataclass
@@ -28,14 +28,6 @@ class _Push:
     link: int
     force: Sequence[float]  # [N], world frame
     steps: int  # control steps that it still acts
-
-
-def _check_joint_names(path: Path) -> None:
-    """Raise `TaskError` for two joints of one name, which crash PyBullet."""
-    with contextlib.suppress(ElementTree.ParseError, LookupError, ValueError):  # PyBullet reads more than XML allows
-        names = [joint.get("name") for joint in ElementTree.fromstring(path.read_bytes().strip()).findall("joint")]
-        if (name := next((name for name in names if names.count(name) > 1), None)) is not None:
-            raise TaskError(f"{path}: {names.count(name)} joints are called {name!r}; give each its own name")
 
 
 class BulletSim(Constraints):
@@ -93,7 +85,6 @@ class BulletSim(Constraints):
         self._check_new(name)
         path = find_model_file(file)
         if path.suffix == ".urdf":
-            _check_joint_names(path)
             flags |= pybullet.URDF_USE_INERTIA_FROM_FILE if inertia == "file" else 0
         if self_collision:
             flags |= pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS
@@ -109,7 +100,7 @@ class BulletSim(Constraints):
             body_id = int(ids[0])
             fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0  # a base without mass
         else:
-            body_id = self._call_loader(path, pybullet.loadURDF, position, orientation, useFixedBase=fixed, flags=flags)
+            body_id = self._load_urdf(path, position, orientation, fixed, flags)
         body = self.bodies[name] = BulletBody(self.client, *self._times, name, body_id, path, fixed)
         body.inertia_from_file = bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE)
         speeds = body.joint_max_speed
@@ -117,12 +108,27 @@ class BulletSim(Constraints):
             body.cap_joint_speed(float(speeds.max()))
         return body
 
-    def _call_loader(self, path: Path, load: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        call = functools.partial(load, str(path), *args, **kwargs, physicsClientId=self.client)
+    def _load_urdf(
+        self, path: Path, position: Sequence[float], orientation: Sequence[float], fixed: bool, flags: int
+    ) -> Any:
+        urdf = read_urdf(path, fixed=fixed, inertia_from_file=bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE))
+        options = {"useFixedBase": fixed, "flags": flags}
+        if not urdf.changed:
+            return self._call_loader(path, pybullet.loadURDF, position, orientation, **options)
+        urdf.check_meshes()
+        with write_temporary(urdf.text, path.name) as copy:
+            return self._call_loader(path, pybullet.loadURDF, position, orientation, read_from=copy, **options)
+
+    def _call_loader(
+        self, path: Path, load: Callable[..., Any], *args: Any, read_from: Path | None = None, **kwargs: Any
+    ) -> Any:
+        file = str(read_from or path)
+        call = functools.partial(load, file, *args, **kwargs, physicsClientId=self.client)
         try:
             return call()
         except pybullet.error as error:
-            raise TaskError(f"PyBullet cannot load {path}: {read_complaint(call) or error}") from None
+            complaint = read_complaint(call).replace(file, str(path))
+            raise TaskError(f"PyBullet cannot load {path}: {complaint or error}") from None
 
     def step(self) -> None:
         if self._pushes:
