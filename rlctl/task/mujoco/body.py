@@ -218,18 +218,14 @@ class MujocoBody(MujocoMotors):
 
     def joint_reaction(self, joint: str) -> Array:
         try:
-            start = int(self._sim.model.sensor(f"{self.name}/{joint}").adr[0])
+            halves = [self._fields.sensor(f"{self.name}/{name}") for name in (joint, f"{joint} torque")]
         except KeyError:
             raise TaskError(f"joint {joint!r} has no force sensor: call add_force_sensor({joint!r}) in build") from None
-        reaction: Array = self._fields.data("sensordata")[..., start : start + 6].copy()
-        return reaction
+        return np.concatenate(halves, axis=-1)
 
     def sensor(self, name: str) -> Array:
         check_name(name, self.sensor_names, f"{self.file.name} has no sensor", TaskError)
-        sensor = self._sim.model.sensor(f"{self.name}/{name}")
-        start, size = int(sensor.adr[0]), int(sensor.dim[0])
-        values: Array = self._fields.derived("sensordata")[..., start : start + size].copy()
-        return values
+        return self._fields.sensor(f"{self.name}/{name}")
 
     def links_touching(self, other: Any) -> set[str]:
         return set(self._list_contacts("links_touching", other)[0])

@@ -129,8 +129,7 @@ def _take_inertia_of_shapes(spec: Any) -> None:
     """Compute each link's inertia from its collision shapes, with the mass and the centre of mass of the file."""
     bodies = {body.name: body for body in spec.bodies[1:] if any(map(is_colliding, body.geoms)) and body.mass > 0}
     shaped = spec.copy()
-    for body in shaped.bodies[1:]:
-        body.explicitinertial = body.name not in bodies
+    shaped.compiler.inertiafromgeom = import_mujoco().mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     model = shaped.compile()
     for name, body in bodies.items():
         number = model.body(name).id

@@ -136,9 +136,9 @@ class MujocoSim(Sim):
         fixed = (fixed or not any(link.mass > 0 for link in child.bodies)) if is_urdf else not free
         if fixed and not child.joints:
             self._flatten_ground(child)
-        if is_urdf and any(not is_colliding(geom) for geom in child.geoms):
-            for geom in filter(is_colliding, child.geoms):
-                geom.group = _HIDDEN
+        drawn = {geom.parent.name for geom in child.geoms if is_urdf and not is_colliding(geom)}
+        for geom in filter(is_colliding, child.geoms):
+            geom.group = _HIDDEN if geom.parent.name in drawn else geom.group
         parts = Parts(name, source, fixed, child)
         for number, geom in enumerate(child.geoms):
             geom.name = str(number)
@@ -159,12 +159,16 @@ class MujocoSim(Sim):
 
     def _flatten_ground(self, child: Any) -> None:
         """Make a wide box that is fixed, such as the ground of `plane.urdf`, a plane: faster, and exact."""
-        for geom in filter(is_colliding, child.geoms):
-            if geom.type == self.mujoco.mjtGeom.mjGEOM_BOX and min(geom.size[:2]) > _WIDE:
-                for visual in [shape for shape in child.geoms if not is_colliding(shape)]:
-                    child.delete(visual)
-                geom.pos = [*geom.pos[:2], geom.pos[2] + geom.size[2]]
-                geom.type, geom.size = self.mujoco.mjtGeom.mjGEOM_PLANE, [geom.size[0], geom.size[1], 1.0]
+        box, plane = self.mujoco.mjtGeom.mjGEOM_BOX, self.mujoco.mjtGeom.mjGEOM_PLANE
+        grounds = [geom for geom in child.geoms if geom.type == box and min(geom.size[:2]) > _WIDE]
+        for geom in filter(is_colliding, grounds):
+            geom.pos = [*geom.pos[:2], geom.pos[2] + geom.size[2]]
+            geom.type, geom.size = plane, [geom.size[0], geom.size[1], 1.0]
+        if grounds:  # recordings draw them themselves
+            used = {geom.meshname for geom in child.geoms if is_colliding(geom)}
+            unused = [mesh for mesh in child.meshes if mesh.name not in used]
+            for part in [*(geom for geom in child.geoms if not is_colliding(geom)), *unused]:
+                child.delete(part)
 
     def _add_body(self, parts: Parts) -> MujocoBody:
         self._parts[parts.name] = parts
@@ -282,8 +286,8 @@ class MujocoSim(Sim):
         try:
             model, data = self._spec.recompile(self.world.mj_model, self.world.mj_data)  # keeps the state
         except ValueError as error:
-            files = ", ".join(str(parts.file.path) for parts in self._parts.values())
-            raise TaskError(f"MuJoCo cannot build the world of {files}: {' '.join(str(error).split())}") from None
+            newest = list(self._parts.values())[-1]  # those before it have been compiled
+            raise TaskError(f"MuJoCo cannot load {newest.file.path}: {' '.join(str(error).split())}") from None
         self._keep_changes(self.world.mj_model, model)
         self.world.set_model(model, data)
         for parts in self._parts.values():

@@ -57,6 +57,7 @@ class MujocoWorld:
         self._saved: Array | None = None
         self._is_fresh = False  # whether all that depends on positions and velocities is up to date
         self._stale: set[int] = set()  # worlds of a batch for which it is not
+        self._has_stepped = np.zeros(1, bool)  # worlds of a batch, since their last reset
 
     def set_model(self, model: Any, data: Any) -> None:
         """Use a newly compiled model; there is one world until `save`."""
@@ -137,6 +138,7 @@ class MujocoWorld:
             ids = None if worlds is None else worlds.astype(np.int32)
             self._stale.difference_update(range(self.batch.nsim) if worlds is None else worlds.tolist())
             self._call("step", ids, nstep=self.substeps, stage=self._velocity_stage)
+            self._has_stepped[slice(None) if worlds is None else worlds] = True
             if self.batch.warning.any():
                 self._raise_warning()
             return
@@ -163,6 +165,16 @@ class MujocoWorld:
         else:
             self.batch.warning[:] = 0
 
+    def read_sensor(self, name: str) -> Array:
+        """Return a copy of a sensor's values, shape (size,); forces and accelerations are 0 after a reset."""
+        self.refresh()
+        sensor = self.mj_model.sensor(name)
+        start, size = int(sensor.adr[0]), int(sensor.dim[0])
+        values: Array = self.data("sensordata")[..., start : start + size].copy()
+        if self.batch is not None and int(sensor.needstage[0]) == int(self.mujoco.mjtStage.mjSTAGE_ACC):
+            values[~self._has_stepped] = 0.0  # the batch leaves them as they were
+        return values
+
     def save(self) -> None:
         """Save the built world for `restore`, and make `count` copies of it."""
         mujoco = self.mujoco
@@ -174,6 +186,7 @@ class MujocoWorld:
             from mujoco.batch import Batch
 
             self.batch = Batch(self.mj_model, self.count, 1)
+            self._has_stepped = np.zeros(self.count, bool)
             self.batch.state[:] = self._saved
             for name in _DERIVED:  # one that is bound later is zero until the next call
                 self.batch.bind(name)
@@ -187,7 +200,7 @@ class MujocoWorld:
         if self.batch is not None:
             self.batch.state[rows] = self._saved
             self.batch.warning[rows] = 0
-            self.batch.bind("sensordata")[rows] = 0.0  # forces and accelerations are of the last step
+            self._has_stepped[rows] = False
         else:
             mujoco = self.mujoco
             mujoco.mj_resetData(self.mj_model, self.mj_data)
@@ -219,6 +232,11 @@ class Fields:
         """Return an array that is computed from the state, up to date."""
         self.world.refresh()
         return self.data(name)
+
+    def sensor(self, name: str) -> Array:
+        """Return the values of a sensor, shape (size,); see `MujocoWorld.read_sensor`."""
+        values: Array = self._select(self.world.read_sensor(name))
+        return values
 
     def model(self, name: str) -> Any:
         """Return an array of the model, for reading and writing, as of the world. Call `touch` after a change."""
