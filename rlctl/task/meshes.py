@@ -20,9 +20,10 @@ _TRANSFORMS = ("matrix", "translate", "rotate", "scale")
 
 
 def convert_mesh(file: Path) -> bytes | None:
-    """Return a file as MuJoCo's MSH format, None if MuJoCo reads the file itself; raises `ValueError` for a damaged one.
+    """Return a file in MuJoCo's MSH format, or None if MuJoCo reads the file itself.
 
-    Text of STL is recognized by its length, which does not fit its number of triangles.
+    Text of STL is recognized by its length, which does not fit its number of triangles. Raises `ValueError` for a
+    damaged file.
     """
     suffix = file.suffix.lower()
     try:
@@ -57,7 +58,9 @@ def _write_msh(points: Array, triangles: Triangles) -> bytes:
 def _is_binary_stl(file: Path) -> bool:
     with file.open("rb") as opened:
         head = opened.read(_STL_HEAD)
-    return len(head) == _STL_HEAD and file.stat().st_size == _STL_HEAD + _STL_TRIANGLE * struct.unpack("<I", head[80:])[0]
+    return (
+        len(head) == _STL_HEAD and file.stat().st_size == _STL_HEAD + _STL_TRIANGLE * struct.unpack("<I", head[80:])[0]
+    )
 
 
 def _read_stl(file: Path) -> tuple[Array, Triangles]:

@@ -1,6 +1,7 @@
 """Reads URDF files so that both engines load the same: finds meshes, replaces inertias that no body can have.
 
-What an engine would change silently is changed here, in the XML that both are given; `rlctl.task.model_faults` lists it.
+What an engine would change silently is changed here, in the XML that both are given. `rlctl.task.model_faults` lists
+these changes.
 """
 
 from __future__ import annotations

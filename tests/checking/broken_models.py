@@ -51,3 +51,10 @@ class HeavyInertia(CartTask):
     """The arm turns like a body of tons."""
 
     file = CART.with_name("cart_of_tons.urdf")
+
+
+@dataclass
+class NoEffort(CartTask):
+    """The model gives the arm's joint an effort limit of 0."""
+
+    file = CART.with_name("cart_without_effort.urdf")

@@ -111,6 +111,12 @@ def test_a_frame_without_inertial_is_named():
     assert finding.evidence == {}
 
 
+def test_a_joint_without_effort_limit_is_named():
+    (finding,) = findings("broken_models.py:NoEffort", "RL207")
+    assert "cart_without_effort.urdf gives no effort limit for joint 'shoulder'" in finding.message
+    assert "pass max_force= [N m]" in finding.message
+
+
 def test_impossible_inertia_is_named():
     (finding,) = findings("broken_models.py:HeavyInertia", "RL809")
     # An arm of 0.2 kg, 0.04 m x 0.04 m x 0.2 m, can have at most 0.2 * (0.04^2 + 0.04^2 + 0.2^2) = 0.0087 kg m^2.

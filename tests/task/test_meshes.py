@@ -24,7 +24,9 @@ def test_collada_is_placed_by_its_nodes(tmp_path, up, corner):
     np.testing.assert_allclose(read_collada(tmp_path / "a.dae")[0][1], corner, atol=1e-12)
 
 
-@pytest.mark.parametrize(("name", "converted"), [("a.stl", False), ("text.stl", True), ("a.obj", False), ("a.dae", True)])
+@pytest.mark.parametrize(
+    ("name", "converted"), [("a.stl", False), ("text.stl", True), ("a.obj", False), ("a.dae", True)]
+)
 def test_what_is_converted(tmp_path, name, converted):
     mesh_files.WRITERS[name](tmp_path / name)
     content = convert_mesh(tmp_path / name)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rlctl.task.pybullet.library import pybullet
 from rlctl.task.model_faults import find_model_faults
+from rlctl.task.pybullet.library import pybullet
 from rlctl.task.pybullet.sim import BulletSim
 from tests.task import models
 

@@ -147,8 +147,10 @@ def swing(folder, visual, **kwargs):
     (folder / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n")
     (folder / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
     box = '<origin xyz="0.1 0 0"/><geometry><box size="0.3 0.04 0.04"/></geometry>'
-    rod = shaped_link(visual, box) if visual else models.link("rod", 1.0).replace(
-        "</link>", f"<collision>{box}</collision></link>"
+    rod = (
+        shaped_link(visual, box)
+        if visual
+        else models.link("rod", 1.0).replace("</link>", f"<collision>{box}</collision></link>")
     )
     file = models.urdf(folder, models.link("base", 1.0), rod, models.joint("turn", "base", "rod"))
     sim = make_sim()
@@ -218,11 +220,16 @@ def test_inertia_of_shapes_keeps_the_mass_of_the_file(tmp_path):
         ),
         (
             "missing.urdf",
-            '<robot name="r"><link name="a"><visual><geometry><mesh filename="no.stl"/></geometry></visual></link></robot>',
+            '<robot name="r"><link name="a"><visual><geometry><mesh filename="no.stl"/></geometry></visual></link>'
+            "</robot>",
             r"link 'a': mesh 'no\.stl' not found: neither below",
         ),
         ("broken.xml", "<mujoco>\n<worldbody></mujoco>", "XML_ERROR_MISMATCHED_ELEMENT .*Line number=2"),
-        ("unknown.xml", "<mujoco>\n<worldbody>\n<bodi/></worldbody></mujoco>", r"unrecognized element Element 'bodi', line 3"),
+        (
+            "unknown.xml",
+            "<mujoco>\n<worldbody>\n<bodi/></worldbody></mujoco>",
+            r"unrecognized element Element 'bodi', line 3",
+        ),
         (
             "missing.xml",
             '<mujoco><asset><mesh file="no.stl"/></asset><worldbody><body name="a"><geom type="mesh" mesh="no"/></body>'

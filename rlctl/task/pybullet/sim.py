@@ -93,8 +93,8 @@ class BulletSim(Constraints):
                 raise TaskError(
                     f"{path.name} contains the pose of its body: position, orientation and fixed are for URDF"
                 )
-            load, options = (pybullet.loadMJCF, {"flags": flags}) if path.suffix == ".xml" else (pybullet.loadSDF, {})
-            ids = self._call_loader(path, load, **options)
+            load = functools.partial(pybullet.loadMJCF, flags=flags) if path.suffix == ".xml" else pybullet.loadSDF
+            ids = self._call_loader(path, load)
             if len(ids) != 1:
                 raise TaskError(f"{path} contains {len(ids)} bodies; split it into files of one body each")
             body_id = int(ids[0])
@@ -112,7 +112,7 @@ class BulletSim(Constraints):
         self, path: Path, position: Sequence[float], orientation: Sequence[float], fixed: bool, flags: int
     ) -> Any:
         urdf = read_urdf(path, fixed=fixed, inertia_from_file=bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE))
-        options = {"useFixedBase": fixed, "flags": flags}
+        options: dict[str, Any] = {"useFixedBase": fixed, "flags": flags}
         if not urdf.changed:
             return self._call_loader(path, pybullet.loadURDF, position, orientation, **options)
         urdf.check_meshes()
