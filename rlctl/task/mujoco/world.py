@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ def import_mujoco() -> Any:
     except ImportError:
         raise UsageError("sim mujoco needs MuJoCo, which is not installed: pip install mujoco") from None
     print_mujoco_warnings()
+    # Of meshes whose textures MuJoCo leaves out.
+    warnings.filterwarnings("ignore", "obj_decoder: invalid or missing face texture coordinate")
     return mujoco
 
 
