@@ -24,6 +24,7 @@ Moments = NDArray[np.float64]
 FRAME_MASS, FRAME_MOMENT = 1e-6, 1e-9  # [kg], [kg m^2], of a link without <inertial> on a body that has mass
 GUESSED_MASS, GUESSED_MOMENT = 1.0, 1.0  # [kg], [kg m^2]: PyBullet's, of any other link without <inertial>
 _SMALLEST_RADIUS = 1e-3  # [m], of gyration: for moments that are not above 0
+_MOST_NAMES = 4
 _ROUNDING = 1e-12
 _MARGIN = 1e-9
 _PRODUCTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
@@ -69,14 +70,14 @@ class Urdf:
 def read_urdf(path: Path, *, fixed: bool = False, inertia_from_file: bool = True) -> Urdf:
     """Read a URDF file; `fixed` means that its base is held by the world.
 
-    Raises `TaskError` for two joints of one name, which crash PyBullet.
+    Raises `TaskError` for two joints of one name, and for several bases, which crash PyBullet.
     """
     try:
         root = ElementTree.fromstring(path.read_bytes().strip())
     except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two: an unknown encoding
         return Urdf(path, None, str(error))
     urdf = Urdf(path, root)
-    _check_joint_names(path, root)
+    _check_names(path, root)
     _find_meshes(urdf, root)
     _add_masses(urdf, root, fixed)
     if inertia_from_file:
@@ -85,10 +86,15 @@ def read_urdf(path: Path, *, fixed: bool = False, inertia_from_file: bool = True
     return urdf
 
 
-def _check_joint_names(path: Path, root: Element) -> None:
+def _check_names(path: Path, root: Element) -> None:
     names = [joint.get("name") for joint in root.findall("joint")]
     if (name := next((name for name in names if names.count(name) > 1), None)) is not None:
         raise TaskError(f"{path}: {names.count(name)} joints are called {name!r}; give each its own name")
+    moved = {child.get("link") for child in root.iterfind("joint/child")}
+    bases = [str(link.get("name")) for link in root.findall("link") if link.get("name") not in moved]
+    if len(bases) > 1:
+        shown = ", ".join(map(repr, bases[:_MOST_NAMES]))
+        raise TaskError(f"{path}: {len(bases)} links are no joint's child ({shown}); a URDF has one base")
 
 
 def _find_meshes(urdf: Urdf, root: Element) -> None:

@@ -1,5 +1,7 @@
 """URDF files as people have them: found meshes, repaired inertias and frames, the same in both engines."""
 
+import tempfile
+
 import numpy as np
 import pytest
 
@@ -174,8 +176,28 @@ def test_a_changed_file_is_read_again_after_it_was_edited(tmp_path):
     sim.close()
 
 
+def test_two_bases(sim, tmp_path):
+    file = models.urdf(tmp_path, models.link("a", 1.0), models.link("b", 1.0))
+    with pytest.raises(TaskError, match=r"model\.urdf: 2 links are no joint's child \('a', 'b'\); a URDF has one base"):
+        sim.load("robot", file)
+
+
 def test_two_joints_of_one_name(sim, tmp_path):
     joints = models.joint("elbow", "a", "b"), models.joint("elbow", "b", "c")
     file = models.urdf(tmp_path, *(models.link(name, 1.0) for name in "abc"), *joints)
     with pytest.raises(TaskError, match=r"model\.urdf: 2 joints are called 'elbow'; give each its own name"):
         sim.load("robot", file)
+
+
+def test_a_changed_file_leaves_nothing_behind(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    (tmp_path / "tmp").mkdir()
+    sim = BulletSim(control_dt=1 / 60, substeps=4)
+    mesh_files.write_stl(tmp_path / "a.stl")
+    hand = sim.load("hand", write_hand(tmp_path, "a.stl", inertia=(1e-4, 1e-4, 1e-3)))
+    assert hand.file == tmp_path / "model.urdf"
+    with pytest.raises(TaskError, match=rf"^PyBullet cannot load {tmp_path}/model\.urdf: ") as caught:
+        sim.load("broken", models.urdf(tmp_path, '<link name="a"><visual><geometry/></visual></link>'))
+    assert "rlctl-" not in str(caught.value)
+    assert list((tmp_path / "tmp").iterdir()) == []
+    sim.close()

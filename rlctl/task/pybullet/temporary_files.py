@@ -2,6 +2,7 @@
 
 import contextlib
 import hashlib
+import os
 import secrets
 import shutil
 import tempfile
@@ -21,7 +22,7 @@ def write_temporary(text: str, name: str) -> Iterator[Path]:
     the same.
     """
     digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-    folder = Path(tempfile.gettempdir()) / f"rlctl-{_PROCESS}-{digest}"
+    folder = Path(tempfile.gettempdir()) / f"rlctl-{_PROCESS}-{os.getpid()}-{digest}"  # a fork has its own
     with _lock:
         folder.mkdir(mode=0o700)
         try:
