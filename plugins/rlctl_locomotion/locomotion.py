@@ -11,12 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from rlctl.task import Event, Joints, Sim, Task, events
 
+MODELS = Path(__file__).parent / "models" / "mujoco"
 TARGET_X, TARGET_Y = 1000.0, 0.0  # [m], world frame: a direction rather than a place
 START_NOISE = 0.1  # [rad]
 AT_LIMIT = float(np.float32(0.99))  # of the way from the middle of a joint's range to its end, rounded as angles are
@@ -28,7 +30,7 @@ class Locomotion(Task):
     """Run towards +x and stay on your feet. A robot fills in its model, feet and motors, and says when it stands."""
 
     model: ClassVar[str]
-    """MJCF file in `pybullet_data`; one of its links, or the base, is called `torso`."""
+    """MJCF file in `pybullet_data`, and in `MODELS` for MuJoCo; one of its links, or the base, is called `torso`."""
     feet: ClassVar[tuple[str, ...]]
     """Links whose contact with the floor is observed."""
     motors: ClassVar[Mapping[str, float]]
@@ -73,9 +75,10 @@ class Locomotion(Task):
         """Load the floor and the robot, its motors switched off."""
         sim.set_gravity(9.8)
         sim.set_contact_erp(0.9)
-        self.floor = sim.load("floor", "plane_stadium.sdf")
+        is_bullet = sim.engine == "PyBullet"  # MuJoCo reads no SDF, and reads these MJCF files differently
+        self.floor = sim.load("floor", "plane_stadium.sdf" if is_bullet else "plane.urdf")
         self.floor.set_friction(0.8)  # and no restitution: theirs is multiplied with the robot's, which is 0
-        self.body = sim.load("robot", f"mjcf/{self.model}", self_collision=True)
+        self.body = sim.load("robot", f"mjcf/{self.model}" if is_bullet else MODELS / self.model, self_collision=True)
         self.body.disable_motors()
         for link in ("torso", *self.feet):
             self.body.mass_state(link)  # raises for one that the model does not have

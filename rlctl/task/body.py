@@ -62,6 +62,8 @@ class Body:
     name: str
     file: Path
     fixed: bool
+    inertia_from_file: bool = False
+    """Whether the moments of inertia are those of a URDF file."""
     base_name: str
     link_names: list[str]
     """Names of all links but the base."""
@@ -73,6 +75,10 @@ class Body:
     """Torque or force limit in the model file [N m or N], shape (joints,); 0 where the file has none."""
     joint_max_speed: Array
     """Velocity limit in the model file [rad/s or m/s], shape (joints,); 0 where the file has none."""
+    actuator_names: Sequence[str] = ()
+    """Names of the actuators that an MJCF file has, for `set_controls`; PyBullet does not read them."""
+    sensor_names: Sequence[str] = ()
+    """Names of the sensors that an MJCF file has, for `sensor`; PyBullet does not read them."""
     terrain: Array | None
     """Points of rough ground [m], world frame, shape (along x, along y, 3); None for any other body."""
     drives: Drives | None
@@ -254,6 +260,22 @@ class Body:
         motor still holds it in place.
         """
         raise NotImplementedError
+
+    def set_controls(self, values: Array, actuators: Sequence[str] = ()) -> None:
+        """Set the controls of actuators that the MJCF file has, in their own units, shape (actuators,).
+
+        By default all of `actuator_names`. They do nothing before the first call after a reset, so that `drive_to`,
+        `drive_at` and `set_torques` move a joint alone. Afterwards all of them act, on top of these motors.
+        """
+        self._refuse("set_controls")
+
+    def sensor(self, name: str) -> Array:
+        """Return the values of a sensor that the MJCF file has, in MuJoCo's units, shape (size,).
+
+        Sensors of positions and velocities are up to date; forces and accelerations are those of the last physics step,
+        and 0 after a reset.
+        """
+        self._refuse("sensor")
 
     def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
         """Scale the force of the joints' motors by `factor`, until the next reset."""

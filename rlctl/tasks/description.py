@@ -107,9 +107,9 @@ def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> 
 
 
 def _describe_definition(env: TaskEnv) -> dict[str, Any]:
-    from rlctl.task.pybullet.model_faults import find_model_faults
+    from rlctl.task.model_faults import find_frames, find_model_faults
 
-    task = env.task
+    task, bodies = env.task, env.sim.bodies.values()
     return {
         "robot": type(task).robot,
         "control_dt": task.control_dt,
@@ -126,7 +126,7 @@ def _describe_definition(env: TaskEnv) -> dict[str, Any]:
             _describe_event(name, event, env.events[name].event if name in env.events else None)
             for name, event in task.events.items()
         ],
-        "model_faults": [fault for body in env.sim.bodies.values() for fault in find_model_faults(body)],
+        "model_faults": [fault for body in bodies for fault in (*find_model_faults(body), find_frames(body)) if fault],
     }
 
 

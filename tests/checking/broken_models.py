@@ -40,7 +40,7 @@ class CartTask(Task):
 
 
 @dataclass
-class TipOfAKilogram(CartTask):
+class TipWithoutInertial(CartTask):
     """The tip has no <inertial>."""
 
     file = CART.with_name("cart_without_inertial.urdf")
@@ -51,3 +51,10 @@ class HeavyInertia(CartTask):
     """The arm turns like a body of tons."""
 
     file = CART.with_name("cart_of_tons.urdf")
+
+
+@dataclass
+class NoEffort(CartTask):
+    """The model gives the arm's joint an effort limit of 0."""
+
+    file = CART.with_name("cart_without_effort.urdf")

@@ -17,8 +17,8 @@ CASES = [
     case("broken_physics.py:Explodes", ("RL805", "warning"), twin=CART),
     case("broken_physics.py:LongPhysicsSteps", ("RL813", "warning"), twin=CART),
     case("broken_physics.py:StartsInTheFloor", ("RL807", "warning"), twin=CART),
-    case("broken_models.py:TipOfAKilogram", ("RL809", "warning"), twin="broken_models.py:CartTask"),
     case("broken_models.py:HeavyInertia", ("RL809", "warning"), twin="broken_models.py:CartTask"),
+    case("broken_models.py:TipWithoutInertial", ("RL809", "info"), twin="broken_models.py:CartTask"),
 ]
 
 
@@ -105,13 +105,16 @@ def test_calls_are_recorded_as_they_are_meant(tmp_path):
     assert inspect.isbuiltin(pybullet.stepSimulation)
 
 
-def test_missing_mass_is_named():
-    (finding,) = findings("broken_models.py:TipOfAKilogram", "RL809")
-    assert finding.message == (
-        "cart_without_inertial.urdf, link 'tip': no <inertial>, so PyBullet gives it a mass of 1 kg. "
-        "Write its mass and inertia"
-    )
+def test_a_frame_without_inertial_is_named():
+    (finding,) = findings("broken_models.py:TipWithoutInertial", "RL809")
+    assert finding.message == "cart_without_inertial.urdf: links without <inertial> weigh 1 mg: 'tip'"
     assert finding.evidence == {}
+
+
+def test_a_joint_without_effort_limit_is_named():
+    (finding,) = findings("broken_models.py:NoEffort", "RL207")
+    assert "cart_without_effort.urdf gives no effort limit for joint 'shoulder'" in finding.message
+    assert "pass max_force= [N m]" in finding.message
 
 
 def test_impossible_inertia_is_named():

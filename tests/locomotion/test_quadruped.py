@@ -6,7 +6,7 @@ import pytest
 from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
-from rlctl.task.pybullet.model_faults import find_model_faults
+from rlctl.task.model_faults import find_model_faults
 from rlctl_locomotion.quadruped import FEET, Quadruped
 
 

@@ -192,3 +192,22 @@ def test_the_time_limit_is_a_parameter():
     ends = [env.step(np.zeros(env.action_space.shape, np.float32))[2:4] for _ in range(2)]
     assert ends == [(False, False), (False, True)]
     assert Ant().max_steps == 1000
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_an_episode_in_mujoco_stays_finite(robot):
+    class Endless(robot):
+        def is_terminated(self):
+            return False
+
+    pytest.importorskip("mujoco")
+    env, rng = TaskEnv(Endless(), sim="mujoco"), np.random.default_rng(0)
+    observation, bullet = env.reset(seed=0)[0], TaskEnv(robot())
+    # The same joints and start. The height is of the torso's centre of mass, which the engines place differently.
+    np.testing.assert_allclose(observation[1:], bullet.reset(seed=0)[0][1:], atol=1e-4)
+    for _ in range(env.max_steps):
+        observation, reward, *_ = env.step(rng.uniform(-1, 1, env.action_space.shape))
+        assert np.isfinite(observation).all()
+        assert np.isfinite(reward)
+    bullet.close()
+    env.close()

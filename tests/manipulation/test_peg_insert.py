@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
-from rlctl.task.pybullet.model_faults import find_model_faults
+from rlctl.task.model_faults import find_model_faults
 from rlctl_manipulation.peg_insert import HOME, TOP_SPEED, PegInsert
 from tests.manipulation.scripted import assert_episodes_repeat, play
 

@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
-from rlctl.task.pybullet.model_faults import find_model_faults
+from rlctl.task.model_faults import find_model_faults
 from rlctl_manipulation.screw_drive import HOME, LEAD, TOP_SPEED, TRAVEL, ScrewDrive
 from tests.manipulation.scripted import assert_episodes_repeat, play
 

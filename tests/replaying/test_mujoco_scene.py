@@ -139,3 +139,18 @@ def test_a_task_of_rlctl_in_mujoco():
     assert "robot/trunk" in robot.links
     assert robot.shapes
     assert robot.box[1][0] - robot.box[0][0] < 3.0  # of the robot, without its ground
+
+
+@pytest.mark.parametrize("task", ["reach", "quadruped"])
+def test_a_task_shows_its_visual_shapes_as_in_pybullet(task):
+    shapes = []
+    for sim in ("pybullet", "mujoco"):
+        spec = EnvSpec(task, sim=sim)
+        with closing(make_drawable(spec, print)) as env:
+            rollout = play_episode(env, spec, 3, lambda observation, step: None, policy="nothing", draw=print)
+        links = [(shape.link.rpartition("/")[2], shape.kind) for body in rollout.scene.bodies for shape in body.shapes]
+        grounds = [body for body in rollout.scene.bodies if body.ground_height is not None]
+        assert len(grounds) == 1
+        shapes.append(sorted((link, kind.value) for link, kind in links if link not in ("planeLink", "base_link")))
+    assert shapes[0] == shapes[1]
+    assert len(shapes[0]) > 5

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from rlctl.task.model_faults import find_model_faults
 from rlctl.task.pybullet.library import pybullet
-from rlctl.task.pybullet.model_faults import find_model_faults
 from rlctl.task.pybullet.sim import PybulletSim
 from tests.task import models
 
@@ -45,15 +45,16 @@ def test_the_inertia_of_the_file(sim, tmp_path):
 @pytest.mark.parametrize(
     ("inertial", "fault"),
     [
-        ("", "no <inertial>, so PyBullet gives it a mass of 1 kg. Write its mass and inertia."),
+        ("", "no <inertial>, so it weighs 1 kg. Write its mass and inertia."),
         (
             inertial(0, 0.01, 0.01),
-            "principal moments 0, 0.01, 0.01 kg m^2 are not all above 0, as those of a link of 1 kg are.",
+            "principal moments 0, 0.01, 0.01 kg m^2: not all above 0, as those of a link of 1 kg are. "
+            "It has 1e-06, 0.01, 0.01 instead.",
         ),
         (
             inertial(0.001, 0.001, 0.01),
             "principal moments 0.001, 0.001, 0.01 kg m^2: the largest exceeds the sum of the others, "
-            "which no solid body has.",
+            "which no solid body has. It has 0.005, 0.005, 0.01 instead.",
         ),
         (
             inertial(1, 1, 1),

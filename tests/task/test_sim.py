@@ -42,8 +42,11 @@ def test_a_model_file_that_is_none(sim, tmp_path):
         sim.load("robot", file)
 
 
+MESH = '<visual><geometry><mesh filename="meshes/hand.stl"/></geometry></visual>'
+
+
 def test_what_pybullet_prints_of_a_model_is_in_the_error(sim, tmp_path):
-    hand = '<link name="hand"><visual><geometry><mesh filename="meshes/hand.stl"/></geometry></visual></link>'
+    hand = models.link("hand", 1.0).replace("</link>", f"{MESH}</link>")
     with pytest.raises(TaskError, match=r"model\.urdf:1: cannot find 'meshes/hand\.stl' in any .* Link: hand failed"):
         sim.load("robot", models.urdf(tmp_path, hand))
 

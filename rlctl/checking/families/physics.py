@@ -15,7 +15,7 @@ from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Joint, Jump,
 from rlctl.checking.families.robots import find_misuses
 from rlctl.checking.instance import Context, EnvironmentRaised, describe_failure
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, experiment, list_names
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, experiment, list_names
 from rlctl.checking.values import is_task
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
 
@@ -76,11 +76,13 @@ def _model_faults(env: Any) -> Iterator[ChildMessage]:
     if not is_task(env):
         yield Skipped("RL809", "only the model files of tasks of rlctl are known", applies=False)
         return
-    from rlctl.task.pybullet.model_faults import find_model_faults
+    from rlctl.task.model_faults import find_frames, find_model_faults
 
     for body in env.unwrapped.sim.bodies.values():
         for fault in find_model_faults(body):
             yield RuleFinding("RL809", fault.rstrip("."))
+        if frames := find_frames(body):
+            yield RuleFinding("RL809", frames, severity=Severity.INFO)
 
 
 def _judge(world: LoggedWorld) -> Iterator[ChildMessage]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Contacts, MassState, Vector
-from rlctl.task.mujoco.files import ModelFile
+from rlctl.task.mujoco.files import ModelFile, is_colliding
 from rlctl.task.mujoco.inverse_kinematics import solve
 from rlctl.task.mujoco.motors import MujocoMotors
 from rlctl.task.mujoco.world import Array, Rows
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 XYZW, WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
 """Indices that reorder MuJoCo's quaternions (w, x, y, z) for rlctl, and back."""
+WORLD = "world"
+"""MuJoCo's name of what all bodies are in; an MJCF file may give it shapes, such as a floor."""
 _RAIL = 100.0  # [m]
 _FAR = 100.0  # [m]
 
@@ -29,18 +31,20 @@ _FAR = 100.0  # [m]
 class Parts:
     """The names of a body's links and joints and their numbers in the compiled model, the same for all worlds."""
 
-    def __init__(self, name: str, file: ModelFile, fixed: bool, child: Any, colliding: Sequence[str]) -> None:
+    def __init__(self, name: str, file: ModelFile, fixed: bool, child: Any) -> None:
         self.name, self.file, self.fixed = name, file, fixed
         self.base_name: str = child.worldbody.first_body().name
         self.terrain: Array | None = None
-        self.own_actuators: list[str] = []
+        self.own_actuators: list[str] = [actuator.name for actuator in child.actuators]
         """Names of the actuators that an MJCF file contains."""
-        self.colliding = set(colliding)
-        self.geom_links: list[str] = [geom.parent.name for geom in child.geoms]
-        """Name of the link of each geom."""
+        self.own_sensors: list[str] = [sensor.name for sensor in child.sensors if sensor.name]
+        self.collision_geoms = [
+            (number, geom.parent.name) for number, geom in enumerate(child.geoms) if is_colliding(geom)
+        ]
+        """Number and link of the geoms that collide."""
         self.moving: set[str] = set()
         """Links that are not fixed to the world."""
-        self.ancestors: dict[str, set[str]] = {}
+        self.ancestors: dict[str, set[str]] = {WORLD: set()}
         for link in child.bodies[1:]:  # a parent comes before its children
             parent = link.parent.name
             self.ancestors[link.name] = {parent, *self.ancestors.get(parent, set())}
@@ -58,9 +62,9 @@ class Parts:
         self.active: dict[int, object] = {}
         """By joint, the kind of command that is written into the model."""
 
-    def list_geoms(self) -> list[tuple[int, str]]:
-        """Return number and link of the geoms that collide."""
-        return [(number, link) for number, link in enumerate(self.geom_links) if link in self.colliding]
+    def full_name(self, link: str) -> str:
+        """Return the name of a link, or of the world, in the compiled model."""
+        return link if link == WORLD else f"{self.name}/{link}"
 
     def bind(self, model: Any) -> None:
         """Look up the numbers in a compiled model."""
@@ -71,10 +75,14 @@ class Parts:
         joints = [model.joint(f"{prefix}{joint}").id for joint in self.joint_names]
         self.positions, self.velocities = _slice(model.jnt_qposadr[joints]), _slice(model.jnt_dofadr[joints])
         self.motors = _slice([model.actuator(f"{prefix}motor {joint}").id for joint in self.joint_names])
+        self.own_motors = np.array([model.actuator(f"{prefix}{name}").id for name in self.own_actuators], int)
+        self.own_gears = model.actuator_gear[self.own_motors]
+        model.actuator_gear[self.own_motors] = 0.0  # until `set_controls`
         limited, limits = model.jnt_limited[joints][:, None], model.jnt_range[joints]
         self.low, self.high = np.where(limited, limits, (-np.inf, np.inf)).T
         self.joints = joints
-        self.geoms = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] in self.link_names]
+        self.geoms = [model.geom(f"{prefix}{number}").id for number, _ in self.collision_geoms]
+        """Numbers of the geoms that collide."""
         self.free: tuple[int, int] | None = None  # where the state of a free base begins, in qpos and qvel
         for joint in range(model.njnt):
             if model.jnt_type[joint] == 0 and model.jnt_bodyid[joint] == self.links[self.base_name]:
@@ -98,6 +106,8 @@ class MujocoBody(MujocoMotors):
         super().__init__(sim, parts)
         self.name, self.file, self.fixed = parts.name, parts.file.path, parts.fixed
         self.base_name, self.terrain = parts.base_name, parts.terrain
+        self.actuator_names, self.sensor_names = parts.own_actuators, parts.own_sensors
+        self.inertia_from_file = parts.file.inertia_from_file
         self.joint_names = parts.joint_names
         self.joint_max_force, self.joint_max_speed = (
             np.array([limits.get(joint, 0.0) for joint in parts.joint_names])
@@ -134,7 +144,7 @@ class MujocoBody(MujocoMotors):
         endless = not (model.jnt_limited[first] and np.ptp(model.jnt_range[first]) < _RAIL)
         if int(model.jnt_type[first]) != 2 or not endless:
             return None
-        return next((link for link in self.link_names if link in self.parts.geom_links), None)
+        return next((link for link in self.link_names if link in dict(self.parts.collision_geoms).values()), None)
 
     @property
     def joint_positions(self) -> Array:
@@ -208,11 +218,14 @@ class MujocoBody(MujocoMotors):
 
     def joint_reaction(self, joint: str) -> Array:
         try:
-            start = int(self._sim.model.sensor(f"{self.name}/{joint}").adr[0])
+            halves = [self._fields.sensor(f"{self.name}/{name}") for name in (joint, f"{joint} torque")]
         except KeyError:
             raise TaskError(f"joint {joint!r} has no force sensor: call add_force_sensor({joint!r}) in build") from None
-        reaction: Array = self._fields.data("sensordata")[..., start : start + 6].copy()
-        return reaction
+        return np.concatenate(halves, axis=-1)
+
+    def sensor(self, name: str) -> Array:
+        check_name(name, self.sensor_names, f"{self.file.name} has no sensor", TaskError)
+        return self._fields.sensor(f"{self.name}/{name}")
 
     def links_touching(self, other: Any) -> set[str]:
         return set(self._list_contacts("links_touching", other)[0])
@@ -348,5 +361,5 @@ class MujocoBody(MujocoMotors):
 
     def set_color(self, rgb: Sequence[float], links: Sequence[str] = ()) -> None:
         numbers, bodies = self._find_links(links), self._sim.model.geom_bodyid
-        geoms = [geom for geom in self.parts.geoms if int(bodies[geom]) in numbers]
+        geoms = np.flatnonzero(np.isin(bodies, numbers))
         self._fields.model("geom_rgba")[..., geoms, :3] = rgb

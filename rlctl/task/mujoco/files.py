@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from rlctl.errors import TaskError
+from rlctl.task.meshes import convert_mesh, count_vertices
 from rlctl.task.mujoco.world import import_mujoco
+from rlctl.task.urdf import Urdf, read_urdf
 
+_FEWEST_VERTICES = 4  # of a mesh in MuJoCo
 _FRICTION = 0.5  # PyBullet's, of a link whose file gives none
 
 
@@ -26,26 +31,114 @@ class ModelFile:
     friction: dict[str, float]  # lateral friction by link
     spin: dict[str, float]  # spinning friction by link [m]
     moved_by: dict[str, str]  # link that a joint moves, by joint; fixed joints too
+    inertia_from_file: bool = False
 
 
-def read_model_file(path: Path) -> ModelFile:
-    """Read a URDF or MJCF file; raises `TaskError` with MuJoCo's message for one that it refuses."""
+def read_model_file(
+    path: Path, *, fixed: bool = False, inertia: Literal["file", "shape"] = "file", visuals: bool = True
+) -> ModelFile:
+    """Read a URDF or MJCF file; raises `TaskError` with MuJoCo's message for one that it refuses.
+
+    With `visuals` the geoms include the visual shapes of a URDF, in group 1; its collision shapes are in group 0.
+    """
     if path.suffix not in (".urdf", ".xml"):
         raise TaskError(f"{path}: MuJoCo reads URDF and MJCF (.xml) files")
-    root = None
+    if path.suffix == ".xml":
+        spec = _call_reader(path, lambda: import_mujoco().MjSpec.from_file(str(path)))
+        return _describe_mjcf(path, _prepare_mjcf(spec))
+    urdf = read_urdf(path, fixed=fixed, inertia_from_file=inertia == "file")
+    if urdf.root is None:
+        raise TaskError(f"MuJoCo cannot load {path}: {urdf.problem}")
+    urdf.check_meshes()
+    spec = _call_reader(path, lambda: _parse_urdf(urdf, visuals=visuals))
+    if visuals and any(geom.meshname for geom in spec.geoms if not is_colliding(geom)):
+        try:
+            spec.copy().compile()
+        except ValueError:  # because of a visual mesh, or it will fail again
+            spec = _call_reader(path, lambda: _parse_urdf(urdf, visuals=False))
+    if inertia == "shape":
+        _call_reader(path, lambda: _take_inertia_of_shapes(spec))
+    return _describe_urdf(path, spec, urdf.root, inertia == "file")
+
+
+def is_colliding(geom: Any) -> bool:
+    """Return whether a geom of a model file is a collision shape."""
+    return bool(geom.contype or geom.conaffinity)
+
+
+def _call_reader(path: Path, read: Callable[[], Any]) -> Any:
     try:
-        if path.suffix == ".urdf":
-            root = ElementTree.fromstring(path.read_bytes().strip())
-        spec = import_mujoco().MjSpec.from_file(str(path))
-    except ElementTree.ParseError as error:
-        raise TaskError(f"MuJoCo cannot load {path}: {error}") from None
+        return read()
     except ValueError as error:
         raise TaskError(f"MuJoCo cannot load {path}: {' '.join(str(error).split())}") from None
+
+
+def _prepare_mjcf(spec: Any) -> Any:
     spec.compiler.fusestatic = False  # links on fixed joints keep their names
-    return _describe_mjcf(path, spec) if root is None else _describe_urdf(path, spec, root)
+    kinds = {"body": spec.bodies[1:], "joint": spec.joints, "actuator": spec.actuators}
+    for kind, elements in kinds.items():
+        for number, element in enumerate(elements):
+            element.name = element.name or f"{kind} {number}"
+    for pair in spec.pairs:
+        spec.delete(pair)  # `Sim.load` defines which links collide
+    return spec
 
 
-def _describe_urdf(path: Path, spec: Any, root: ElementTree.Element) -> ModelFile:
+def _parse_urdf(urdf: Urdf, *, visuals: bool) -> Any:
+    """Return the `MjSpec` of a URDF; a mesh that MuJoCo does not read is converted, or left out if it is visual."""
+    mujoco, root = import_mujoco(), ElementTree.fromstring(urdf.text)
+    assets: dict[str, bytes] = {}
+    for link in root.findall("link"):
+        for shape in link.findall("visual"):
+            if not visuals or not all(_can_be_drawn(mesh) for mesh in shape.iterfind(".//mesh[@filename]")):
+                link.remove(shape)
+    for mesh in root.iterfind(".//mesh[@filename]"):
+        file = Path(mesh.get("filename", ""))
+        if (converted := convert_mesh(file)) is not None:
+            # MuJoCo keeps meshes in memory, by name.
+            name = f"{file.with_suffix('')}-{hashlib.sha256(converted).hexdigest()[:16]}.msh"
+            assets[name] = converted
+            mesh.set("filename", name)
+    extension = root.find("mujoco")
+    extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
+    compiler = extension.find("compiler")
+    compiler = ElementTree.SubElement(extension, "compiler") if compiler is None else compiler
+    compiler.attrib |= {"strippath": "false", "discardvisual": "false", "fusestatic": "false"}
+    compiler.attrib.pop("meshdir", None)  # all paths are absolute
+    try:
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"), assets=assets)
+    except ValueError:
+        mujoco.MjSpec.from_file(str(urdf.path))  # it has the file's numbers of lines in its message
+        raise
+    kinds, colliding = mujoco.mjtMeshInertia, {geom.meshname for geom in spec.geoms if is_colliding(geom)}
+    for mesh in spec.meshes:
+        # What is only drawn may be flat.
+        is_solid = mesh.name in colliding
+        mesh.inertia = kinds.mjMESH_INERTIA_CONVEX if is_solid else kinds.mjMESH_INERTIA_SHELL
+    return spec
+
+
+def _can_be_drawn(mesh: ElementTree.Element) -> bool:
+    try:
+        return count_vertices(Path(mesh.get("filename", ""))) >= _FEWEST_VERTICES
+    except (OSError, ValueError, LookupError, ElementTree.ParseError, StopIteration):
+        return False
+
+
+def _take_inertia_of_shapes(spec: Any) -> None:
+    """Compute each link's inertia from its collision shapes, with the mass and the centre of mass of the file."""
+    bodies = {body.name: body for body in spec.bodies[1:] if any(map(is_colliding, body.geoms)) and body.mass > 0}
+    shaped = spec.copy()
+    shaped.compiler.inertiafromgeom = import_mujoco().mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    model = shaped.compile()
+    for name, body in bodies.items():
+        number = model.body(name).id
+        body.fullinertia = [np.nan] * 6
+        body.iquat = model.body_iquat[number]
+        body.inertia = model.body_inertia[number] * body.mass / model.body_mass[number]
+
+
+def _describe_urdf(path: Path, spec: Any, root: ElementTree.Element, inertia_from_file: bool) -> ModelFile:
     joints = {str(joint.get("name")): joint for joint in root.findall("joint")}
     links = {str(link.get("name")): link for link in root.findall("link")}
     return ModelFile(
@@ -57,6 +150,7 @@ def _describe_urdf(path: Path, spec: Any, root: ElementTree.Element) -> ModelFil
         {name: _read(link, "contact/lateral_friction", default=_FRICTION) for name, link in links.items()},
         {name: _read(link, "contact/spinning_friction") for name, link in links.items()},
         {name: str(child.get("link")) for name, joint in joints.items() if (child := joint.find("child")) is not None},
+        inertia_from_file,
     )
 
 
@@ -64,20 +158,22 @@ def _describe_mjcf(path: Path, spec: Any) -> ModelFile:
     frictions = {geom.parent.name: float(geom.friction[0]) for geom in spec.geoms}
     moved = {joint.name: joint.parent.name for joint in spec.joints}
     forces = {joint.name: _find_force(spec, joint) for joint in spec.joints}
-    bodies = [body.name for body in spec.bodies[1:]]
+    bodies = [body.name for body in spec.bodies]
     friction = {name: frictions.get(name, 1.0) for name in bodies}
     return ModelFile(path, spec, forces, dict.fromkeys(moved, 0.0), friction, dict.fromkeys(bodies, 0.0), moved)
 
 
 def _find_force(spec: Any, joint: Any) -> float:
     """Return the force limit of an MJCF joint: its own, or what its actuators can give."""
-    if joint.actfrclimited:
+    if np.any(joint.actfrcrange):
         return float(np.max(np.abs(joint.actfrcrange)))
     moving = [actuator for actuator in spec.actuators if actuator.target == joint.name]
     if not moving:
         return 0.0
-    actuator = moving[0]
-    ranges = actuator.forcerange if np.any(actuator.forcerange) else actuator.gainprm[0] * np.array(actuator.ctrlrange)
+    actuator, is_motor = moving[0], int(moving[0].biastype) == 0  # else it is a spring or a damper
+    ranges = actuator.forcerange
+    if not np.any(ranges) and is_motor:
+        ranges = actuator.gainprm[0] * np.array(actuator.ctrlrange)
     return float(np.max(np.abs(ranges)) * abs(actuator.gear[0]))
 
 

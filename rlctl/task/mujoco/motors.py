@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rlctl.errors import TaskError
+from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body, Drives
 from rlctl.task.mujoco.world import Rows
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _UNLIMITED = 1e9  # [N m or N]
 _USUAL_SPEED = 10.0  # [rad/s or m/s], of joints whose file gives no limit
 _STIFFEST = 10.0
+_OWN = -1  # the key of `Parts.active` for the actuators of the file
 
 
 class _Mode(NamedTuple):
@@ -75,6 +76,9 @@ class MujocoMotors(Body):
 
     @property
     def joint_torques(self) -> Array:
+        if self.parts.own_actuators:  # they may act on several joints
+            sums: Array = self._fields.data("qfrc_actuator")[..., self.parts.velocities].copy()
+            return sums
         torques: Array = self._fields.data("actuator_force")[..., self.parts.motors].copy()
         return torques
 
@@ -143,6 +147,23 @@ class MujocoMotors(Body):
             )
         self._write_mode(mode)
         self._fields.data("ctrl")[..., mode.motors] = given * self._fields.model("strength")[..., mode.motors]
+
+    def set_controls(self, values: Array, actuators: Sequence[str] = ()) -> None:
+        names = self.parts.own_actuators
+        for actuator in actuators:
+            check_name(actuator, names, f"{self.file.name} has no actuator", TaskError)
+        chosen = [names.index(actuator) for actuator in actuators] or list(range(len(names)))
+        controls, shape = np.asarray(values, float), (*self._fields.shape, len(chosen))
+        if not chosen or controls.shape != shape:
+            raise TaskError(
+                f"{self.file.name}: controls of shape {controls.shape} for actuators of shape {shape}; actuator_names "
+                "of the body has all"
+            )
+        if self.parts.active.get(_OWN) is not self:
+            self.parts.active[_OWN] = self
+            self._fields.model("actuator_gear")[..., self.parts.own_motors, :] = self.parts.own_gears
+            self._fields.touch()
+        self._fields.data("ctrl")[..., self.parts.own_motors[chosen]] = controls
 
     def _read(self, values: Any, mode: _Mode) -> Array:
         array, shape = np.asarray(values, float), (*self._fields.shape, len(mode.joints))

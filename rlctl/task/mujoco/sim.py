@@ -20,14 +20,15 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError, UsageError
 from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.model_files import find_model_file
-from rlctl.task.mujoco.body import MujocoBody, Parts
-from rlctl.task.mujoco.files import ModelFile, read_model_file
+from rlctl.task.mujoco.body import WORLD, MujocoBody, Parts
+from rlctl.task.mujoco.files import ModelFile, is_colliding, read_model_file
 from rlctl.task.mujoco.world import Array, Fields, MujocoWorld, Rows
 from rlctl.task.sim import Sim
 
 _RIGID = (0.9999, 0.9999, 0.001, 0.5, 2)  # impedance of constraints: as stiff as PyBullet's
 _WXYZ = [3, 0, 1, 2]
 _WIDE = 5.0  # [m], of half a box
+_HIDDEN = 3  # group of geoms that neither pictures nor recordings show
 _GROUND_THICKNESS = 0.5  # [m], of rough ground
 
 
@@ -125,15 +126,10 @@ class MujocoSim(Sim):
         inertia: Literal["file", "shape"] = "file",
     ) -> MujocoBody:
         self._check_new(name)
-        source = read_model_file(find_model_file(file))
+        # Nobody sees one world of many.
+        visuals = self.world.count in (None, 1)
+        source = read_model_file(find_model_file(file), fixed=fixed, inertia=inertia, visuals=visuals)
         child = source.spec
-        if inertia == "shape":
-            child.compiler.inertiafromgeom = self.mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-        colliding = [geom.parent.name for geom in child.geoms if geom.contype or geom.conaffinity]
-        for number, geom in enumerate(child.geoms):
-            geom.name = str(number)
-            # Only the pairs of `_add_pairs` collide.
-            geom.contype = geom.conaffinity = 0
         for joint in child.joints:
             joint.actfrclimited = False  # the force limits are those of the motors
         is_urdf = source.path.suffix == ".urdf"
@@ -141,25 +137,39 @@ class MujocoSim(Sim):
         fixed = (fixed or not any(link.mass > 0 for link in child.bodies)) if is_urdf else not free
         if fixed and not child.joints:
             self._flatten_ground(child)
-        parts = Parts(name, source, fixed, child, colliding)
+        drawn = {geom.parent.name for geom in child.geoms if is_urdf and not is_colliding(geom)}
+        for geom in filter(is_colliding, child.geoms):
+            geom.group = _HIDDEN if geom.parent.name in drawn else geom.group
+        parts = Parts(name, source, fixed, child)
+        for number, geom in enumerate(child.geoms):
+            geom.name = str(number)
+            # Only the pairs of `_add_pairs` collide.
+            geom.contype = geom.conaffinity = 0
         frame = self._spec.worldbody.add_frame(pos=list(position), quat=[orientation[part] for part in _WXYZ])
-        own = [actuator.name for actuator in child.actuators]
+        for option in dir(self._spec.option):  # the file's are not used, and MuJoCo warns of them
+            if not option.startswith("_"):
+                setattr(child.option, option, getattr(self._spec.option, option))
         self._spec.attach(child, prefix=f"{name}/", frame=frame)
         if not fixed and is_urdf:
             self._spec.body(f"{name}/{parts.base_name}").add_freejoint(name=f"{name}/free")
-        self._add_motors(parts, own)
+        self._add_motors(parts)
         for other in self._parts.values():
             self._add_pairs(parts, other)
-        if self_collision:
-            self._add_own_pairs(parts)
+        self._add_own_pairs(parts, self_collision)
         return self._add_body(parts)
 
     def _flatten_ground(self, child: Any) -> None:
         """Make a wide box that is fixed, such as the ground of `plane.urdf`, a plane: faster, and exact."""
-        for geom in child.geoms:
-            if geom.type == self.mujoco.mjtGeom.mjGEOM_BOX and min(geom.size[:2]) > _WIDE:
-                geom.pos = [*geom.pos[:2], geom.pos[2] + geom.size[2]]
-                geom.type, geom.size = self.mujoco.mjtGeom.mjGEOM_PLANE, [geom.size[0], geom.size[1], 1.0]
+        box, plane = self.mujoco.mjtGeom.mjGEOM_BOX, self.mujoco.mjtGeom.mjGEOM_PLANE
+        grounds = [geom for geom in child.geoms if geom.type == box and min(geom.size[:2]) > _WIDE]
+        for geom in filter(is_colliding, grounds):
+            geom.pos = [*geom.pos[:2], geom.pos[2] + geom.size[2]]
+            geom.type, geom.size = plane, [geom.size[0], geom.size[1], 1.0]
+        if grounds:  # recordings draw them themselves
+            used = {geom.meshname for geom in child.geoms if is_colliding(geom)}
+            unused = [mesh for mesh in child.meshes if mesh.name not in used]
+            for part in [*(geom for geom in child.geoms if not is_colliding(geom)), *unused]:
+                child.delete(part)
 
     def _add_body(self, parts: Parts) -> MujocoBody:
         self._parts[parts.name] = parts
@@ -175,10 +185,9 @@ class MujocoSim(Sim):
         for view in self._views.values():
             view.look_up()
 
-    def _add_motors(self, parts: Parts, own: list[str]) -> None:
+    def _add_motors(self, parts: Parts) -> None:
         """Add a motor to each joint: its force is `ctrl + b1 * position + b2 * velocity`, within a range."""
         mujoco = self.mujoco
-        parts.own_actuators.extend(own)
         for joint in parts.joint_names:
             motor = self._spec.add_actuator(
                 name=f"{parts.name}/motor {joint}", target=f"{parts.name}/{joint}", trntype=mujoco.mjtTrn.mjTRN_JOINT
@@ -187,13 +196,18 @@ class MujocoSim(Sim):
             motor.forcelimited, motor.forcerange = True, [-1e9, 1e9]
 
     def _add_pairs(self, first: Parts, second: Parts) -> None:
-        for (one, link), (two, other) in itertools.product(first.list_geoms(), second.list_geoms()):
+        for (one, link), (two, other) in itertools.product(first.collision_geoms, second.collision_geoms):
             if link in first.moving or other in second.moving:
                 self._add_pair(first, one, link, second, two, other)
 
-    def _add_own_pairs(self, parts: Parts) -> None:
-        for (one, link), (two, other) in itertools.combinations(parts.list_geoms(), 2):
-            if link != other and link not in parts.ancestors[other] and other not in parts.ancestors[link]:
+    def _add_own_pairs(self, parts: Parts, self_collision: bool) -> None:
+        for (one, link), (two, other) in itertools.combinations(parts.collision_geoms, 2):
+            if WORLD in (link, other):  # the floor of an MJCF file
+                collide = link in parts.moving or other in parts.moving
+            else:
+                related = link == other or link in parts.ancestors[other] or other in parts.ancestors[link]
+                collide = self_collision and not related
+            if collide:
                 self._add_pair(parts, one, link, parts, two, other)
 
     def _add_pair(self, first: Parts, one: int, link: str, second: Parts, two: int, other: str) -> None:
@@ -204,7 +218,7 @@ class MujocoSim(Sim):
             condim=4 if spins else 3,
             solref=[self._solref, 1.0],
         )
-        self._pairs.append((f"{first.name}/{link}", f"{second.name}/{other}"))
+        self._pairs.append((first.full_name(link), second.full_name(other)))
 
     def add_height_field(
         self, name: str, heights: Array, *, cell: float, color: Sequence[float] = (0.55, 0.6, 0.5)
@@ -219,9 +233,10 @@ class MujocoSim(Sim):
         child.add_hfield(name="heights", size=size, nrow=columns, ncol=rows, userdata=scaled.T.ravel())
         body = child.worldbody.add_body(name="ground")
         geom = body.add_geom(type=self.mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="heights", rgba=[*color, 1.0])
-        geom.pos, geom.name, geom.contype, geom.conaffinity = [0.0, 0.0, lowest], "0", 0, 0
+        geom.pos, geom.name = [0.0, 0.0, lowest], "0"
         source = ModelFile(Path("height field"), child, {}, {}, {"ground": 0.5}, {"ground": 0.0}, {})
-        parts = Parts(name, source, True, child, ["ground"])
+        parts = Parts(name, source, True, child)
+        geom.contype = geom.conaffinity = 0
         x, y = ((np.arange(count) - (count - 1) / 2) * cell for count in heights.shape)
         parts.terrain = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1)
         self._spec.attach(child, prefix=f"{name}/", frame=self._spec.worldbody.add_frame())
@@ -272,8 +287,8 @@ class MujocoSim(Sim):
         try:
             model, data = self._spec.recompile(self.world.mj_model, self.world.mj_data)  # keeps the state
         except ValueError as error:
-            files = ", ".join(str(parts.file.path) for parts in self._parts.values())
-            raise TaskError(f"MuJoCo cannot build the world of {files}: {' '.join(str(error).split())}") from None
+            newest = list(self._parts.values())[-1]  # those before it have been compiled
+            raise TaskError(f"MuJoCo cannot load {newest.file.path}: {' '.join(str(error).split())}") from None
         self._keep_changes(self.world.mj_model, model)
         self.world.set_model(model, data)
         for parts in self._parts.values():
@@ -294,14 +309,13 @@ class MujocoSim(Sim):
                 getattr(after, name)[number] = getattr(before, name)[actuator]
 
     def _set_extra(self, model: Any) -> None:
-        links = {f"{name}/{link}": parts for name, parts in self._parts.items() for link in parts.file.friction}
         friction, spin = np.zeros(model.nbody), np.zeros(model.nbody)
-        for full, parts in links.items():
-            link = full.removeprefix(f"{parts.name}/")
-            number = parts.links.get(link)
-            if number is not None:
-                friction[number] = parts.built_friction.get(link, parts.file.friction[link])
-                spin[number] = parts.file.spin[link]
+        for parts in self._parts.values():
+            for link, value in parts.file.friction.items():
+                number = 0 if link == WORLD else parts.links.get(link)
+                if number is not None:
+                    friction[number] = parts.built_friction.get(link, value)
+                    spin[number] = parts.file.spin[link]
         self.world.extra |= {"friction": friction, "spin": spin, "strength": np.ones(model.nu)}
         numbers = [[model.body(end).id for end in pair] for pair in self._pairs]
         self._pair_links = np.array(numbers, int).reshape(-1, 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ _SERIOUS = {
     "mjWARN_CNSTRFULL": "too many constraints",
 }
 """MuJoCo's warnings that are errors, and what they mean."""
-_DERIVED = ("xpos", "xquat", "xipos", "sensordata", "actuator_force")
+_DERIVED = ("xpos", "xquat", "xipos", "sensordata", "actuator_force", "qfrc_actuator")
 """Arrays that bodies read and the state does not have."""
 
 
@@ -33,6 +34,8 @@ def import_mujoco() -> Any:
     except ImportError:
         raise UsageError("sim mujoco needs MuJoCo, which is not installed: pip install mujoco") from None
     print_mujoco_warnings()
+    # Of meshes whose textures MuJoCo leaves out.
+    warnings.filterwarnings("ignore", "obj_decoder: invalid or missing face texture coordinate")
     return mujoco
 
 
@@ -57,6 +60,7 @@ class MujocoWorld:
         self._saved: Array | None = None
         self._is_fresh = False  # whether all that depends on positions and velocities is up to date
         self._stale: set[int] = set()  # worlds of a batch for which it is not
+        self._has_stepped = np.zeros(1, bool)  # worlds of a batch, since their last reset
 
     def set_model(self, model: Any, data: Any) -> None:
         """Use a newly compiled model; there is one world until `save`."""
@@ -137,6 +141,7 @@ class MujocoWorld:
             ids = None if worlds is None else worlds.astype(np.int32)
             self._stale.difference_update(range(self.batch.nsim) if worlds is None else worlds.tolist())
             self._call("step", ids, nstep=self.substeps, stage=self._velocity_stage)
+            self._has_stepped[slice(None) if worlds is None else worlds] = True
             if self.batch.warning.any():
                 self._raise_warning()
             return
@@ -163,6 +168,16 @@ class MujocoWorld:
         else:
             self.batch.warning[:] = 0
 
+    def read_sensor(self, name: str) -> Array:
+        """Return a copy of a sensor's values, shape (size,); forces and accelerations are 0 after a reset."""
+        self.refresh()
+        sensor = self.mj_model.sensor(name)
+        start, size = int(sensor.adr[0]), int(sensor.dim[0])
+        values: Array = self.data("sensordata")[..., start : start + size].copy()
+        if self.batch is not None and int(sensor.needstage[0]) == int(self.mujoco.mjtStage.mjSTAGE_ACC):
+            values[~self._has_stepped] = 0.0  # the batch leaves them as they were
+        return values
+
     def save(self) -> None:
         """Save the built world for `restore`, and make `count` copies of it."""
         mujoco = self.mujoco
@@ -174,6 +189,7 @@ class MujocoWorld:
             from mujoco.batch import Batch
 
             self.batch = Batch(self.mj_model, self.count, 1)
+            self._has_stepped = np.zeros(self.count, bool)
             self.batch.state[:] = self._saved
             for name in _DERIVED:  # one that is bound later is zero until the next call
                 self.batch.bind(name)
@@ -187,6 +203,7 @@ class MujocoWorld:
         if self.batch is not None:
             self.batch.state[rows] = self._saved
             self.batch.warning[rows] = 0
+            self._has_stepped[rows] = False
         else:
             mujoco = self.mujoco
             mujoco.mj_resetData(self.mj_model, self.mj_data)
@@ -218,6 +235,11 @@ class Fields:
         """Return an array that is computed from the state, up to date."""
         self.world.refresh()
         return self.data(name)
+
+    def sensor(self, name: str) -> Array:
+        """Return the values of a sensor, shape (size,); see `MujocoWorld.read_sensor`."""
+        values: Array = self._select(self.world.read_sensor(name))
+        return values
 
     def model(self, name: str) -> Any:
         """Return an array of the model, for reading and writing, as of the world. Call `touch` after a change."""

@@ -25,7 +25,6 @@ class PybulletBody(Properties):
         self.file = file
         self.fixed = fixed
         self.terrain: Array | None = None
-        self.inertia_from_file = False
         self.client = client
         self._substeps, self._physics_dt = substeps, dt / substeps
         self._cache: dict[Any, Any] = {}

@@ -3,10 +3,8 @@
 Quaternions are (x, y, z, w), as in PyBullet. The state of a body is read at most once per control step.
 """
 
-import contextlib
 import dataclasses
 import functools
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +18,8 @@ from rlctl.task.model_files import find_model_file
 from rlctl.task.pybullet.body import PybulletBody
 from rlctl.task.pybullet.constraints import Constraints
 from rlctl.task.pybullet.library import check_display, draw_world, pybullet, pybullet_data, read_complaint
+from rlctl.task.pybullet.temporary_files import write_temporary
+from rlctl.task.urdf import read_urdf
 
 
 @dataclasses.dataclass
@@ -28,14 +28,6 @@ class _Push:
     link: int
     force: Sequence[float]  # [N], world frame
     steps: int  # control steps that it still acts
-
-
-def _check_joint_names(path: Path) -> None:
-    """Raise `TaskError` for two joints of one name, which crash PyBullet."""
-    with contextlib.suppress(ElementTree.ParseError, LookupError, ValueError):  # PyBullet reads more than XML allows
-        names = [joint.get("name") for joint in ElementTree.fromstring(path.read_bytes().strip()).findall("joint")]
-        if (name := next((name for name in names if names.count(name) > 1), None)) is not None:
-            raise TaskError(f"{path}: {names.count(name)} joints are called {name!r}; give each its own name")
 
 
 class PybulletSim(Constraints):
@@ -94,7 +86,6 @@ class PybulletSim(Constraints):
         self._check_new(name)
         path = find_model_file(file)
         if path.suffix == ".urdf":
-            _check_joint_names(path)
             flags |= pybullet.URDF_USE_INERTIA_FROM_FILE if inertia == "file" else 0
         if self_collision:
             flags |= pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS
@@ -103,14 +94,14 @@ class PybulletSim(Constraints):
                 raise TaskError(
                     f"{path.name} contains the pose of its body: position, orientation and fixed are for URDF"
                 )
-            load, options = (pybullet.loadMJCF, {"flags": flags}) if path.suffix == ".xml" else (pybullet.loadSDF, {})
-            ids = self._call_loader(path, load, **options)
+            load = functools.partial(pybullet.loadMJCF, flags=flags) if path.suffix == ".xml" else pybullet.loadSDF
+            ids = self._call_loader(path, load)
             if len(ids) != 1:
                 raise TaskError(f"{path} contains {len(ids)} bodies; split it into files of one body each")
             body_id = int(ids[0])
             fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0  # a base without mass
         else:
-            body_id = self._call_loader(path, pybullet.loadURDF, position, orientation, useFixedBase=fixed, flags=flags)
+            body_id = self._load_urdf(path, position, orientation, fixed, flags)
         body = self.bodies[name] = PybulletBody(self.client, *self._times, name, body_id, path, fixed)
         body.inertia_from_file = bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE)
         speeds = body.joint_max_speed
@@ -118,12 +109,27 @@ class PybulletSim(Constraints):
             body.cap_joint_speed(float(speeds.max()))
         return body
 
-    def _call_loader(self, path: Path, load: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        call = functools.partial(load, str(path), *args, **kwargs, physicsClientId=self.client)
+    def _load_urdf(
+        self, path: Path, position: Sequence[float], orientation: Sequence[float], fixed: bool, flags: int
+    ) -> Any:
+        urdf = read_urdf(path, fixed=fixed, inertia_from_file=bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE))
+        options: dict[str, Any] = {"useFixedBase": fixed, "flags": flags}
+        if not urdf.changed:
+            return self._call_loader(path, pybullet.loadURDF, position, orientation, **options)
+        urdf.check_meshes()
+        with write_temporary(urdf.text, path.name) as copy:
+            return self._call_loader(path, pybullet.loadURDF, position, orientation, read_from=copy, **options)
+
+    def _call_loader(
+        self, path: Path, load: Callable[..., Any], *args: Any, read_from: Path | None = None, **kwargs: Any
+    ) -> Any:
+        file = str(read_from or path)
+        call = functools.partial(load, file, *args, **kwargs, physicsClientId=self.client)
         try:
             return call()
         except pybullet.error as error:
-            raise TaskError(f"PyBullet cannot load {path}: {read_complaint(call) or error}") from None
+            complaint = read_complaint(call).replace(file, str(path))
+            raise TaskError(f"PyBullet cannot load {path}: {complaint or error}") from None
 
     def step(self) -> None:
         # With springs and dampers the physics steps are taken one by one: they need the state before each.
