@@ -14,11 +14,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
-from rlctl.checking.bullet_calls import LIBRARIES
 from rlctl.checking.progress import CallProgress, read_clock
 from rlctl.checking.records import CallFailure
 from rlctl.checking.values import find_leaves, is_task
 from rlctl.environments import registry
+from rlctl.environments.bullet_calls import LIBRARIES
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError, TaskError
 from rlctl.version import PACKAGE_FOLDER

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking import bullet_worlds
-from rlctl.checking.bullet_calls import BulletCalls, Target
 from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Jump, Link, Pair, World, WorldBody
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.values import flatten
+from rlctl.environments.bullet_calls import BulletCalls, Target
 
 DEEPEST_FINE = 0.02  # [m]; Bullet pushes links apart over several steps, heavy robots leave up to 2 cm
 LEAST_LIMIT = 0.005  # The same for the smallest things [m]: collision margins alone are 1 to 4 mm

@@ -32,6 +32,7 @@ from rlctl.rollout.messages import Answer, EpisodeResult, FailedInEpisode, Messa
 from rlctl.rollout.running_episode import ObservationWriter, RunningEpisode, compute_rewards
 from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
+from rlctl.rollout.shared_world import make_watched
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import Event, EventSettings, push
 
@@ -58,7 +59,7 @@ class Worker:
             case messages.ComputeRewards():
                 return Answer(rewards=compute_rewards(self._episodes[0].env, message.achieved, message.desired))
             case messages.Build():
-                return Answer(info=self._build(message.spec))
+                return self._build(message.spec)
             case messages.SetEvents():
                 return Answer(info=self._set_events(message))
             case messages.Attach():
@@ -69,12 +70,13 @@ class Worker:
                 self._limit_actions(message)
         return Answer()
 
-    def _build(self, spec: EnvSpec) -> EnvInfo:
+    def _build(self, spec: EnvSpec) -> Answer:
         if self._episodes:
             self.close()
             gc.unfreeze()
             gc.collect()  # environments may hold themselves in cycles
-        envs = [spec.make() for _ in range(self._job.count)]
+        first, shared_world = make_watched(spec) if self._job.count > 1 else (spec.make(), None)
+        envs = [first, *(spec.make() for _ in range(0 if shared_world else self._job.count - 1))]
         self._info = describe(envs[0])
         metrics = [name for name, weight in self._info.reward_weights.items() if weight == 0]
         self._episodes = [RunningEpisode(env, self._job.first + index, metrics) for index, env in enumerate(envs)]
@@ -83,7 +85,7 @@ class Worker:
         checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
         self._writer = ObservationWriter(space, checked=checked)
         gc.freeze()  # present objects live long: later collections skip them
-        return self._info
+        return Answer(info=self._info, shared_world=shared_world)
 
     def _set_events(self, message: messages.SetEvents) -> EnvInfo:
         spec, added = message.spec, {}

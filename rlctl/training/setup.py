@@ -24,6 +24,7 @@ from rlctl.errors import AnswerIsNo, RecipeError, TaskError
 from rlctl.output import format_count
 from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import ON_POLICY, Recipe
+from rlctl.rollout.shared_world import explain_processes
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory
@@ -61,6 +62,8 @@ def set_up(start: Start, display: Display) -> Iterator[TrainingLoop]:
         from rlctl.training.loop import TrainingLoop
 
         learner = _build_learner(start, specs, workers, make_workers, display)
+        if workers.shared_world is not None:
+            display.message(explain_processes(workers.shared_world, workers.n_envs))
         if start.run is None:
             _warn_of_opposite_weights(specs, display)
         rewards: list[NDArray[np.float64]] = []

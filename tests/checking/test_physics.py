@@ -5,7 +5,7 @@ import inspect
 import pybullet
 import pytest
 
-from rlctl.checking.bullet_calls import record_calls
+from rlctl.environments.bullet_calls import record_calls
 from tests.checking.judging import case, check_case, findings, found, rules_of
 
 RULES = set(rules_of("RL8"))

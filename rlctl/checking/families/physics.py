@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.bullet_calls import BulletCall, record_calls
 from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Joint, Jump, Pair, WorldBody, find_clients
 from rlctl.checking.families.robots import find_misuses
 from rlctl.checking.instance import Context, EnvironmentRaised, describe_failure
@@ -18,6 +17,7 @@ from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, experiment, list_names
 from rlctl.checking.values import is_task
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
+from rlctl.environments.bullet_calls import BulletCall, record_calls
 
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))  # actions and logged steps
 LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved yet

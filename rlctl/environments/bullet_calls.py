@@ -9,7 +9,7 @@ import math
 import re
 import sys
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any, NamedTuple
@@ -179,8 +179,8 @@ def _replace_functions(replace: Callable[[str, Any], Any]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def record_calls() -> Iterator[BulletCalls]:
-    """Record the calls of PyBullet inside the `with` block."""
+def record_calls(with_results: Collection[str] = RECORDED) -> Iterator[BulletCalls]:
+    """Record the calls of PyBullet inside the `with` block; of some functions also what they set or return."""
     calls = BulletCalls()
 
     def replace(name: str, function: Any) -> Any:
@@ -188,7 +188,7 @@ def record_calls() -> Iterator[BulletCalls]:
             frame = sys._getframe(1)
             calls.note_call(name, frame, arguments, keywords)
             result = function(*arguments, **keywords)
-            if name in RECORDED:
+            if name in with_results:
                 calls.note_result(name, frame, arguments, keywords, result)
             return result
 
