@@ -51,7 +51,7 @@ class NoSuchClassError(UsageError):
 
 
 class OldGymError(UsageError):
-    """An id is registered with the old gym, not with Gymnasium."""
+    """An id is registered with the old gym, not with Gymnasium, or a space is the old gym's."""
 
 
 class RecipeError(UsageError):
@@ -62,6 +62,10 @@ class TaskError(RlctlError):
     """The task or its plugin failed: import error, exception, crash, hang, or values that are not finite."""
 
     exit_code = 3
+
+
+class NoDisplayError(TaskError):
+    """The environment opens a window, and there is no display."""
 
 
 class PolicyError(TaskError):

@@ -1,5 +1,6 @@
 """Instances of an untrusted environment: how they are called, and what a call raised, as plain data."""
 
+import ast
 import contextlib
 import dataclasses
 import functools
@@ -7,21 +8,19 @@ import inspect
 import linecache
 import re
 import sys
-import sysconfig
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, Literal
 
 from rlctl.checking.progress import CallProgress, read_clock
 from rlctl.checking.records import CallFailure
 from rlctl.checking.values import find_leaves, is_task
 from rlctl.environments import registry
-from rlctl.environments.bullet_calls import LIBRARIES
+from rlctl.environments.places import find_line, format_place
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError, TaskError
-from rlctl.version import PACKAGE_FOLDER
 
 _HERE = Path(__file__).parent
 NO_DISPLAY = re.compile(
@@ -31,11 +30,6 @@ NO_DISPLAY = re.compile(
     re.IGNORECASE,
 )
 """What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
-_LIBRARY = re.compile(
-    rf"^<|^{re.escape(sysconfig.get_path('stdlib'))}/(?!site-packages|dist-packages)|"
-    rf"(site|dist)-packages/({'|'.join(LIBRARIES)})(/|\\.)"
-)
-"""Files of Python itself and of libraries: an exception there comes from a wrong call in the environment."""
 _MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
 
 
@@ -63,35 +57,9 @@ def describe(error: BaseException) -> str:
     if isinstance(error, RlctlError):  # of the task layer, which names the task and the step itself
         return f"{type(error).__name__}: {error}"
     where = find_line(error)
-    place = f" ({Path(where[0]).name}:{where[1]})" if where else ""
+    place = f" ({format_place(*where)})" if where else ""
     text = " ".join(str(error).split()) or "no message"
     return f"{type(error).__name__}: {text}{place}"
-
-
-def find_line(error: BaseException) -> tuple[str, int] | None:
-    """Return the last file and line of the environment's own package in a traceback; None if it has only libraries."""
-    if isinstance(error, SyntaxError) and error.filename:
-        return error.filename, error.lineno or 1
-    own = [frame for frame in traceback.extract_tb(error.__traceback__) if is_own_file(frame.filename)]
-    own = [frame for frame in own if _find_package(frame.filename) == _find_package(own[0].filename)]
-    return (own[-1].filename, own[-1].lineno or 1) if own else None
-
-
-def _find_package(file: str) -> str:
-    installed = re.search(r"(?:site|dist)-packages/([^/]+)", file)
-    return installed[1] if installed else ""
-
-
-def is_own_file(file: str) -> bool:
-    """Say whether a file belongs to the environment, not to rlctl, Python or a library."""
-    return PACKAGE_FOLDER not in Path(file).parents and _LIBRARY.search(file) is None
-
-
-def opengl_fix(error: str) -> str:
-    """Return what to do if an error says that OpenGL is missing; empty for other errors."""
-    is_missing = re.search(r"OpenGL|\bEGL\b|OSMesa|GLFW", error, re.IGNORECASE)
-    hint = "Where there is no display, set MUJOCO_GL=egl (or osmesa). Use OpenGL only to render or to observe images."
-    return hint if is_missing else ""
 
 
 def display_error(failure: CallFailure) -> str:
@@ -125,21 +93,47 @@ def get_causes(error: BaseException | None) -> list[BaseException]:
 
 
 def _find_model(trace: TracebackType | None) -> str | None:
-    """Return the model that the failing call was given: a text in its source, or the value of a name there."""
+    """Return the model that the failing call was given; None if that is not known."""
     calls = list(zip(traceback.walk_tb(trace), traceback.extract_tb(trace), strict=True))
     calls = [pair for pair in calls if _HERE not in Path(pair[1].filename).parents]
     if not calls:
         return None
     (frame, _), summary = calls[-1]
-    source = "".join(linecache.getlines(summary.filename)[(summary.lineno or 1) - 1 : summary.end_lineno])
-    texts = re.findall(r"[\"']([^\"']+)[\"']", source)
-    for name in re.findall(r"[a-zA-Z_][\w.]*", source):
-        root, *attributes = name.split(".")
-        value = frame.f_locals.get(root, frame.f_globals.get(root))
-        for attribute in attributes:
-            value = inspect.getattr_static(value, attribute, None)  # runs no code of the environment
-        texts += [str(value)] if isinstance(value, (str, Path)) else []
-    return next((text for text in texts if _MODEL.fullmatch(text) and not Path(text).is_file()), None)
+    lines = linecache.getlines(summary.filename)[(summary.lineno or 1) - 1 : summary.end_lineno]
+    if lines and summary.end_colno is not None and summary.colno is not None:
+        lines[-1] = lines[-1].encode()[: summary.end_colno].decode()
+        lines[0] = lines[0].encode()[summary.colno :].decode()
+    try:
+        nodes = list(ast.walk(ast.parse("".join(lines).strip())))
+    except SyntaxError:
+        return None
+    texts = [_evaluate(node, frame) for node in nodes]  # an expression before the texts that it is made of
+    return next((text for text in texts if text and _MODEL.fullmatch(text) and not Path(text).is_file()), None)
+
+
+def _evaluate(node: ast.AST, frame: FrameType) -> str | None:
+    """Return the text that an expression of a frame has; None if it is none, or only code could tell."""
+    parts: list[str | None]
+    match node:
+        case ast.Constant(value=value):
+            return value if isinstance(value, str) else None
+        case ast.Name() | ast.Attribute():
+            root, *attributes = ast.unparse(node).split(".")
+            value = frame.f_locals.get(root, frame.f_globals.get(root))
+            for attribute in attributes:
+                value = inspect.getattr_static(value, attribute, None)  # runs no code of the environment
+            return str(value) if isinstance(value, (str, Path)) else None
+        case ast.FormattedValue(value=value):
+            return _evaluate(value, frame)
+        case ast.JoinedStr(values=values):
+            parts, separator = [_evaluate(value, frame) for value in values], ""
+        case ast.BinOp(left=left, right=right, op=ast.Add() | ast.Div() as op):
+            parts, separator = [_evaluate(value, frame) for value in (left, right)], "/" * isinstance(op, ast.Div)
+        case ast.Call(func=ast.Attribute(attr="join"), args=arguments):  # of os.path
+            parts, separator = [_evaluate(value, frame) for value in arguments], "/"
+        case _:
+            return None
+    return None if None in parts else separator.join(part for part in parts if part is not None)
 
 
 Timer = Callable[..., Any]  # calls its first argument with the others
