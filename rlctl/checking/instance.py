@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import inspect
 import linecache
+import math
 import re
 import sys
 import traceback
@@ -16,6 +17,7 @@ from typing import Any, Literal
 
 from rlctl.checking.progress import CallProgress, read_clock
 from rlctl.checking.records import CallFailure
+from rlctl.checking.rules import NotJudged
 from rlctl.checking.values import find_leaves, is_task
 from rlctl.environments import registry
 from rlctl.environments.places import find_line, format_place
@@ -146,6 +148,7 @@ class Budget:
     """What the episodes of an experiment may use together."""
 
     deadline: float  # On `read_clock`'s clock [s]
+    last: float = math.inf  # when the time of the whole process is over: no call begins after it
     bytes_left: int = 48 * 2**20
     failures: int = 0
     was_cut: bool = False  # whether time ran out before all steps or resets were done
@@ -160,6 +163,12 @@ class Budget:
         is_over = read_clock() > self.deadline
         self.was_cut |= is_over
         return is_over
+
+    def require_time(self, least_s: float = 0.0) -> None:
+        """Raise `NotJudged` if the time of the whole process is over in `least_s`."""
+        if read_clock() + least_s > self.last:
+            self.was_cut = True
+            raise NotJudged("time ran out")
 
     def why_spent(self) -> str:
         """Return which resource is used up; empty if none is."""
@@ -192,7 +201,12 @@ class Instance:
         return int(self.env.unwrapped.max_steps) if is_task(self.env) else find_time_limit(self.env)
 
     def call(self, name: str, function: Any, *arguments: Any, step: int = 0, **keywords: Any) -> Any:
-        """Call into the environment; whatever it raises, `SystemExit` included, is an `EnvironmentRaised`."""
+        """Call into the environment; whatever it raises, `SystemExit` included, is an `EnvironmentRaised`.
+
+        Raises `NotJudged` where the time of the process is over.
+        """
+        if name != "close":
+            self.context.budget.require_time()
         self.progress.enter(name, step)
         try:
             if timer := self.timers.get(name):
@@ -225,17 +239,21 @@ class Context:
         self.spec = spec
         self.progress = progress or CallProgress()
         self.budget = Budget(read_clock())  # What the experiment that is running may use
+        self.least_s = 0.0  # what the last build took: an experiment takes at least so long
         self.unseeded_calls: set[tuple[str, int]] = set()  # file and line of default_rng() in reset or step
         self.generators: dict[str, str] | None = None  # State of each after the first watched reset; None before
 
     def build(self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None) -> Instance:
         """Return a new instance; what its import or constructor raises is an `EnvironmentRaised`."""
+        self.budget.require_time(self.least_s)
         try:
             # Loaded before it is built, to distinguish an import error from a constructor's.
             self.progress.enter("load")
             registry.load(self.spec.task)
             self.progress.enter("build")
+            began = read_clock()
             env = (spec or self.spec).make(render_mode)
+            self.least_s = read_clock() - began
             self.progress.leave()
             return Instance(env, self)
         except BaseException as error:

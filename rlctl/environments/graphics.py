@@ -23,7 +23,7 @@ def opengl_fix(error: str) -> str:
 @contextlib.contextmanager
 def refuse_windows(task: str) -> Iterator[None]:
     """Let PyBullet raise `NoDisplayError` in the `with` block where it would end the process: without a display."""
-    pybullet = sys.modules.get("pybullet")
+    pybullet: Any = sys.modules.get("pybullet")
     if pybullet is None or not sys.platform.startswith("linux") or os.environ.get("DISPLAY"):
         yield
         return

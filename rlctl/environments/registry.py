@@ -74,6 +74,11 @@ def is_task(constructor: Any) -> bool:
     return task_module is not None and inspect.isclass(constructor) and issubclass(constructor, task_module.Task)
 
 
+def is_gymnasium_id(task: str) -> bool:
+    """Return whether a task is named by a Gymnasium id of the usual form, `Env-v0` or `package:Env-v0`."""
+    return installed.find(task) is None and _GYMNASIUM_ID.match(task) is not None
+
+
 def find_recipe_file(task: str) -> Path | None:
     """Return the recipe that comes with a task: `<name>.yaml` next to its module, or `<file>.yaml` next to its file."""
     if entry := installed.find(task):

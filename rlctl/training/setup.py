@@ -215,7 +215,14 @@ def _refuse_errors(report: CheckReport, display: Display) -> None:
         text = "; ".join(f"{finding.rule} {finding.name} ({finding.message})" for finding in errors)
         raise (TaskError if any(finding.rule in _FAILURES for finding in errors) else AnswerIsNo)(
             f"the check before training found {format_count(len(errors), 'error')}: {text}\n"
+            f"fix{f' of {errors[0].rule}' * (len(errors) > 1)}: {errors[0].fix}\n"
             f"rlctl check-env {task} shows details; --no-check trains anyway."
         )
+    for finding in findings:
+        if finding.rule == "RL503":  # evaluations wait for the end of episodes
+            steps, fix = max(finding.evidence["steps"].values()), finding.fix.partition(". ")[0]
+            option = "; here: --set task.max_episode_steps=1000" if registry.is_gymnasium_id(report.task) else ""
+            ends = "an evaluation fails if an episode does not end"
+            display.message(f"warning: no episode ended within {steps:,} steps of the check, and {ends}. {fix}{option}")
     if warnings := [finding.rule for finding in findings if finding.severity is Severity.WARNING]:
         display.message(f"check before training: warnings {', '.join(warnings)}; rlctl check-env {task} shows details")
