@@ -56,8 +56,8 @@ class Display:
         self.title = title
         self.total = total
         self._first: tuple[float, int] | None = None  # time and steps of the first segment
-        self._steps, self._stage, self._last_line = 0, "", 0.0
         self._began = time.monotonic()
+        self._steps, self._stage, self._last_line = 0, "", 0.0
 
     def __enter__(self) -> Self:
         self.message(self.title)
@@ -83,11 +83,12 @@ class Display:
         now = time.monotonic()
         if self._first is None:
             self._first = now, steps
-        if steps <= self._steps or now - max(self._began, self._last_line) < _LINE_OF_SEGMENT_EVERY_S:
+        began, first_steps = self._first
+        if steps <= self._steps or now - max(began, self._last_line) < _LINE_OF_SEGMENT_EVERY_S:
             return
         self._last_line = now
-        rate = (steps - self._first[1]) / max(now - self._first[0], 1e-9)
-        self.message(f"{steps:,}/{self.total:,} steps  {rate:.3g} steps/s")
+        rate = (steps - first_steps) / max(now - began, 1e-9)
+        self.message(f"{steps:,}/{self.total:,} steps  {rate:,.{0 if rate >= 10 else 1}f} steps/s")
 
     def time_left(self) -> str:
         """Return the remaining time at the rate so far; empty if unknown."""

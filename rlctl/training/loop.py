@@ -29,6 +29,7 @@ class TrainingLoop:
         self.evaluator = evaluator
         self.checkpoints = checkpoints
         self.stop_signal: int | None = None  # number of the signal after which to stop at the next boundary
+        self.has_begun = False  # whether the first episodes have begun; before, a signal has nothing to save
         self.callbacks = checkpoints.callbacks
         self._metrics = Metrics(learner, checkpoints, display)
         self._display = display
@@ -44,6 +45,7 @@ class TrainingLoop:
         self._display.phase("first steps")
         try:
             learner.rollouts.begin(learner.recipe.total_timesteps)
+            self.has_begun = True
             while not self.boundary():
                 learner.rollouts.advance(self._watch_segment)
                 self._display.steps(learner.steps)

@@ -78,3 +78,15 @@ def test_a_signal_stops_a_slow_segment(start, rlctl, tmp_path, algo):  # noqa: F
     assert done.returncode == 0, done.stderr
     assert ", bit-exact" in done.stderr
     assert json.loads(done.stdout)["steps"] > int(newest.name)
+
+
+@pytest.mark.slow
+def test_a_signal_stops_slow_first_resets(start, tmp_path):  # noqa: F811
+    training = start(tmp_path, "--no-check", "--set", "task.reset_s=30.0", task=SLOW)
+    wait_for(lambda: list(tmp_path.glob("runs/*/*/run.json")))
+    time.sleep(1.0)
+    training.process.send_signal(signal.SIGTERM)
+    began = time.monotonic()
+    code, _, stderr = training.wait()
+    assert (code, time.monotonic() - began < 8.0) == (143, True)
+    assert stderr.strip().endswith("error: interrupted before the training began")
