@@ -53,7 +53,7 @@ class NoSuchClassError(UsageError):
 
 
 class OldGymError(UsageError):
-    """An id is registered with the old gym, not with Gymnasium."""
+    """An id is registered with the old gym, not with Gymnasium, or a space is the old gym's."""
 
 
 class RecipeError(UsageError):
@@ -72,6 +72,10 @@ class WorldFailed(TaskError):
     def __init__(self, message: str, world: int = 0, *, details: str | None = None) -> None:
         super().__init__(message, details=details)
         self.world = world
+
+
+class NoDisplayError(TaskError):
+    """The environment opens a window, and there is no display."""
 
 
 class PolicyError(TaskError):

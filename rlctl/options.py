@@ -28,7 +28,9 @@ class Argument(Option):
     """A positional argument."""
 
 
-TASK_FORMS = "Installed name, package.module:Class, path/to/file.py:Class, or Gymnasium id."
+TASK_FORMS = (
+    "Installed name, package.module:Class or path/to/file.py:Class (or a function), Gymnasium id, or package:Id."
+)
 
 TaskName = Annotated[str, Argument(TASK_FORMS, metavar="TASK", completes="task")]
 OptionalTask = Annotated[str | None, Argument(TASK_FORMS, metavar="TASK", completes="task")]

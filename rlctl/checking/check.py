@@ -21,6 +21,7 @@ from rlctl.recipe import sources
 METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6": "step", "RL7": "step"}
 """The method that the findings of a family are about, where nothing more is known."""
 OF_SPACES = ("RL103", "RL106", "RL108", "RL109")  # rules about what a space declares
+OF_OLD_GYM = ("RL106", "RL109", "RL207")  # which today's libraries cannot read or call: not faults of their own
 LOADING = ("RL0", "RL216")  # judged even if no instance could be built
 
 
@@ -143,6 +144,10 @@ def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> CheckVerdi
     verdict = CheckVerdict(crashed={name: end.crash for name, end in records.finished.items() if end.crash})
     for rule in rules:
         _apply(rule, records, verdict)
+    if any(finding.rule == "RL008" for finding in verdict.findings):
+        for finding in [finding for finding in verdict.findings if finding.rule in OF_OLD_GYM]:
+            verdict.findings.remove(finding)
+            verdict.not_judged[finding.rule] = "the environment is written for the old gym (RL008)"
     if records.built is not None:
         for finding in verdict.findings if records.built.names else ():
             if finding.fix == (general := RULES[finding.rule]).fix:

@@ -60,10 +60,10 @@ def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> 
         elif context.is_built and not isinstance(context.instance.env.action_space, spaces.Space):
             yield Skipped(experiment.name, "its action space is not a space of Gymnasium")
         elif started > end:
-            yield Skipped(experiment.name, f"earlier experiments used all of the {seconds:g} s")
+            yield Skipped(experiment.name, f"earlier experiments used all of the {seconds:g} s of computing time")
             yield Finished(experiment.name, 0.0, is_complete=False, is_cut=True)
         else:
-            context.budget = Budget(started + (end - started) * experiment.share / shares)
+            context.budget = Budget(started + (end - started) * experiment.share / shares, last=end)
             yield from _run(experiment, context)
         shares -= experiment.share
     if context.is_built:

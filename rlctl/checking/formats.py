@@ -18,6 +18,7 @@ from rlctl.checking.families.speed import format_speed
 from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, find_rule
 from rlctl.checking.tool_formats import Row, action_rows, observation_rows, to_annotations, to_json, to_sarif
 from rlctl.environments.info import describe_randomization
+from rlctl.environments.places import format_place
 from rlctl.storage import files
 
 STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO: "cyan"}
@@ -84,7 +85,7 @@ def _add(body: Text, finding: RuleFinding) -> None:
     texts = ("traceback", "last_output")
     shown = {key: value for key, value in finding.evidence.items() if key not in texts and value not in (None, [], "")}
     if finding.where is not None:
-        shown["at"] = f"{Path(finding.where[0]).name}:{finding.where[1]}"
+        shown["at"] = format_place(*finding.where)
     if shown:
         body.append(", ".join(f"{key.replace('_', ' ')} {_short(value)}" for key, value in shown.items()), "dim")
         body.append("\n")

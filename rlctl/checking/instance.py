@@ -1,28 +1,29 @@
 """Instances of an untrusted environment: how they are called, and what a call raised, as plain data."""
 
+import ast
 import contextlib
 import dataclasses
 import functools
 import inspect
 import linecache
+import math
 import re
 import sys
-import sysconfig
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, Literal
 
-from rlctl.checking.bullet_calls import LIBRARIES
 from rlctl.checking.progress import CallProgress, read_clock
 from rlctl.checking.records import CallFailure
+from rlctl.checking.rules import NotJudged
 from rlctl.checking.values import find_leaves, is_task
 from rlctl.environments import registry
+from rlctl.environments.places import find_line, format_place
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError, TaskError
 from rlctl.missing_packages import advise
-from rlctl.version import PACKAGE_FOLDER
 
 _HERE = Path(__file__).parent
 NO_DISPLAY = re.compile(
@@ -32,11 +33,6 @@ NO_DISPLAY = re.compile(
     re.IGNORECASE,
 )
 """What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
-_LIBRARY = re.compile(
-    rf"^<|^{re.escape(sysconfig.get_path('stdlib'))}/(?!site-packages|dist-packages)|"
-    rf"(site|dist)-packages/({'|'.join(LIBRARIES)})(/|\\.)"
-)
-"""Files of Python itself and of libraries: an exception there comes from a wrong call in the environment."""
 _MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
 
 
@@ -64,35 +60,9 @@ def describe(error: BaseException) -> str:
     if isinstance(error, RlctlError):  # of the task layer, which names the task and the step itself
         return f"{type(error).__name__}: {error}"
     where = find_line(error)
-    place = f" ({Path(where[0]).name}:{where[1]})" if where else ""
+    place = f" ({format_place(*where)})" if where else ""
     text = " ".join(str(error).split()) or "no message"
     return f"{type(error).__name__}: {text}{place}{advise(error)}"
-
-
-def find_line(error: BaseException) -> tuple[str, int] | None:
-    """Return the last file and line of the environment's own package in a traceback; None if it has only libraries."""
-    if isinstance(error, SyntaxError) and error.filename:
-        return error.filename, error.lineno or 1
-    own = [frame for frame in traceback.extract_tb(error.__traceback__) if is_own_file(frame.filename)]
-    own = [frame for frame in own if _find_package(frame.filename) == _find_package(own[0].filename)]
-    return (own[-1].filename, own[-1].lineno or 1) if own else None
-
-
-def _find_package(file: str) -> str:
-    installed = re.search(r"(?:site|dist)-packages/([^/]+)", file)
-    return installed[1] if installed else ""
-
-
-def is_own_file(file: str) -> bool:
-    """Say whether a file belongs to the environment, not to rlctl, Python or a library."""
-    return PACKAGE_FOLDER not in Path(file).parents and _LIBRARY.search(file) is None
-
-
-def opengl_fix(error: str) -> str:
-    """Return what to do if an error says that OpenGL is missing; empty for other errors."""
-    is_missing = re.search(r"OpenGL|\bEGL\b|OSMesa|GLFW", error, re.IGNORECASE)
-    hint = "Where there is no display, set MUJOCO_GL=egl (or osmesa). Use OpenGL only to render or to observe images."
-    return hint if is_missing else ""
 
 
 def display_error(failure: CallFailure) -> str:
@@ -126,21 +96,47 @@ def get_causes(error: BaseException | None) -> list[BaseException]:
 
 
 def _find_model(trace: TracebackType | None) -> str | None:
-    """Return the model that the failing call was given: a text in its source, or the value of a name there."""
+    """Return the model that the failing call was given; None if that is not known."""
     calls = list(zip(traceback.walk_tb(trace), traceback.extract_tb(trace), strict=True))
     calls = [pair for pair in calls if _HERE not in Path(pair[1].filename).parents]
     if not calls:
         return None
     (frame, _), summary = calls[-1]
-    source = "".join(linecache.getlines(summary.filename)[(summary.lineno or 1) - 1 : summary.end_lineno])
-    texts = re.findall(r"[\"']([^\"']+)[\"']", source)
-    for name in re.findall(r"[a-zA-Z_][\w.]*", source):
-        root, *attributes = name.split(".")
-        value = frame.f_locals.get(root, frame.f_globals.get(root))
-        for attribute in attributes:
-            value = inspect.getattr_static(value, attribute, None)  # runs no code of the environment
-        texts += [str(value)] if isinstance(value, (str, Path)) else []
-    return next((text for text in texts if _MODEL.fullmatch(text) and not Path(text).is_file()), None)
+    lines = linecache.getlines(summary.filename)[(summary.lineno or 1) - 1 : summary.end_lineno]
+    if lines and summary.end_colno is not None and summary.colno is not None:
+        lines[-1] = lines[-1].encode()[: summary.end_colno].decode()
+        lines[0] = lines[0].encode()[summary.colno :].decode()
+    try:
+        nodes = list(ast.walk(ast.parse("".join(lines).strip())))
+    except SyntaxError:
+        return None
+    texts = [_evaluate(node, frame) for node in nodes]  # an expression before the texts that it is made of
+    return next((text for text in texts if text and _MODEL.fullmatch(text) and not Path(text).is_file()), None)
+
+
+def _evaluate(node: ast.AST, frame: FrameType) -> str | None:
+    """Return the text that an expression of a frame has; None if it is none, or only code could tell."""
+    parts: list[str | None]
+    match node:
+        case ast.Constant(value=value):
+            return value if isinstance(value, str) else None
+        case ast.Name() | ast.Attribute():
+            root, *attributes = ast.unparse(node).split(".")
+            value = frame.f_locals.get(root, frame.f_globals.get(root))
+            for attribute in attributes:
+                value = inspect.getattr_static(value, attribute, None)  # runs no code of the environment
+            return str(value) if isinstance(value, (str, Path)) else None
+        case ast.FormattedValue(value=value):
+            return _evaluate(value, frame)
+        case ast.JoinedStr(values=values):
+            parts, separator = [_evaluate(value, frame) for value in values], ""
+        case ast.BinOp(left=left, right=right, op=ast.Add() | ast.Div() as op):
+            parts, separator = [_evaluate(value, frame) for value in (left, right)], "/" * isinstance(op, ast.Div)
+        case ast.Call(func=ast.Attribute(attr="join"), args=arguments):  # of os.path
+            parts, separator = [_evaluate(value, frame) for value in arguments], "/"
+        case _:
+            return None
+    return None if None in parts else separator.join(part for part in parts if part is not None)
 
 
 Timer = Callable[..., Any]  # calls its first argument with the others
@@ -153,6 +149,7 @@ class Budget:
     """What the episodes of an experiment may use together."""
 
     deadline: float  # On `read_clock`'s clock [s]
+    last: float = math.inf  # when the time of the whole process is over: no call begins after it
     bytes_left: int = 48 * 2**20
     failures: int = 0
     was_cut: bool = False  # whether time ran out before all steps or resets were done
@@ -167,6 +164,12 @@ class Budget:
         is_over = read_clock() > self.deadline
         self.was_cut |= is_over
         return is_over
+
+    def require_time(self, least_s: float = 0.0) -> None:
+        """Raise `NotJudged` if the time of the whole process is over in `least_s`."""
+        if read_clock() + least_s > self.last:
+            self.was_cut = True
+            raise NotJudged("time ran out")
 
     def why_spent(self) -> str:
         """Return which resource is used up; empty if none is."""
@@ -199,7 +202,12 @@ class Instance:
         return int(self.env.unwrapped.max_steps) if is_task(self.env) else find_time_limit(self.env)
 
     def call(self, name: str, function: Any, *arguments: Any, step: int = 0, **keywords: Any) -> Any:
-        """Call into the environment; whatever it raises, `SystemExit` included, is an `EnvironmentRaised`."""
+        """Call into the environment; whatever it raises, `SystemExit` included, is an `EnvironmentRaised`.
+
+        Raises `NotJudged` where the time of the process is over.
+        """
+        if name != "close":
+            self.context.budget.require_time()
         self.progress.enter(name, step)
         try:
             if timer := self.timers.get(name):
@@ -232,17 +240,21 @@ class Context:
         self.spec = spec
         self.progress = progress or CallProgress()
         self.budget = Budget(read_clock())  # What the experiment that is running may use
+        self.least_s = 0.0  # what the last build took: an experiment takes at least so long
         self.unseeded_calls: set[tuple[str, int]] = set()  # file and line of default_rng() in reset or step
         self.generators: dict[str, str] | None = None  # State of each after the first watched reset; None before
 
     def build(self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None) -> Instance:
         """Return a new instance; what its import or constructor raises is an `EnvironmentRaised`."""
+        self.budget.require_time(self.least_s)
         try:
             # Loaded before it is built, to distinguish an import error from a constructor's.
             self.progress.enter("load")
             registry.load(self.spec.task)
             self.progress.enter("build")
+            began = read_clock()
             env = (spec or self.spec).make(render_mode)
+            self.least_s = read_clock() - began
             self.progress.leave()
             return Instance(env, self)
         except BaseException as error:

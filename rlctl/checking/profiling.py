@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from rlctl.checking import bullet_calls
 from rlctl.checking.progress import read_waited_s
 from rlctl.checking.values import find_author
+from rlctl.environments import bullet_calls
 from rlctl.version import PACKAGE_FOLDER
 
 _BUILTIN = re.compile(

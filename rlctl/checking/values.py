@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.checking.bullet_calls import LIBRARIES, is_library
+from rlctl.environments.bullet_calls import LIBRARIES, is_library
 
 Path = tuple[str | int, ...]
 NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)

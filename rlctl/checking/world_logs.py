@@ -2,18 +2,21 @@
 
 import contextlib
 import dataclasses
+import functools
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking import bullet_worlds
-from rlctl.checking.bullet_calls import BulletCalls, Target
 from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Jump, Link, Pair, World, WorldBody
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.values import flatten
+from rlctl.environments.bullet_calls import BulletCalls, Target
 
 DEEPEST_FINE = 0.02  # [m]; Bullet pushes links apart over several steps, heavy robots leave up to 2 cm
 LEAST_LIMIT = 0.005  # The same for the smallest things [m]: collision margins alone are 1 to 4 mm
@@ -87,6 +90,16 @@ class LoggedWorld:
     weight_matters: bool | None = None  # tested if gravity is zero
 
 
+@functools.cache
+def find_continuous_joints(model: str, search_paths: tuple[str, ...]) -> frozenset[str]:
+    """Return the joints of a URDF that turn without end; PyBullet reports a <limit> of theirs, which has no meaning."""
+    for folder in ("", *search_paths):
+        with contextlib.suppress(OSError, ElementTree.ParseError):
+            joints = ElementTree.parse(Path(folder, model)).getroot().iter("joint")
+            return frozenset(joint.get("name", "") for joint in joints if joint.get("type") == "continuous")
+    return frozenset()
+
+
 @dataclasses.dataclass
 class WorldLogger:
     """Logs the worlds of one instance."""
@@ -138,7 +151,19 @@ class WorldLogger:
         own = [bullet_worlds.read_world(id) for id in ids if id not in self.older]
         if not any(world.bodies for world in own):
             own = [bullet_worlds.read_world(id) for id in ids]
-        return [world for world in own if world.bodies][:4]
+        return [self._without_meaningless_limits(world) for world in own if world.bodies][:4]
+
+    def _without_meaningless_limits(self, world: World) -> World:
+        bodies = []
+        for body in world.bodies:
+            model = self.calls.models.get((world.client, body.id))
+            turning = find_continuous_joints(model, tuple(self.calls.search_paths)) if model and body.joints else ()
+            joints = [
+                dataclasses.replace(joint, low=0.0, high=-1.0) if joint.name in turning else joint
+                for joint in body.joints
+            ]
+            bodies.append(dataclasses.replace(body, joints=tuple(joints)))
+        return dataclasses.replace(world, bodies=tuple(bodies))
 
     def simulate_alone(self, number: int) -> None:
         """Reset, and simulate every world without the environment, which leaves them unusable."""

@@ -13,7 +13,7 @@ import pydantic
 from gymnasium import spaces
 
 from rlctl.environments.dict_spaces import LARGEST_SPACE, format_space
-from rlctl.errors import ArtifactError, TaskError, UsageError, short_repr
+from rlctl.errors import ArtifactError, OldGymError, TaskError, UsageError, short_repr
 from rlctl.storage import validation
 from rlctl.task.joints import Joints
 
@@ -160,6 +160,9 @@ def describe_randomization(events: Mapping[str, bool]) -> str:
     return "not randomised" if events else ""
 
 
+_PORT = "write `import gymnasium as gym`; reset returns (observation, info), and step five values"
+
+
 def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
     """Return a space as plain data; raises `UsageError` for a kind or size of space that policies do not support."""
     if isinstance(space, spaces.Box | spaces.MultiBinary) and (size := math.prod(space.shape or ())) > LARGEST_SPACE:
@@ -175,6 +178,8 @@ def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
         return {"type": "MultiBinary", "n": space.n if isinstance(space.n, int) else list(space.n)}
     if isinstance(space, spaces.Dict):
         return {"type": "Dict", "spaces": {key: space_to_json(value) for key, value in space.spaces.items()}}
+    if type(space).__module__.partition(".")[0] == "gym":
+        raise OldGymError(f"the space {short_repr(space)} is of the old gym package, not of Gymnasium\n{_PORT}")
     kinds = "Box, Discrete, MultiDiscrete of one axis, MultiBinary, Dict"
     raise UsageError(f"the space {short_repr(space)} is not supported; {kinds} are")
 

@@ -188,3 +188,13 @@ def find_module_file(module: str, *, in_current_folder: bool = False) -> Path | 
     except (ImportError, ValueError):
         return None
     return Path(spec.origin) if spec and spec.origin and spec.has_location else None
+
+
+def explain_hidden_package(module: str) -> str:
+    """Say which installed package hides the current folder's package of a module; empty if none does."""
+    head = module.partition(".")[0]
+    own = PathFinder.find_spec(head, [os.getcwd()])
+    file, other = Path(*module.split(".")), find_module_file(head)
+    if own is None or other is None or not (file.is_dir() or file.with_suffix(".py").is_file()):
+        return ""
+    return f": {other} hides {head}/ of this folder\nput this folder first: PYTHONPATH=. rlctl ..."

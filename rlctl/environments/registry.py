@@ -11,13 +11,14 @@ import os
 import re
 import subprocess
 import sys
-import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from rlctl import errors, missing_packages
-from rlctl.environments import installed, suggestions
+from rlctl.environments import installed, own_ids, suggestions
+from rlctl.environments.graphics import opengl_fix
+from rlctl.environments.places import describe_exception_place
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError, did_you_mean
 from rlctl.storage import files
 
@@ -59,6 +60,11 @@ def is_task(constructor: Any) -> bool:
     """Return whether a constructor is a `Task` or a `BatchTask` of `rlctl.task`."""
     module = sys.modules.get("rlctl.task.task")
     return module is not None and inspect.isclass(constructor) and issubclass(constructor, module.TaskDefinition)
+
+
+def is_gymnasium_id(task: str) -> bool:
+    """Return whether a task is named by a Gymnasium id of the usual form, `Env-v0` or `package:Env-v0`."""
+    return installed.find(task) is None and _GYMNASIUM_ID.match(task) is not None
 
 
 def find_recipe_file(task: str) -> Path | None:
@@ -172,8 +178,13 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
             if name in getattr(registry, "env_specs", registry):
                 known = f"{name} is registered with the old gym package"
                 raise OldGymError(f"{known}; Gymnasium cannot find it there") from None
+            if module := own_ids.find_registering_module(task):
+                raise UsageError(
+                    f"{module} registers {task}, which Gymnasium cannot know: write {module}:{task}"
+                ) from None
+            forms = "" if ":" in task else f" If a package registers it, write PACKAGE:{task}."
             close = did_you_mean(name, gymnasium.registry)
-            raise UsageError(f"Gymnasium has no environment {task!r}.{close}") from None
+            raise UsageError(f"Gymnasium has no environment {task!r}.{close}{forms}") from None
         except (gymnasium.error.DeprecatedEnv, ModuleNotFoundError) as error:
             missing = getattr(error.__cause__, "name", None) or getattr(error, "name", None)
             if missing and missing != task.partition(":")[0]:
@@ -192,22 +203,18 @@ def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
     except (RlctlError, KeyboardInterrupt):
         raise
     except BaseException as error:
-        where = ""
-        frames = traceback.extract_tb(error.__traceback__)
-        own = frames and Path(frames[-1].filename).parent == Path(__file__).parent
-        if frames and not own and not frames[-1].filename.startswith("<frozen"):  # a syntax error names its place
-            file = Path(frames[-1].filename)
-            name = f"{file.parent.name}/{file.name}" if file.name == "__init__.py" else file.name
-            where = f" ({name}:{frames[-1].lineno})"
+        where = describe_exception_place(error)
         reason, details = errors.describe_exception(error, where), errors.format_plugin_traceback(error) or None
-        raise TaskError(f"task {task!r}: {doing}{reason}", details=details) from error
+        hint = opengl_fix(reason)
+        message = f"task {task!r}: {doing}{reason}" + (f"\n{hint}" if hint else "")
+        raise TaskError(message, details=details) from error
 
 
 def import_module(task: str, name: str) -> Any:
     """Import a module that is installed or in the current folder; raises `TaskError` for any exception in it."""
     is_installed = name in sys.modules or installed.find_module_file(name) is not None
     if not is_installed and installed.find_module_file(name, in_current_folder=True) is None:
-        hint = missing_packages.advise_on(name) or suggestions.suggest(task)
+        hint = missing_packages.advise_on(name) or suggestions.suggest(task) or installed.explain_hidden_package(name)
         raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}{hint}")
     return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
 

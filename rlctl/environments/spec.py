@@ -14,6 +14,7 @@ from annotated_types import Ge, Le
 from pydantic import AfterValidator, PlainSerializer
 
 from rlctl.environments import named_task
+from rlctl.environments.graphics import refuse_windows
 from rlctl.environments.registry import call_plugin, is_task, load, make_slug, may_make_environments
 from rlctl.errors import RecipeError, TaskError, check_name, short_repr
 from rlctl.library_output import print_mujoco_warnings
@@ -139,7 +140,8 @@ class EnvSpec:
 
         parameters = dict(self.parameters)
         if not may_make_environments(constructor):
-            hint = "\nit was not called: its source file mentions neither gymnasium nor rlctl"
+            why = "; it was not called, because its source file mentions neither gymnasium nor rlctl"
+            hint = f"{why}\nwrite `import gymnasium` in that file"
             self._refuse(constructor, "" if isinstance(constructor, type) else hint)
         check_keywords(self.task, constructor, parameters)
         if render_mode is not None:
@@ -148,7 +150,8 @@ class EnvSpec:
                 check_keywords(self.task, constructor, parameters)
             except RecipeError:
                 raise RecipeError(f"{self.task} takes no render_mode") from None
-        env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
+        with refuse_windows(self.task):
+            env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
         if hasattr(env, "num_envs") and not isinstance(env, gymnasium.Env):
             hint = "give a single environment; rlctl itself runs n_envs of them in parallel"
             raise TaskError(f"{self.task}: {type(env).__name__} is a vectorised environment\n{hint}")

@@ -18,7 +18,7 @@ from rlctl.run.episode import EpisodeInfo, RecordedEpisode, Trajectory
 from rlctl.version import collect_versions
 
 _CONTACTS_MEASURED = 10  # the first recorded episodes, in which contacts are measured; it takes about 3 % of a step
-MOST_STEPS = 100_000  # steps after which an episode without a time limit is an error: it may never end
+MOST_STEPS = 20_000  # steps after which an episode without a time limit is an error: it may never end
 _SEGMENT = 1000  # steps after which the main process copies the recorded part of a long episode
 
 

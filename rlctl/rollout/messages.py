@@ -121,6 +121,14 @@ class EpisodeResult:
 
 
 @dataclasses.dataclass(frozen=True)
+class SharedWorld:
+    """Why environments in one process would share a PyBullet world."""
+
+    how: str
+    process_bytes: int  # resident memory of a process with one environment; 0 if it is not known
+
+
+@dataclasses.dataclass(frozen=True)
 class Answer:
     """The answer of a worker; it contains only what the message asks for."""
 
@@ -128,6 +136,7 @@ class Answer:
     left: Sequence[int] = ()  # environments whose episode ended or failed while its actions were replayed
     info: EnvInfo | None = None  # description of the environments, if it has changed
     lockstep: bool = False  # whether they are the worlds of a `BatchTask`, which play together
+    shared_world: SharedWorld | None = None  # of environments that were built
     rewards: NDArray[np.float64] | None = None  # those of `ComputeRewards`, shape (n,)
 
 

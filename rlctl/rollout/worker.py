@@ -34,6 +34,7 @@ from rlctl.rollout.messages import Answer, EpisodeResult, FailedInEpisode, Messa
 from rlctl.rollout.running_episode import ObservationWriter, RunningEpisode, compute_rewards
 from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
+from rlctl.rollout.shared_world import make_watched
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import Event, EventSettings, push
 
@@ -63,7 +64,7 @@ class Worker:
             case messages.ComputeRewards():
                 return Answer(rewards=compute_rewards(self._episodes[0].env, message.achieved, message.desired))
             case messages.Build():
-                return Answer(info=self._build(message.spec), lockstep=self._batch is not None)
+                return self._build(message.spec)
             case messages.SetEvents():
                 return Answer(info=self._set_events(message))
             case messages.Attach():
@@ -74,15 +75,20 @@ class Worker:
                 self._limit_actions(message)
         return Answer()
 
-    def _build(self, spec: EnvSpec) -> EnvInfo:
+    def _build(self, spec: EnvSpec) -> Answer:
         if self._episodes:
             self.close()
             gc.unfreeze()
             gc.collect()  # environments may hold themselves in cycles
-        envs = [spec.make()]
-        if (batch := spec.make_batch(envs[0], self._job.count)) is not None:
-            self._batch = BatchEpisodes(batch, self._job.first)
+        shared_world = None
+        if self._job.count > 1 and not spec.is_batch:
+            first, shared_world = make_watched(spec)
         else:
+            first = spec.make()
+        envs = [first]
+        if (batch := spec.make_batch(first, self._job.count)) is not None:
+            self._batch = BatchEpisodes(batch, self._job.first)
+        elif shared_world is None:
             envs += [spec.make() for _ in range(self._job.count - 1)]
         self._info = describe(envs[0])
         metrics = [name for name, weight in self._info.reward_weights.items() if weight == 0]
@@ -92,7 +98,7 @@ class Worker:
         checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
         self._writer = ObservationWriter(space, checked=checked)
         gc.freeze()  # present objects live long: later collections skip them
-        return self._info
+        return Answer(info=self._info, lockstep=self._batch is not None, shared_world=shared_world)
 
     def _set_events(self, message: messages.SetEvents) -> EnvInfo:
         spec, added = message.spec, {}

@@ -25,6 +25,7 @@ from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault
 from rlctl.rollout import messages
 from rlctl.rollout.messages import Answer, EpisodeResult, Message, format_hint, make_error
 from rlctl.rollout.shared_arrays import PolicyNumbers, SharedArrays
+from rlctl.rollout.shared_world import check_memory
 
 BUILD_TIMEOUT_S = 300.0
 DEFAULT_TIMEOUT_S = 60.0
@@ -54,23 +55,30 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         self.n_envs = n_envs
         self.timeout_s = timeout_s
         self.spec = spec  # spec of the environments
-        n_workers = min(n_envs, n_workers or available_cores())
-        bounds = np.linspace(0, n_envs, n_workers + 1).round().astype(int).tolist()
+        self.shared_world: messages.SharedWorld | None = None  # why each environment has a process of its own
+        self._printed = printed
+        self._memories = [anonymous_file(), anonymous_file()]
+        self._numbers = PolicyNumbers(self._memories[1], n_envs)
+        self._steps = 1
+        self._start(min(n_envs, n_workers or available_cores()))
+
+    def _start(self, n_workers: int) -> None:
+        """Start processes for the environments and let them build."""
+        bounds = np.linspace(0, self.n_envs, n_workers + 1).round().astype(int).tolist()
         self._ranges = list(itertools.pairwise(bounds))
         self._owner = [worker for worker, (low, high) in enumerate(self._ranges) for _ in range(low, high)]
-        self._memories = [anonymous_file(), anonymous_file()]
-        arrays, numbers = self._memories
-        self._numbers = PolicyNumbers(numbers, n_envs)
-        self._steps = 1
         self._ready = False
-        jobs = [{"job": messages.WorkerJob(arrays, numbers, low, high - low, n_envs)} for low, high in self._ranges]
+        arrays, numbers = self._memories
+        ranges = [(low, high - low, self.n_envs) for low, high in self._ranges]
+        jobs = [{"job": messages.WorkerJob(arrays, numbers, *environments)} for environments in ranges]
         main = "rlctl.rollout.worker:main"
         try:
-            self._pool = ProcessPool(main, jobs, printed, self._read_progress, self._memories)
+            self._pool = ProcessPool(main, jobs, self._printed, self._read_progress, self._memories)
         except BaseException as error:
             self._close_memory()
             if isinstance(error, OSError):
-                raise TaskError(f"task {spec.task!r}: no worker can be started: {error.strerror or error}") from None
+                task = self.spec.task
+                raise TaskError(f"task {task!r}: no worker can be started: {error.strerror or error}") from None
             raise
         self._begin_to_build()
 
@@ -120,10 +128,23 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         if self._ready:
             return
         answers = self._wait("being built", max(BUILD_TIMEOUT_S, self.timeout_s))
+        if shared := [answer.shared_world for answer in answers.values() if answer.shared_world is not None]:
+            self._give_each_a_process(shared[0])
+            return
         self._info, self._lockstep = _info_of(answers), answers[0].lockstep
         self._numbers.forget()
         self._ready = True
         self._attach(self._steps)
+
+    def _give_each_a_process(self, shared_world: messages.SharedWorld) -> None:
+        self._pool.close(grace_s=0.0)  # their close could end the world of another environment
+        try:
+            check_memory(self.spec.task, shared_world, self.n_envs)
+        except TaskError as error:
+            self._fail(error)
+        self.shared_world = shared_world
+        self._start(self.n_envs)
+        self._wait_until_built()
 
     def _attach(self, steps: int) -> None:
         self._steps = steps

@@ -17,6 +17,7 @@ _ASCII_BLOCKS = "_.-=+*#@"
 _CURVE = 200  # points of a curve
 _WIDE = 100  # columns of a terminal
 _LINE_EVERY_S = 5.0
+_LINE_OF_SEGMENT_EVERY_S = 10.0
 
 
 def sparkline(values: list[float], low: float | None = None, high: float | None = None) -> str:
@@ -55,6 +56,7 @@ class Display:
         self.title = title
         self.total = total
         self._first: tuple[float, int] | None = None  # time and steps of the first segment
+        self._began = time.monotonic()
         self._steps, self._stage, self._last_line = 0, "", 0.0
 
     def __enter__(self) -> Self:
@@ -75,6 +77,18 @@ class Display:
         if self._first is None:
             self._first = (time.monotonic(), steps)
         self._steps = steps
+
+    def playing(self, steps: int) -> None:
+        """A segment is being played, and `steps` environment steps have begun; called several times a second."""
+        now = time.monotonic()
+        if self._first is None:
+            self._first = now, steps
+        began, first_steps = self._first
+        if steps <= self._steps or now - max(began, self._last_line) < _LINE_OF_SEGMENT_EVERY_S:
+            return
+        self._last_line = now
+        rate = (steps - first_steps) / max(now - began, 1e-9)
+        self.message(f"{steps:,}/{self.total:,} steps  {rate:,.{0 if rate >= 10 else 1}f} steps/s")
 
     def time_left(self) -> str:
         """Return the remaining time at the rate so far; empty if unknown."""
@@ -133,7 +147,6 @@ class LiveDisplay(Display):
         super().__init__(title, total)
         from rich.live import Live
 
-        self._began = time.monotonic()
         self._phase: tuple[str, float] | None = None
         self._folder = ""
         self._fps = 0.0
@@ -170,6 +183,11 @@ class LiveDisplay(Display):
         """Move the bar to `steps`, the environment steps so far."""
         super().steps(steps)
         self._phase = None
+
+    def playing(self, steps: int) -> None:
+        """Move the bar inside a segment."""
+        if steps > self._steps:
+            self.steps(steps)
 
     def metrics(self, row: Mapping[str, Any]) -> None:
         """Draw a row of `metrics.csv`: speed, curves and reward terms."""

@@ -18,6 +18,8 @@ from rlctl.training.learner import Learner
 from rlctl.training.metrics import Metrics
 from rlctl.training.snapshot import check_finite
 
+_SEGMENT_MAY_TAKE_S = 3.0  # after a signal [s]: `timeout -k` and clusters kill some seconds later
+
 
 class TrainingLoop:
     """The loop of a training whose environments, model and run folder are ready."""
@@ -27,10 +29,11 @@ class TrainingLoop:
         self.evaluator = evaluator
         self.checkpoints = checkpoints
         self.stop_signal: int | None = None  # number of the signal after which to stop at the next boundary
+        self.has_begun = False  # whether the first episodes have begun; before, a signal has nothing to save
         self.callbacks = checkpoints.callbacks
         self._metrics = Metrics(learner, checkpoints, display)
         self._display = display
-        self._stop_announced = False
+        self._stop_at_s: float | None = None  # when to stop even inside a segment, after a signal
         self._resume_command = shlex.join(["rlctl", "train", "--resume", str(checkpoints.run.path)])
         learner.start_clock()
 
@@ -42,8 +45,9 @@ class TrainingLoop:
         self._display.phase("first steps")
         try:
             learner.rollouts.begin(learner.recipe.total_timesteps)
+            self.has_begun = True
             while not self.boundary():
-                learner.rollouts.advance(self._announce_stop)
+                learner.rollouts.advance(self._watch_segment)
                 self._display.steps(learner.steps)
         except TaskError as error:
             raise self._explain_fault(error) from None
@@ -95,18 +99,31 @@ class TrainingLoop:
             self.callbacks.finish_evaluation(row)
         self._metrics.exclude(time.monotonic() - began)
 
-    def _announce_stop(self) -> None:
-        if self.stop_signal is not None and not self._stop_announced:
-            self._stop_announced = True
-            self._display.message("stopping after this update, with a checkpoint; Ctrl-C again stops immediately")
-
-    def _stop_if_requested(self) -> None:
+    def _watch_segment(self) -> None:
+        """Show how far a segment is; after a signal give it some seconds to end, then stop without it."""
+        learner = self.learner
+        self._display.playing(learner.steps + learner.env.steps_in_segment)
         if self.stop_signal is None:
             return
-        state = "checkpoint saved" if self.checkpoints.save() else "the last saved checkpoint is intact"
+        if self._stop_at_s is None:
+            self._stop_at_s = time.monotonic() + _SEGMENT_MAY_TAKE_S
+            self._display.message("stopping, with a checkpoint; Ctrl-C again stops immediately")
+        elif time.monotonic() > self._stop_at_s:
+            learner.env.workers.close(grace_s=0.0)
+            # Nothing of the segment is stored: the state is that of the last boundary, except that with overlap the
+            # model has learned since then.
+            self._stop_if_requested(may_save=not learner.rollouts.overlap)
+
+    def _stop_if_requested(self, *, may_save: bool = True) -> None:
+        if self.stop_signal is None:
+            return
+        steps, saved_step = self.learner.steps, self.checkpoints.saved_step
+        if may_save and (saved_step == steps or self.checkpoints.save()):
+            state = "checkpoint saved"
+        else:
+            state = f"the last saved checkpoint{'' if saved_step is None else f', of step {saved_step:,},'} is intact"
         raise Interrupted(
-            f"interrupted at step {self.learner.steps:,}; {state}. Resume with: {self._resume_command}",
-            self.stop_signal,
+            f"interrupted at step {steps:,}; {state}. Resume with: {self._resume_command}", self.stop_signal
         )
 
     def _save_the_end(self) -> None:

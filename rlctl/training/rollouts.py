@@ -13,7 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from rlctl.environments.dict_spaces import split_space
+from rlctl.environments.dict_spaces import Observations, join, split_space
 from rlctl.errors import EpisodeFailed
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.players.player import Exploration
@@ -59,6 +59,7 @@ class WorkerVecEnv(VecEnv):
         self.last_segment: SegmentArrays | None = None  # of `finish`; the next segment overwrites its arrays
         self.waited_s = 0.0  # time spent waiting for the environments to play [s], since it was set to 0
         self._steps = 0
+        self._is_playing = False  # whether a segment has been started and not finished
         super().__init__(workers.n_envs, *workers.info.spaces())
 
     def _seed(self, env: int, episode: int) -> int:
@@ -90,7 +91,8 @@ class WorkerVecEnv(VecEnv):
 
     def start(self, steps: int, exploration: Exploration) -> None:
         """Begin to play `steps` steps of each environment."""
-        self._steps = steps
+        self._steps, self._is_playing = steps, True
+        self.workers.arrays.inside[:, 2] = -1
         running, next_episodes = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
         self.workers.start_playing(Play(steps, running, next_episodes, self.run_seed, exploration=exploration))
 
@@ -102,6 +104,7 @@ class WorkerVecEnv(VecEnv):
         except EpisodeFailed as error:
             error.actions = self._failed_actions(error)
             raise
+        self._is_playing = False
         self.waited_s += time.monotonic() - began
         segment, steps = self.workers.arrays.segment, self._steps
         last_rows = {episode.env: episode.row for episode in ended}  # where the last episode of the segment ended
@@ -116,6 +119,21 @@ class WorkerVecEnv(VecEnv):
         self.outside, self.outside_message = self.outside + count, self.outside_message or message
         self.last_segment = segment.first(steps, ended)
         return self.last_segment
+
+    @property
+    def steps_in_segment(self) -> int:
+        """How many steps of the segment that is being played were begun so far, by all environments."""
+        return int((self.workers.arrays.inside[:, 2] + 1).sum()) if self._is_playing else 0
+
+    def last_observations(self) -> Observations:
+        """Return the last observations of all segments that were finished, shape (n_envs, ...) or a dict of such."""
+        arrays = self.workers.arrays
+        observations = {key: array.copy() for key, array in arrays.observation.items()}
+        if self._is_playing:
+            begun = arrays.inside[:, 2] >= 0  # row 0 was written before; those done have replaced the other
+            for key, array in observations.items():
+                array[begun] = arrays.segment.observation[key][begun, 0]
+        return join(observations)
 
     def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any]:
         """Return the actions of a failed episode; the last is that of the failed step."""

@@ -26,6 +26,7 @@ from rlctl.output import format_count
 from rlctl.printed_lines import PrintedLines
 from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import ON_POLICY, Recipe
+from rlctl.rollout.shared_world import explain_processes
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory
@@ -65,6 +66,8 @@ def set_up(start: Start, display: Display, printed: PrintedLines) -> Iterator[Tr
 
         learner = _build_learner(start, specs, workers, make_workers, display)
         stack.callback(learner.rollouts.close)
+        if workers.shared_world is not None:
+            display.message(explain_processes(workers.shared_world, workers.n_envs))
         if start.run is None:
             _warn_of_opposite_weights(specs, display)
             if registered := describe_registrations(start.task, "train"):
@@ -220,7 +223,14 @@ def _refuse_errors(report: CheckReport, display: Display) -> None:
         text = "; ".join(f"{finding.rule} {finding.name} ({finding.message})" for finding in errors)
         raise (TaskError if any(finding.rule in _FAILURES for finding in errors) else AnswerIsNo)(
             f"the check before training found {format_count(len(errors), 'error')}: {text}\n"
+            f"fix{f' of {errors[0].rule}' * (len(errors) > 1)}: {errors[0].fix}\n"
             f"rlctl check-env {task} shows details; --no-check trains anyway."
         )
+    for finding in findings:
+        if finding.rule == "RL503":  # evaluations wait for the end of episodes
+            steps, fix = max(finding.evidence["steps"].values()), finding.fix.partition(". ")[0]
+            option = "; here: --set task.max_episode_steps=1000" if registry.is_gymnasium_id(report.task) else ""
+            ends = "an evaluation fails if an episode does not end"
+            display.message(f"warning: no episode ended within {steps:,} steps of the check, and {ends}. {fix}{option}")
     if warnings := [finding.rule for finding in findings if finding.severity is Severity.WARNING]:
         display.message(f"check before training: warnings {', '.join(warnings)}; rlctl check-env {task} shows details")

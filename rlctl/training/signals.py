@@ -83,7 +83,7 @@ class StopSignals(HandledSignals):
             output.leave_closed_terminal()
         if self._done and not (self._loop and self._loop.callbacks.running):
             return
-        if self._loop is None:
+        if self._loop is None or not self._loop.has_begun:
             raise Interrupted("interrupted before the training began", number)
         if self._loop.stop_signal is not None:
             if number == self._loop.stop_signal and time.monotonic() - self._received_s < _SAME_S:

@@ -126,6 +126,12 @@ class BeyondLimits(Cart):
         p.resetJointState(self.cart, SHOULDER, self.angle, physicsClientId=self.client)
 
 
+class TurnsWithoutEnd(BeyondLimits):
+    """Its joint is continuous: the <limit> of its model means nothing."""
+
+    model = CART.replace("cart.urdf", "cart_with_a_wheel.urdf")
+
+
 class Explodes(Cart):
     """A ball beside the cart is driven by a force without a bound."""
 

@@ -41,3 +41,25 @@ def test_what_the_clock_cut_off_is_not_judged():
     assert not {finding.rule for finding in verdict.findings} & of_absence
     assert of_absence <= verdict.not_judged.keys()
     assert "time" in verdict.not_judged["RL611"]
+
+
+def test_no_call_begins_when_the_time_of_the_process_is_over(tmp_path):
+    """An experiment without a look at the clock ends, too; the rules that one step decides come first."""
+    resets = tmp_path / "resets"
+    file = tmp_path / "slow_ball.py"
+    file.write_text(
+        "import sys, time\n"
+        f"sys.path.append({str(FOLDER)!r})\n"
+        "from broken_repeats import SharedWorld\n"
+        "class Slow(SharedWorld):\n"
+        "    def start(self):\n"
+        f"        open({str(resets)!r}, 'a').write('.')\n"
+        "        time.sleep(0.2)\n"
+        "        super().start()\n"
+    )
+    records = Records("slow")
+    for message in children.run("instances", EnvSpec(f"{file}:Slow"), families.PROCESSES["instances"], 1.5):
+        records.add(message)
+    assert len(resets.read_text()) <= 1.5 / 0.2 + 2
+    assert "RL808" in {finding.rule for finding in records.findings}
+    assert {"unseeded", "worlds"} & records.skipped.keys()

@@ -4,9 +4,12 @@ import sys
 import types
 from pathlib import Path
 
+import numpy as np
 import pybullet_data
 import pytest
 
+from rlctl.environments.info import space_to_json
+from rlctl.errors import OldGymError
 from tests.checking.judging import case, check_case, findings
 
 ERROR = "error"
@@ -86,6 +89,40 @@ def test_a_class_of_the_old_gym(monkeypatch, tmp_path):
         "    def step(self, action): return np.zeros(2, np.float32), 0.0, True, {}\n"
     )
     assert [finding.rule for finding in findings(f"{file}:Pushed", "RL003", "RL008")] == ["RL008"]
+
+
+def test_consequences_of_the_old_gym_are_not_reported(monkeypatch, tmp_path):
+    old = types.ModuleType("gym")
+    old.Env = type("Env", (), {"__module__": "gym.core"})
+    old.Box = type("Box", (), {"__module__": "gym.spaces.box", "shape": (2,), "sample": lambda self: np.zeros(2)})
+    monkeypatch.setitem(sys.modules, "gym", old)
+    file = tmp_path / "with_spaces_of_gym.py"
+    file.write_text(
+        "import gym\nclass Pushed(gym.Env):\n    observation_space = action_space = gym.Box()\n"
+        "    def reset(self): return [0.0, 0.0]\n    def step(self, action): return [0.0, 0.0], 0.0, True, {}\n"
+    )
+    assert [finding.rule for finding in findings(f"{file}:Pushed", "RL008", "RL106", "RL109", "RL207")] == ["RL008"]
+    with pytest.raises(
+        OldGymError, match=r"is of the old gym package, not of Gymnasium\nwrite `import gymnasium as gym`"
+    ):
+        space_to_json(old.Box())
+
+
+def test_the_model_of_a_failed_call_is_named_as_it_was_computed(tmp_path):
+    file = tmp_path / "computes_paths.py"
+    file.write_text(
+        "import os, gymnasium, pybullet as p\nFOLDER, NAME = '/no/such', 'robot'\n"
+        "class Env(gymnasium.Env):\n    def __init__(self):\n"
+        "        p.loadURDF(CALL, physicsClientId=p.connect(p.DIRECT))\n"
+    )
+    text = file.read_text()
+    for number, call in enumerate(
+        ("f'{FOLDER}/{NAME}.urdf'", "FOLDER + '/robot.urdf'", "os.path.join(FOLDER, 'robot.urdf')")
+    ):
+        other = file.with_stem(f"computes_{number}")
+        other.write_text(text.replace("CALL", call))
+        (finding,) = findings(f"{other}:Env", "RL007")
+        assert finding.message.startswith("the constructor does not find '/no/such/robot.urdf'")
 
 
 def test_an_id_whose_module_imports_what_is_not_there(monkeypatch, tmp_path):

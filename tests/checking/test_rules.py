@@ -142,7 +142,7 @@ def test_out_of_range_is_placed():
 
 def test_exception_is_placed():
     (finding,) = findings("broken_envs.py:Raises", "RL207")
-    assert finding.message.startswith("step 7 raised RuntimeError: joint 3 is gone (broken_envs.py:")
+    assert finding.message.startswith("step 7 raised RuntimeError: joint 3 is gone (tests/checking/broken_envs.py:")
     assert finding.evidence["step"] == 7
     assert finding.evidence["seed"] == 1000
 

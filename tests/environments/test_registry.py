@@ -11,7 +11,7 @@ import pytest
 import rlctl
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import RecipeError, TaskError, UsageError
+from rlctl.errors import NoDisplayError, RecipeError, TaskError, UsageError
 
 ENV = """
     import gymnasium, numpy as np
@@ -228,9 +228,10 @@ def test_a_vectorised_environment_is_named_as_one(my_env, write_module):
 
 def test_gymnasium_ids(write_module, monkeypatch):
     assert error(UsageError, "Pendulun-v1") == (
-        "Gymnasium has no environment 'Pendulun-v1'. Did you mean 'Pendulum-v1'?"
+        "Gymnasium has no environment 'Pendulun-v1'. Did you mean 'Pendulum-v1'? "
+        "If a package registers it, write PACKAGE:Pendulun-v1."
     )
-    assert error(UsageError, "Pendulum-v9") == (
+    assert error(UsageError, "Pendulum-v9").startswith(
         "Gymnasium has no environment 'Pendulum-v9'. Did you mean 'Pendulum-v1'?"
     )
     assert error(UsageError, "nopackage:Env-v0").startswith("Gymnasium: nopackage:Env-v0: No module named 'nopackage'")
@@ -393,3 +394,68 @@ def test_what_is_no_environment_is_not_called(write_module, tmp_path, name):
     assert f"{name} is neither a Gymnasium environment" in error(TaskError, f"rocket.py:{name}")
     assert "getcwd is neither a Gymnasium environment" in error(TaskError, "os:getcwd")
     assert not (tmp_path / "launched").exists()
+
+
+def test_an_id_that_a_package_of_this_folder_registers(write_module):
+    write_module("driving/__init__.py", "import gymnasium\ngymnasium.register(id='Driving-v0', entry_point=object)\n")
+    write_module("driving/other.py", "print('Driving-v0', 'Parking-v0')\n")
+    write_module(
+        "src/parking/__init__.py", "import gymnasium\ngymnasium.register(id='Parking-v0', entry_point=object)\n"
+    )
+    driving = "driving registers Driving-v0, which Gymnasium cannot know: write driving:Driving-v0"
+    assert error(UsageError, "Driving-v0") == driving
+    # `src` is a folder of modules that can be imported, too.
+    assert error(UsageError, "Parking-v0").endswith("write src.parking:Parking-v0")
+    assert error(UsageError, "Flying-v0").endswith("If a package registers it, write PACKAGE:Flying-v0.")
+
+
+def test_an_id_that_an_installed_package_registers(write_module, install, monkeypatch):
+    folder = install("gym-crane", {}, {"gym_crane/__init__.py": "", "gym_crane/ids.py": "register('Crane-v3')\n"})
+    (metadata,) = folder.glob("*.dist-info/METADATA")
+    metadata.write_text(f"{metadata.read_text()}Requires-Dist: gymnasium>=0.29\n")
+    monkeypatch.syspath_prepend(folder)
+    (folder / "elsewhere").mkdir()
+    monkeypatch.chdir(folder / "elsewhere")
+    assert error(UsageError, "Crane-v3").endswith("write gym_crane:Crane-v3")
+
+
+def test_a_package_that_an_installed_one_hides(write_module):
+    write_module("numpy/envs/__init__.py", ENV)
+    message = error(UsageError, "numpy.envs:MyEnv")
+    assert message.splitlines()[0].endswith("numpy/__init__.py hides numpy/ of this folder")
+    assert message.splitlines()[1] == "put this folder first: PYTHONPATH=. rlctl ..."
+
+
+def test_the_place_of_an_error_is_a_line_of_the_author(write_module):
+    write_module("arms/__init__.py", "")
+    write_module("arms/envs/__init__.py", "import numpy as np\n\ndef make():  # for gymnasium\n    np.zeros(-1)\n")
+    write_module(
+        "draws.py", "import numpy as np  # gym\n\ndef make():\n    np.random.default_rng(0).uniform(5, -np.inf)\n"
+    )
+    with pytest.raises(TaskError, match=r"\(arms/envs/__init__.py:4\)$"):
+        EnvSpec("arms.envs:make").make()
+    with pytest.raises(TaskError, match=r"\(draws.py:4\)$"):  # not the line of NumPy's _common.pyx
+        EnvSpec("draws.py:make").make()
+
+
+def test_a_window_without_a_display_is_refused(write_module, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    write_module("window.py", "import pybullet as p  # gym\n\ndef make():\n    p.connect(p.GUI)\n")
+    with pytest.raises(NoDisplayError) as caught:
+        EnvSpec("window.py:make").make()
+    first, second = str(caught.value).splitlines()
+    assert first == "task 'window.py:make': PyBullet opens a window (p.GUI, window.py:4), and there is no display"
+    assert second.startswith("write p.connect(p.GUI if render_mode ==")
+
+
+def test_opengl_without_a_display_is_explained(write_module):
+    error = "raise RuntimeError('an OpenGL platform library has not been loaded')"
+    write_module("camera.py", f"def make():  # for gymnasium\n    {error}\n")
+    with pytest.raises(TaskError, match=r"has not been loaded \(camera.py:2\)\nWhere there .* set MUJOCO_GL=egl"):
+        EnvSpec("camera.py:make").make()
+
+
+def test_a_function_whose_file_lacks_gymnasium(write_module):
+    write_module("factory.py", "def make():\n    pass\n")
+    with pytest.raises(TaskError, match=r"it was not called, .*\nwrite `import gymnasium` in that file$"):
+        EnvSpec("factory.py:make").make()

@@ -81,7 +81,9 @@ def test_a_worker_that_is_killed_while_idle(spec, start, children):
 
 def test_an_environment_that_cannot_be_built(spec, start):
     workers = start(spec("FailsToStart"), 4)
-    with pytest.raises(TaskError, match=r"^task '.*:FailsToStart': RuntimeError: no licence for this robot \(envs.py:"):
+    with pytest.raises(
+        TaskError, match=r"^task '.*:FailsToStart': RuntimeError: no licence for this robot \(tests/rollout/envs.py:"
+    ):
         workers.reset({0: 1})
 
 

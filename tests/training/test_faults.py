@@ -103,7 +103,7 @@ def test_connections_closed_by_the_environment(fail):
 
 
 def test_an_environment_that_cannot_be_built_leaves_no_run(train, tmp_path):
-    with pytest.raises(TaskError, match=r"RuntimeError: no licence \(envs.py:"):
+    with pytest.raises(TaskError, match=r"RuntimeError: no licence \(tests/training/envs.py:"):
         train("Unbuilt", TINY)
     assert not (tmp_path / "runs").exists()
 

@@ -56,11 +56,13 @@ def start(tmp_path):
     """Start a long training in a folder."""
     started = []
 
-    def begin(folder: Path, *arguments: str, stdout: int | None = None, stderr: int | None = None) -> Training:
+    def begin(
+        folder: Path, *arguments: str, task: str = f"{ENVS}:Line", stdout: int | None = None, stderr: int | None = None
+    ) -> Training:
         files = [tmp_path / name for name in ("stdout", "stderr")]
         with files[0].open("wb") as out, files[1].open("wb") as err:
             process = fork_server.for_commands().start(
-                [*COMMAND, f"{ENVS}:Line", "-n", "1e8", *SMALL, *arguments],
+                [*COMMAND, task, "-n", "1e8", *SMALL, *arguments],
                 cwd=folder,
                 stdout=out.fileno() if stdout is None else stdout,
                 stderr=err.fileno() if stderr is None else stderr,

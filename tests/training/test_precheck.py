@@ -13,8 +13,9 @@ def runs(tmp_path):
 def test_an_error_refuses_before_a_run_begins(train, runs, small_ppo):
     with pytest.raises(AnswerIsNo) as refused:
         train("Unseeded", small_ppo, check=True)
-    first, second = str(refused.value).splitlines()
+    first, fix, second = str(refused.value).splitlines()
     assert first.startswith("the check before training found 1 error: RL302 trajectory not repeatable (played twice by")
+    assert fix.startswith("fix: ")
     assert second.startswith("rlctl check-env ")
     assert second.endswith("--no-check trains anyway.")
     assert runs() == []
@@ -47,3 +48,21 @@ def test_warnings_are_printed_and_training_goes_on(train, small_ppo, capsys):
 def test_an_environment_that_cannot_be_built_is_the_workers_matter(train, small_ppo):
     with pytest.raises(TaskError, match="no licence"):
         train("Unbuilt", small_ppo, check=True)
+
+
+def test_episodes_that_do_not_end_are_a_warning_before_the_training(train, small_ppo, write_module, capsys):
+    source = """
+        from tests.training.envs import Line
+
+        class Endless(Line):
+            def step(self, action):
+                observation, reward, _, _, info = super().step(action)
+                return observation, reward, False, False, info
+    """
+    with pytest.raises(TaskError, match="evaluations failed"):
+        train("Endless", {**small_ppo, "eval": {"episodes": 1}}, envs=write_module("endless.py", source), check=True)
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: no episode ended")]
+    assert (
+        "steps of the check, and an evaluation fails if an episode does not end. Wrap it in gymnasium.wrappers" in line
+    )
+    assert "--set" not in line  # it is no Gymnasium id

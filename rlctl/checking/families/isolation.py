@@ -5,7 +5,7 @@ import dataclasses
 import gc
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,9 @@ from rlctl.checking.families.interface import select_failures
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance, describe_failure
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Records, Skipped
-from rlctl.checking.rules import RULES, NotJudged, RuleFinding, Severity, check, experiment
+from rlctl.checking.rules import RULES, NotJudged, RuleFinding, Severity, check, experiment, list_names
+from rlctl.environments import registry
+from rlctl.environments.bullet_calls import BulletCall, record_calls
 
 IN_TURNS, AFTER_CLOSE = "two instances stepped alternately", "after another instance was closed"
 MOST_RESETS = 100
@@ -37,7 +39,7 @@ LEAKS = {
 _PROCESS = Path("/proc/self")
 
 
-@experiment("instances", "RL404", share=10.0)
+@experiment("instances", "RL404", "RL808", share=10.0)
 def compare_instances(context: Context) -> Iterator[ChildMessage]:
     """Play on three instances: one alone, one after it, and two side by side of which one is closed."""
     progress, budget = context.progress, context.budget
@@ -49,10 +51,14 @@ def compare_instances(context: Context) -> Iterator[ChildMessage]:
         return Recording(role, EpisodePlayer(instance, seed, number=number, max_steps=steps, longest_s=longest_s))
 
     progress.phase("alone")
-    first = context.build()
-    yield from begin(first, "fresh process", FIRST_SEED).run()
-    yield from begin(first, "second alone", SECOND_SEED).run()
+    registry.load(context.spec.task)  # and so, usually, PyBullet
+    with record_calls(with_results=()) as calls:
+        first = context.build()
+    with record_calls(with_results=()) as later:  # of a PyBullet that the constructor has imported
+        yield from begin(first, "fresh process", FIRST_SEED).run()
+        yield from begin(first, "second alone", SECOND_SEED).run()
     yield from first.close()
+    yield from _left_out_clients(sorted(calls.without_client | later.without_client))
 
     progress.phase("fresh instance")
     neighbour = context.build()
@@ -84,6 +90,16 @@ def compare_instances(context: Context) -> Iterator[ChildMessage]:
     progress.phase("after close")
     yield from recording.run()
     yield from survivor.close()
+
+
+def _left_out_clients(calls: Sequence[BulletCall]) -> Iterator[ChildMessage]:
+    if "pybullet" not in sys.modules:
+        yield Skipped("RL808", "no PyBullet world", applies=False)
+    if calls:
+        count = f"{len(calls)} calls" if len(calls) > 1 else "a call"
+        shown = list_names([f"{call.place} {call.name}" for call in calls], most=3)
+        evidence = {"file": calls[0].file, "line": calls[0].line, "places": [call.place for call in calls[:20]]}
+        yield RuleFinding("RL808", f"{count} of PyBullet without physicsClientId: {shown}", evidence)
 
 
 def _require_same_alone(records: Records) -> None:

@@ -23,21 +23,20 @@ from rlctl.checking.instance import (
     EnvironmentRaised,
     Instance,
     display_error,
-    find_line,
     find_missing_file,
     get_causes,
-    is_own_file,
-    opengl_fix,
 )
 from rlctl.checking.records import FIRST_SEED, Built, ChildMessage, Records, Skipped
 from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, check, experiment
 from rlctl.checking.values import find_assignment, find_author, flatten, is_task
 from rlctl.environments import registry
 from rlctl.environments.dict_spaces import format_space
+from rlctl.environments.graphics import opengl_fix
 from rlctl.environments.info import describe_mujoco_model
+from rlctl.environments.places import find_line, is_own_file
 from rlctl.environments.registrations import describe_registrations
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import NoSuchClassError, OldGymError, RecipeError, RlctlError, TaskError, UsageError
+from rlctl.errors import NoDisplayError, NoSuchClassError, OldGymError, RecipeError, RlctlError, TaskError, UsageError
 
 WAIVERS = "rlctl_ignore"  # The class attribute that waives rules: rule id -> reason
 
@@ -68,11 +67,14 @@ def _explain(context: Context, error: RlctlError) -> RuleFinding:
     cause = error.__cause__
     details = {"traceback": error.details} if error.details else {}
     message, to_install = missing_packages.split(str(error), cause)
+    message = message.partition("\n")[0] if isinstance(error, TaskError) else message  # what to do is the fix
     if isinstance(error, NoSuchClassError):
         return RuleFinding("RL005", str(error), details)
     missing_modules = [str(e.name) for e in get_causes(cause) if isinstance(e, ModuleNotFoundError)]
     if isinstance(error, OldGymError) or any(name.partition(".")[0] == "gym" for name in missing_modules):
         return RuleFinding("RL008", message, details, fix=to_install)
+    if isinstance(error, NoDisplayError):
+        return RuleFinding("RL216", message)
     if (file := find_missing_file(cause)) is not None:
         return _not_found("the constructor", file, error.details)
     where = find_line(cause) if cause is not None else None
@@ -86,7 +88,8 @@ def _explain(context: Context, error: RlctlError) -> RuleFinding:
         return RuleFinding("RL006", message, details, fix=f"{fix} The class is {registered}" if registered else fix)
     is_without_trace = isinstance(error, TaskError) and error.details is None  # a constructor's error has one
     if is_without_trace and not registry.is_task(registry.load(context.spec.task)):
-        return RuleFinding("RL003", str(error))
+        fix = str(error).partition("\n")[2]
+        return RuleFinding("RL003", message, fix=f"{fix[:1].upper()}{fix[1:]}")
     return RuleFinding("RL002", message, details, fix=to_install or opengl_fix(str(cause)), where=where)
 
 

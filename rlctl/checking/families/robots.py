@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.bullet_calls import FULL_TURN, BulletCalls, ContactQuery
 from rlctl.checking.bullet_worlds import JOINTS, ClientCalls
 from rlctl.checking.rules import RuleFinding, Severity
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
+from rlctl.environments.bullet_calls import FULL_TURN, BulletCalls, ContactQuery
 
 FAR_RANGES = 3.0  # a target farther outside the limits is not just out of reach
 FEWEST_JOINTS, FEWEST_QUERIES, FEWEST_LOOKS = 3, 50, 30

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from rlctl.checking.bullet_calls import visible_to_profilers
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Context, Instance, Timer
 from rlctl.checking.profiling import Profile, Stopwatch, TimedCall, find_own_code
@@ -14,6 +13,7 @@ from rlctl.checking.progress import read_clock
 from rlctl.checking.records import ChildMessage, Fact, Records
 from rlctl.checking.rules import NotJudged, RuleFinding, Severity, check, experiment, list_names
 from rlctl.checking.values import find_author, is_task
+from rlctl.environments.bullet_calls import visible_to_profilers
 from rlctl.output import format_duration
 
 FIRST_SPEED_SEED = 5000

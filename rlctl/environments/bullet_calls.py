@@ -9,7 +9,7 @@ import math
 import re
 import sys
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any, NamedTuple
@@ -50,7 +50,7 @@ def is_library(frame: FrameType) -> bool:
 
 
 MOTORS = ("setJointMotorControl2", "setJointMotorControlArray", "resetJointState")
-RECORDED = (*MOTORS, "getContactPoints", "getLinkState")
+RECORDED = (*MOTORS, "getContactPoints", "getLinkState", "loadURDF", "setAdditionalSearchPath")
 POSITION = 2  # PyBullet's POSITION_CONTROL
 FULL_TURN = 2 * math.pi
 
@@ -87,6 +87,8 @@ class BulletCalls:
         self.far_targets: list[Target] = []  # Positions of more than a full turn
         self.queries: dict[tuple[Any, ...], ContactQuery] = {}
         self.late_links: dict[BulletCall, float] = {}  # how far getLinkState was from the present position [m]
+        self.models: dict[tuple[int, int], str] = {}  # the file of a URDF, by client and body
+        self.search_paths: list[str] = []
         self._known: set[tuple[CodeType, int]] = set()
 
     def note_call(self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
@@ -101,9 +103,15 @@ class BulletCalls:
     def note_result(
         self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any], result: Any
     ) -> None:
-        """Note what a call set or returned, if it moves joints or asks for contacts or the place of a link."""
+        """Note what a call set or returned, if it loads, moves joints, or asks for contacts or a place."""
         call = BulletCall(frame.f_code.co_filename, frame.f_lineno, name)
         client = int(keywords.get("physicsClientId", 0))
+        if name == "loadURDF":
+            self.models[client, result] = str(keywords.get("fileName", arguments[0] if arguments else ""))
+            return
+        if name == "setAdditionalSearchPath":
+            self.search_paths.append(str(keywords.get("path", arguments[0] if arguments else "")))
+            return
         if name == "getLinkState":
             if len(arguments) <= 3 and not keywords.get("computeForwardKinematics") and not is_library(frame):
                 again = sys.modules["pybullet"].getLinkState
@@ -182,8 +190,8 @@ def replace_functions(replace: Callable[[str, Any], Any]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def record_calls() -> Iterator[BulletCalls]:
-    """Record the calls of PyBullet inside the `with` block."""
+def record_calls(with_results: Collection[str] = RECORDED) -> Iterator[BulletCalls]:
+    """Record the calls of PyBullet inside the `with` block; of some functions also what they set or return."""
     calls = BulletCalls()
 
     def replace(name: str, function: Any) -> Any:
@@ -191,7 +199,7 @@ def record_calls() -> Iterator[BulletCalls]:
             frame = sys._getframe(1)
             calls.note_call(name, frame, arguments, keywords)
             result = function(*arguments, **keywords)
-            if name in RECORDED:
+            if name in with_results:
                 calls.note_result(name, frame, arguments, keywords, result)
             return result
 

@@ -1,0 +1,50 @@
+"""Finds the package that registers a Gymnasium id which is not registered in this process, without importing it."""
+
+import contextlib
+import itertools
+import re
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+from rlctl.environments import installed
+
+_MOST_FILES = 400  # of the current folder, and of each installed package
+_DEEPEST = 4  # folders below the current one
+
+
+def find_registering_module(name: str) -> str:
+    """Return the module to write before an id, `module:Id-v0`; empty if none is found, or one is named already."""
+    return "" if ":" in name else next(_list_modules(name), "")
+
+
+def _list_modules(name: str) -> Iterator[str]:
+    """Yield the modules whose text has the id in quotes and that can be imported, first those of the current folder."""
+    quoted = re.compile(rf"""["']{re.escape(name)}["']""".encode())
+    here = Path()
+    depths = (here.glob("/".join(["*"] * depth + ["*.py"])) for depth in range(_DEEPEST))
+    for file in itertools.islice(itertools.chain.from_iterable(depths), _MOST_FILES):
+        module = ".".join(file.parent.parts if file.name == "__init__.py" else file.with_suffix("").parts)
+        if module and _has(file, quoted) and installed.find_module_file(module, in_current_folder=True) is not None:
+            yield module
+    for package, folder in _list_packages():
+        if any(_has(file, quoted) for file in itertools.islice(folder.rglob("*.py"), _MOST_FILES)):
+            yield package
+
+
+def _has(file: Path, quoted: re.Pattern[bytes]) -> bool:
+    with contextlib.suppress(OSError):
+        text = file.read_bytes()
+        return b"register" in text and quoted.search(text) is not None
+    return False
+
+
+def _list_packages() -> Iterator[tuple[str, Path]]:
+    """Yield the packages of all distributions that need Gymnasium or the old gym, and their folders."""
+    for distribution in metadata.distributions():
+        if not any(re.match(r"gym(nasium)?\b", requirement) for requirement in distribution.requires or ()):
+            continue
+        for package in (distribution.read_text("top_level.txt") or distribution.metadata["Name"] or "").split():
+            file = installed.find_module_file(package.replace("-", "_"))
+            if file is not None and file.name == "__init__.py":
+                yield package.replace("-", "_"), file.parent
