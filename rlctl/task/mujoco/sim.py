@@ -318,17 +318,18 @@ class MujocoSim(Sim):
 
     def step(self, worlds: Rows = None) -> None:
         if self._pushes:
-            self._apply_pushes()
+            self._apply_pushes(None if worlds is None else set(worlds.tolist()))
         self.world.step(worlds)
         for body in self.bodies.values():
             body.limit_speeds()
 
-    def _apply_pushes(self) -> None:
+    def _apply_pushes(self, worlds: set[int] | None) -> None:
         forces = self.world.data("xfrc_applied")
-        for push in self._pushes:
+        moving = [push for push in self._pushes if worlds is None or push.world in worlds]
+        for push in moving:
             forces[(push.world, push.link) if self.world.count is not None else push.link] = 0.0
-        self._pushes[:] = [push for push in self._pushes if push.steps > 0]
-        for push in self._pushes:
+        self._pushes[:] = [push for push in self._pushes if push.steps > 0 or push not in moving]
+        for push in [push for push in moving if push.steps > 0]:
             row = (push.world, push.link) if self.world.count is not None else push.link
             forces[row][:3] += push.force
             push.steps -= 1

@@ -22,8 +22,10 @@ _SERIOUS = {
     "mjWARN_CNSTRFULL": "too many constraints",
 }
 """MuJoCo's warnings that are errors, and what they mean."""
-_DERIVED = ("xpos", "xquat", "xipos", "sensordata", "actuator_force")
+_DERIVED = ("xpos", "xquat", "xipos")
 """Arrays that bodies read and the state does not have."""
+_OF_STEPS = ("sensordata", "actuator_force")
+"""Those that only a step computes; after any other call a world of a batch has those of another world."""
 
 
 def import_mujoco() -> Any:
@@ -54,6 +56,7 @@ class MujocoWorld:
         """Arrays by name, without the leading axis of worlds."""
         self._built: dict[str, Array] = {}  # values of the built world, of arrays that may have changed
         self._rows: dict[str, Array] = {}  # arrays of `extra` with a row per world
+        self._of_steps: dict[str, Array] = {}  # arrays of `_OF_STEPS` of a batch, since the last step or reset
         self._saved: Array | None = None
         self._is_fresh = False  # whether all that depends on positions and velocities is up to date
         self._stale: set[int] = set()  # worlds of a batch for which it is not
@@ -68,7 +71,7 @@ class MujocoWorld:
     def data(self, name: str) -> Any:
         """Return an array of MjData; those that are derived are valid after `refresh`."""
         if self.batch is not None:
-            return self.batch.bind(name)
+            return self._of_steps[name] if name in _OF_STEPS else self.batch.bind(name)
         array = getattr(self.mj_data, name)
         return array if self.count is None else array[None]
 
@@ -137,6 +140,9 @@ class MujocoWorld:
             ids = None if worlds is None else worlds.astype(np.int32)
             self._stale.difference_update(range(self.batch.nsim) if worlds is None else worlds.tolist())
             self._call("step", ids, nstep=self.substeps, stage=self._velocity_stage)
+            rows: Any = slice(None) if worlds is None else worlds
+            for name, values in self._of_steps.items():
+                values[rows] = self.batch.bind(name)[rows]
             if self.batch.warning.any():
                 self._raise_warning()
             return
@@ -177,6 +183,7 @@ class MujocoWorld:
             self.batch.state[:] = self._saved
             for name in _DERIVED:  # one that is bound later is zero until the next call
                 self.batch.bind(name)
+            self._of_steps = {name: np.zeros_like(self.batch.bind(name)) for name in _OF_STEPS}
             self.touch()
 
     def restore(self, worlds: Rows = None) -> None:
@@ -187,6 +194,8 @@ class MujocoWorld:
         if self.batch is not None:
             self.batch.state[rows] = self._saved
             self.batch.warning[rows] = 0
+            for values in self._of_steps.values():
+                values[rows] = 0.0
         else:
             mujoco = self.mujoco
             mujoco.mj_resetData(self.mj_model, self.mj_data)
