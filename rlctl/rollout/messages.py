@@ -93,7 +93,7 @@ class Play:
     run_seed: int = 0
     exploration: Exploration = dataclasses.field(default_factory=Exploration)
     record: bool = False  # whether to write reward terms
-    contacts: bool = False  # whether to measure after every step how far bodies of a task overlap
+    contacts: Sequence[int] = ()  # the environments in which to measure after every step how far bodies overlap
 
 
 @dataclasses.dataclass(frozen=True)

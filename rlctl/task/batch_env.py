@@ -52,6 +52,7 @@ class BatchEnv:
         self.sim = MujocoSim(
             control_dt=task.control_dt, substeps=task.substeps, solref=solref, iterations=iterations, worlds=worlds
         )
+        self._all = np.arange(worlds)
         self.step_of = np.zeros(worlds, np.int64)
         """Steps since the start of each world's episode."""
         self._streams: list[Streams] = [{} for _ in range(worlds)]
@@ -88,13 +89,14 @@ class BatchEnv:
             self._act("reset", world)
         self.task.clear_kept(worlds)
         self.task.reset(WorldRngs(generators), worlds)
-        self._check_kept("reset")
         for world in worlds.tolist():
             self._act("start", world)
             if self._signals is not None:
                 self._signals.begin(world, self._streams[world], level)
         with self._leave_others(worlds):
-            return self._observe(worlds)
+            observation = self._observe(worlds)
+            self._check_kept("reset")
+        return observation
 
     def _act(self, when: Literal["reset", "start"], world: int) -> None:
         if self._events:
@@ -103,7 +105,7 @@ class BatchEnv:
 
     def step(self, action: NDArray[Any], worlds: Worlds | None = None) -> BatchStep:
         """Advance all worlds, or some, by a control step; `action` has a row for each of them, shape (k, ...)."""
-        rows = np.arange(self.worlds) if worlds is None else worlds
+        rows = self._all if worlds is None else worlds
         self.step_of[rows] += 1
         chosen = self._check_action(action, rows)
         with self._leave_others(rows):
@@ -111,7 +113,7 @@ class BatchEnv:
 
     def _step(self, chosen: NDArray[Any], rows: Worlds) -> BatchStep:
         self.task.act(self._spread(chosen if self._signals is None else self._signals.act(chosen, rows), rows))
-        self.sim.step(None if len(rows) == self.worlds else rows)
+        self.sim.step(None if rows is self._all else rows)
         terminated = self._read_flags("is_terminated")[rows]
         truncated = ~terminated & (self.step_of[rows] >= self.max_steps)
         terms = self._read_terms(self._spread(chosen, rows))[rows]
@@ -126,7 +128,7 @@ class BatchEnv:
         return BatchStep(observation, reward, terminated, truncated, terms, success)
 
     def _spread(self, values: NDArray[Any], worlds: Worlds) -> NDArray[Any]:
-        if len(worlds) == self.worlds:
+        if worlds is self._all:
             return values
         full = np.zeros((self.worlds, *values.shape[1:]), values.dtype)
         full[worlds] = values

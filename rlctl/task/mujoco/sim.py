@@ -336,9 +336,8 @@ class MujocoSim(Sim):
 
     @property
     def deepest_contact(self) -> float:
-        self.world.refresh()
-        data = self.data
-        return max(0.0, -float(data.contact.dist.min())) if data.ncon else 0.0
+        distances = self.world.read_contact_distances(self.fields.index or 0)
+        return max(0.0, -float(distances.min(initial=0.0)))
 
     def save(self) -> None:
         for body in self.bodies.values():
@@ -361,7 +360,7 @@ class MujocoSim(Sim):
         pushed = self.body(body)
         steps = max(1, round(duration_s / self._control_dt))
         number = pushed.find_link(link or pushed.base_name)  # type: ignore[attr-defined]
-        self._pushes.append(_MujocoPush(self.fields._index or 0, number, np.array(force, float), steps))
+        self._pushes.append(_MujocoPush(self.fields.index or 0, number, np.array(force, float), steps))
 
     def render(
         self,

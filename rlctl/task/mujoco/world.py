@@ -137,7 +137,7 @@ class MujocoWorld:
     def step(self, worlds: Rows = None) -> None:
         """Take all substeps of a control step; afterwards everything but accelerations and forces is up to date."""
         if self.batch is not None:
-            ids = None if worlds is None else worlds.astype(np.int32)
+            ids = None if worlds is None else np.sort(worlds).astype(np.int32)
             self._stale.difference_update(range(self.batch.nsim) if worlds is None else worlds.tolist())
             self._call("step", ids, nstep=self.substeps, stage=self._velocity_stage)
             rows: Any = slice(None) if worlds is None else worlds
@@ -159,7 +159,8 @@ class MujocoWorld:
             self._raise_warning()
 
     def _raise_warning(self) -> None:
-        rows = self.batch.warning if self.batch is not None else self.mj_data.warning.number[None].copy()
+        # Of a batch: the last value and the number of each warning.
+        rows = self.batch.warning[..., 1] if self.batch is not None else self.mj_data.warning.number[None].copy()
         for name, what in _SERIOUS.items():
             bad = np.flatnonzero(rows[:, int(getattr(self.mujoco.mjtWarning, name))])
             if bad.size:
@@ -168,6 +169,18 @@ class MujocoWorld:
             self.mj_data.warning.number[:] = 0
         else:
             self.batch.warning[:] = 0
+
+    def read_contact_distances(self, world: int) -> Array:
+        """Return the distances of the bodies at the contacts of a world [m], negative where they overlap."""
+        if self.batch is None:
+            self.refresh()
+        else:
+            # Bodies that are fixed may stand elsewhere in each world; all else that is theirs moves no contact.
+            is_moved = self.batch.expanded("body_pos") is not None
+            model = self.batch.get_model(world) if is_moved else self.mj_model
+            self.batch.get_data(world, self.mj_data)
+            self.mujoco.mj_fwdPosition(model, self.mj_data)
+        return self.mj_data.contact.dist.copy()  # type: ignore[no-any-return]
 
     def save(self) -> None:
         """Save the built world for `restore`, and make `count` copies of it."""
@@ -209,7 +222,7 @@ class Fields:
 
     def __init__(self, world: MujocoWorld, index: int | None = None) -> None:
         self.world = world
-        self._index = index
+        self.index = index
         self._cache: dict[str, Any] = {}
 
     def forget(self) -> None:
@@ -233,13 +246,13 @@ class Fields:
         return self._select(self.world.model(name))
 
     def _select(self, array: Any) -> Any:
-        return array if self._index is None else array[self._index]
+        return array if self.index is None else array[self.index]
 
     def touch(self, worlds: Rows = None) -> None:
         """Note a change of the state or the model."""
-        self.world.touch(self._index if worlds is None else worlds)
+        self.world.touch(self.index if worlds is None else worlds)
 
     @property
     def shape(self) -> tuple[int, ...]:
         """The leading axis: (n,) for the worlds of a batch, else ()."""
-        return () if self._index is not None or self.world.count is None else (self.world.count,)
+        return () if self.index is not None or self.world.count is None else (self.world.count,)
