@@ -59,7 +59,7 @@ def test_what_is_done_with_its_policy(trained, tmp_path):
     result = rlctl("replay", "--episodes", "1")
     assert result.returncode == 0, result.stderr
     episode = sorted(tmp_path.glob("runs/*/*/episodes/*.npz"))[0]
-    result = rlctl("replay", episode, "--verify")
+    result = rlctl("replay", "--verify", episode)
     assert result.returncode == 0, result.stderr
     result = rlctl("check-env", "stool.py:Stool")
     assert result.returncode == 0, result.stdout
