@@ -46,7 +46,17 @@ PROCESSES = {
         *("hindsight", "leaks"),
     ),
     "instances": (
-        *("instances", "unseeded", "worlds", "action effects", "hidden state", "nan action", "variants", "rendering"),
+        *(
+            "instances",
+            "unseeded",
+            "worlds",
+            "batches",
+            "action effects",
+            "hidden state",
+            "nan action",
+            "variants",
+            "rendering",
+        ),
     ),
 }
 """The experiments of each child process, in their order: what may crash the environment comes last."""
