@@ -201,8 +201,9 @@ class Players:
 
     def end_segment(self, worlds: Worlds) -> None:
         """Let the main process see the recurrent states."""
-        for world in worlds.tolist() if self._states is not None else ():
-            self._states[world] = self._single[world].state
+        if self._states is not None:
+            for world in worlds.tolist():
+                self._states[world] = self._single[world].state
 
     def begin_episodes(self, worlds: Worlds) -> None:
         """Forget the recurrent states."""

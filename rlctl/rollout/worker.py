@@ -162,7 +162,8 @@ class Worker:
         return left
 
     def _replay_worlds(self, batch: BatchEpisodes, message: messages.BeginEpisodes) -> list[int]:
-        left, episodes = [], dict(message.episodes)
+        left: list[int] = []
+        episodes = dict(message.episodes)
         while episodes:
             try:
                 return left + batch.replay(self._arrays, episodes)

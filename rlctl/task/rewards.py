@@ -43,7 +43,7 @@ def closeness(distance: Values, scale: float) -> Values:
 
 def arrival(distance: Values, tolerance: float) -> Values:
     """Return 1 where the distance is below `tolerance`, in the same unit, else 0."""
-    return _count(distance < tolerance)  # type: ignore[return-value]
+    return _count(distance < tolerance)
 
 
 def _count(flags: Any) -> PerWorld:
@@ -113,7 +113,7 @@ def _posture_of_many(orientations: Array) -> Array:
 
 def fallen(height: Values, lowest: float) -> Values:
     """Return 1 if `height` is below `lowest`, the smallest height of a standing robot, both [m], else 0."""
-    return _count(height < lowest)  # type: ignore[return-value]
+    return _count(height < lowest)
 
 
 def speed(velocity: Array) -> PerWorld:
@@ -123,7 +123,7 @@ def speed(velocity: Array) -> PerWorld:
     return math.sqrt(np.dot(velocity, velocity))
 
 
-def grasp(distance: Values, scale: float, held: Flags) -> Values:
+def grasp(distance: Any, scale: float, held: Flags) -> PerWorld:
     """Return 0.5 `closeness` to the object, plus 0.5 while it is held: in [0, 1]."""
     if isinstance(held, np.ndarray):
         return 0.5 * closeness(distance, scale) + 0.5 * held

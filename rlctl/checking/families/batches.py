@@ -25,7 +25,7 @@ Rows = NDArray[np.float64]
 
 
 @dataclasses.dataclass
-class Play:
+class PlayedWorlds:
     """What the worlds gave: observation, reward and whether the episode terminated, of the reset and of each step."""
 
     rows: list[Rows]  # shape (worlds, size + 2) each
@@ -34,7 +34,7 @@ class Play:
 
 @experiment("batches", "RL406", "RL407", "RL408", "RL409")
 def compare_worlds(context: Context) -> Iterator[ChildMessage]:
-    """Play a few steps with one world and with several, whose seeds and actions change."""
+    """PlayedWorlds a few steps with one world and with several, whose seeds and actions change."""
     with context.fresh() as instance:
         task = find_batch(instance.env)
         if task is None:
@@ -89,15 +89,15 @@ class _Worlds:
         first: NDArray[np.float32] = self._instance.call("reset", self.env.reset, np.array(worlds), seeds)
         return first
 
-    def play(self, others: int = 0, replaced: dict[str, Any] | None = None) -> Play:
-        """Play until an episode ends; `others` changes the seeds and actions of all worlds but the compared one.
+    def play(self, others: int = 0, replaced: dict[str, Any] | None = None) -> PlayedWorlds:
+        """PlayedWorlds until an episode ends; `others` changes the seeds and actions of all worlds but the compared one.
 
         `replaced` has attributes of the task to set after `LATER` steps.
         """
         numbers = [world if world == COMPARED else world + others for world in range(WORLDS)]
         actions = np.stack([_choose_actions(self.env._space, number) for number in numbers], axis=1)
         first = self.reset(range(WORLDS), [FIRST_SEED + number for number in numbers])
-        played = Play([np.hstack([first, np.zeros((WORLDS, 2))])], [self._read_attributes()])
+        played = PlayedWorlds([np.hstack([first, np.zeros((WORLDS, 2))])], [self._read_attributes()])
         for step, action in enumerate(actions, start=1):
             result = self._instance.call("step", self.env.step, action, step=step)
             played.rows.append(np.column_stack([result.observation, result.reward, result.terminated]))

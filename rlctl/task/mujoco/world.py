@@ -180,7 +180,8 @@ class MujocoWorld:
             model = self.batch.get_model(world) if is_moved else self.mj_model
             self.batch.get_data(world, self.mj_data)
             self.mujoco.mj_fwdPosition(model, self.mj_data)
-        return self.mj_data.contact.dist.copy()  # type: ignore[no-any-return]
+        distances: Array = self.mj_data.contact.dist.copy()
+        return distances
 
     def save(self) -> None:
         """Save the built world for `restore`, and make `count` copies of it."""
