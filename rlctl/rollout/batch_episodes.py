@@ -11,6 +11,7 @@ from rlctl.environments.dict_spaces import SINGLE
 from rlctl.errors import in_world
 from rlctl.policy.players.player import Player
 from rlctl.policy.rows import RowsPolicy
+from rlctl.printed_lines import print_line
 from rlctl.rollout import messages
 from rlctl.rollout.messages import EpisodeResult, FailedInEpisode
 from rlctl.rollout.seeds import list_training_seeds
@@ -51,8 +52,23 @@ class BatchEpisodes:
         inside[worlds, 1] = -1
         return first
 
-    def replay(self, arrays: SharedArrays, episodes: Mapping[int, tuple[int, NDArray[np.generic]]]) -> list[int]:
-        """Begin episodes and take their recorded actions in lockstep; return the environments whose episode ended."""
+    def replay(self, arrays: SharedArrays, asked: messages.BeginEpisodes) -> list[int]:
+        """Begin episodes and replay their actions; return the environments whose episode ended or failed."""
+        left: list[int] = []
+        episodes = dict(asked.episodes)
+        while episodes:
+            try:
+                return left + self._replay(arrays, episodes)
+            except FailedInEpisode as failure:
+                if not asked.may_fail:
+                    raise
+                del episodes[failure.where[0]]  # the others begin again, without this one
+                left.append(failure.where[0])
+                print_line(f"{failure} when it was replayed")
+        return left
+
+    def _replay(self, arrays: SharedArrays, episodes: Mapping[int, tuple[int, NDArray[np.generic]]]) -> list[int]:
+        """Take the recorded actions in lockstep; return the environments whose episode ended."""
         envs = np.array([*episodes], np.int64) - self._first
         self.begin(arrays, envs, [seed for seed, _ in episodes.values()])
         actions = {env - self._first: taken for env, (_, taken) in episodes.items()}

@@ -145,7 +145,7 @@ class Worker:
         """Begin episodes and replay their actions; return the environments whose episode ended or failed."""
         left = []
         if self._batch is not None:
-            return self._replay_worlds(self._batch, message)
+            return self._batch.replay(self._arrays, message)
         for env, (seed, actions) in message.episodes.items():
             episode = self._episodes[env - self._job.first]
             try:
@@ -158,20 +158,6 @@ class Worker:
                     raise
                 # It did not fail the first time, so its state differs now: the environment begins its next episode.
                 left.append(env)
-                print_line(f"{failure} when it was replayed")
-        return left
-
-    def _replay_worlds(self, batch: BatchEpisodes, message: messages.BeginEpisodes) -> list[int]:
-        left: list[int] = []
-        episodes = dict(message.episodes)
-        while episodes:
-            try:
-                return left + batch.replay(self._arrays, episodes)
-            except FailedInEpisode as failure:
-                if not message.may_fail:
-                    raise
-                del episodes[failure.where[0]]  # the others begin again, without this one
-                left.append(failure.where[0])
                 print_line(f"{failure} when it was replayed")
         return left
 

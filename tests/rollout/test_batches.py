@@ -215,3 +215,16 @@ def test_a_world_that_fails_when_it_is_replayed_is_left_out(start, capfd):
     still = np.zeros((5, 2), np.float32)
     left = workers.replay_actions({0: (4, still[:2]), 1: (5, still), 2: (6, still[:1])}, may_fail=True)
     assert left == {1}
+
+
+def test_limits_apply_in_every_world(start):
+    spec, seeds, episodes = EnvSpec(STOOL), list(range(4)), []
+    limits = {"joints": ["front_hip", "back_hip"], "limits": {"all": {"action": [-0.1, 0.1]}}}
+    for workers in (start(spec, 1), start(spec, 4, n_workers=2)):
+        workers.set_policy(linear(workers.info, WEIGHT))
+        workers.limit_actions(limits)
+        episodes.append(play_episodes(workers, seeds, record=True))
+    for alone, among in zip(*episodes, strict=True):
+        assert np.abs(among.trajectory.actions).max() <= 0.1 + 1e-6
+        assert among.result.report["interventions"]
+        assert among.result.report == alone.result.report

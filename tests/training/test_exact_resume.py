@@ -67,7 +67,7 @@ CASES = {
 # trainings of plain ppo and sac are in tests/crash.
 QUICK = {
     *("ppo with gSDE", "ppo, curriculum", "recurrent_ppo", "sac, hindsight, normalised"),
-    *("ppo, on worlds in batches", "recurrent_ppo, on worlds in batches"),
+    "ppo, on worlds in batches",
 }
 
 

@@ -34,7 +34,7 @@ class PlayedWorlds:
 
 @experiment("batches", "RL406", "RL407", "RL408", "RL409")
 def compare_worlds(context: Context) -> Iterator[ChildMessage]:
-    """PlayedWorlds a few steps with one world and with several, whose seeds and actions change."""
+    """Play a few steps with one world and with several, whose seeds and actions change."""
     with context.fresh() as instance:
         task = find_batch(instance.env)
         if task is None:
@@ -90,7 +90,7 @@ class _Worlds:
         return first
 
     def play(self, others: int = 0, replaced: dict[str, Any] | None = None) -> PlayedWorlds:
-        """PlayedWorlds until an episode ends; `others` changes the seeds and actions of all worlds but the compared one.
+        """Play until an episode ends; `others` changes the seeds and actions of all worlds but the compared one.
 
         `replaced` has attributes of the task to set after `LATER` steps.
         """
