@@ -139,13 +139,13 @@ def _is_success(self: OneWorld) -> bool:
     return bool(read_rows(self._name, "is_success()", self.batch.is_success(), (1,), bool)[0])
 
 
-def read_rows(task: str, where: str, value: Any, shape: Sequence[int | None], dtype: type) -> NDArray[Any]:
+def read_rows(task: str, where: str, value: Any, shape: tuple[int | None, ...], dtype: type) -> NDArray[Any]:
     """Return what a method of a `BatchTask` returned as an array; raises `ShapeError` unless it has a row per world.
 
-    None in `shape` is any size. Numbers are converted to `dtype`; flags must be `bool`.
+    None in `shape`, after the first axis, is any size. Numbers are converted to `dtype`; flags must be `bool`.
     """
     array = np.asarray(value)
-    fits = array.ndim == len(shape) and all(size in (None, got) for got, size in zip(array.shape, shape, strict=True))
+    fits = array.shape == shape or (None in shape and array.ndim == len(shape) and len(array) == shape[0])
     if not fits or array.dtype.kind not in ("b" if dtype is bool else "fiub"):
         sizes = ", ".join("size" if size is None else str(size) for size in shape) + ("," if len(shape) == 1 else "")
         what = "bool" if dtype is bool else "numbers"
