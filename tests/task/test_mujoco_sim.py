@@ -171,6 +171,6 @@ def test_no_picture_without_a_display(monkeypatch):
         monkeypatch.delenv(name, raising=False)
     sim = MujocoSim(control_dt=1 / 60, substeps=4)
     for _ in range(2):  # MuJoCo itself ends the process the second time
-        with pytest.raises(UsageError, match="^MuJoCo cannot draw: there is no display") as caught:
+        with pytest.raises(UsageError, match=r"^MuJoCo cannot draw: there is no display") as caught:
             sim.render()
         assert "MUJOCO_GL=egl" in str(caught.value)

@@ -95,7 +95,7 @@ class _Worlds:
         `replaced` has attributes of the task to set after `LATER` steps.
         """
         numbers = [world if world == COMPARED else world + others for world in range(WORLDS)]
-        actions = np.stack([_choose_actions(self.env._space, number) for number in numbers], axis=1)
+        actions = np.stack([_choose_actions(self.env.task.action_space, number) for number in numbers], axis=1)
         first = self.reset(range(WORLDS), [FIRST_SEED + number for number in numbers])
         played = PlayedWorlds([np.hstack([first, np.zeros((WORLDS, 2))])], [self._read_attributes()])
         for step, action in enumerate(actions, start=1):
