@@ -1,11 +1,12 @@
 """The exceptions of rlctl, with their exit codes, and helpers for their messages."""
 
+import contextlib
 import difflib
 import importlib
 import re
 import shlex
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,21 @@ class WorldFailed(TaskError):
 
 class NoDisplayError(TaskError):
     """The environment opens a window, and there is no display."""
+
+
+class ShapeError(TaskError):
+    """A method of a `BatchTask` did not return a row per world."""
+
+
+@contextlib.contextmanager
+def in_world(world: int) -> Iterator[None]:
+    """Note in any exception which of the worlds that are simulated together it is about, as `WorldFailed.world`."""
+    try:
+        yield
+    except Exception as error:
+        if not hasattr(error, "world"):
+            error.world = world  # type: ignore[attr-defined]
+        raise
 
 
 class PolicyError(TaskError):

@@ -142,8 +142,16 @@ NO_GENERATORS = {id(np.random.mtrand._rand), id(random._inst)}  # of the whole p
 
 def find_author(env: Any) -> Any:
     """Return the object whose class the environment's author wrote: not rlctl's environment of a task, but the task."""
-    inner = getattr(env, "unwrapped", env)
-    return inner.task if is_task(env) else inner
+    if not is_task(env):
+        return getattr(env, "unwrapped", env)
+    return find_batch(env) or env.unwrapped.task
+
+
+def find_batch(env: Any) -> Any:
+    """Return the `BatchTask` of an environment; None for any other."""
+    batches = sys.modules.get("rlctl.task.batch")
+    task = env.unwrapped.task if is_task(env) else None
+    return task.batch if batches is not None and isinstance(task, batches.OneWorld) else None
 
 
 def is_task(env: Any) -> bool:

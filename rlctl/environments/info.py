@@ -96,7 +96,8 @@ def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.Mj
     library, inner = sys.modules.get("mujoco"), getattr(env, "unwrapped", env)
     if library is None:
         return None
-    world = getattr(inner, "sim", None) if type(getattr(inner, "sim", None)).__name__ == "MujocoSim" else inner
+    sim = getattr(inner, "sim", None)
+    world = sim if "MujocoSim" in {cls.__name__ for cls in type(sim).__mro__} else inner
     model, data = (getattr(world, name, None) for name in ("model", "data"))
     if not isinstance(model, library.MjModel) or not isinstance(data, library.MjData):
         return None

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.errors import DivergedError, short_repr
+from rlctl.errors import DivergedError, in_world, short_repr
 from rlctl.policy.file import DETERMINISTIC, PolicyFile
 from rlctl.policy.layers import Activation, Array, Flatten, Linear, Normalize
 from rlctl.policy.network import Network
@@ -75,7 +75,8 @@ class RowsPolicy:
             value = value + self._network._std * self._draw(seeds, steps, rows)
         if not np.isfinite(value.sum()):
             bad = int((~np.isfinite(value)).any(axis=1).argmax())
-            raise DivergedError(f"the policy's action is not finite: {short_repr(value[bad].tolist())}")
+            with in_world(int(rows[bad])):
+                raise DivergedError(f"the policy's action is not finite: {short_repr(value[bad].tolist())}")
         action = np.minimum(np.maximum(value, self._low), self._high).astype(self._space.dtype, copy=False)
         return value, action.reshape(len(rows), *self._space.shape)  # type: ignore[misc]
 

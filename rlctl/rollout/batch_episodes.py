@@ -1,7 +1,6 @@
 """The worlds of a `BatchTask` in a worker: they play their segments in lockstep, with one forward pass per step."""
 
-import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from time import perf_counter
 from typing import Any, NoReturn
 
@@ -9,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import SINGLE
-from rlctl.errors import WorldFailed
+from rlctl.errors import in_world
 from rlctl.policy.players.player import Player
 from rlctl.policy.rows import RowsPolicy
+from rlctl.printed_lines import print_line
 from rlctl.rollout import messages
 from rlctl.rollout.messages import EpisodeResult, FailedInEpisode
-from rlctl.rollout.seeds import Stream, episode_seed
+from rlctl.rollout.seeds import list_training_seeds
 from rlctl.rollout.shared_arrays import SharedArrays
 from rlctl.task.batch_env import BatchEnv, BatchStep
 
@@ -30,7 +30,7 @@ class BatchEpisodes:
         self.seeds = np.full(count, -1, np.int64)
         self._return, self._time = np.zeros(count), np.zeros((count, 2))  # of policy and environment [s]
         self._sums = np.zeros((count, len(env.weights)))
-        self._observation: NDArray[np.float32] | None = None
+        self._deepest = np.full(count, np.nan)  # how far bodies overlapped at most [m]; NaN: it was not measured
         self._weights = np.array([*env.weights.values()])
 
     def begin(self, arrays: SharedArrays, worlds: Worlds, seeds: Sequence[int]) -> NDArray[np.float32]:
@@ -39,6 +39,7 @@ class BatchEpisodes:
         self._return[worlds] = 0.0
         self._sums[worlds] = 0.0
         self._time[worlds] = 0.0
+        self._deepest[worlds] = np.nan
         inside = arrays.inside[self._first : self._first + self.env.worlds]
         inside[worlds] = np.stack(
             [self.seeds[worlds], np.zeros(len(worlds), np.int64), np.full(len(worlds), -1)], axis=1
@@ -51,8 +52,23 @@ class BatchEpisodes:
         inside[worlds, 1] = -1
         return first
 
-    def replay(self, arrays: SharedArrays, episodes: Mapping[int, tuple[int, NDArray[np.generic]]]) -> list[int]:
-        """Begin episodes and take their recorded actions in lockstep; return the environments whose episode ended."""
+    def replay(self, arrays: SharedArrays, asked: messages.BeginEpisodes) -> list[int]:
+        """Begin episodes and replay their actions; return the environments whose episode ended or failed."""
+        left: list[int] = []
+        episodes = dict(asked.episodes)
+        while episodes:
+            try:
+                return left + self._replay(arrays, episodes)
+            except FailedInEpisode as failure:
+                if not asked.may_fail:
+                    raise
+                del episodes[failure.where[0]]  # the others begin again, without this one
+                left.append(failure.where[0])
+                print_line(f"{failure} when it was replayed")
+        return left
+
+    def _replay(self, arrays: SharedArrays, episodes: Mapping[int, tuple[int, NDArray[np.generic]]]) -> list[int]:
+        """Take the recorded actions in lockstep; return the environments whose episode ended."""
         envs = np.array([*episodes], np.int64) - self._first
         self.begin(arrays, envs, [seed for seed, _ in episodes.values()])
         actions = {env - self._first: taken for env, (_, taken) in episodes.items()}
@@ -79,7 +95,7 @@ class BatchEpisodes:
         return result
 
     def _fail(self, error: BaseException, world: int) -> NoReturn:
-        world = error.world if isinstance(error, WorldFailed) else world
+        world = getattr(error, "world", world)  # of `WorldFailed` and `in_world`
         raise FailedInEpisode(self._first + world, int(self.seeds[world]), int(self.env.step_of[world])) from error
 
     def play(self, arrays: SharedArrays, asked: messages.Play, players: "Players") -> list[EpisodeResult]:
@@ -90,7 +106,10 @@ class BatchEpisodes:
         if new.any():
             self.begin(arrays, worlds[new], [seed for seed in seeds if seed >= 0])
             players.begin_episodes(worlds[new])
-        following = {env: _list_seeds(asked.run_seed, env, number) for env, number in asked.next_episodes.items()}
+        played = worlds
+        following = {
+            env: list_training_seeds(asked.run_seed, env, number) for env, number in asked.next_episodes.items()
+        }
         segment, now = arrays.segment, arrays.segment.observation[SINGLE]
         now[envs, 0] = arrays.observation[SINGLE][envs]
         inside = arrays.inside
@@ -99,7 +118,7 @@ class BatchEpisodes:
         ended: list[EpisodeResult] = []
         for row in range(asked.steps):
             began = perf_counter()
-            stored, action = players.act(now[envs, row], self.seeds[worlds], self.env.step_of[worlds], worlds)
+            stored, action = self._choose(players, now[envs, row], worlds)
             acted = perf_counter()
             segment.stored[envs, row], segment.action[envs, row] = stored, action
             inside[envs, 1], inside[envs, 2] = self.env.step_of[worlds] + 1, row
@@ -110,9 +129,12 @@ class BatchEpisodes:
             if asked.record:
                 segment.terms[envs, row] = result.terms
             now[envs, row + 1] = result.observation
+            self._measure_contacts(worlds[np.isin(envs, asked.contacts)])
             done = result.terminated | result.truncated
             if done.any():
-                ended += [self._summarize(int(k), int(worlds[k]), row, result) for k in np.flatnonzero(done)]
+                for k in np.flatnonzero(done).tolist():
+                    world = int(worlds[k])
+                    ended.append(self._summarize(k, world, row, result, players.report(world)))
                 segment.final[SINGLE][envs[done], row] = result.observation[done]
                 if following:
                     fresh = [next(following[int(env)]) for env in envs[done]]
@@ -125,9 +147,24 @@ class BatchEpisodes:
                         break
         arrays.observation[SINGLE][envs] = now[envs, asked.steps]
         inside[self._first : self._first + self.env.worlds, 1] = -1
-        return ended
+        players.end_segment(played)
+        return sorted(
+            ended, key=lambda result: result.env
+        )  # in the order of environments that play one after the other
 
-    def _summarize(self, k: int, world: int, row: int, result: BatchStep) -> EpisodeResult:
+    def _choose(
+        self, players: "Players", observations: NDArray[Any], worlds: Worlds
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        try:
+            return players.act(observations, self.seeds[worlds], self.env.step_of[worlds], worlds)
+        except BaseException as error:  # a user's function may raise anything, SystemExit too
+            self._fail(error, int(worlds[0]))
+
+    def _measure_contacts(self, worlds: Worlds) -> None:
+        for world in worlds.tolist():
+            self._deepest[world] = np.fmax(self._deepest[world], self.env.sim.one(world).deepest_contact)
+
+    def _summarize(self, k: int, world: int, row: int, result: BatchStep, report: dict[str, Any]) -> EpisodeResult:
         steps, sums = int(self.env.step_of[world]), self._sums[world]
         names = list(self.env.weights)
         acting, stepping = self._time[world].tolist()
@@ -141,6 +178,8 @@ class BatchEpisodes:
             dict(zip(names, (sums * self._weights).tolist(), strict=True)),
             last.get("distance"),
             row,
+            report,
+            None if np.isnan(self._deepest[world]) else float(self._deepest[world]),
             acting=acting / max(acting + stepping, 1e-9),
             metrics={name: float(sums[index]) / steps for index, name in enumerate(names) if not self._weights[index]},
         )
@@ -153,8 +192,11 @@ class BatchEpisodes:
 class Players:
     """What chooses the actions of the worlds: one pass for all rows, or a player per world where there is none."""
 
-    def __init__(self, rows: RowsPolicy | None, single: Sequence[Player]) -> None:
+    def __init__(
+        self, rows: RowsPolicy | None, single: Sequence[Player] = (), states: NDArray[np.float32] | None = None
+    ) -> None:
         self._rows, self._single = rows, single
+        self._states = states  # recurrent states that the main process sees, shape (worlds, 2, layers, hidden)
         self._exploration: Any = None
 
     def explore(self, exploration: Any) -> None:
@@ -168,7 +210,16 @@ class Players:
         if self._rows is not None:
             self._rows.begin_segment()
         for world in worlds.tolist() if self._single else ():
-            self._single[world].begin_segment(int(seeds[world]), int(steps[world]))
+            player = self._single[world]
+            if player.state is not None and self._states is not None:
+                player.state[:] = self._states[world]
+            player.begin_segment(int(seeds[world]), int(steps[world]))
+
+    def end_segment(self, worlds: Worlds) -> None:
+        """Let the main process see the recurrent states."""
+        if self._states is not None:
+            for world in worlds.tolist():
+                self._states[world] = self._single[world].state
 
     def begin_episodes(self, worlds: Worlds) -> None:
         """Forget the recurrent states."""
@@ -176,6 +227,12 @@ class Players:
             state = self._single[world].state
             if state is not None:
                 state[:] = 0.0
+            if self._states is not None:
+                self._states[world] = 0.0
+
+    def report(self, world: int) -> dict[str, Any]:
+        """Return the player's report of the episode that ended in a world."""
+        return self._single[world].report() if self._single else {}
 
     def act(
         self, observations: NDArray[Any], seeds: Worlds, steps: Worlds, worlds: Worlds
@@ -183,19 +240,13 @@ class Players:
         """Return the actions to store, shape (k, elements), and those for the environments, shape (k, ...)."""
         if self._rows is not None:
             return self._rows.act(observations, seeds, steps, worlds, self._exploration)
-        chosen = [
-            self._single[world].act(observation, seed, step)
-            for world, observation, seed, step in zip(
-                worlds.tolist(), observations, seeds.tolist(), steps.tolist(), strict=True
-            )
-        ]
+        chosen = []
+        for row, world in enumerate(worlds.tolist()):
+            with in_world(world):
+                chosen.append(self._single[world].act(observations[row], int(seeds[row]), int(steps[row])))
         return np.stack([np.ravel(stored) for stored, _ in chosen]), np.stack([action for _, action in chosen])
 
     def close(self) -> None:
         """Release resources."""
         for player in self._single:
             player.close()
-
-
-def _list_seeds(run_seed: int, env: int, first: int) -> Iterator[int]:
-    return (episode_seed(run_seed, Stream.TRAIN, env, number) for number in itertools.count(first))

@@ -80,7 +80,7 @@ def play_episodes(
             elif waiting:
                 index, begin[env] = waiting.pop()
                 running[env] = _Recorder(index, record)
-        contacts = terms and any(running[env].index < _CONTACTS_MEASURED for env in begin)
+        contacts = [env for env in begin if terms and running[env].index < _CONTACTS_MEASURED]
         if begin:
             workers.start_playing(Play(steps, begin, exploration=exploration, record=terms, contacts=contacts))
 

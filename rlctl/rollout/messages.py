@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from rlctl import errors
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import EpisodeFailed, RlctlError, TaskError, describe_exception, format_plugin_traceback
+from rlctl.errors import (
+    EpisodeFailed,
+    RlctlError,
+    ShapeError,
+    TaskError,
+    WorldFailed,
+    describe_exception,
+    format_plugin_traceback,
+)
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.players.player import Exploration
 from rlctl.processes.pool import WorkerException
@@ -85,7 +93,7 @@ class Play:
     run_seed: int = 0
     exploration: Exploration = dataclasses.field(default_factory=Exploration)
     record: bool = False  # whether to write reward terms
-    contacts: bool = False  # whether to measure after every step how far bodies of a task overlap
+    contacts: Sequence[int] = ()  # the environments in which to measure after every step how far bodies overlap
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,7 +166,9 @@ def describe_failure(error: BaseException) -> WorkerException:
     if isinstance(error, FailedInEpisode):
         where, error = error.where, error.__cause__ or error
     if isinstance(error, RlctlError):
-        return WorkerException(str(error), type(error).__name__, error.details, where)
+        # What is wrong with a row is known here: to the main process it is a task that failed.
+        kind = TaskError if isinstance(error, WorldFailed | ShapeError) else type(error)
+        return WorkerException(str(error), kind.__name__, error.details, where)
     return WorkerException(describe_exception(error), "", format_plugin_traceback(error) or None, where)
 
 

@@ -1,6 +1,8 @@
 """Episode addresses: (run seed, stream, environment, episode) determines the seed of every episode."""
 
 import enum
+import itertools
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -21,6 +23,11 @@ def episode_seed(run_seed: int, stream: Stream, env_index: int, episode: int) ->
     sequence = np.random.SeedSequence(run_seed, spawn_key=(int(stream), env_index, episode))
     # Some environments pass the seed to a generator that takes signed 32-bit numbers.
     return int(sequence.generate_state(1)[0]) >> 1
+
+
+def list_training_seeds(run_seed: int, env_index: int, first: int) -> Iterator[int]:
+    """Return the seeds of an environment's training episodes from number `first` on, without end."""
+    return (episode_seed(run_seed, Stream.TRAIN, env_index, number) for number in itertools.count(first))
 
 
 def episode_seeds(run_seed: int, stream: Stream, episodes: int) -> list[int]:

@@ -6,8 +6,7 @@ policy's parameters are in shared memory.
 
 import contextlib
 import gc
-import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from time import perf_counter
 from typing import Any
@@ -32,7 +31,7 @@ from rlctl.rollout import messages
 from rlctl.rollout.batch_episodes import BatchEpisodes, Players
 from rlctl.rollout.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
 from rlctl.rollout.running_episode import ObservationWriter, RunningEpisode, compute_rewards
-from rlctl.rollout.seeds import Stream, episode_seed
+from rlctl.rollout.seeds import list_training_seeds
 from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
 from rlctl.rollout.shared_world import make_watched
 from rlctl.task.env import TaskEnv
@@ -49,6 +48,7 @@ class Worker:
         self._batch: BatchEpisodes | None = None
         """The worlds of a `BatchTask`; then `_episodes` has one environment that only describes them."""
         self._players: Players | None = None
+        self._make_player: Callable[[], Player]
         self._states: NDArray[np.float32] | None = None
         self._info: EnvInfo
         self._arrays: SharedArrays
@@ -117,28 +117,30 @@ class Worker:
 
     def _load_policy(self, message: messages.LoadPolicy) -> None:
         self._states = None
-        self._close_player()
-        if message.info is None:
-            self._player = make_player_of(message.other, self._episodes[0].env)
-            if self._batch is not None:
-                env = self._episodes[0].env
-                self._players = Players(None, [make_player_of(message.other, env) for _ in range(self._job.count)])
-        else:
+        policy: PolicyFile | None = None
+        if message.info is not None:
             layout = {name: (shape, np.dtype(dtype)) for name, shape, dtype in message.layout}
             tensors = map_arrays(self._job.numbers, layout)
             self._states = tensors.pop("state", None)
             policy = PolicyFile(message.info, tensors)
-            self._player = PolicyPlayer(policy)
-            if self._batch is not None and RowsPolicy.supports(policy):
-                self._players = Players(RowsPolicy(policy, self._job.count), [])
-            elif self._batch is not None:
-                self._players = Players(None, [PolicyPlayer(policy) for _ in range(self._job.count)])
+        env, other = self._episodes[0].env, message.other
+        self._set_players(lambda: make_player_of(other, env) if policy is None else PolicyPlayer(policy), policy)
+
+    def _set_players(self, make: Callable[[], Player], policy: PolicyFile | None = None) -> None:
+        self._close_player()
+        self._make_player, self._player = make, make()
+        if self._batch is not None and policy is not None and RowsPolicy.supports(policy):
+            self._players = Players(RowsPolicy(policy, self._job.count))
+        elif self._batch is not None:
+            own = None if self._states is None else self._states[self._job.first :]
+            self._players = Players(None, [make() for _ in range(self._job.count)], own)
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
         from rlctl.deploy.filter.limited_player import LimitedPlayer  # few evaluations need it
         from rlctl.deploy.filter.limits import Limits
 
-        self._player = LimitedPlayer(self._loaded_player, self._info, Limits.model_validate(message.limits))
+        make, limits = self._make_player, Limits.model_validate(message.limits)
+        self._set_players(lambda: LimitedPlayer(make(), self._info, limits))
 
     @property
     def _loaded_player(self) -> Player:
@@ -149,7 +151,7 @@ class Worker:
         """Begin episodes and replay their actions; return the environments whose episode ended or failed."""
         left = []
         if self._batch is not None:
-            return self._batch.replay(self._arrays, message.episodes)
+            return self._batch.replay(self._arrays, message)
         for env, (seed, actions) in message.episodes.items():
             episode = self._episodes[env - self._job.first]
             try:
@@ -191,7 +193,7 @@ class Worker:
         for env, seed in message.begin.items():
             episode = self._episodes[env - self._job.first]
             number = message.next_episodes.get(env)
-            next_seeds = None if number is None else _list_training_seeds(message.run_seed, env, number)
+            next_seeds = None if number is None else list_training_seeds(message.run_seed, env, number)
             with self._within(episode):
                 if seed >= 0:
                     self._begin(episode, seed)
@@ -233,7 +235,7 @@ class Worker:
             segment.terminated[row], segment.truncated[row] = terminated, truncated
             if asked.record:
                 segment.terms[row] = list(info["metrics"].values())
-            if asked.contacts:
+            if index in asked.contacts:
                 episode.measure_contact()
             row += 1
             if terminated or truncated:
@@ -279,10 +281,6 @@ class Worker:
         if self._batch is not None:
             self._batch.close()
         self._batch = None
-
-
-def _list_training_seeds(run_seed: int, env: int, first: int) -> Iterator[int]:
-    return (episode_seed(run_seed, Stream.TRAIN, env, number) for number in itertools.count(first))
 
 
 def make_player_of(name: str, env: Any) -> Player:

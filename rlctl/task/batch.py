@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError
+from rlctl.errors import ShapeError, TaskError
 from rlctl.task.joints import Joints
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, TaskDefinition
@@ -106,35 +106,69 @@ class OneWorld(Task):
         self.batch.act(np.asarray(action)[None])
 
     def observe(self) -> dict[str, NDArray[np.float64]]:
-        return {name: values[0] for name, values in self.batch.observe().items()}
+        return self._read("observe", self.batch.observe(), 2)
 
     def rewards(self, action: NDArray[Any]) -> dict[str, float]:
-        return {name: float(values[0]) for name, values in self.batch.rewards(np.asarray(action)[None]).items()}
+        terms = self._read("rewards", self.batch.rewards(np.asarray(action)[None]), 1)
+        return {name: float(value) for name, value in terms.items()} if isinstance(terms, dict) else terms
 
     def is_terminated(self) -> bool:
-        return bool(self.batch.is_terminated()[0])
+        return bool(read_rows(self._name, "is_terminated()", self.batch.is_terminated(), (1,), bool)[0])
 
     def markers(self) -> dict[str, NDArray[np.float64]]:
-        return {name: positions[0] for name, positions in self.batch.markers().items()}
+        return self._read("markers", self.batch.markers(), 2)
+
+    @property
+    def _name(self) -> str:
+        return type(self).__name__
+
+    def _read(self, method: str, values: Any, axes: int) -> Any:
+        """Return the row of each array; what is not a dict is left to `TaskEnv`."""
+        if not isinstance(values, dict):
+            return values
+        return {
+            name: read_rows(self._name, f"{method}()[{name!r}]", value, (1, None)[:axes], np.float64)[0]
+            for name, value in values.items()
+        }
 
     def describe_joints(self) -> Joints | None:
         return self.batch.describe_joints()
 
 
-def _base(method: str) -> Any:
-    return getattr(BatchTask, method)
+def _is_success(self: OneWorld) -> bool:
+    return bool(read_rows(self._name, "is_success()", self.batch.is_success(), (1,), bool)[0])
+
+
+def read_rows(task: str, where: str, value: Any, shape: tuple[int | None, ...], dtype: type) -> NDArray[Any]:
+    """Return what a method of a `BatchTask` returned as an array; raises `ShapeError` unless it has a row per world.
+
+    None in `shape`, after the first axis, is any size. Numbers are converted to `dtype`; flags must be `bool`.
+    """
+    array = np.asarray(value)
+    fits = array.shape == shape or (None in shape and array.ndim == len(shape) and len(array) == shape[0])
+    if not fits or array.dtype.kind not in ("b" if dtype is bool else "fiub"):
+        sizes = ", ".join("size" if size is None else str(size) for size in shape) + ("," if len(shape) == 1 else "")
+        what = "bool" if dtype is bool else "numbers"
+        raise ShapeError(
+            f"{task}: {where} is an array of {array.dtype} of shape {array.shape}, expected {what} of shape ({sizes}): "
+            "a row per world"
+        )
+    return array.astype(dtype, copy=False)
 
 
 def as_single(task: Task | BatchTask) -> Task:
     """Return a task for one world: a `BatchTask` without its leading axis, any other as it is."""
     if not isinstance(task, BatchTask):
         return task
-    missing = [name for name in ("build", "act", "observe", "rewards") if getattr(type(task), name) is _base(name)]
+    required = ("build", "act", "observe", "rewards")
+    missing = [f"{name}()" for name in required if getattr(type(task), name) is getattr(BatchTask, name)]
     if missing:
-        raise TaskError(f"{type(task).__name__} does not define {', '.join(f'{name}()' for name in missing)}")
+        raise TaskError(
+            f"{type(task).__name__} does not define {', '.join(missing)}; a task needs {', '.join(required)}"
+        )
     values = {name: getattr(task, name) for name in TaskDefinition.__annotations__ if hasattr(task, name)}
     if type(task).is_success is not BatchTask.is_success:
-        values["is_success"] = lambda self: bool(self.batch.is_success()[0])
+        values["is_success"] = _is_success
     single: Task = type(type(task).__name__, (OneWorld,), values | {"__doc__": type(task).__doc__})()
     single.batch = task  # type: ignore[attr-defined]
     return single

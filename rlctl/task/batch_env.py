@@ -1,17 +1,19 @@
 """`BatchEnv`: n worlds of a `BatchTask`, stepped together; the same episodes as of one world at a time."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+import contextlib
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, WorldFailed, short_repr
-from rlctl.task.batch import BatchTask, WorldRngs
+from rlctl.errors import TaskError, WorldFailed, in_world, short_repr
+from rlctl.task.batch import BatchTask, WorldRngs, read_rows
 from rlctl.task.env import TaskEnv
-from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
+from rlctl.task.events.acting import ActingEvents, Streams, seed_streams
+from rlctl.task.events.batch_signals import BatchSignals
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 
 Array = NDArray[np.float64]
@@ -50,6 +52,7 @@ class BatchEnv:
         self.sim = MujocoSim(
             control_dt=task.control_dt, substeps=task.substeps, solref=solref, iterations=iterations, worlds=worlds
         )
+        self._all = np.arange(worlds)
         self.step_of = np.zeros(worlds, np.int64)
         """Steps since the start of each world's episode."""
         self._streams: list[Streams] = [{} for _ in range(worlds)]
@@ -68,11 +71,11 @@ class BatchEnv:
         self._single = single
         self._events = single.events
         self._acting = ActingEvents(self._events, self.task.control_dt)
-        make = (self._events, single._first, self._space, self.task.observation_bounds)
-        self._signals = [Signals(*make) for _ in range(self.worlds)] if self._has_signals() else []
-
-    def _has_signals(self) -> bool:
-        return any(event.event.when in ("observation", "action") for event in self._events.values())
+        self._signals: BatchSignals | None = None
+        if any(event.event.when in ("observation", "action") for event in self._events.values()):
+            assert isinstance(self._space, spaces.Box)
+            bounds = self.task.observation_bounds
+            self._signals = BatchSignals(self.worlds, self._events, single._first, self._space, bounds)
 
     def reset(self, worlds: Worlds, seeds: Sequence[int]) -> NDArray[np.float32]:
         """Begin the episodes of `seeds` in `worlds`; return their first observations, shape (k, size)."""
@@ -80,35 +83,40 @@ class BatchEnv:
         self.step_of[worlds] = 0
         generators = [np_random(int(seed))[0] for seed in seeds]
         level = self._single.level
+        self._levels[worlds] = level
         for world, seed in zip(worlds.tolist(), seeds, strict=True):
-            if self._events:
-                self._streams[world] = seed_streams(self._events, int(seed))
-                self._acting.run("reset", self.sim.one(world), self._streams[world], level)
-            self._levels[world] = level
+            self._streams[world] = seed_streams(self._events, int(seed))
+            self._act("reset", world)
         self.task.clear_kept(worlds)
         self.task.reset(WorldRngs(generators), worlds)
-        self._check_kept("reset")
         for world in worlds.tolist():
-            if self._events:
-                self._acting.run("start", self.sim.one(world), self._streams[world], level)
-            if self._signals:
-                self._signals[world].begin(self._streams[world], level)
-        return self._observe(worlds)
+            self._act("start", world)
+            if self._signals is not None:
+                self._signals.begin(world, self._streams[world], level)
+        with self._leave_others(worlds):
+            observation = self._observe(worlds)
+            self._check_kept("reset")
+        return observation
+
+    def _act(self, when: Literal["reset", "start"], world: int) -> None:
+        if self._events:
+            with in_world(world):
+                self._acting.run(when, self.sim.one(world), self._streams[world], float(self._levels[world]))
 
     def step(self, action: NDArray[Any], worlds: Worlds | None = None) -> BatchStep:
         """Advance all worlds, or some, by a control step; `action` has a row for each of them, shape (k, ...)."""
-        rows = np.arange(self.worlds) if worlds is None else worlds
-        chosen = self._check_action(action, rows)
-        kept = None if worlds is None else self._copy_kept()
-        acting = chosen
-        if self._signals:
-            acting = np.stack([self._signals[world].act(chosen[k]) for k, world in enumerate(rows.tolist())])
-        self.task.act(acting if worlds is None else self._spread(acting, worlds))
-        self.sim.step(worlds)
+        rows = self._all if worlds is None else worlds
         self.step_of[rows] += 1
+        chosen = self._check_action(action, rows)
+        with self._leave_others(rows):
+            return self._step(chosen, rows)
+
+    def _step(self, chosen: NDArray[Any], rows: Worlds) -> BatchStep:
+        self.task.act(self._spread(chosen if self._signals is None else self._signals.act(chosen, rows), rows))
+        self.sim.step(None if rows is self._all else rows)
         terminated = self._read_flags("is_terminated")[rows]
         truncated = ~terminated & (self.step_of[rows] >= self.max_steps)
-        terms = self._read_terms(chosen if worlds is None else self._spread(chosen, worlds))[rows]
+        terms = self._read_terms(self._spread(chosen, rows))[rows]
         reward = np.zeros(len(rows))
         for index, weight in enumerate(self.weights.values()):  # in the order of `TaskEnv`, for the same last bits
             reward += weight * terms[:, index]
@@ -117,24 +125,29 @@ class BatchEnv:
         success = self._read_flags("is_success")[rows] if self.has_success else None
         observation = self._observe(rows)
         self._check_kept("a step")
-        if kept is not None:
-            self._restore_kept(kept, rows)
         return BatchStep(observation, reward, terminated, truncated, terms, success)
 
     def _spread(self, values: NDArray[Any], worlds: Worlds) -> NDArray[Any]:
+        if worlds is self._all:
+            return values
         full = np.zeros((self.worlds, *values.shape[1:]), values.dtype)
         full[worlds] = values
         return full
 
-    def _copy_kept(self) -> dict[str, Array]:
-        return {name: getattr(self.task, name).copy() for name in self.task.per_world}
-
-    def _restore_kept(self, kept: Mapping[str, Array], stepped: Worlds) -> None:
-        # The task's methods see all worlds, and may have changed what it keeps for those that did not move.
-        still = np.ones(self.worlds, bool)
-        still[stepped] = False
+    @contextlib.contextmanager
+    def _leave_others(self, worlds: Worlds) -> Iterator[None]:
+        """Take back what the task's methods, which see all worlds, change in the others than `worlds`."""
+        if len(worlds) == self.worlds:
+            yield
+            return
+        others = np.ones(self.worlds, bool)
+        others[worlds] = False
+        state = self.sim.world.batch.state
+        saved, kept = state[others], {name: getattr(self.task, name)[others] for name in self.task.per_world}
+        yield
+        state[others] = saved
         for name, values in kept.items():
-            getattr(self.task, name)[still] = values[still]
+            getattr(self.task, name)[others] = values
 
     def _check_kept(self, when: str) -> None:
         for name, shape in self.task.per_world.items():
@@ -161,12 +174,7 @@ class BatchEnv:
         raise WorldFailed(f"{self.name}: {message} at step {self.step_of[world]}", int(world))
 
     def _read_flags(self, method: str) -> NDArray[np.bool_]:
-        flags = np.asarray(getattr(self.task, method)())
-        if flags.shape != (self.worlds,) or flags.dtype != bool:
-            raise TaskError(
-                f"{self.name}: {method}() returned {_describe(flags)}, expected bool of shape ({self.worlds},)"
-            )
-        return flags
+        return read_rows(self.name, f"{method}()", getattr(self.task, method)(), (self.worlds,), bool)
 
     def _read_terms(self, action: NDArray[Any]) -> Array:
         raw = self.task.rewards(action)
@@ -176,13 +184,7 @@ class BatchEnv:
             )
         terms = np.empty((self.worlds, len(self.weights)))
         for index, name in enumerate(self.weights):
-            value = np.asarray(raw[name])
-            if value.shape != (self.worlds,) or value.dtype.kind not in "fiub":
-                raise TaskError(
-                    f"{self.name}: rewards()[{name!r}] is {_describe(value)}, expected a number per world: shape "
-                    f"({self.worlds},)"
-                )
-            terms[:, index] = value
+            terms[:, index] = read_rows(self.name, f"rewards()[{name!r}]", raw[name], (self.worlds,), np.float64)
         return terms
 
     def _check_finite(self, reward: Array, terms: Array, rows: Worlds) -> None:
@@ -198,22 +200,19 @@ class BatchEnv:
         due = np.any([self.step_of[rows] % period == 0 for period in set(self._acting.periods)], axis=0)
         for world in rows[due].tolist():
             step, level = int(self.step_of[world]), float(self._levels[world])
-            self._acting.run_due(step, self.sim.one(world), self._streams[world], level)
+            with in_world(world):
+                self._acting.run_due(step, self.sim.one(world), self._streams[world], level)
 
     def _observe(self, rows: Worlds) -> NDArray[np.float32]:
         parts = self.task.observe()
         if not isinstance(parts, dict) or list(parts) != self._names:
             raise TaskError(f"{self.name}: observe() returned {short_repr(list(parts))}, at first {self._names}")
-        for name, size in zip(self._names, self._sizes, strict=True):
-            part = np.asarray(parts[name])
-            if part.shape != (self.worlds, size):
-                raise TaskError(
-                    f"{self.name}: observation {name!r} is {_describe(part)}, expected shape {(self.worlds, size)}"
-                )
-        if self._signals:
-            values = self._disturb(parts, rows)
-        else:
-            values = np.concatenate([*parts.values()], axis=1, dtype=np.float32)[rows]
+        columns = [
+            read_rows(self.name, f"observe()[{name!r}]", parts[name], (self.worlds, size), np.float64)
+            for name, size in zip(self._names, self._sizes, strict=True)
+        ]
+        exact = np.concatenate(columns, axis=1)[rows]
+        values = (exact if self._signals is None else self._signals.observe(exact, rows)).astype(np.float32)
         bad = ~np.isfinite(values.sum(axis=1))
         if bad.any():
             row = int(bad.argmax())
@@ -221,14 +220,6 @@ class BatchEnv:
             self._fail(rows[row], f"observation {name!r} is not finite")
         if self._bounds is not None:
             values = self._clip(values, rows)
-        return values
-
-    def _disturb(self, exact: Mapping[str, Any], rows: Worlds) -> NDArray[np.float32]:
-        """Return observations with noise and delay, as those of one world have them, shape (k, size)."""
-        values = np.empty((len(rows), int(self._ends[-1])), np.float32)
-        for row, world in enumerate(rows.tolist()):
-            parts = self._signals[world].observe({name: part[world] for name, part in exact.items()})
-            np.concatenate([*parts.values()], axis=None, out=values[row], casting="same_kind")
         return values
 
     def _clip(self, values: NDArray[np.float32], rows: Worlds) -> NDArray[np.float32]:
@@ -244,7 +235,3 @@ class BatchEnv:
     def close(self) -> None:
         """End the simulation."""
         self.sim.close()
-
-
-def _describe(value: NDArray[Any]) -> str:
-    return f"an array of {value.dtype} of shape {value.shape}"

@@ -1,11 +1,12 @@
 """Reward terms that tasks share: pure functions of numbers, without weights.
 
-Terms are unsigned: the sign is in the weight.
+Terms are unsigned: the sign is in the weight. A `BatchTask` gives arrays with a leading axis of n worlds, and gets n
+values, shape (n,).
 """
 
 import math
 from collections.abc import Callable
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +14,24 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError
 
 Array = NDArray[np.floating]
+PerWorld = Any
+"""A number; n numbers, shape (n,), for arguments with a leading axis."""
+Values = TypeVar("Values", float, NDArray[np.float64])
+Flags = bool | NDArray[np.bool_]
 
 
-def distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def distance(a: Array, b: Array) -> PerWorld:
     """Return the Euclidean distance between two points of shape (3,), in their unit."""
-    x, y, z = (a - b).tolist()
+    difference = a - b
+    if difference.ndim > 1:
+        return _length(difference)
+    x, y, z = difference.tolist()
     return float((x * x + y * y + z * z) ** 0.5)
 
 
-Values = TypeVar("Values", float, NDArray[np.float64])
+def _length(vectors: Array) -> Array:
+    lengths: Array = np.sqrt(np.square(vectors).sum(axis=-1))
+    return lengths
 
 
 def closeness(distance: Values, scale: float) -> Values:
@@ -31,49 +41,62 @@ def closeness(distance: Values, scale: float) -> Values:
     return math.exp(-((distance / scale) ** 2))
 
 
-def arrival(distance: float, tolerance: float) -> float:
+def arrival(distance: Values, tolerance: float) -> Values:
     """Return 1 where the distance is below `tolerance`, in the same unit, else 0."""
-    return float(distance < tolerance)
+    return _count(distance < tolerance)
 
 
-def squared(x: NDArray[np.floating]) -> float:
+def _count(flags: Any) -> PerWorld:
+    return flags.astype(np.float64) if isinstance(flags, np.ndarray) else float(flags)
+
+
+def squared(x: Array) -> PerWorld:
     """Return the mean of the squared elements: in [0, 1] for an action in [-1, 1], whatever its size."""
     if x.ndim > 1:
         return np.square(x).mean(axis=-1)
     return float(x.dot(x)) / x.size
 
 
-def change(x: Array, last: Array) -> float:
+def change(x: Array, last: Array) -> PerWorld:
     """Return the mean of the squared differences between two vectors, such as an action and the one before it."""
     return squared(x - last)
 
 
-def power(torques: Array, velocities: Array) -> float:
+def power(torques: Array, velocities: Array) -> PerWorld:
     """Return the mechanical power of the joints' motors [W]: the sum of |torque [N m] x velocity [rad/s]|."""
-    return float(np.abs(torques * velocities).sum())
+    powers = np.abs(torques * velocities)
+    return powers.sum(axis=-1) if powers.ndim > 1 else float(powers.sum())
 
 
-def forward_velocity(velocity: Array, heading: Array) -> float:
+def forward_velocity(velocity: Array, heading: Array) -> PerWorld:
     """Return the part of a velocity [m/s] along `heading`, a direction of any length but 0; both of shape (3,)."""
+    if velocity.ndim > 1 or heading.ndim > 1:
+        return (velocity * heading).sum(axis=-1) / _length(heading)
     return float(np.dot(velocity, heading) / math.sqrt(np.dot(heading, heading)))
 
 
-def forward_while_alive(velocity: Array, heading: Array, alive: bool) -> float:
+def forward_while_alive(velocity: Array, heading: Array, alive: Flags) -> PerWorld:
     """Return `forward_velocity` [m/s] while `alive`, else 0: a fall forward earns nothing."""
+    if isinstance(alive, np.ndarray):
+        return np.where(alive, forward_velocity(velocity, heading), 0.0)
     return forward_velocity(velocity, heading) if alive else 0.0
 
 
-def alive(terminated: bool) -> float:
+def alive(terminated: Flags) -> PerWorld:
     """Return 0 in a step that terminates the episode, else 1."""
+    if isinstance(terminated, np.ndarray):
+        return _count(~terminated)
     return 0.0 if terminated else 1.0
 
 
-def posture(orientation: Array) -> float:
+def posture(orientation: Array) -> PerWorld:
     """Return roll^2 + pitch^2 [rad^2] of a quaternion (x, y, z, w): 0 upright, whatever the heading.
 
     With the z-y-x (yaw, pitch, roll) angles of a unit quaternion: roll = atan2(2 (w x + y z), 1 - 2 (x^2 + y^2)),
     pitch = asin(2 (w y - z x)). Where the pitch is a right angle the roll is undefined, and it counts as 0.
     """
+    if orientation.ndim > 1:
+        return _posture_of_many(orientation)
     x, y, z, w = orientation.tolist()
     sine = 2 * (w * y - z * x)
     if abs(sine) > 0.99999:
@@ -81,18 +104,29 @@ def posture(orientation: Array) -> float:
     return math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)) ** 2 + math.asin(sine) ** 2
 
 
-def fallen(height: float, lowest: float) -> float:
+def _posture_of_many(orientations: Array) -> Array:
+    x, y, z, w = np.moveaxis(orientations, -1, 0)
+    sine = 2 * (w * y - z * x)
+    roll, pitch = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), np.arcsin(np.clip(sine, -1.0, 1.0))
+    return np.where(np.abs(sine) > 0.99999, (math.pi / 2) ** 2, roll**2 + pitch**2)
+
+
+def fallen(height: Values, lowest: float) -> Values:
     """Return 1 if `height` is below `lowest`, the smallest height of a standing robot, both [m], else 0."""
-    return float(height < lowest)
+    return _count(height < lowest)
 
 
-def speed(velocity: Array) -> float:
+def speed(velocity: Array) -> PerWorld:
     """Return the length of a velocity: an angular one of shape (3,) [rad/s], or a linear one [m/s]."""
+    if velocity.ndim > 1:
+        return _length(velocity)
     return math.sqrt(np.dot(velocity, velocity))
 
 
-def grasp(distance: float, scale: float, held: bool) -> float:
+def grasp(distance: Any, scale: float, held: Flags) -> PerWorld:
     """Return 0.5 `closeness` to the object, plus 0.5 while it is held: in [0, 1]."""
+    if isinstance(held, np.ndarray):
+        return 0.5 * closeness(distance, scale) + 0.5 * held
     return 0.5 * closeness(distance, scale) + (0.5 if held else 0.0)
 
 
@@ -101,23 +135,24 @@ def time_spent(control_dt: float) -> float:
     return control_dt
 
 
-def near_limits(positions: Array, low: Array, high: Array, margin: float) -> float:
+def near_limits(positions: Array, low: Array, high: Array, margin: float) -> PerWorld:
     """Return how close joints are to their limits: 0 farther away than `margin`, 1 at a limit; the mean of all joints.
 
     Everything in [rad] or [m], arrays of shape (joints,); beyond a limit the value rises further. A joint whose lower
     limit is not below its upper one has no limits.
     """
     inside = np.maximum(0.0, 1.0 - np.minimum(positions - low, high - positions) / margin)
-    return float(np.where(low < high, inside, 0.0).mean())
+    limited = np.where(low < high, inside, 0.0)
+    return limited.mean(axis=-1) if limited.ndim > 1 else float(limited.mean())
 
 
 def excess_force(forces: Array, limit: float) -> float:
-    """Return the sum of the contact forces above `limit` [N]; 0 without contacts, for forces of shape (0,)."""
+    """Return the sum of the contact forces of one world above `limit` [N]; 0 without contacts, shape (0,)."""
     return float(np.maximum(0.0, forces - limit).sum())
 
 
 def penetration(distances: Array) -> float:
-    """Return the depth of the deepest contact [m], 0 if there is none; `distances` are negative for overlaps."""
+    """Return the depth of one world's deepest contact [m], 0 without one; `distances` are negative for overlaps."""
     return float(np.maximum(0.0, -distances).max()) if distances.size else 0.0
 
 
@@ -152,8 +187,12 @@ def tolerance(
     if falloff not in _FALLOFFS:
         raise TaskError(f"tolerance: no falloff {falloff!r}. There are: {', '.join(_FALLOFFS)}")
     if isinstance(x, np.ndarray):
-        values = [tolerance(element, bounds, margin, falloff, at_margin) for element in x.ravel().tolist()]
-        return np.array(values, np.float64).reshape(x.shape)
+        outsides = np.maximum(low - x, x - high)
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            beyond = (
+                _FALLOFFS[falloff](outsides / margin, at_margin) if margin else np.where(outsides > 0, 0.0, outsides)
+            )
+        return np.where(outsides <= 0, 1.0, beyond)
     outside = max(low - x, x - high)
     if outside <= 0:
         return 1.0
@@ -162,8 +201,8 @@ def tolerance(
     return _FALLOFFS[falloff](outside / margin, at_margin) if margin else 0.0
 
 
-_FALLOFFS: dict[str, Callable[[float, float], float]] = {
-    "gaussian": lambda d, v: math.pow(v, d * d),
-    "linear": lambda d, v: max(0.0, 1 - (1 - v) * d),
+_FALLOFFS: dict[str, Callable[[Any, float], Any]] = {
+    "gaussian": lambda d, v: v ** (d * d),
+    "linear": lambda d, v: np.maximum(0.0, 1 - (1 - v) * d) if isinstance(d, np.ndarray) else max(0.0, 1 - (1 - v) * d),
     "long_tail": lambda d, v: 1 / (1 + (1 / v - 1) * d * d),
 }

@@ -160,3 +160,17 @@ def test_engines():
 def test_what_is_no_engine(sim):
     with pytest.raises(UsageError, match="give pybullet, mujoco, or mujoco:SOLREF"):
         read_solref(sim)
+
+
+def test_no_picture_without_a_display(monkeypatch):
+    import mujoco
+
+    if "glfw" not in mujoco.GLContext.__module__:
+        pytest.skip("MuJoCo draws without a display")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    sim = MujocoSim(control_dt=1 / 60, substeps=4)
+    for _ in range(2):  # MuJoCo itself ends the process the second time
+        with pytest.raises(UsageError, match=r"^MuJoCo cannot draw: there is no display") as caught:
+            sim.render()
+        assert "MUJOCO_GL=egl" in str(caught.value)

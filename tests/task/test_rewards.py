@@ -182,3 +182,76 @@ def test_tolerance_that_makes_no_sense(arguments, message):
     with pytest.raises(TaskError) as caught:
         rewards.tolerance(0.0, **arguments)
     assert str(caught.value) == message
+
+
+STEEP = np.array([0.0, 0.70710679, 0.0, 0.70710679])
+VELOCITIES = np.array([[1.0, 2.0, 3.0], [-2.0, 0.0, 0.0]])  # [m/s]
+UPRIGHT = np.array([True, False])
+AHEAD = np.array([2.0, 0.0, 0.0])
+OF_WORLDS = {  # arguments of two worlds, arguments of both, values
+    # (3, 4, 12) and (0, 0, 2) m apart: 13 and 2
+    "distance": ([[[4.0, 6.0, 15.0], [1.0, 2.0, 5.0]]], {"b": np.array([1.0, 2.0, 3.0])}, [13.0, 2.0]),
+    # exp(-(0.1 / 0.05)^2) and exp(0)
+    "closeness": ([[0.1, 0.0]], {"scale": 0.05}, [math.exp(-4), 1.0]),
+    "arrival": ([[0.049, 0.05]], {"tolerance": 0.05}, [1.0, 0.0]),
+    # (1 + 4 + 9 + 0) / 4 and (4 + 0 + 0 + 0) / 4
+    "squared": ([[[1.0, -2.0, 3.0, 0.0], [0.0, 2.0, 0.0, 0.0]]], {}, [3.5, 1.0]),
+    # (0.25 + 1.0) / 2 and no change
+    "change": ([[[0.5, -0.5], [1.0, 2.0]], [[0.0, 0.5], [1.0, 2.0]]], {}, [0.625, 0.0]),
+    # 6 + 4 + 0 and |1 x -2| W
+    "power": ([[[2.0, -1.0, 5.0], [1.0, 0.0, 0.0]], [[3.0, 4.0, 0.0], [-2.0, 1.0, 1.0]]], {}, [10.0, 2.0]),
+    # (2 * 3 + 3 * 4) / 5 along (0, 3, 4), and -2 along (1, 0, 0)
+    "forward_velocity": ([VELOCITIES, [[0.0, 3.0, 4.0], [1.0, 0.0, 0.0]]], {}, [3.6, -2.0]),
+    "forward_while_alive": ([VELOCITIES], {"heading": AHEAD, "alive": UPRIGHT}, [1.0, 0.0]),
+    "alive": ([UPRIGHT], {}, [0.0, 1.0]),
+    # 0.3 rad of roll, and on its nose: (pi / 2)^2
+    "posture": ([[quaternion(0, 0.3), STEEP]], {}, [0.09, (math.pi / 2) ** 2]),
+    "fallen": ([[0.19, 0.2]], {"lowest": 0.2}, [1.0, 0.0]),
+    # sqrt(4 + 9 + 36) = 7 rad/s
+    "speed": ([[[2.0, 3.0, -6.0], [0.0, 0.0, 0.5]]], {}, [7.0, 0.5]),
+    # at the scale 0.5 / e, with 0.5 while it is held
+    "grasp": ([[0.1, 0.1]], {"scale": 0.1, "held": UPRIGHT}, [0.5 / math.e + 0.5, 0.5 / math.e]),
+    # (0.25 + 1) / 2, and in the middle
+    "near_limits": (
+        [[[0.85, -1.0], [0.0, 0.0]]],
+        {"low": -np.ones(2), "high": np.ones(2), "margin": 0.2},
+        [0.625, 0.0],
+    ),
+    # half a margin outside 0.1^(0.5^2), and inside
+    "tolerance": ([[0.8, 1.5]], {"bounds": (1.0, 2.0), "margin": 0.4}, [0.1**0.25, 1.0]),
+}
+
+
+@pytest.mark.parametrize("term", OF_WORLDS)
+def test_a_value_per_world(term):
+    of_worlds, of_both, expected = OF_WORLDS[term]
+    function, arrays = getattr(rewards, term), [np.array(values) for values in of_worlds]
+    values = function(*arrays, **of_both)
+    assert values.shape == (2,)
+    assert values.dtype == np.float64
+    np.testing.assert_allclose(values, expected, atol=1e-12)
+
+
+def test_one_heading_for_all_worlds():
+    np.testing.assert_array_equal(rewards.forward_velocity(VELOCITIES, AHEAD), [1.0, -2.0])
+
+
+@pytest.mark.parametrize("term", ["speed", "posture", "squared", "power", "near_limits", "forward_velocity"])
+def test_a_world_has_the_same_bits_alone(term):
+    rows, both = np.random.default_rng(0).normal(size=(2, 65, 4)), OF_WORLDS[term][1]
+    both = {name: np.resize(value, 4) if isinstance(value, np.ndarray) else value for name, value in both.items()}
+    arrays = rows[: len(OF_WORLDS[term][0])]
+    every = getattr(rewards, term)(*arrays, **both)
+    for world in range(65):
+        alone = getattr(rewards, term)(*(values[[world]] for values in arrays), **both)
+        assert alone.tolist() == [every[world]]
+
+
+@pytest.mark.parametrize("falloff", ["gaussian", "linear", "long_tail"])
+def test_tolerance_of_many_is_that_of_each(falloff):
+    values = np.array([-1e200, -1.0, 0.0, 0.3, 1.0, 1.05, 1.2, 2.0, math.inf, math.nan])
+    many = rewards.tolerance(values, (0.0, 1.0), 0.1, falloff)
+    each = [rewards.tolerance(value, (0.0, 1.0), 0.1, falloff) for value in values.tolist()]
+    np.testing.assert_allclose(many, each, rtol=1e-14)
+    step = rewards.tolerance(values, (0.0, 1.0))
+    np.testing.assert_array_equal(step, [0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, math.nan])

@@ -29,6 +29,7 @@ STAGES = {
     "stages": [{"task": {"tolerance": 0.5}, "promote": {"success": 0.5, "window": 6}}, {"task": {"tolerance": 0.3}}]
 }
 WIDE = {"policy_kwargs": {"net_arch": [128, 128]}}
+STOOL = "tests.task.batches:Stool"
 CASES = {
     "ppo": ("Line", settings("ppo")),
     "ppo with gSDE": ("Line", settings("ppo", **SDE)),
@@ -42,6 +43,8 @@ CASES = {
     "ppo, stochastic evaluation": ("Line", settings("ppo", eval={"deterministic": False}, **SDE)),
     "ppo, other observations than declared": (f"{FAULTY}:Outside", settings("ppo")),
     "ppo, on reach": ("reach", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
+    "ppo, on worlds in batches": (STOOL, settings("ppo", randomize=True)),
+    "recurrent_ppo, on worlds in batches": (STOOL, settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
     "ppo, on hopper": ("hopper", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
     "a2c": ("Line", settings("a2c")),
     "recurrent_ppo": ("Line", settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
@@ -68,6 +71,7 @@ CASES = {
 # trainings of plain ppo and sac are in tests/crash.
 QUICK = {
     *("ppo with gSDE", "ppo, curriculum", "recurrent_ppo", "sac, hindsight, normalised"),
+    "ppo, on worlds in batches",
 }
 
 

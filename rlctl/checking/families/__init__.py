@@ -46,7 +46,8 @@ PROCESSES = {
         *("hindsight", "leaks"),
     ),
     "instances": (
-        *("instances", "worlds", "unseeded", "action effects", "hidden state", "nan action", "variants", "rendering"),
+        *("instances", "worlds", "batches", "unseeded", "action effects"),
+        *("hidden state", "nan action", "variants", "rendering"),
     ),
 }
 """The experiments of each child process, in their order: the most important rules first, and what may crash last."""

@@ -11,7 +11,7 @@ from rlctl.checking.instance import Context, EnvironmentRaised, display_error, f
 from rlctl.checking.records import FIRST_SEED, SUCCESS, CallFailure, CheckedEpisode, ChildMessage, Form, Records
 from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
 from rlctl.environments.graphics import opengl_fix
-from rlctl.errors import RecipeError
+from rlctl.errors import RecipeError, UsageError
 
 NUMBERS = ("float", "int", "numpy.float64")  # Reward types that both libraries accept
 MANY_LINES, FEWEST_STEPS = 0.5, 20  # lines per step; with fewer steps most lines come from the start
@@ -144,6 +144,10 @@ def render(context: Context) -> Iterator[ChildMessage]:
         causes = get_causes(error.cause)
         if any(isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in causes):
             raise NotJudged(f"a library that rendering needs is not installed: {raised}") from None
+        if isinstance(error.cause, UsageError) and not isinstance(error.cause, RecipeError):
+            raise NotJudged(
+                str(error.cause).splitlines()[0]
+            ) from None  # rlctl draws the world of a task, not its author
         call = "the constructor" if error.call == "build" else error.call
         message = f"with render_mode='rgb_array' {call} raises {raised}"
         if isinstance(error.cause, RecipeError):  # the constructor was not even called

@@ -66,18 +66,18 @@ class Signals:
         action_space: spaces.Space[Any],
         bounds: Mapping[str, tuple[float, float]],
     ) -> None:
-        self._on_observation = [event for event in events.values() if event.event.when == "observation"]
-        self._on_action = [event for event in events.values() if event.event.when == "action"]
-        self._of = {event.name: _find_observed(event, first) for event in self._on_observation}
+        self.on_observation = [event for event in events.values() if event.event.when == "observation"]
+        self.on_action = [event for event in events.values() if event.event.when == "action"]
+        self.of = {event.name: _find_observed(event, first) for event in self.on_observation}
         self._first = first
         self._space = action_space
-        for event in self._on_action:
+        for event in self.on_action:
             if not isinstance(action_space, spaces.Box):
                 raise event.error(
                     f"events.{event.name}: only actions in a Box can have noise or delay, not {action_space}."
                 )
         pictures = {name: (0, 255) for name, value in first.items() if np.asarray(value).dtype == np.uint8}
-        self._bounds = {**pictures, **bounds}
+        self.bounds = {**pictures, **bounds}
         self._observation_signals: dict[str, Signal] = {}  # by event
         self._action_signals: list[Signal] = []
         self.drawn: dict[str, Drawn] = {}
@@ -88,10 +88,10 @@ class Signals:
         self.drawn = {}
         self._streams, self._level = streams, level
         self._observation_signals = {}  # they begin with the first observation
-        if self._on_action:
+        if self.on_action:
             low, high = self._space.low, self._space.high  # type: ignore[attr-defined]
             zero = {_ACTION: np.clip(np.zeros_like(low), low, high)}
-            self._action_signals = [self._start(event, zero) for event in self._on_action]
+            self._action_signals = [self._start(event, zero) for event in self.on_action]
 
     def try_once(self) -> None:
         """Begin every signal once, to find mistakes."""
@@ -99,25 +99,19 @@ class Signals:
         self.observe(self._first)
 
     def _start(self, event: BoundEvent, first: Parts) -> Signal:
-        result = event(self._streams[event.name], first, self._level)
-        if not (isinstance(result, tuple) and len(result) == 2 and callable(result[1])):
-            raise TaskError(
-                f"events.{event.name}: its function must return the drawn values and a signal, not {result!r}"
-            )
-        self.drawn[event.name], signal = result
-        _check_drawn(event.name, self.drawn[event.name])
+        self.drawn[event.name], signal = start_signal(event, self._streams[event.name], first, self._level)
         return signal
 
     def observe(self, parts: Parts) -> Parts:
         """Return an observation with noise and delay, as the policy sees it."""
-        for event in self._on_observation:
-            observed = {name: parts[name] for name in self._of[event.name]}
+        for event in self.on_observation:
+            observed = {name: parts[name] for name in self.of[event.name]}
             if event.name not in self._observation_signals:
                 self._observation_signals[event.name] = self._start(event, observed)
             changed = dict(self._observation_signals[event.name](observed))
             for name in observed:
-                if name in self._bounds:
-                    changed[name] = np.clip(changed[name], *self._bounds[name])
+                if name in self.bounds:
+                    changed[name] = np.clip(changed[name], *self.bounds[name])
             parts = {**parts, **changed}
         return parts
 
@@ -125,11 +119,21 @@ class Signals:
         """Return an action with noise and delay, as the motors get it; it stays inside the action space."""
         if not self._action_signals:
             return action
-        parts = {_ACTION: action}
+        parts: Parts = {_ACTION: np.asarray(action, np.float64)}
         for signal in self._action_signals:
             parts = signal(parts)
         low, high = self._space.low, self._space.high  # type: ignore[attr-defined]
         return np.clip(parts[_ACTION], low, high).astype(self._space.dtype)
+
+
+def start_signal(event: BoundEvent, rng: np.random.Generator, first: Parts, level: float) -> tuple[Drawn, Signal]:
+    """Call the function of an event on observations or actions; raises `TaskError` for a result of the wrong type."""
+    result = event(rng, first, level)
+    if not (isinstance(result, tuple) and len(result) == 2 and callable(result[1])):
+        raise TaskError(f"events.{event.name}: its function must return the drawn values and a signal, not {result!r}")
+    drawn, signal = result
+    _check_drawn(event.name, drawn)
+    return drawn, signal
 
 
 def _find_observed(event: BoundEvent, first: Parts) -> list[str]:

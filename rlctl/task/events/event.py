@@ -258,8 +258,12 @@ class BoundEvent:
 
     def __call__(self, first: Any, second: Any, level: float) -> Any:
         """Call the function, with its ranges at `level`."""
-        values = {key: v.at(level) if isinstance(v, Widening) else v for key, v in self.values.items()}
-        return self.event.function(first, second, **values)
+        return self.event.function(first, second, **{key: self.read(key, level) for key in self.values})
+
+    def read(self, key: str, level: float) -> Any:
+        """Return a parameter; a range is that at `level`."""
+        value = self.values[key]
+        return value.at(level) if isinstance(value, Widening) else value
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """Pictures of a world in MuJoCo, drawn by OpenGL without a display."""
 
+import os
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,6 +10,9 @@ from numpy.typing import NDArray
 
 from rlctl.errors import UsageError, describe_exception
 from rlctl.task.mujoco.world import import_mujoco
+
+_DISPLAYS = {"DISPLAY", "WAYLAND_DISPLAY"}
+_HINT = "without a display set MUJOCO_GL=egl (Debian: libegl1) or MUJOCO_GL=osmesa"
 
 
 def draw(
@@ -26,6 +31,9 @@ def draw(
     [m] and colour.
     """
     mujoco = import_mujoco()
+    # It chose how to draw at import. Without a display GLFW fails, and ends the process when it is asked again.
+    if "glfw" in mujoco.GLContext.__module__ and sys.platform == "linux" and not _DISPLAYS & os.environ.keys():
+        raise UsageError(f"MuJoCo cannot draw: there is no display\n{_HINT}")
     camera, way = mujoco.MjvCamera(), np.subtract(target, eye)
     camera.type, camera.lookat[:] = mujoco.mjtCamera.mjCAMERA_FREE, target
     camera.distance = float(np.linalg.norm(way))
@@ -48,8 +56,5 @@ def draw(
                 renderer.scene.ngeom += 1
             picture: NDArray[np.uint8] = renderer.render()
     except Exception as error:  # OpenGL raises many kinds
-        raise UsageError(
-            f"MuJoCo cannot draw: {describe_exception(error)}\n"
-            "without a display set MUJOCO_GL=egl (Debian: libegl1) or MUJOCO_GL=osmesa"
-        ) from None
+        raise UsageError(f"MuJoCo cannot draw: {describe_exception(error)}\n{_HINT}") from None
     return picture

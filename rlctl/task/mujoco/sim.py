@@ -333,26 +333,26 @@ class MujocoSim(Sim):
 
     def step(self, worlds: Rows = None) -> None:
         if self._pushes:
-            self._apply_pushes()
+            self._apply_pushes(None if worlds is None else set(worlds.tolist()))
         self.world.step(worlds)
         for body in self.bodies.values():
             body.limit_speeds()
 
-    def _apply_pushes(self) -> None:
+    def _apply_pushes(self, worlds: set[int] | None) -> None:
         forces = self.world.data("xfrc_applied")
-        for push in self._pushes:
+        moving = [push for push in self._pushes if worlds is None or push.world in worlds]
+        for push in moving:
             forces[(push.world, push.link) if self.world.count is not None else push.link] = 0.0
-        self._pushes[:] = [push for push in self._pushes if push.steps > 0]
-        for push in self._pushes:
+        self._pushes[:] = [push for push in self._pushes if push.steps > 0 or push not in moving]
+        for push in [push for push in moving if push.steps > 0]:
             row = (push.world, push.link) if self.world.count is not None else push.link
             forces[row][:3] += push.force
             push.steps -= 1
 
     @property
     def deepest_contact(self) -> float:
-        self.world.refresh()
-        data = self.data
-        return max(0.0, -float(data.contact.dist.min())) if data.ncon else 0.0
+        distances = self.world.read_contact_distances(self.fields.index or 0)
+        return max(0.0, -float(distances.min(initial=0.0)))
 
     def save(self) -> None:
         for body in self.bodies.values():
@@ -375,7 +375,7 @@ class MujocoSim(Sim):
         pushed = self.body(body)
         steps = max(1, round(duration_s / self._control_dt))
         number = pushed.find_link(link or pushed.base_name)  # type: ignore[attr-defined]
-        self._pushes.append(_MujocoPush(self.fields._index or 0, number, np.array(force, float), steps))
+        self._pushes.append(_MujocoPush(self.fields.index or 0, number, np.array(force, float), steps))
 
     def add_marker(self, position: Sequence[float], radius: float, color: Sequence[float]) -> int:
         self._markers.append((np.array(position, float), radius, np.array(color, float)))

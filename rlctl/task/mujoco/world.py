@@ -23,8 +23,10 @@ _SERIOUS = {
     "mjWARN_CNSTRFULL": "too many constraints",
 }
 """MuJoCo's warnings that are errors, and what they mean."""
-_DERIVED = ("xpos", "xquat", "xipos", "sensordata", "actuator_force", "qfrc_actuator")
+_DERIVED = ("xpos", "xquat", "xipos")
 """Arrays that bodies read and the state does not have."""
+_OF_STEPS = ("sensordata", "actuator_force", "qfrc_actuator")
+"""Those that only a step computes; after any other call a world of a batch has those of another world."""
 
 
 def import_mujoco() -> Any:
@@ -57,10 +59,10 @@ class MujocoWorld:
         """Arrays by name, without the leading axis of worlds."""
         self._built: dict[str, Array] = {}  # values of the built world, of arrays that may have changed
         self._rows: dict[str, Array] = {}  # arrays of `extra` with a row per world
+        self._of_steps: dict[str, Array] = {}  # arrays of `_OF_STEPS` of a batch, since the last step or reset
         self._saved: Array | None = None
         self._is_fresh = False  # whether all that depends on positions and velocities is up to date
         self._stale: set[int] = set()  # worlds of a batch for which it is not
-        self._has_stepped = np.zeros(1, bool)  # worlds of a batch, since their last reset
 
     def set_model(self, model: Any, data: Any) -> None:
         """Use a newly compiled model; there is one world until `save`."""
@@ -72,7 +74,7 @@ class MujocoWorld:
     def data(self, name: str) -> Any:
         """Return an array of MjData; those that are derived are valid after `refresh`."""
         if self.batch is not None:
-            return self.batch.bind(name)
+            return self._of_steps[name] if name in _OF_STEPS else self.batch.bind(name)
         array = getattr(self.mj_data, name)
         return array if self.count is None else array[None]
 
@@ -138,10 +140,12 @@ class MujocoWorld:
     def step(self, worlds: Rows = None) -> None:
         """Take all substeps of a control step; afterwards everything but accelerations and forces is up to date."""
         if self.batch is not None:
-            ids = None if worlds is None else worlds.astype(np.int32)
+            ids = None if worlds is None else np.sort(worlds).astype(np.int32)
             self._stale.difference_update(range(self.batch.nsim) if worlds is None else worlds.tolist())
             self._call("step", ids, nstep=self.substeps, stage=self._velocity_stage)
-            self._has_stepped[slice(None) if worlds is None else worlds] = True
+            rows: Any = slice(None) if worlds is None else worlds
+            for name, values in self._of_steps.items():
+                values[rows] = self.batch.bind(name)[rows]
             if self.batch.warning.any():
                 self._raise_warning()
             return
@@ -158,7 +162,8 @@ class MujocoWorld:
             self._raise_warning()
 
     def _raise_warning(self) -> None:
-        rows = self.batch.warning if self.batch is not None else self.mj_data.warning.number[None].copy()
+        # Of a batch: the last value and the number of each warning.
+        rows = self.batch.warning[..., 1] if self.batch is not None else self.mj_data.warning.number[None].copy()
         for name, what in _SERIOUS.items():
             bad = np.flatnonzero(rows[:, int(getattr(self.mujoco.mjtWarning, name))])
             if bad.size:
@@ -173,10 +178,24 @@ class MujocoWorld:
         self.refresh()
         sensor = self.mj_model.sensor(name)
         start, size = int(sensor.adr[0]), int(sensor.dim[0])
-        values: Array = self.data("sensordata")[..., start : start + size].copy()
-        if self.batch is not None and int(sensor.needstage[0]) == int(self.mujoco.mjtStage.mjSTAGE_ACC):
-            values[~self._has_stepped] = 0.0  # the batch leaves them as they were
+        # Sensors of positions and velocities are up to date after `refresh`, the others since the last step.
+        is_of_steps = int(sensor.needstage[0]) == int(self.mujoco.mjtStage.mjSTAGE_ACC)
+        row = self.data("sensordata") if self.batch is None or is_of_steps else self.batch.bind("sensordata")
+        values: Array = row[..., start : start + size].copy()
         return values
+
+    def read_contact_distances(self, world: int) -> Array:
+        """Return the distances of the bodies at the contacts of a world [m], negative where they overlap."""
+        if self.batch is None:
+            self.refresh()
+        else:
+            # Bodies that are fixed may stand elsewhere in each world; all else that is theirs moves no contact.
+            is_moved = self.batch.expanded("body_pos") is not None
+            model = self.batch.get_model(world) if is_moved else self.mj_model
+            self.batch.get_data(world, self.mj_data)
+            self.mujoco.mj_fwdPosition(model, self.mj_data)
+        distances: Array = self.mj_data.contact.dist.copy()
+        return distances
 
     def save(self) -> None:
         """Save the built world for `restore`, and make `count` copies of it."""
@@ -189,10 +208,10 @@ class MujocoWorld:
             from mujoco.batch import Batch
 
             self.batch = Batch(self.mj_model, self.count, 1)
-            self._has_stepped = np.zeros(self.count, bool)
             self.batch.state[:] = self._saved
             for name in _DERIVED:  # one that is bound later is zero until the next call
                 self.batch.bind(name)
+            self._of_steps = {name: np.zeros_like(self.batch.bind(name)) for name in _OF_STEPS}
             self.touch()
 
     def restore(self, worlds: Rows = None) -> None:
@@ -203,7 +222,8 @@ class MujocoWorld:
         if self.batch is not None:
             self.batch.state[rows] = self._saved
             self.batch.warning[rows] = 0
-            self._has_stepped[rows] = False
+            for values in self._of_steps.values():
+                values[rows] = 0.0
         else:
             mujoco = self.mujoco
             mujoco.mj_resetData(self.mj_model, self.mj_data)
@@ -217,7 +237,7 @@ class Fields:
 
     def __init__(self, world: MujocoWorld, index: int | None = None) -> None:
         self.world = world
-        self._index = index
+        self.index = index
         self._cache: dict[str, Any] = {}
 
     def forget(self) -> None:
@@ -246,13 +266,13 @@ class Fields:
         return self._select(self.world.model(name))
 
     def _select(self, array: Any) -> Any:
-        return array if self._index is None else array[self._index]
+        return array if self.index is None else array[self.index]
 
     def touch(self, worlds: Rows = None) -> None:
         """Note a change of the state or the model."""
-        self.world.touch(self._index if worlds is None else worlds)
+        self.world.touch(self.index if worlds is None else worlds)
 
     @property
     def shape(self) -> tuple[int, ...]:
         """The leading axis: (n,) for the worlds of a batch, else ()."""
-        return () if self._index is not None or self.world.count is None else (self.world.count,)
+        return () if self.index is not None or self.world.count is None else (self.world.count,)

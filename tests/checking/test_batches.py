@@ -1,0 +1,68 @@
+"""What goes wrong only when a task in batches has several worlds."""
+
+import pytest
+
+from tests.checking.judging import case, check_case, findings, found
+
+pytest.importorskip("mujoco")
+
+FILE = "broken_batches.py"
+SOUND = f"{FILE}:Point"
+CASES = [
+    case(f"{FILE}:ScalesByAll", ("RL406", "error"), twin=f"{FILE}:ScalesByEach"),
+    case(f"{FILE}:SharesNoise", ("RL406", "error"), twin=SOUND),
+    case(f"{FILE}:ResetsAllGoals", ("RL407", "error"), ("RL406", "error"), twin=f"{FILE}:ResetsItsGoal"),
+    case(f"{FILE}:MovesAllBases", ("RL407", "error"), ("RL406", "warning"), twin=f"{FILE}:MovesItsBase"),
+    case(f"{FILE}:OneRow", ("RL408", "error"), twin=SOUND),
+    case(f"{FILE}:OneGoal", ("RL408", "error"), twin=SOUND),
+    case(f"{FILE}:CountsSteps", ("RL409", "error"), twin=f"{FILE}:CountsStepsOfEach"),
+    case(f"{FILE}:KeepsLast", ("RL409", "error"), twin=SOUND),
+    case(f"{FILE}:Logs", ("RL409", "warning"), twin=SOUND),
+]
+CLEAN = [SOUND, f"{FILE}:ScalesByEach", f"{FILE}:ResetsItsGoal", f"{FILE}:MovesItsBase", f"{FILE}:CountsStepsOfEach"]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+@pytest.mark.parametrize("task", ["walk", *CLEAN])
+def test_a_sound_task_has_no_finding_of_batches(task):
+    assert found(task, "RL406", "RL407", "RL408", "RL409") == set()
+
+
+@pytest.mark.parametrize(
+    ("name", "rule", "message"),
+    [
+        ("ScalesByAll", "RL406", "the episode of a world differs with other seeds and actions in the other worlds: at"),
+        ("SharesNoise", "RL406", "the episode of a world differs with one world alone: at reset goal is"),
+        ("ResetsAllGoals", "RL407", "the reset of world 2 of 4 changes in the others: self.goal"),
+        ("MovesAllBases", "RL407", "the reset of world 2 of 4 changes in the others: base_position of 'cart'"),
+        (
+            "OneRow",
+            "RL408",
+            "step with 4 worlds raises ShapeError: OneRow: rewards()['change'] is an array of float64 of shape (1,), "
+            "expected numbers of shape (4,): a row per world",
+        ),
+        ("OneGoal", "RL408", "step with 4 worlds raises ValueError: cannot reshape array of size 2 into shape (4,2)"),
+        (
+            "CountsSteps",
+            "RL409",
+            "self.steps changes from step to step, changes what later steps give, and is not in per_world",
+        ),
+        ("KeepsLast", "RL409", "self.last_action changes from step to step, changes what later steps give"),
+        ("Logs", "RL409", "self.mean_error changes from step to step, is the same for all worlds, and is not in"),
+    ],
+)
+def test_the_message_names_what_is_wrong(name, rule, message):
+    (finding,) = findings(f"{FILE}:{name}", rule)
+    assert finding.message.startswith(message)
+
+
+def test_any_other_environment_has_no_worlds():
+    from tests.checking.judging import verdict_of
+
+    assert verdict_of("broken_envs.py:Clean", "RL406").not_applicable == {
+        "RL406": "it is no BatchTask, whose worlds are simulated together"
+    }
