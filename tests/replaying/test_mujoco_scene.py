@@ -146,7 +146,7 @@ def test_a_task_shows_its_visual_shapes_as_in_pybullet(task):
     shapes = []
     for sim in ("pybullet", "mujoco"):
         spec = EnvSpec(task, sim=sim)
-        with closing(make_drawable(spec, print)) as env:
+        with closing(make_drawable(spec)) as env:
             rollout = play_episode(env, spec, 3, lambda observation, step: None, policy="nothing", draw=print)
         links = [(shape.link.rpartition("/")[2], shape.kind) for body in rollout.scene.bodies for shape in body.shapes]
         grounds = [body for body in rollout.scene.bodies if body.ground_height is not None]
