@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,9 @@ from rlctl.task.env import TaskEnv
 
 if TYPE_CHECKING:
     import mujoco
+
+    from rlctl.task.body import Body
+    from rlctl.task.mujoco.sim import MujocoSim
 
 Array = NDArray[np.float64]
 
@@ -107,6 +111,19 @@ def _describe_ground(model: mujoco.MjModel, geom: int, centers: Array) -> BodyMo
 def _find_box(model: mujoco.MjModel, geoms: list[int], centers: Array) -> tuple[Array, Array]:
     radii, middle = model.geom_rbound[geoms, None], centers[geoms]
     return ((middle - radii).min(axis=0), (middle + radii).max(axis=0)) if geoms else (-np.ones(3), np.ones(3))
+
+
+def find_mujoco_bounds(sim: MujocoSim, bodies: Sequence[Body], markers: Sequence[Array]) -> tuple[Array, Array]:
+    """Return the lowest and highest corner [m] of markers and bodies of a task's world, without the ground."""
+    sim.world.refresh()
+    wanted = {number for body in bodies for number in sim.bodies[body.name].parts.links.values()}
+    geoms = [
+        geom
+        for geom in range(sim.model.ngeom)
+        if int(sim.model.geom_bodyid[geom]) in wanted and 0 < sim.model.geom_rbound[geom] < _GROUND_SIZE / 2
+    ]
+    corners = [*markers, *(_find_box(sim.model, geoms, sim.data.geom_xpos) if geoms else ())]
+    return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
 
 
 def _find_trunk(model: mujoco.MjModel, positions: Array) -> int | None:

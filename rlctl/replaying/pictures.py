@@ -1,6 +1,6 @@
 """Shows episodes: films (`.mp4` or `.gif`) and pictures without a display, and windows.
 
-A task is drawn by PyBullet's software renderer, any other environment by its own `render()`.
+A task is drawn by its engine, PyBullet's software renderer or MuJoCo, any other environment by its own `render()`.
 """
 
 import contextlib
@@ -19,14 +19,16 @@ from numpy.typing import NDArray
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, UsageError, describe_exception, explain_missing_package
+from rlctl.replaying.mujoco_scene import find_mujoco_bounds
 from rlctl.replaying.recorder import Choose, Rollout, Watch, find_dt, play_episode, recorded_actions
 from rlctl.replaying.report import FilmReport
 from rlctl.replaying.reproduce import find_difference
 from rlctl.replaying.scene import Env, encode_jpeg, find_bounds
 from rlctl.run.episode import RecordedEpisode
 from rlctl.storage import files
-from rlctl.task import Sim
+from rlctl.task import Body, Sim
 from rlctl.task.env import TaskEnv
+from rlctl.task.mujoco.sim import MujocoSim
 
 Picture = NDArray[np.uint8]
 
@@ -60,7 +62,7 @@ class _Pictures:
 
 
 class _World:
-    """A task's PyBullet world, seen by a camera that follows the first robot that travels."""
+    """A task's world, seen by a camera that follows the first robot that travels."""
 
     def __init__(self, env: TaskEnv, width: int, height: int) -> None:
         self._env = env
@@ -72,12 +74,17 @@ class _World:
         trunks = [(body, trunk) for body in robots if (trunk := body.find_trunk()) is not None]
         self._followed = trunks[0] if trunks else None
         markers = [np.asarray(position) for position in self._env.task.markers().values()]
-        low, high = find_bounds([trunks[0][0]]) if trunks else find_bounds(bodies, markers)
+        low, high = self._find_bounds([trunks[0][0]], []) if trunks else self._find_bounds(bodies, markers)
         self._target, size = (low + high) / 2, float(np.linalg.norm(high - low))
         distances = [1.6 * size if trunks else 1.5 * size]
         if trunks:
             distances += [2.5 * float(np.linalg.norm(marker - self._target)) for marker in markers]
         self._offset = np.clip(max(distances), _CLOSEST, _FARTHEST) * _EYE_DIRECTION / np.linalg.norm(_EYE_DIRECTION)
+
+    def _find_bounds(self, bodies: list[Body], markers: list[NDArray[np.float64]]) -> tuple[Any, Any]:
+        if isinstance(self._env.sim, MujocoSim):
+            return find_mujoco_bounds(self._env.sim, bodies, markers)
+        return find_bounds(bodies, markers)
 
     def draw(self) -> Picture:
         if self._followed is not None:

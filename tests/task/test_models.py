@@ -46,15 +46,15 @@ def test_models_of_pybullet_data_have_their_names_too():
     assert str(find_model_file("kuka_iiwa/model.urdf")) == f"{data}/kuka_iiwa/model.urdf"
 
 
-def test_without_pybullet_data_the_error_lists_what_there_is(monkeypatch):
+def test_without_pybullet_data_the_error_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "pybullet_data", None)  # importing it raises ModuleNotFoundError
     assert find_model_file("kuka_iiwa.urdf").is_file()
     with pytest.raises(TaskError) as caught:
         find_model_file("kuka_iiwa/model.urdf")
-    assert "among rlctl's models (a1.urdf, kuka_iiwa.urdf, plane.urdf), nor in pybullet_data, which is" in str(
-        caught.value
+    assert str(caught.value).startswith(
+        "model file 'kuka_iiwa/model.urdf' not found. If it is one of PyBullet's: pip install "
     )
-    assert "not installed: pip install " in str(caught.value)
+    assert str(caught.value).endswith("; for a file next to your module: Path(__file__).with_name('model.urdf')")
 
 
 @pytest.mark.parametrize("model", THEIRS)

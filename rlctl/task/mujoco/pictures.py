@@ -1,6 +1,7 @@
 """Pictures of a world in MuJoCo, drawn by OpenGL without a display."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,24 @@ from rlctl.errors import UsageError, describe_exception
 from rlctl.task.mujoco.world import import_mujoco
 
 
+@dataclass
+class Marker:
+    """A sphere that is drawn, and is no part of the world."""
+
+    position: Sequence[float] | NDArray[np.float64]  # [m]
+    radius: float  # [m]
+    color: Sequence[float]  # red, green, blue, opacity
+
+
 def draw(
-    model: Any, data: Any, size: tuple[int, int], *, eye: Sequence[float], target: Sequence[float], field_of_view: float
+    model: Any,
+    data: Any,
+    size: tuple[int, int],
+    markers: Iterable[Marker] = (),
+    *,
+    eye: Sequence[float],
+    target: Sequence[float],
+    field_of_view: float,
 ) -> NDArray[np.uint8]:
     """Return an RGB image of shape (height, width, 3), seen from `eye` [m] to `target` [m]; z is up.
 
@@ -31,6 +48,8 @@ def draw(
     try:
         with mujoco.Renderer(model, size[1], size[0]) as renderer:
             renderer.update_scene(data, camera)
+            for marker in markers:
+                _add_marker(renderer.scene, marker)
             picture: NDArray[np.uint8] = renderer.render()
     except Exception as error:  # OpenGL raises many kinds
         raise UsageError(
@@ -38,3 +57,11 @@ def draw(
             "without a display set MUJOCO_GL=egl (Debian: libegl1) or MUJOCO_GL=osmesa"
         ) from None
     return picture
+
+
+def _add_marker(scene: Any, marker: Marker) -> None:
+    mujoco = import_mujoco()
+    size, position, turn = [marker.radius] * 3, np.array(marker.position, float), np.eye(3).ravel()
+    geom, color = scene.geoms[scene.ngeom], np.array(marker.color, np.float32)
+    mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_SPHERE, size, position, turn, color)
+    scene.ngeom += 1
