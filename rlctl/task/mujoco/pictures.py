@@ -1,5 +1,8 @@
 """Pictures of a world in MuJoCo, drawn by OpenGL without a display."""
 
+import importlib
+import os
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -46,6 +49,7 @@ def draw(
         for wanted, present in zip(size, (model.vis.global_.offwidth, model.vis.global_.offheight), strict=True)
     )
     try:
+        _choose_opengl(mujoco)
         with mujoco.Renderer(model, size[1], size[0]) as renderer:
             renderer.update_scene(data, camera)
             for marker in markers:
@@ -57,6 +61,16 @@ def draw(
             "without a display set MUJOCO_GL=egl (Debian: libegl1) or MUJOCO_GL=osmesa"
         ) from None
     return picture
+
+
+def _choose_opengl(mujoco: Any) -> None:
+    """Let MuJoCo draw by EGL where there is no display, unless MUJOCO_GL is set.
+
+    It has chosen at its import, and without a display that choice, GLFW, ends the process.
+    """
+    if sys.platform == "linux" and not os.environ.get("DISPLAY") and "MUJOCO_GL" not in os.environ:
+        os.environ["MUJOCO_GL"] = "egl"
+        importlib.reload(sys.modules[mujoco.Renderer.__module__].gl_context)
 
 
 def _add_marker(scene: Any, marker: Marker) -> None:
