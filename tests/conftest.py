@@ -5,11 +5,6 @@ import os
 # Each of the processes that run the tests has a core: threads of a library would only wait for each other.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
-HIDDEN = os.path.join(os.path.dirname(__file__), "hidden")
-if os.environ.get("HIDE_PACKAGES"):  # as HIDE_PACKAGES="pybullet pybullet_data" make test: as if not installed
-    os.environ["PYTHONPATH"] = os.pathsep.join([HIDDEN, *filter(None, [os.environ.get("PYTHONPATH")])])
-    import tests.hidden.sitecustomize
-
 import contextlib
 import gc
 import importlib.util

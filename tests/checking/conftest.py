@@ -11,7 +11,7 @@ pytest.register_assert_rewrite("tests.checking.judging")
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark mistakes in PyBullet. Let one mistake for each rule be quick; all mistakes are slow tests, and in test_all_rules.py."""
+    """Mark what needs PyBullet, and let one mistake for each rule be quick; all are in test_all_rules.py, slow."""
     rules = set()
     for item in items:
         if item.name.startswith("test_finds_the_mistake_and_only_that"):

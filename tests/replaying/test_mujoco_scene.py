@@ -7,6 +7,7 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.replaying.mjcf import ShapeKind
+from rlctl.replaying.mujoco_scene import find_mujoco_bounds
 from rlctl.replaying.recorder import make_drawable, play_episode
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.rrd import write_rrd
@@ -138,3 +139,15 @@ def test_a_task_of_rlctl_in_mujoco():
     assert "robot/trunk" in robot.links
     assert robot.shapes
     assert robot.box[1][0] - robot.box[0][0] < 3.0  # of the robot, without its ground
+
+
+def test_bounds_of_a_task_leave_out_the_ground():
+    with closing(EnvSpec("reach", sim="mujoco").make()) as env:
+        env.reset(seed=0)
+        sim = env.unwrapped.sim
+        low, high = find_mujoco_bounds(sim, list(sim.bodies.values()), [np.array([0.0, 2.0, 0.0])])
+        assert (high - low).max() < 3.0  # [m]; the ground is 30 m wide
+        assert high[1] == 2.0  # the marker
+        assert high[2] > sim.body("arm").link_position("lbr_iiwa_link_4")[2]
+        empty, _ = find_mujoco_bounds(sim, [sim.body("plane")], [])
+        assert empty.tolist() == [-1, -1, -1]

@@ -68,9 +68,10 @@ def _choose_opengl(mujoco: Any) -> None:
 
     It has chosen at its import, and without a display that choice, GLFW, ends the process.
     """
-    if sys.platform == "linux" and not os.environ.get("DISPLAY") and "MUJOCO_GL" not in os.environ:
-        os.environ["MUJOCO_GL"] = "egl"
-        importlib.reload(sys.modules[mujoco.Renderer.__module__].gl_context)
+    chosen = sys.modules[mujoco.Renderer.__module__].gl_context
+    if sys.platform == "linux" and not os.environ.get("DISPLAY") and "glfw" in chosen.GLContext.__module__:
+        os.environ.setdefault("MUJOCO_GL", "egl")
+        importlib.reload(chosen)
 
 
 def _add_marker(scene: Any, marker: Marker) -> None:
