@@ -8,6 +8,8 @@ from rlctl.task.pybullet.model_faults import find_model_faults
 from rlctl.task.pybullet.sim import BulletSim
 from tests.task import models
 
+pytestmark = pytest.mark.pybullet
+
 BOX = '<collision><geometry><box size="0.3 0.04 0.04"/></geometry></collision>'
 
 

@@ -93,6 +93,7 @@ def test_a_velocity_motor_and_brakes(weightless_arm):
     assert arm.joint_velocities == pytest.approx(wanted, abs=2e-3)
 
 
+@pytest.mark.pybullet
 def test_frictions_are_multiplied_and_restored():
     with closing(TaskEnv(Cart(), sim="mujoco")) as env:
         cube, plane = env.task.cube, env.task.plane
@@ -113,6 +114,7 @@ def test_feet_have_the_spinning_friction_of_their_file():
     assert spins[:-2] == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize("world", [BulletSim, MujocoSim])
 def test_a_force_sensor_measures_what_hangs_from_it(world):
     options = {"solref": 0.02} if world is MujocoSim else {}
@@ -148,6 +150,7 @@ def test_events_act_in_mujoco_too():
     assert masses[1] > 1.2 * masses[0]
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize(
     ("task", "parameters", "missing"),
     [("kuka-grasp", {}, "kuka_with_gripper2.sdf: MuJoCo reads URDF and MJCF")],
