@@ -90,7 +90,8 @@ class EnvSpec:
             return self
         from rlctl.task.env import choose_engine
 
-        return dataclasses.replace(self, sim=choose_engine(self.constructor()))
+        task: Any = self.constructor()
+        return dataclasses.replace(self, sim=choose_engine(task))
 
     @property
     def is_batch(self) -> bool:

@@ -384,8 +384,8 @@ class MujocoSim(Sim):
         if self.world.batch is not None:
             self._refuse("pictures of many worlds")
         self.world.refresh()
-        camera = {"eye": eye, "target": target, "field_of_view": field_of_view}
-        return draw(self.model, self.data, (width, height), self._markers, **camera)
+        size = width, height
+        return draw(self.model, self.data, size, self._markers, eye=eye, target=target, field_of_view=field_of_view)
 
     def close(self) -> None:
         with contextlib.suppress(AttributeError):
