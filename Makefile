@@ -1,5 +1,8 @@
-# `make demo` and `make test` do all set-up on a fresh machine, with Python 3.11 or with uv, which downloads it.
-PYTHON ?= $(shell python3.11 -c 'import sys; print(sys.executable)' 2> /dev/null)
+# `make demo` and `make test` do all set-up on a fresh machine, with a Python from 3.11 to 3.14, or with uv, which
+# downloads 3.11: PyBullet has no wheels above. With the others MuJoCo simulates.
+PYTHONS := python3.11 python3.14 python3.13 python3.12
+PYTHON ?= $(shell for python in $(PYTHONS); do \
+	$$python -c 'import sys; print(sys.executable)' 2> /dev/null && break; done)
 # `make demo TORCH_INDEX=ADDRESS` takes PyTorch from the index that its installation page names for the CPU, which saves
 # gigabytes of CUDA where pip's default build has it.
 TORCH_INDEX ?=
@@ -66,15 +69,15 @@ clean:
 $(BIN)/python:
 	@if [ -n "$(PYTHON)" ]; then \
 		$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] > (3, 11))' || \
-			echo "PyBullet has no wheels for Python 3.12 and newer, so it is left out; make demo and most bundled tasks need" \
-				"it: use Python 3.11, or build it afterwards (CONTRIBUTING.md). Nothing else is built"; \
+			echo "PyBullet has no wheels for Python 3.12 and newer: tasks are simulated in MuJoCo. For those that need" \
+				"PyBullet use Python 3.11, or build PyBullet afterwards (CONTRIBUTING.md)"; \
 		$(PYTHON) -m venv $(VENV); \
 	elif command -v uv > /dev/null; then \
 		uv venv --quiet --seed --python 3.11 $(VENV); \
 	else \
-		echo "Python 3.11 is missing: install it, or uv (https://docs.astral.sh/uv), and run make again"; exit 1; \
+		echo "no Python from 3.11 to 3.14 found: install one, or uv (https://docs.astral.sh/uv), and run make again"; exit 1; \
 	fi
-	@echo "installing into $(VENV): 2.1 GB, of which PyTorch for the CPU 0.7, Rerun 0.7, PyBullet 0.3 and SciPy 0.1 GB"
+	@echo "installing into $(VENV): up to 2.2 GB, of which PyTorch for the CPU 0.7, Rerun 0.7, PyBullet 0.3 and SciPy 0.1 GB"
 	@if [ -n "$(TORCH_INDEX)" ]; then $(INSTALL) --no-deps -c constraints.txt --index-url "$(TORCH_INDEX)" torch; fi
 
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python

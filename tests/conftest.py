@@ -7,6 +7,7 @@ os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL
 
 import contextlib
 import gc
+import importlib.util
 import signal
 import subprocess
 import sys
@@ -23,6 +24,13 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup what is started here
 ALL_CORES = sorted(os.sched_getaffinity(0))
 if name := os.environ.get("PYTEST_XDIST_WORKER"):  # so what it trains and evaluates has one worker and not one per core
     os.sched_setaffinity(0, {ALL_CORES[int(name.removeprefix("gw")) % len(ALL_CORES)]})
+
+
+def pytest_collection_modifyitems(items):
+    if importlib.util.find_spec("pybullet") is None:
+        for item in items:
+            if item.get_closest_marker("pybullet"):
+                item.add_marker(pytest.mark.skip(reason="needs PyBullet, which is not installed"))
 
 
 def pytest_collection_finish():

@@ -357,6 +357,7 @@ def test_the_site_is_whole_and_loads_nothing_from_elsewhere():
             assert local.exists(), f"{page.name} loads {address}"
 
 
+@pytest.mark.pybullet
 def test_pages_of_the_rules_are_current():
     make_rules = load_generator("make_rules")
     for file, text in make_rules.render_all(make_rules.read_printed()).items():

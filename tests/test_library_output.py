@@ -32,6 +32,7 @@ def test_own_output_of_a_command(capfd):
     assert len(shown) == 3
 
 
+@pytest.mark.pybullet
 def test_pybullet_is_imported_without_its_line():
     use = "import pybullet, sys; print(pybullet.DIRECT, file=sys.stderr)"
     code = (

@@ -110,7 +110,7 @@ def test_make_says_what_is_missing(tmp_path):
     done = make_environment(tmp_path)
     assert done.returncode == 2
     assert done.stdout == (
-        "Python 3.11 is missing: install it, or uv (https://docs.astral.sh/uv), and run make again\n"
+        "no Python from 3.11 to 3.14 found: install one, or uv (https://docs.astral.sh/uv), and run make again\n"
     )
 
 
@@ -119,7 +119,28 @@ def test_make_uses_uv_where_python_is_missing(tmp_path):
     assert done.returncode == 0, done.stderr
     first, size = done.stdout.splitlines()
     assert first == "uv venv --quiet --seed --python 3.11 .venv"
-    assert size.startswith("installing into .venv: 2.1 GB, of which PyTorch for the CPU 0.7, Rerun 0.7,")
+    assert size.startswith("installing into .venv: up to 2.2 GB, of which PyTorch for the CPU 0.7, Rerun 0.7,")
+
+
+PYTHON = f"""case "$1" in
+  -c) case "$2" in *version*) exit 1;; *) echo "$0";; esac;;
+  *) echo "$0 $@"; {INSTALL};;
+esac"""
+
+
+@pytest.mark.parametrize(
+    ("found", "used"),
+    [(["3.11", "3.14"], "3.11"), (["3.12", "3.13"], "3.13"), (["3.12", "3.14"], "3.14")],
+)
+def test_make_prefers_the_python_that_has_both_engines_then_the_newest(tmp_path, found, used):
+    done = make_environment(tmp_path, **{f"python{version}": PYTHON for version in found})
+    assert done.returncode == 0, done.stderr
+    assert f"/bin/python{used} -m venv .venv" in done.stdout
+
+
+def test_make_says_what_a_python_without_pybullet_does(tmp_path):
+    done = make_environment(tmp_path, **{"python3.13": PYTHON})
+    assert done.stdout.startswith("PyBullet has no wheels for Python 3.12 and newer: tasks are simulated in MuJoCo.")
 
 
 def test_make_installs_with_uv_if_it_is_there(tmp_path):

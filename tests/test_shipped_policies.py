@@ -44,6 +44,7 @@ def check_score(task: str, info: PolicyInfo, episodes: int = 20) -> None:
             pytest.fail(f"{task}: {name} is {now} over {episodes} episodes, its metadata has {before}. {advice}")
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize(
     "task", [pytest.param(task, marks=[] if task == "reach" else pytest.mark.slow) for task in OURS]
 )
@@ -57,6 +58,7 @@ def test_the_file_of_a_task_is_as_its_policy_was_exported(task):
     assert not [note for note in find_policy(task, "pretrained").notes if "warning" in note]
 
 
+@pytest.mark.pybullet
 def test_a_task_that_has_changed_is_noticed():
     info = PolicyFile.read_info(find_shipped_policy("reach"))
     better = info.provenance.score.model_copy(update={"return_interval": (900.0, 901.0)})
@@ -92,6 +94,7 @@ def test_what_is_not_shipped():
         find_shipped_policy("raech")
 
 
+@pytest.mark.pybullet
 def test_the_actor_of_a_run_and_its_score(tmp_path):
     run = RunDirectory(tmp_path / "reach" / "2026-01-01_00-00-00_s3")
     info = PolicyFile.read_info(find_shipped_policy("reach")).model_copy(update={"provenance": None})
@@ -125,6 +128,7 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
         export_actor(ExportRequest(str(tmp_path / "policy.onnx"), checkpoint="best", policy=target))
 
 
+@pytest.mark.pybullet
 def test_a_shipped_policy_is_measured_anew(tmp_path):
     shipped = PolicyFile.read_info(find_shipped_policy("reach")).provenance
     target = tmp_path / "reach.safetensors"

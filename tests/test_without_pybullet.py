@@ -1,21 +1,20 @@
-"""Where PyBullet is not installed, as on Python 3.12 and later, everything but tasks of rlctl works."""
+"""Where PyBullet is not installed, as on Python 3.12 and later, MuJoCo simulates the tasks of rlctl."""
 
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-GONE = "raise ModuleNotFoundError('not installed', name={0!r})"
+HIDDEN = str(Path(__file__).parent / "hidden")
 
 
 @pytest.fixture
 def rlctl_without(tmp_path, monkeypatch):
     """Run the command line in `tmp_path` with PyBullet hidden from it and from its workers."""
-    for name in ("pybullet", "pybullet_data"):
-        (tmp_path / "hidden").mkdir(exist_ok=True)
-        (tmp_path / "hidden" / f"{name}.py").write_text(GONE.format(name))
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "hidden"), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("HIDE_PACKAGES", "pybullet pybullet_data")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([HIDDEN, *filter(None, [os.environ.get("PYTHONPATH")])]))
     monkeypatch.setenv("NO_COLOR", "1")
 
     def run(*arguments):
@@ -26,15 +25,37 @@ def rlctl_without(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "command",
-    [("train", "reach", "-n", "100"), pytest.param(("eval", "reach", "--pretrained"), marks=pytest.mark.slow)],
+    ("task", "model"), [("ant", "plane_stadium.sdf"), ("kuka-grasp", "kuka_iiwa/kuka_with_gripper2.sdf")]
 )
-def test_a_task_of_rlctl_names_what_is_missing(rlctl_without, command):
-    done = rlctl_without(*command)
+def test_a_task_with_a_model_of_pybullet_names_what_is_missing(rlctl_without, task, model):
+    done = rlctl_without("train", task, "-n", "100")
+    assert done.returncode == 3
+    expected = f"error: task '{task}': model file '{model}' not found. If it is one of PyBullet's: pip install "
+    assert done.stderr.splitlines()[-1].startswith(expected)
+    assert "Traceback" not in done.stderr
+
+
+def test_a_policy_of_pybullet_says_how_to_install_it_or_to_do_without(rlctl_without):
+    done = rlctl_without("eval", "reach", "--pretrained")
     assert done.returncode == 2
-    error = done.stderr.splitlines()[-1]
-    assert error.startswith("error: tasks of rlctl need PyBullet, which is not installed: pip install ")
-    assert error.endswith(" pybullet")
+    *_, missing, instead = done.stderr.splitlines()
+    assert missing.startswith("error: PyBullet is not installed: pip install ")
+    assert missing.endswith("pybullet")
+    assert instead == "or train in MuJoCo, unless the task needs models of PyBullet: --set sim=mujoco"
+
+
+@pytest.mark.slow
+def test_the_demo_learns_in_mujoco(rlctl_without):
+    for command in (
+        ("train", "reach"),
+        ("eval", "reach", "--min-success", "0.95"),
+        ("export", "reach", "--onnx"),
+        ("replay", "reach"),
+        ("check-env", "reach"),
+        ("tasks", "show", "reach"),
+    ):
+        done = rlctl_without(*command)
+        assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_a_gymnasium_environment_is_recorded(rlctl_without):
@@ -45,8 +66,6 @@ def test_a_gymnasium_environment_is_recorded(rlctl_without):
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["Pendulum-v1", "Reacher-v5"])
 def test_a_gymnasium_environment_goes_through_every_verb(rlctl_without, task):
-    if task == "Reacher-v5":
-        pytest.importorskip("mujoco")
     for command in (
         ("check-env", task),
         ("train", task, "-n", "1000", "--set", "eval.episodes=2"),

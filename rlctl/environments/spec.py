@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import inspect
 import math
 import os
@@ -90,8 +89,10 @@ class EnvSpec:
         """Return the spec with its engine: PyBullet if it is installed, for a `BatchTask` and otherwise MuJoCo."""
         if self.sim or not is_task(self.constructor()):
             return self
-        engine = "mujoco" if self.is_batch or importlib.util.find_spec("pybullet") is None else "pybullet"
-        return dataclasses.replace(self, sim=engine)
+        from rlctl.task.env import choose_engine
+
+        task: Any = self.constructor()
+        return dataclasses.replace(self, sim=choose_engine(task))
 
     @property
     def is_batch(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,6 +16,9 @@ from rlctl.task.env import TaskEnv
 
 if TYPE_CHECKING:
     import mujoco
+
+    from rlctl.task.body import Body
+    from rlctl.task.mujoco.sim import MujocoSim
 
 Array = NDArray[np.float64]
 
@@ -116,6 +120,19 @@ def find_trunk_joint(model: mujoco.MjModel, joint: int) -> Literal["free", "rail
         return "free"
     endless = kind == _enum("mjtJoint", "mjJNT_SLIDE") and not 0 < np.ptp(model.jnt_range[joint]) < _RAIL
     return "rail" if endless else None
+
+
+def find_mujoco_bounds(sim: MujocoSim, bodies: Sequence[Body], markers: Sequence[Array]) -> tuple[Array, Array]:
+    """Return the lowest and highest corner [m] of markers and bodies of a task's world, without the ground."""
+    sim.world.refresh()
+    wanted = {number for body in bodies for number in sim.bodies[body.name].parts.links.values()}
+    geoms = [
+        geom
+        for geom in range(sim.model.ngeom)
+        if int(sim.model.geom_bodyid[geom]) in wanted and 0 < sim.model.geom_rbound[geom] < _GROUND_SIZE / 2
+    ]
+    corners = [*markers, *(_find_box(sim.model, geoms, sim.data.geom_xpos) if geoms else ())]
+    return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
 
 
 def _find_trunk(model: mujoco.MjModel, positions: Array) -> int | None:

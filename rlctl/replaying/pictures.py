@@ -1,7 +1,7 @@
 """Shows episodes as films (`.mp4` or `.gif`) and pictures, without a display.
 
-A task is drawn by PyBullet's software renderer, any other environment by its own `render()`, or, where it has none, its
-PyBullet world by that renderer.
+A task is drawn by its engine, PyBullet's software renderer or MuJoCo, any other environment by its own `render()`, or,
+where it has none, its PyBullet world by that renderer.
 """
 
 import contextlib

@@ -8,8 +8,10 @@ from rlctl.errors import UsageError, describe_exception
 from rlctl.replaying.bullet_bodies import read_body
 from rlctl.replaying.bullet_camera import EYE_DIRECTION, BulletCamera, Picture, find_world
 from rlctl.replaying.drawable import DrawableEnv, make_drawable
+from rlctl.replaying.mujoco_scene import find_mujoco_bounds
 from rlctl.replaying.scene import Env
 from rlctl.task.env import TaskEnv
+from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.task.pybullet.sim import PybulletSim
 
 
@@ -85,12 +87,13 @@ class _MujocoTaskView:
         self._size = size
 
     def begin(self) -> None:
-        bodies = [body for body in self._env.sim.bodies.values() if body.link_names]
-        self._followed = next((body for body in bodies if not body.fixed), None)
-        shown = [self._followed] if self._followed is not None else bodies
-        points = [body.link_position(link) for body in shown for link in body.link_names]
-        points += [np.asarray(position) for position in self._env.task.markers().values()]
-        low, high = (np.min(points, axis=0), np.max(points, axis=0)) if points else (-np.ones(3), np.ones(3))
+        sim = self._env.sim
+        assert isinstance(sim, MujocoSim)  # `look_at` asks
+        bodies = list(sim.bodies.values())
+        self._followed = next((body for body in bodies if body.link_names and not body.fixed), None)
+        shown = bodies if self._followed is None else [self._followed]
+        markers = [np.asarray(position) for position in self._env.task.markers().values()]
+        low, high = find_mujoco_bounds(sim, shown, markers)
         self._target = (low + high) / 2
         distance = max(1.5, 2.5 * float(np.linalg.norm(high - low)))
         self._offset = distance * EYE_DIRECTION / np.linalg.norm(EYE_DIRECTION)

@@ -18,6 +18,7 @@ from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_stream
 from rlctl.task.joints import Joints
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.observation import Observation, ObservationFormat
+from rlctl.task.pybullet.library import is_installed
 from rlctl.task.pybullet.sim import PybulletSim
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_definition, check_parameters
@@ -27,7 +28,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     """Steps a `Task`: act, physics, terminated, rewards, interval events, observe.
 
     `info` holds `reward_terms` (weighted; they add up to the reward), `metrics` (every raw term), `is_success`
-    where the task defines it, and, in steps with events, `events` (the drawn values).
+    where the task defines it, and, in steps with events, `events` (the drawn values). `sim` is the engine:
+    `pybullet`, `mujoco`, `mujoco:SOLREF`; by default that of `choose_engine`.
     """
 
     def __init__(
@@ -37,7 +39,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         render_mode: Literal["human", "rgb_array"] | None = None,
         reward_weights: Mapping[str, float] | None = None,
         events: EventSettings | None = None,
-        sim: str = "pybullet",
+        sim: str = "",
     ) -> None:
         check_parameters(type(task))
         self.task = task = as_single(task)
@@ -240,8 +242,13 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.sim.close()
 
 
+def choose_engine(task: type) -> str:
+    """Return `pybullet` if it is installed, for a `BatchTask` and otherwise `mujoco`."""
+    return "mujoco" if issubclass(task, BatchTask | OneWorld) or not is_installed() else "pybullet"
+
+
 def _make_world(task: Task, sim: str, render_mode: str | None) -> Sim:
-    solref, iterations = read_solref(sim), task.solver_iterations
+    solref, iterations = read_solref(sim or choose_engine(type(task))), task.solver_iterations
     if isinstance(task, OneWorld):
         if solref is None:
             raise UsageError(f"{type(task).__name__} simulates its worlds in MuJoCo: sim: mujoco, or --sim mujoco")

@@ -21,10 +21,12 @@ def find_model_file(file: str | Path) -> Path:
         if (folder / path).is_file():  # PyBullet crashes on a folder
             return folder / path
     own = ", ".join(sorted(model.name for model in MODELS.glob("*.urdf")))
+    hint = f"for a file next to your module: Path(__file__).with_name({path.name!r})"
+    if other_models is None:
+        raise TaskError(f"model file {str(file)!r} not found. If it is one of PyBullet's: {INSTALL_PYBULLET}; {hint}")
     raise TaskError(
         f"model file {str(file)!r} not found: neither under {Path.cwd()}, nor among rlctl's models ({own}), "
-        f"nor in pybullet_data{'' if other_models else f', which is not installed: {INSTALL_PYBULLET}'}; "
-        f"for a file next to your module: Path(__file__).with_name({path.name!r})"
+        f"nor in pybullet_data; {hint}"
     )
 
 

@@ -1,13 +1,16 @@
 """Environments that keep what they take or share spaces."""
 
+import contextlib
 import os
 import threading
 
 import numpy as np
-import pybullet
 from broken_envs import Clean
 from broken_repeats import OwnWorld
 from gymnasium import spaces
+
+with contextlib.suppress(ModuleNotFoundError):  # whatever needs it is skipped without it
+    import pybullet
 
 
 class Reconnects(OwnWorld):

@@ -1,18 +1,21 @@
 """Environments that are slow, each in its own way, and others that are slow with good reason."""
 
 import argparse
+import contextlib
 import functools
 import time
 
 import numpy as np
-import pybullet
-import pybullet_data
 from broken_envs import Clean
 from gymnasium import spaces
-from pybullet_utils.bullet_client import BulletClient
 
 from rlctl.checking.families.speed import FIRST_SPEED_SEED
 from rlctl_manipulation.reach import Reach
+
+with contextlib.suppress(ModuleNotFoundError):  # whatever needs it is skipped without it
+    import pybullet
+    import pybullet_data
+    from pybullet_utils.bullet_client import BulletClient
 
 
 def work(seconds):

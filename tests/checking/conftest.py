@@ -11,11 +11,15 @@ pytest.register_assert_rewrite("tests.checking.judging")
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Let one mistake for each rule be quick; all mistakes are slow tests, and in test_all_rules.py."""
+    """Mark what needs PyBullet, and let one mistake for each rule be quick; all are in test_all_rules.py, slow."""
     rules = set()
     for item in items:
-        if item.name.startswith("test_finds_the_mistake_and_only_that") and "test_all_rules" not in item.nodeid:
+        if item.name.startswith("test_finds_the_mistake_and_only_that"):
             case = item.callspec.params["case"]
+            if case.needs_pybullet:
+                item.add_marker(pytest.mark.pybullet)
+            if "test_all_rules" in item.nodeid:
+                continue
             if rules.issuperset(case.rules):
                 item.add_marker(pytest.mark.slow)
             rules.update(case.rules)

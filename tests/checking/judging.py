@@ -7,18 +7,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import pybullet
-
 from rlctl.checking import children, families
 from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.check import judge
 from rlctl.checking.records import Records
 from rlctl.checking.rules import RULES
 from rlctl.environments.spec import EnvSpec
+from rlctl.task.pybullet.library import pybullet
 
 FOLDER = Path(__file__).parent
 SECONDS = 10 * families.PROCESS_S
 """For the experiments of a process: a slow machine judges as a fast one does."""
+PYBULLET_FILES = ("broken_models.py", "broken_physics.py", "broken_robots.py")
+"""All of their environments need PyBullet."""
 sys.dont_write_bytecode = False  # each experiment imports its environment's file anew
 
 
@@ -31,6 +32,12 @@ class Case:
     expected: frozenset[tuple[str, str]]
     """Every finding: rule and severity."""
     twin: str = "broken_envs.py:Clean"
+    pybullet: bool = False
+    """Whether one of them needs PyBullet."""
+
+    @property
+    def needs_pybullet(self) -> bool:
+        return self.pybullet or self.broken.startswith(PYBULLET_FILES)
 
     @property
     def rules(self) -> tuple[str, ...]:
@@ -46,7 +53,7 @@ IN_PROCESSES = [
     case("broken_envs.py:Segfaults", ("RL208", "error")),
     case("broken_envs.py:Hangs", ("RL209", "error")),
     case("broken_envs.py:Prints", ("RL211", "warning")),
-    case("broken_interface.py:Gui", ("RL216", "error")),
+    case("broken_interface.py:Gui", ("RL216", "error"), pybullet=True),
     case("broken_repeats.py:HashOrder", ("RL305", "error")),
 ]
 """What only shows with real child processes: tested in test_processes.py, and RL216 in test_interface.py."""

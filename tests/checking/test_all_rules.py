@@ -4,11 +4,15 @@ from importlib import import_module
 
 import pytest
 
-from tests.checking.judging import FOLDER, found
+from tests.checking.judging import FOLDER, PYBULLET_FILES, found
 
 MODULES = [import_module(f"tests.checking.{file.stem}") for file in sorted(FOLDER.glob("test_*.py"))]
 CASES = [case for module in MODULES for case in getattr(module, "CASES", [])]
-CLEAN = [task for module in MODULES for task in getattr(module, "CLEAN", [])]
+CLEAN = [
+    pytest.param(task, marks=pytest.mark.pybullet if task.startswith(PYBULLET_FILES) else ())
+    for module in MODULES
+    for task in getattr(module, "CLEAN", [])
+]
 
 pytestmark = pytest.mark.slow
 

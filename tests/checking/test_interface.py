@@ -72,6 +72,7 @@ def test_no_limit_is_told_with_what_is_known():
     )
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize(
     ("name", "rule", "severity", "text"),
     [

@@ -5,11 +5,11 @@ import types
 from pathlib import Path
 
 import numpy as np
-import pybullet_data
 import pytest
 
 from rlctl.environments.info import space_to_json
 from rlctl.errors import OldGymError
+from rlctl.task.pybullet.library import pybullet_data
 from tests.checking.judging import case, check_case, findings
 
 ERROR = "error"
@@ -20,8 +20,8 @@ CASES = [
     case("broken_envs.py:Cleen", ("RL005", ERROR)),
     case("broken_loading.py:NeedsArguments", ("RL006", ERROR)),
     case("broken_loading.py:NoFile", ("RL007", ERROR)),
-    case("broken_loading.py:NoModel", ("RL007", ERROR)),
-    case("broken_loading.py:NoModelAtReset", ("RL007", ERROR)),
+    case("broken_loading.py:NoModel", ("RL007", ERROR), pybullet=True),
+    case("broken_loading.py:NoModelAtReset", ("RL007", ERROR), pybullet=True),
     case("broken_old_gym.py:Pushed", ("RL008", ERROR)),
 ]
 
@@ -42,6 +42,7 @@ def test_a_missing_class_gets_the_closest_name():
     assert "has no 'Cleen'. Did you mean 'Clean'?" in finding.message
 
 
+@pytest.mark.pybullet
 def test_a_missing_model_is_named_with_the_search_path():
     (finding,) = findings("broken_loading.py:NoModel", "RL007")
     data = Path(pybullet_data.getDataPath())
@@ -61,6 +62,7 @@ def test_a_missing_file_is_named_without_the_words_around_it():
     assert finding.evidence["file"] == "data/table.csv"
 
 
+@pytest.mark.pybullet
 def test_a_missing_model_of_a_reset_is_named():
     (finding,) = findings("broken_loading.py:NoModelAtReset", "RL007")
     assert finding.message.startswith("reset does not find 'robot.urdf', looked for in ")

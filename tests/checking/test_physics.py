@@ -2,10 +2,10 @@
 
 import inspect
 
-import pybullet
 import pytest
 
 from rlctl.environments.bullet_calls import record_calls
+from rlctl.task.pybullet.library import pybullet
 from tests.checking.judging import case, check_case, findings, found, rules_of
 
 RULES = set(rules_of("RL8"))
@@ -30,6 +30,7 @@ def test_finds_the_mistake_and_only_that(case):
 CLEAN = ["broken_physics.py:FixedCart", "broken_physics.py:ThroughBulletClient"]
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize("task", CLEAN)
 def test_worlds_without_a_mistake_are_clean(task):
     assert found(task, *rules_of("RL8")) == set()
@@ -39,6 +40,7 @@ def the_finding(name):
     return next(each for each in findings(f"broken_physics.py:{name}", *sorted(RULES)) if each.rule in RULES)
 
 
+@pytest.mark.pybullet
 def test_joint_beyond_its_limits_is_placed():
     finding = the_finding("BeyondLimits")
     # Actions are within +-1, and an action of 1 sets 1.8 rad.
@@ -49,6 +51,7 @@ def test_joint_beyond_its_limits_is_placed():
     assert {"seed", "episode", "step"} <= finding.evidence.keys()
 
 
+@pytest.mark.pybullet
 def test_penetration_is_measured():
     finding = the_finding("InTheFloor")
     # Set back to 5 cm every step, of which the solver takes away a fifth.
@@ -57,6 +60,7 @@ def test_penetration_is_measured():
     assert "for 30 steps in a row" in finding.message
 
 
+@pytest.mark.pybullet
 def test_explosion_is_measured():
     finding = the_finding("Explodes")
     # PyBullet stops at 100 m/s along each of three axes.
@@ -64,6 +68,7 @@ def test_explosion_is_measured():
     assert finding.message.startswith("link0 moves at 173.")
 
 
+@pytest.mark.pybullet
 def test_calls_that_run_without_the_client_are_found():
     assert found("broken_physics.py:ForgetsClient", "RL808") == {("RL808", "error")}
     assert found("broken_physics.py:OverridesForgetful", "RL808") == set()
@@ -90,6 +95,7 @@ def right(client):
 """
 
 
+@pytest.mark.pybullet
 def test_calls_are_recorded_as_they_are_meant(tmp_path):
     file = tmp_path / "calls.py"
     file.write_text(SOURCE)
@@ -117,6 +123,7 @@ def test_a_joint_without_effort_limit_is_named():
     assert "pass max_force= [N m]" in finding.message
 
 
+@pytest.mark.pybullet
 def test_impossible_inertia_is_named():
     (finding,) = findings("broken_models.py:HeavyInertia", "RL809")
     # An arm of 0.2 kg, 0.04 m x 0.04 m x 0.2 m, can have at most 0.2 * (0.04^2 + 0.04^2 + 0.2^2) = 0.0087 kg m^2.

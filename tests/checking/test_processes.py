@@ -37,7 +37,15 @@ def in_root(monkeypatch):
     [
         ("tests/checking/broken_import.py:Anything", "RL001", "ZeroDivisionError: at import", "Repair the line"),
         (f"{BROKEN}:RaisingConstructor", "RL007", "does not find 'robot.urdf', looked for in", "__file__"),
-        ("tests/checking/broken_loading.py:NoSearchPath", "RL007", "call setAdditionalSearchPath first", "__file__"),
+        pytest.param(
+            *(
+                "tests/checking/broken_loading.py:NoSearchPath",
+                "RL007",
+                "call setAdditionalSearchPath first",
+                "__file__",
+            ),
+            marks=pytest.mark.pybullet,
+        ),
         (f"{BROKEN}:NeedsArgument", "RL006", "missing 1 required", "(--set task.gain=...)"),
         (f"{BROKEN}:NUMBER", "RL005", "NUMBER is of type int, not a class", "case-sensitive"),
         (

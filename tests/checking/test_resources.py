@@ -13,7 +13,7 @@ from tests.checking.judging import case, check_case, findings, records_of
 
 FILE = "broken_resources.py"
 CASES = [
-    case(f"{FILE}:LeavesBodies", ("RL405", "error"), twin="broken_repeats.py:OwnWorld"),
+    case(f"{FILE}:LeavesBodies", ("RL405", "error"), twin="broken_repeats.py:OwnWorld", pybullet=True),
     case(f"{FILE}:KeepsFiles", ("RL405", "warning")),
     case(f"{FILE}:KeepsThreads", ("RL405", "warning")),
     case(f"{FILE}:KeepsMemory", ("RL405", "warning"), twin=f"{FILE}:Caches"),
@@ -32,6 +32,7 @@ def the_finding(name, rule):
     return finding
 
 
+@pytest.mark.pybullet
 def test_each_reset_leaves_a_client(monkeypatch):
     monkeypatch.setattr(isolation, "MOST_RESETS", 12)  # each is slow: PyBullet connects anew
     (finding,) = judge(records_of(f"{FILE}:Reconnects", "build", "leaks"), ["RL405"]).findings

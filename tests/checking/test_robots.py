@@ -55,6 +55,7 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize(
     ("name", "rule", "text"),
     [

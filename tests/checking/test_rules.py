@@ -53,7 +53,7 @@ CASES = [
     case("broken_repeats.py:UnseededLater", ("RL308", "warning")),
     case("broken_repeats.py:OldActionsAsRegistered", ("RL301", "error")),
     case("broken_repeats.py:Residue", ("RL301", "warning")),
-    case("broken_repeats.py:SharedWorld", ("RL401", "error"), ("RL402", "error"), ("RL808", "error")),
+    case("broken_repeats.py:SharedWorld", ("RL401", "error"), ("RL402", "error"), ("RL808", "error"), pybullet=True),
     case("broken_repeats.py:CloseBreaks", ("RL402", "error")),
     case("broken_repeats.py:OnlyOne", ("RL403", "error")),
     case("broken_envs.py:TimeLimitTerminates", ("RL501", "warning")),
@@ -80,7 +80,7 @@ def test_finds_the_mistake_and_only_that(case):
         "broken_envs.py:Clean",
         pytest.param("broken_envs.py:CleanDict", marks=pytest.mark.slow),
         pytest.param("broken_repeats.py:FixedStartNoise", marks=pytest.mark.slow),
-        pytest.param("broken_repeats.py:OwnWorld", marks=pytest.mark.slow),
+        pytest.param("broken_repeats.py:OwnWorld", marks=[pytest.mark.slow, pytest.mark.pybullet]),
         pytest.param("reach", marks=pytest.mark.slow),  # in test_processes.py by the command
     ],
 )

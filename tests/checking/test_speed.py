@@ -19,7 +19,7 @@ CASES = [
     case("broken_speed.py:Sleeps", ("RL903", "warning")),
     case("broken_speed.py:Renders", ("RL903", "warning"), twin="broken_speed.py:Sees"),
     case("broken_speed.py:ReadsFile", ("RL904", "warning")),
-    case("broken_speed.py:Reconnects", ("RL904", "warning"), twin="broken_speed.py:World"),
+    case("broken_speed.py:Reconnects", ("RL904", "warning"), twin="broken_speed.py:World", pybullet=True),
 ]
 STEP = TimedCall("pybullet.stepSimulation", "world.py:10", 0.61)
 NOTHING = Speed(66e-6, 52e-6, 200, 5, [STEP], [], [], False)
@@ -49,9 +49,16 @@ def test_finds_the_mistake_and_only_that(case):
 
 @pytest.mark.parametrize(
     "task",
-    [pytest.param("reach", marks=pytest.mark.slow), "CartPole-v1", "broken_envs.py:Clean", "broken_speed.py:World",
-     "broken_speed.py:Sees", "broken_speed.py:RendersNothing", "broken_speed.py:KeepsPartials"],
-)  # fmt: skip
+    [
+        pytest.param("reach", marks=pytest.mark.slow),
+        "CartPole-v1",
+        "broken_envs.py:Clean",
+        "broken_speed.py:Sees",
+        "broken_speed.py:RendersNothing",
+        pytest.param("broken_speed.py:World", marks=pytest.mark.pybullet),
+        pytest.param("broken_speed.py:KeepsPartials", marks=pytest.mark.pybullet),
+    ],
+)
 def test_what_is_fast_has_no_finding(task):
     assert findings(measured(task)) == []
     assert "steps/s: a million steps take " in format_speed(measured(task))
@@ -112,6 +119,7 @@ def test_a_task_that_says_that_it_reloads_may_load():
     assert findings(evidence) == []
 
 
+@pytest.mark.pybullet
 def test_calls_through_a_bullet_client_are_seen():
     finding, *more = findings(measured("broken_speed.py:CameraAtEveryStep"))
     assert (finding.rule, more) == ("RL903", [])
@@ -119,6 +127,7 @@ def test_calls_through_a_bullet_client_are_seen():
     assert finding.evidence["share"] > 0.5
 
 
+@pytest.mark.pybullet
 def test_rebuilding_is_named_with_its_calls():
     (finding,) = findings(measured("broken_speed.py:Rebuilds"))
     assert (finding.rule, finding.severity) == ("RL904", "warning")

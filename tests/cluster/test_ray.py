@@ -79,6 +79,7 @@ def lose(cluster, node, pid):
     wait_for(lambda: has_ended(pid), 10)
 
 
+@pytest.mark.pybullet
 def test_cells_are_equal_and_a_lost_node_is_no_end(cluster, node, block_run, toy, tmp_path, capsys):
     """One test, because each process of the test run would start a cluster of its own."""
     request, vary = EvalRequest(str(block_run.path), episodes=3), ["push=0:3:3", "limit=0.1:9:2"]

@@ -42,6 +42,7 @@ def evaluate(tmp_path, text, **options):
     return run_evaluation(request)
 
 
+@pytest.mark.pybullet
 def test_what_limits_cost(tmp_path):
     result = evaluate(tmp_path, STEP + "limits: {all: {speed: 0.02}}")  # [rad/s]: it gets nowhere
     assert result.unlimited is not None
@@ -54,6 +55,7 @@ def test_what_limits_cost(tmp_path):
     assert content["interventions"] == counts
 
 
+@pytest.mark.pybullet
 def test_a_wrong_scale_is_noticed_by_how_far_the_joints_move(tmp_path):
     def print_with(text):
         with output.out().capture() as captured:
@@ -64,6 +66,7 @@ def test_a_wrong_scale_is_noticed_by_how_far_the_joints_move(tmp_path):
     assert "as far as commanded" not in print_with(STEP)
 
 
+@pytest.mark.pybullet
 def test_limits_that_never_step_in_cost_nothing(tmp_path):
     result = evaluate(tmp_path, STEP + "limits: {all: {speed: 100, position: [-9, 9]}}")
     assert result.unlimited is not None
@@ -71,11 +74,13 @@ def test_limits_that_never_step_in_cost_nothing(tmp_path):
     assert not count_interventions(result)
 
 
+@pytest.mark.pybullet
 def test_limits_that_the_task_cannot_have(tmp_path):
     with pytest.raises(RecipeError, match=r"no observation 'joints'\. .*joint_positions"):
         evaluate(tmp_path, "sensors: {joints: {range: [0, 1]}}")
 
 
+@pytest.mark.pybullet
 def test_through_a_server_it_is_the_same(reach_server):
     direct = run_evaluation(EvalRequest("reach", checkpoint=PRETRAINED, episodes=2, n_envs=1))
     served = run_evaluation(EvalRequest("reach", baseline=f"ws://{reach_server.address}", episodes=2, n_envs=1))
@@ -142,6 +147,7 @@ def serve_answer(metadata, answer):
     loop.close()
 
 
+@pytest.mark.pybullet
 def test_self_test(tmp_path):
     from rlctl.deploy.server.request import ServeRequest
     from rlctl.deploy.server.serve import make_server

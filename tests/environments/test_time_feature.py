@@ -24,7 +24,7 @@ from tests.evaluation.conftest import ENVS
 BLOCK = f"{ENVS}:Block"
 
 
-@pytest.mark.parametrize("task", [BLOCK, "Pendulum-v1", "reach-sparse"])
+@pytest.mark.parametrize("task", [pytest.param(BLOCK, marks=pytest.mark.pybullet), "Pendulum-v1", "reach-sparse"])
 def test_it_is_that_of_sb3_contrib(task):
     ours, plain = EnvSpec(task, time_feature=True).make(), EnvSpec(task).make()
     limit = describe(plain).max_steps
@@ -46,6 +46,7 @@ def test_it_is_that_of_sb3_contrib(task):
         theirs.close()
 
 
+@pytest.mark.pybullet
 def test_it_has_a_name_and_can_be_stacked():
     env = EnvSpec(BLOCK, time_feature=True, frame_stack=2).make()
     assert describe(env).observation_sizes == {"position": 3, "time_left": 1}
@@ -99,6 +100,7 @@ def zoo_agent(tmp_path_factory):
     env.close()
 
 
+@pytest.mark.pybullet
 def test_the_zoos_agents_play_as_they_did(zoo_agent):
     model, env, imported = zoo_agent
     assert imported.info.spec.time_feature
@@ -112,6 +114,7 @@ def test_the_zoos_agents_play_as_they_did(zoo_agent):
         assert episode.result.total_reward == pytest.approx(total, rel=1e-5)
 
 
+@pytest.mark.pybullet
 def test_export_and_replay_honour_it(zoo_agent, tmp_path):
     _, _, imported = zoo_agent
     # It raises unless the file acts the same in closed loop.
@@ -120,6 +123,7 @@ def test_export_and_replay_honour_it(zoo_agent, tmp_path):
     assert run_replay(ReplayRequest(None, verify=episode.episode)).verification.difference is None
 
 
+@pytest.mark.pybullet
 def test_one_number_more_that_is_not_the_time_is_refused(tmp_path):
     class Wider(gymnasium.ObservationWrapper):
         def __init__(self, env):

@@ -13,6 +13,8 @@ from rlctl.evaluation.robustness import read
 from rlctl.evaluation.vary import measure_robustness
 from tests.evaluation.conftest import ENVS, write_run
 
+pytestmark = pytest.mark.pybullet
+
 
 def push(run, **request):
     return measure_robustness(EvalRequest(str(run.path), episodes=4, **request), push=True).push

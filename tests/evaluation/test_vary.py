@@ -27,6 +27,7 @@ def measured(tmp_path_factory):
     return measure_robustness(request, ["push=0:3:3", "mass=1:3:2"])
 
 
+@pytest.mark.pybullet
 def test_a_cell_is_the_evaluation_with_its_values(block_run, measured):
     (found,) = measured.maps
     assert [(axis.name, axis.setting, axis.values, axis.nominal) for axis in found.axes] == [
@@ -42,6 +43,7 @@ def test_a_cell_is_the_evaluation_with_its_values(block_run, measured):
     assert cell.return_interval == mean_interval([episode.result.total_reward for episode in alone.played])
 
 
+@pytest.mark.pybullet
 def test_nominal_and_worst_cells(measured):
     (found,) = measured.maps
     assert [cell.nominal for cell in found.cells] == [True, False, False, False, False, False]
@@ -58,6 +60,7 @@ def test_interval_of_the_mean_by_hand():
     assert mean_interval(returns[:1]) == (1.0, 1.0)
 
 
+@pytest.mark.pybullet
 def test_it_is_kept_with_the_run(measured):
     file = Path(measured.policy_file).parents[1] / "robustness.json"
     assert read(file) == measured
@@ -66,6 +69,7 @@ def test_it_is_kept_with_the_run(measured):
         read(file)
 
 
+@pytest.mark.pybullet
 def test_parameters_of_the_task_are_varied_too(block_run):
     request = EvalRequest(str(block_run.path), episodes=3)
     result = measure_robustness(request, ["push.force=0:3:2", "limit=0.1:9:2"])
@@ -76,6 +80,7 @@ def test_parameters_of_the_task_are_varied_too(block_run):
     assert read(block_run.robustness_file).maps == result.maps
 
 
+@pytest.mark.pybullet
 def test_command_line_draws_the_map_and_gates_the_worst_cell(rlctl, block_run):
     arguments = ("eval", block_run.path, "--episodes", 3, "--vary", "push=0:6:2", "--vary", "mass=1:2:2")
     done = rlctl(*arguments, "--min-success", "0.5")
@@ -101,6 +106,7 @@ def test_command_line_draws_the_map_and_gates_the_worst_cell(rlctl, block_run):
     )
 
 
+@pytest.mark.pybullet
 def test_the_command_for_one_cell_is_the_whole_of_it(measured):
     (found,) = measured.maps
     axis = found.axes[0].model_copy(update={"setting": "task.limit"})
@@ -122,6 +128,7 @@ def test_the_command_for_one_cell_is_the_whole_of_it(measured):
     )
 
 
+@pytest.mark.pybullet
 def test_command_line_as_json(rlctl, block_run):
     done = rlctl("eval", block_run.path, "--episodes", 2, "--vary", "friction=0.2:1:2", "--json", "-")
     content = json.loads(done.stdout)
@@ -129,6 +136,7 @@ def test_command_line_as_json(rlctl, block_run):
     assert [cell["values"] for cell in content["maps"][0]["cells"]] == [[0.2], [1.0]]
 
 
+@pytest.mark.pybullet
 def test_a_long_measurement_is_not_begun_unasked(block_run):
     vary = ["push=0:3:1000", "mass=1:2:1000"]
     with pytest.raises(UsageError, match=r"1,000,000 cells will take about [\d.]+ (h|days): .*start anyway with --yes"):
@@ -136,6 +144,7 @@ def test_a_long_measurement_is_not_begun_unasked(block_run):
     assert [format_duration(seconds) for seconds in (50, 600, 5400, 200_000)] == ["50 s", "10 min", "1.5 h", "2.3 days"]
 
 
+@pytest.mark.pybullet
 def test_gates_without_a_map_are_for_the_nominal_cell(measured):
     alone = measured.model_copy(update={"maps": []})
     check_gates(alone, Gates(min_success=1.0))
@@ -247,6 +256,7 @@ def test_events_set_in_a_standing_world_act_as_in_a_new_one():
         fresh.close()
 
 
+@pytest.mark.pybullet
 def test_the_same_episodes_in_mujoco(rlctl):
     pytest.importorskip("mujoco")
     done = rlctl("eval", "reach", "--pretrained", "--sim", "mujoco", "--episodes", "2", "--json", "-")
@@ -265,6 +275,7 @@ def test_the_worst_contacts_are_gated(rlctl):
     assert "--sim mujoco:0.02 --set randomize=false" in done.stdout
 
 
+@pytest.mark.pybullet
 def test_what_mujoco_has_not_is_said_before_an_episode_is_played(rlctl):
     pytest.importorskip("mujoco")
     done = rlctl("eval", "kuka-grasp", "--pretrained", "--sim", "mujoco")

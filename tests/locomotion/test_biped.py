@@ -22,6 +22,7 @@ def env(request):
     env.close()
 
 
+@pytest.mark.pybullet
 def test_it_can_stand(env):
     earned = sum(env.step(STAND)[1] for _ in range(200))
     assert not env.task.is_terminated()
@@ -188,6 +189,7 @@ def test_mistakes(parameters, message):
     assert str(caught.value) == message
 
 
+@pytest.mark.pybullet
 def test_nothing_is_wrong_with_the_models(env):
     assert find_model_faults(env.task.body) == []
     masses = 4.0 + 2 * (0.8 + 0.5 + 0.2)  # [kg]

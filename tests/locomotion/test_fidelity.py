@@ -6,11 +6,12 @@ its later episodes, which is what a training sees, are the family's.
 
 import gymnasium
 import numpy as np
-import pybullet_envs_gymnasium  # noqa: F401  # registers the reference
 import pytest
 
 from rlctl.task.env import TaskEnv
 from rlctl_locomotion.robots import Ant, HalfCheetah, Hopper, Humanoid, Walker2D
+
+pytest.importorskip("pybullet_envs_gymnasium")  # registers the reference
 
 ROBOTS = [Ant, HalfCheetah, Hopper, Walker2D, Humanoid]
 STEPS = 1000

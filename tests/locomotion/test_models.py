@@ -6,6 +6,8 @@ import pytest
 from rlctl.errors import TaskError
 from rlctl.task.pybullet.sim import PybulletSim
 
+pytestmark = pytest.mark.pybullet
+
 ONE_LEG = """<mujoco model="leg"><worldbody><body name="torso" pos="0 0 2">
   <geom type="sphere" size="0.1"/>
   <body name="shin"><joint name="knee" type="hinge" axis="0 1 0" range="-90 90"/>

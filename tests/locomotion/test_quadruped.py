@@ -18,6 +18,7 @@ def env():
     env.close()
 
 
+@pytest.mark.pybullet
 def test_it_stands_in_its_stance(env):
     for _ in range(100):
         _, _, terminated, _, info = env.step(np.zeros(12))

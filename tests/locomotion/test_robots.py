@@ -9,6 +9,8 @@ from rlctl.task.events import EventSettings
 from rlctl.task.pybullet.library import pybullet
 from rlctl_locomotion.robots import Ant, HalfCheetah, Hopper, Humanoid, Walker2D
 
+pytestmark = pytest.mark.pybullet
+
 ROBOTS = {"ant": Ant, "half-cheetah": HalfCheetah, "hopper": Hopper, "walker2d": Walker2D, "humanoid": Humanoid}
 
 

@@ -11,6 +11,8 @@ from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
 from rlctl_manipulation.kuka_grasp import HAND, HAND_HIGH, HAND_LOW, KukaGrasp, wrap
 
+pytestmark = pytest.mark.pybullet
+
 
 def steer(task):
     """Move towards the block, and turn until the fingers close on its narrow side."""

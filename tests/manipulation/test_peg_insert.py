@@ -41,6 +41,7 @@ def insert(task):
     return np.clip(action, -1, [1, 1, 0.5, 1]).astype(np.float32)
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize("seed", range(4))
 def test_the_peg_can_be_inserted(env, seed):
     _, info = play(env, seed, insert, STEPS)
@@ -52,6 +53,7 @@ def test_the_peg_can_be_inserted(env, seed):
     assert info["metrics"]["excess_force"] == pytest.approx(np.linalg.norm(env.task.force) - 20)
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize(("aside", "turned"), [(0.004, 0.0), (0.0, 0.4)])
 def test_a_peg_beside_the_hole_or_turned_does_not_go_in(env, aside, turned):
     """2 mm of play to each side, and a square of 16 mm turned by 0.4 rad is 21 mm wide."""

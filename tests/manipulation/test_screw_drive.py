@@ -32,6 +32,7 @@ def drive(task, stop=0.0004):
     return np.clip(action, -1, 1).astype(np.float32)
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize("seed", range(4))
 def test_the_screw_can_be_driven(env, seed):
     _, info = play(env, seed, drive, STEPS)
@@ -42,6 +43,7 @@ def test_the_screw_can_be_driven(env, seed):
     assert travel == pytest.approx(turned * LEAD / (2 * math.pi), abs=2e-5)  # the thread holds
 
 
+@pytest.mark.pybullet
 def test_a_blocked_screw_stops_the_spindle(env):
     _, info = play(env, 0, lambda task: drive(task, stop=-1.0), STEPS)
     # The spindle has 1 N m, of which 0.5 are safe. The head lies on the block.
@@ -49,6 +51,7 @@ def test_a_blocked_screw_stops_the_spindle(env):
     assert env.task.travel == pytest.approx(TRAVEL, abs=1e-4)
 
 
+@pytest.mark.pybullet
 def test_pressing_alone_drives_no_screw(env):
     """37 N on a lead of 5 mm are 0.03 N m, and the thread's friction is 0.2 N m."""
     task = env.task

@@ -19,6 +19,8 @@ from rlctl.task.pybullet.library import pybullet
 from tests.replaying.conftest import play
 from tests.replaying.reading import column, entities, layout, static
 
+pytestmark = pytest.mark.pybullet
+
 ROBOTS = ("ant", "half-cheetah", "hopper", "walker2d", "humanoid")
 PROBE_RADIUS = 0.01  # [m]
 MARGIN = 0.04  # [m]; Bullet rounds off what is thinner

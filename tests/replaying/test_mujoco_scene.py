@@ -8,6 +8,7 @@ import pytest
 from rlctl.environments.spec import EnvSpec
 from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.mjcf import ShapeKind
+from rlctl.replaying.mujoco_scene import find_mujoco_bounds
 from rlctl.replaying.recorder import play_episode
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.rrd import write_rrd
@@ -141,6 +142,7 @@ def test_a_task_of_rlctl_in_mujoco():
     assert robot.box[1][0] - robot.box[0][0] < 3.0  # of the robot, without its ground
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize("task", ["reach", "quadruped"])
 def test_a_task_shows_its_visual_shapes_as_in_pybullet(task):
     shapes = []
@@ -154,3 +156,15 @@ def test_a_task_shows_its_visual_shapes_as_in_pybullet(task):
         shapes.append(sorted((link, kind.value) for link, kind in links if link not in ("planeLink", "base_link")))
     assert shapes[0] == shapes[1]
     assert len(shapes[0]) > 5
+
+
+def test_bounds_of_a_task_leave_out_the_ground():
+    with closing(EnvSpec("reach", sim="mujoco").make()) as env:
+        env.reset(seed=0)
+        sim = env.unwrapped.sim
+        low, high = find_mujoco_bounds(sim, list(sim.bodies.values()), [np.array([0.0, 2.0, 0.0])])
+        assert (high - low).max() < 3.0  # [m]; the ground is 30 m wide
+        assert high[1] == 2.0  # the marker
+        assert high[2] > sim.body("arm").link_position("lbr_iiwa_link_4")[2]
+        empty, _ = find_mujoco_bounds(sim, [sim.body("plane")], [])
+        assert empty.tolist() == [-1, -1, -1]

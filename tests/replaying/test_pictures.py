@@ -28,6 +28,7 @@ def short_episode(reached, tmp_path_factory):
     return path
 
 
+@pytest.mark.pybullet
 def test_gif_of_a_robot_and_its_goal(short_episode, tmp_path):
     film = run_replay(ReplayRequest(str(short_episode), video=tmp_path / "reach.gif")).film
     # 60 steps a second, 20 pictures: those of the steps 0, 3, 6 and 9, which is the end.
@@ -40,6 +41,7 @@ def test_gif_of_a_robot_and_its_goal(short_episode, tmp_path):
     assert ((red > 180) & (green < 130) & (blue < 60)).sum() > 200  # the arm's joints
 
 
+@pytest.mark.pybullet
 def test_mp4_plays(short_episode, tmp_path):
     av = pytest.importorskip("av")
     film = run_replay(ReplayRequest(str(short_episode), video=tmp_path / "reach.mp4")).film
@@ -83,6 +85,7 @@ def test_episodes_take_their_time():
     assert time.monotonic() - arrived[0] >= 0.2
 
 
+@pytest.mark.pybullet
 def test_closing_the_window_ends_it_well():
     spec = EnvSpec("reach")
     env = spec.make()

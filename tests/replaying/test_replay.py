@@ -116,6 +116,7 @@ def test_policy_without_a_run_records_into_the_current_folder(run, tmp_path, mon
     assert names == ["episodes/000000.rrd", "episodes/000001.rrd"]
 
 
+@pytest.mark.pybullet
 def test_recorded_episode_is_recorded_beside_itself(replay, episode_file, tmp_path):
     own = shutil.copy(episode_file, tmp_path)
     done = replay("000007.npz")
@@ -190,6 +191,7 @@ def test_damaged_episode(replay, tmp_path):
     assert done.stderr.startswith("error: x.npz: damaged, or not an .npz file: ")
 
 
+@pytest.mark.pybullet
 def test_policy_for_another_task(run, tmp_path):
     request = ReplayRequest(str(run.run.best_policy), task=f"{ENVS}:Tumble", output=tmp_path)
     with pytest.raises(
@@ -210,6 +212,7 @@ def test_environment_that_fails(replay, tmp_path):
     assert not (tmp_path / "x.rrd").exists()
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize(
     ("display", "reason"),
     [("", "DISPLAY is not set"), (":87", "no X server answers at :87")],

@@ -12,6 +12,8 @@ from rlctl.task import rough_heights
 from tests.replaying.conftest import play, reach
 from tests.replaying.reading import column, entities, properties, reader, static
 
+pytestmark = pytest.mark.pybullet
+
 
 def observed_by_name(rollout):
     return split_names(rollout.episode.observations, rollout.env.observation_sizes)

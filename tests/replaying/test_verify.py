@@ -9,6 +9,8 @@ from rlctl.replaying.reproduce import find_difference, verify_episode
 from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
 from tests.replaying.conftest import as_json, play
 
+pytestmark = pytest.mark.pybullet
+
 
 @pytest.fixture
 def episode(reached) -> RecordedEpisode:

@@ -82,6 +82,7 @@ def test_terms_are_recorded(spec, start):
     assert trajectory.rewards == pytest.approx([count + 1.0] * 4, abs=1e-6)
 
 
+@pytest.mark.pybullet
 def test_overlapping_bodies_are_measured_in_the_first_episodes(spec, start):
     workers = start(EnvSpec(spec("Sunk").task), 2)
     workers.set_policy(linear(workers.info, np.zeros((1, 3))))

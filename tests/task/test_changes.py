@@ -9,6 +9,8 @@ from rlctl.task.events import EventSettings
 from rlctl.task.pybullet.library import pybullet
 from rlctl_manipulation.reach import Reach
 
+pytestmark = pytest.mark.pybullet
+
 
 class Arm(Task):
     """An arm that holds still above a cube, with every kind of change."""

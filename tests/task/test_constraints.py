@@ -8,6 +8,8 @@ from rlctl.task import Attachment
 from rlctl.task.pybullet.sim import PybulletSim
 from tests.task import models
 
+pytestmark = pytest.mark.pybullet
+
 
 @pytest.fixture
 def sim():

@@ -170,6 +170,7 @@ class NamesItsBody(Whole):
         return {"height": self.robot.base_position[2:]}
 
 
+@pytest.mark.pybullet
 def test_a_body_may_be_called_robot():
     env = TaskEnv(NamesItsBody())
     assert env.reset(seed=0)[0].tolist() == [1.0]

@@ -317,6 +317,7 @@ def test_gymnasiums_own_checker_is_content(make):
     check_env(make(Bounded(start=0.0)), skip_render_check=True)
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize(("display", "why"), [("", "DISPLAY is not set"), (":9876", "no X server answers at :9876")])
 def test_a_window_without_a_display_does_not_end_the_process(monkeypatch, display, why):
     monkeypatch.setenv("DISPLAY", display)

@@ -42,6 +42,7 @@ def test_a_task_without_events():
 RANGE = "Write [low, high], a number, or {from: [low, high], to: [low, high]}."
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -111,6 +112,7 @@ def forgets_its_draw(sim, rng, *, size: Range):
     rng.uniform(*size)
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize(
     ("event", "message"),
     [

@@ -9,6 +9,8 @@ from rlctl.task.events import Range
 from rlctl.task.pybullet.library import pybullet
 from tests.task.tasks import Cart
 
+pytestmark = pytest.mark.pybullet
+
 
 def mass(env):
     return dynamics(env.task.cube)[0]

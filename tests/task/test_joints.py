@@ -12,6 +12,8 @@ from rlctl.exporting.actor import make_metadata
 from rlctl.policy.file import PolicyInfo
 from rlctl.task.joints import Joints
 
+pytestmark = pytest.mark.pybullet
+
 
 def describe_task(task):
     env = EnvSpec(task).make()

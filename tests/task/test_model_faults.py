@@ -8,6 +8,8 @@ from rlctl.task.pybullet.library import pybullet
 from rlctl.task.pybullet.sim import PybulletSim
 from tests.task import models
 
+pytestmark = pytest.mark.pybullet
+
 BOX = '<collision><geometry><box size="0.3 0.04 0.04"/></geometry></collision>'
 
 

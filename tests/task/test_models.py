@@ -46,17 +46,18 @@ def test_models_of_pybullet_data_have_their_names_too():
     assert str(find_model_file("kuka_iiwa/model.urdf")) == f"{data}/kuka_iiwa/model.urdf"
 
 
-def test_without_pybullet_data_the_error_lists_what_there_is(monkeypatch):
+def test_without_pybullet_data_the_error_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "pybullet_data", None)  # importing it raises ModuleNotFoundError
     assert find_model_file("kuka_iiwa.urdf").is_file()
     with pytest.raises(TaskError) as caught:
         find_model_file("kuka_iiwa/model.urdf")
-    assert "among rlctl's models (a1.urdf, kuka_iiwa.urdf, plane.urdf), nor in pybullet_data, which is" in str(
-        caught.value
+    assert str(caught.value).startswith(
+        "model file 'kuka_iiwa/model.urdf' not found. If it is one of PyBullet's: pip install "
     )
-    assert "not installed: pip install " in str(caught.value)
+    assert str(caught.value).endswith("; for a file next to your module: Path(__file__).with_name('model.urdf')")
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize("model", THEIRS)
 def test_numbers_are_those_of_the_model_in_pybullet_data(sim, model):
     ours, theirs = load_both(sim, model)
@@ -77,6 +78,7 @@ def test_numbers_are_those_of_the_model_in_pybullet_data(sim, model):
                 np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize("model", ["plane.urdf", "a1.urdf"])
 def test_collision_shapes_are_those_of_the_model_in_pybullet_data(sim, model):
     ours, theirs = load_both(sim, model)
@@ -91,6 +93,7 @@ def test_collision_shapes_are_those_of_the_model_in_pybullet_data(sim, model):
                 np.testing.assert_allclose(one[field], other[field], rtol=0, atol=1e-9)
 
 
+@pytest.mark.pybullet
 def test_the_arm_has_the_outline_of_the_real_one(sim):
     ours, theirs = load_both(sim, "kuka_iiwa.urdf")
     rng = np.random.default_rng(0)
@@ -104,6 +107,7 @@ def test_the_arm_has_the_outline_of_the_real_one(sim):
             np.testing.assert_allclose(*boxes, rtol=0, atol=0.02)  # [m]
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize("pose", [reach.HOME, np.zeros(7)], ids=["home", "stretched"])
 def test_the_arm_does_not_touch_the_ground_that_it_stands_on(sim, pose):
     plane, arm = sim.load("plane", "plane.urdf", fixed=True), sim.load("arm", "kuka_iiwa.urdf", fixed=True)
@@ -113,6 +117,7 @@ def test_the_arm_does_not_touch_the_ground_that_it_stands_on(sim, pose):
     assert not arm.links_touching(plane)
 
 
+@pytest.mark.pybullet
 def test_the_dog_stands_on_its_feet(sim):
     plane, dog = sim.load("plane", "plane.urdf", fixed=True), sim.load("dog", "a1.urdf", position=(0, 0, 0.27))
     joints = dog.find_joints(quadruped.JOINTS)
@@ -126,6 +131,7 @@ def test_the_dog_stands_on_its_feet(sim):
     assert dog.mass_state("trunk").position[2] == pytest.approx(0.27, abs=0.02)
 
 
+@pytest.mark.pybullet
 def test_something_falls_on_the_plane_as_on_that_of_pybullet_data(sim):
     heights = []
     for plane in ("plane.urdf", f"{pytest.importorskip('pybullet_data').getDataPath()}/plane.urdf"):

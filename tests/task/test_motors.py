@@ -7,6 +7,8 @@ from rlctl.errors import TaskError
 from rlctl.task.pybullet.sim import PybulletSim
 from tests.task import models
 
+pytestmark = pytest.mark.pybullet
+
 
 @pytest.fixture(params=[1, 4], ids=["1 substep", "4 substeps"])
 def sim(request):

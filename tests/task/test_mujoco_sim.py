@@ -1,5 +1,8 @@
 """Worlds of tasks in MuJoCo: the same models, starts and motors as in PyBullet, and bit-exact resets."""
 
+import ctypes.util
+import subprocess
+import sys
 from contextlib import closing
 
 import numpy as np
@@ -7,11 +10,12 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
+from rlctl.task import env as env_module
 from rlctl.task.env import TaskEnv
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.pybullet.sim import PybulletSim
 from rlctl_manipulation.peg_insert import SCARA
-from tests.task.tasks import Cart
+from tests.task.tasks import Cart, Slider
 
 pytest.importorskip("mujoco")
 
@@ -30,9 +34,10 @@ def play(env, steps: int = 40):
     return [np.concatenate([*part.values()]) if isinstance(part, dict) else part for part in observations]
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize("task", TASKS)
 def test_an_episode_starts_as_in_pybullet_and_repeats_bit_for_bit(task):
-    with closing(EnvSpec(task).make()) as env:
+    with closing(EnvSpec(task, sim="pybullet").make()) as env:
         bullet = play(env, steps=0)[0]
         joints = env.unwrapped.task.describe_joints()
     with closing(EnvSpec(task, sim="mujoco").make()) as env:
@@ -88,6 +93,7 @@ def test_a_velocity_motor_and_brakes(weightless_arm):
     assert arm.joint_velocities == pytest.approx(wanted, abs=2e-3)
 
 
+@pytest.mark.pybullet
 def test_frictions_are_multiplied_and_restored():
     with closing(TaskEnv(Cart(), sim="mujoco")) as env:
         cube, plane = env.task.cube, env.task.plane
@@ -108,6 +114,7 @@ def test_feet_have_the_spinning_friction_of_their_file():
     assert spins[:-2] == pytest.approx(0.0, abs=1e-4)
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize("world", [PybulletSim, MujocoSim])
 def test_a_force_sensor_measures_what_hangs_from_it(world):
     options = {"solref": 0.02} if world is MujocoSim else {}
@@ -143,6 +150,7 @@ def test_events_act_in_mujoco_too():
     assert masses[1] > 1.2 * masses[0]
 
 
+@pytest.mark.pybullet
 @pytest.mark.parametrize(
     ("task", "parameters", "missing"),
     [("kuka-grasp", {}, "kuka_with_gripper2.sdf: MuJoCo reads URDF and MJCF")],
@@ -162,15 +170,38 @@ def test_what_is_no_engine(sim):
         read_solref(sim)
 
 
-def test_no_picture_without_a_display(monkeypatch):
-    import mujoco
+needs_egl = pytest.mark.skipif(ctypes.util.find_library("EGL") is None, reason="needs libEGL")
 
-    if "glfw" not in mujoco.GLContext.__module__:
-        pytest.skip("MuJoCo draws without a display")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+
+@needs_egl
+def test_markers_are_drawn_where_they_are_moved():
+    with closing(EnvSpec("reach", sim="mujoco").make("rgb_array")) as env:
+        env.reset(seed=0)
+        pictures = []
+        for y in (-0.3, 0.3, 0.3):
+            env.unwrapped.task.goal = np.array([0.5, y, 0.5])
+            pictures.append(env.render())
+    left, right, again = pictures
+    assert left.shape == (240, 320, 3)
+    np.testing.assert_array_equal(right, again)
+    assert 30 < (left != right).any(axis=2).sum() < 2000  # two small spheres
+
+
+@needs_egl
+def test_a_task_draws_without_a_display(monkeypatch):
+    # In a process of its own: MuJoCo chooses at its import how to draw, and GLFW would end the process.
+    for name in ("DISPLAY", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)
-    sim = MujocoSim(control_dt=1 / 60, substeps=4)
-    for _ in range(2):  # MuJoCo itself ends the process the second time
-        with pytest.raises(UsageError, match=r"^MuJoCo cannot draw: there is no display") as caught:
-            sim.render()
-        assert "MUJOCO_GL=egl" in str(caught.value)
+    code = "from rlctl.environments.spec import EnvSpec; env = EnvSpec('reach', sim='mujoco').make(); "
+    code += "env.reset(seed=0); print(env.unwrapped.sim.render().shape)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=250)
+    assert done.stdout == "(240, 320, 3)\n", done.stderr
+
+
+def test_an_engine_is_chosen_by_what_is_installed(monkeypatch):
+    installed = env_module.is_installed()
+    with closing(TaskEnv(Slider())) as env:
+        assert env.sim.engine == ("PyBullet" if installed else "MuJoCo")
+    monkeypatch.setattr(env_module, "is_installed", lambda: False)
+    with closing(TaskEnv(Slider())) as env:
+        assert env.sim.engine == "MuJoCo"

@@ -1,6 +1,7 @@
 """A camera's pictures as an observation: bytes in a Dict space."""
 
 import numpy as np
+import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
@@ -27,6 +28,7 @@ class Seen(Cart):
         return {"camera": self.picture, "height": self.cube.base_position[2:]}
 
 
+@pytest.mark.pybullet
 def test_pictures_are_bytes():
     env = TaskEnv(Seen())
     assert env.observation_space["camera"] == spaces.Box(0, 255, (24, 32, 3), np.uint8)

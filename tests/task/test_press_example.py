@@ -6,6 +6,8 @@ import pytest
 from rlctl.environments import registry
 from rlctl.task.env import TaskEnv
 
+pytestmark = pytest.mark.pybullet
+
 
 @pytest.fixture
 def env(request):

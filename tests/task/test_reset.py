@@ -8,6 +8,8 @@ from rlctl.task.pybullet.library import pybullet
 from rlctl_manipulation.reach import Reach
 from tests.task.tasks import Cubes, Pile, PileAnew
 
+pytestmark = pytest.mark.pybullet
+
 SEEDS = range(10)
 
 

@@ -73,6 +73,7 @@ def test_posture():
     assert rewards.posture(np.array([0.0, 0.70710679, 0.0, 0.70710679])) == pytest.approx((math.pi / 2) ** 2)
 
 
+@pytest.mark.pybullet
 def test_posture_agrees_with_pybullet():
     from rlctl.task.pybullet.library import pybullet
 

@@ -34,6 +34,7 @@ def test_mistakes():
         rough_heights(0, size=(0.5, 4), cell=0.5, roughness=0.1)
 
 
+@pytest.mark.pybullet
 def test_heights_are_where_they_should_be():
     sim = PybulletSim(control_dt=1 / 60, substeps=4)
     heights = rough_heights(0, size=(4, 2), cell=0.1, roughness=0.2)

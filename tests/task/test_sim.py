@@ -13,6 +13,8 @@ from rlctl_manipulation.reach import Reach
 from tests.task import models
 from tests.task.tasks import Slider
 
+pytestmark = pytest.mark.pybullet
+
 
 @pytest.fixture
 def sim():

@@ -1,8 +1,10 @@
 """Pictures of a world in MuJoCo, drawn by OpenGL without a display."""
 
+import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,15 +13,23 @@ from numpy.typing import NDArray
 from rlctl.errors import UsageError, describe_exception
 from rlctl.task.mujoco.world import import_mujoco
 
-_DISPLAYS = {"DISPLAY", "WAYLAND_DISPLAY"}
 _HINT = "without a display set MUJOCO_GL=egl (Debian: libegl1) or MUJOCO_GL=osmesa"
+
+
+@dataclass
+class Marker:
+    """A sphere that is drawn, and is no part of the world."""
+
+    position: Sequence[float] | NDArray[np.float64]  # [m]
+    radius: float  # [m]
+    color: Sequence[float]  # red, green, blue, opacity
 
 
 def draw(
     model: Any,
     data: Any,
     size: tuple[int, int],
-    markers: Sequence[tuple[Any, float, Any]] = (),
+    markers: Iterable[Marker] = (),
     *,
     eye: Sequence[float],
     target: Sequence[float],
@@ -31,9 +41,6 @@ def draw(
     [m] and colour.
     """
     mujoco = import_mujoco()
-    # It chose how to draw at import. Without a display GLFW fails, and ends the process when it is asked again.
-    if "glfw" in mujoco.GLContext.__module__ and sys.platform == "linux" and not _DISPLAYS & os.environ.keys():
-        raise UsageError(f"MuJoCo cannot draw: there is no display\n{_HINT}")
     camera, way = mujoco.MjvCamera(), np.subtract(target, eye)
     camera.type, camera.lookat[:] = mujoco.mjtCamera.mjCAMERA_FREE, target
     camera.distance = float(np.linalg.norm(way))
@@ -45,16 +52,31 @@ def draw(
         for wanted, present in zip(size, (model.vis.global_.offwidth, model.vis.global_.offheight), strict=True)
     )
     try:
+        _choose_opengl(mujoco)
         with mujoco.Renderer(model, size[1], size[0]) as renderer:
             renderer.update_scene(data, camera)
-            for position, radius, color in markers:
-                geom = renderer.scene.geoms[renderer.scene.ngeom]
-                sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-                mujoco.mjv_initGeom(
-                    geom, sphere, np.full(3, radius), position, np.eye(3).ravel(), color.astype(np.float32)
-                )
-                renderer.scene.ngeom += 1
+            for marker in markers:
+                _add_marker(renderer.scene, marker)
             picture: NDArray[np.uint8] = renderer.render()
     except Exception as error:  # OpenGL raises many kinds
         raise UsageError(f"MuJoCo cannot draw: {describe_exception(error)}\n{_HINT}") from None
     return picture
+
+
+def _choose_opengl(mujoco: Any) -> None:
+    """Let MuJoCo draw by EGL where there is no display, unless MUJOCO_GL is set.
+
+    It has chosen at its import, and without a display that choice, GLFW, ends the process.
+    """
+    chosen = sys.modules[mujoco.Renderer.__module__].gl_context
+    if sys.platform == "linux" and not os.environ.get("DISPLAY") and "glfw" in chosen.GLContext.__module__:
+        os.environ.setdefault("MUJOCO_GL", "egl")
+        importlib.reload(chosen)
+
+
+def _add_marker(scene: Any, marker: Marker) -> None:
+    mujoco = import_mujoco()
+    size, position, turn = [marker.radius] * 3, np.array(marker.position, float), np.eye(3).ravel()
+    geom, color = scene.geoms[scene.ngeom], np.array(marker.color, np.float32)
+    mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_SPHERE, size, position, turn, color)
+    scene.ngeom += 1

@@ -22,6 +22,7 @@ from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.model_files import find_model_file
 from rlctl.task.mujoco.body import WORLD, MujocoBody, Parts
 from rlctl.task.mujoco.files import ModelFile, is_colliding, read_model_file
+from rlctl.task.mujoco.pictures import Marker, draw
 from rlctl.task.mujoco.world import Array, Fields, MujocoWorld, Rows
 from rlctl.task.sim import Sim
 
@@ -73,7 +74,7 @@ class MujocoSim(Sim):
         self._parts: dict[str, Parts] = {}
         self._pairs: list[tuple[str, str]] = []  # links whose geoms collide, each as BODY/LINK
         self._pushes: list[_MujocoPush] = []
-        self._markers: list[tuple[Array, float, Array]] = []  # position [m], radius [m] and colour
+        self._markers: list[Marker] = []
         self._spec = self.mujoco.MjSpec()
         option = self._spec.option
         option.timestep = self._control_dt / self.world.substeps
@@ -378,11 +379,11 @@ class MujocoSim(Sim):
         self._pushes.append(_MujocoPush(self.fields.index or 0, number, np.array(force, float), steps))
 
     def add_marker(self, position: Sequence[float], radius: float, color: Sequence[float]) -> int:
-        self._markers.append((np.array(position, float), radius, np.array(color, float)))
+        self._markers.append(Marker(position, radius, color))
         return len(self._markers) - 1
 
     def move_marker(self, marker: int, position: Sequence[float] | Array) -> None:
-        self._markers[marker][0][:] = position
+        self._markers[marker].position = position
 
     def render(
         self,
@@ -394,13 +395,11 @@ class MujocoSim(Sim):
         up: Sequence[float] = (0.0, 0.0, 1.0),
         field_of_view: float = 45.0,
     ) -> NDArray[np.uint8]:
-        from rlctl.task.mujoco.pictures import draw
-
         if self.world.batch is not None:
             self._refuse("pictures of many worlds")
         self.world.refresh()
-        view = {"eye": eye, "target": target, "field_of_view": field_of_view}
-        return draw(self.model, self.data, (width, height), self._markers, **view)  # type: ignore[arg-type]
+        size = width, height
+        return draw(self.model, self.data, size, self._markers, eye=eye, target=target, field_of_view=field_of_view)
 
     def close(self) -> None:
         with contextlib.suppress(AttributeError):

@@ -34,7 +34,7 @@ def import_mujoco() -> Any:
     try:
         import mujoco
     except ImportError:
-        raise UsageError("sim mujoco needs MuJoCo, which is not installed: pip install mujoco") from None
+        raise UsageError("MuJoCo is not installed: pip install mujoco") from None
     print_mujoco_warnings()
     # Of meshes whose textures MuJoCo leaves out.
     warnings.filterwarnings("ignore", "obj_decoder: invalid or missing face texture coordinate")

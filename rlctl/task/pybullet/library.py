@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import importlib
+import importlib.util
 import os
 import re
 import sys
@@ -19,6 +20,11 @@ from rlctl.errors import UsageError
 _NO_WHEELS = sys.version_info >= (3, 12)
 INSTALL_PYBULLET = f"pip install {'setuptools && pip install --no-build-isolation ' if _NO_WHEELS else ''}pybullet"
 """The command that installs PyBullet on this version of Python."""
+
+
+def is_installed() -> bool:
+    """Return whether PyBullet is installed; it is not imported."""
+    return importlib.util.find_spec("pybullet") is not None
 
 
 class _LazyModule:
@@ -46,7 +52,10 @@ def _import_silently(name: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name != name:
             raise
-        raise UsageError(f"tasks of rlctl need PyBullet, which is not installed: {INSTALL_PYBULLET}") from None
+        raise UsageError(
+            f"PyBullet is not installed: {INSTALL_PYBULLET}\n"
+            "or train in MuJoCo, unless the task needs models of PyBullet: --set sim=mujoco"
+        ) from None
     finally:
         os.dup2(stderr, 2)
         os.close(stderr)
