@@ -95,6 +95,13 @@ class EnvSpec:
         return dataclasses.replace(self, sim=choose_engine(task))
 
     @property
+    def engine(self) -> str:
+        """The name of the physics engine, for people; empty for a plain environment. The task is imported."""
+        if not is_task(self.constructor()):
+            return ""
+        return "PyBullet" if self.resolve().sim == "pybullet" else "MuJoCo"
+
+    @property
     def is_batch(self) -> bool:
         """Whether the task is a `BatchTask`; it is imported."""
         from rlctl.task.batch import BatchTask

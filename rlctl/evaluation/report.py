@@ -31,9 +31,9 @@ def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
     mode = "" if result.deterministic else ", sampled actions"
     trained = "" if info is None else f" ({info.algo}, step {info.training_steps:,})"
     out.print(f"{result.spec.task}: {'policy ' if info is None else ''}{result.name}{trained}")
-    randomization = describe_randomization(result.events)
     episodes = output.format_count(len(result.played), "episode")
-    out.print(f"{episodes}, seed {result.seed}{mode}{randomization and f', {randomization}'}")
+    settings = f"seed {result.seed}{mode}", result.spec.engine, describe_randomization(result.events)
+    out.print(", ".join(filter(None, [episodes, *settings])))
     if result.spec.stage and info is not None:
         out.print(f"stage {result.spec.stage} of {len(info.stages)}")
     if result.success_rate is not None and result.success_interval is not None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import output
+from rlctl.environments.named_task import RUN
 from rlctl.errors import ArtifactError, TaskError
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.printed_lines import collect, print_line
@@ -49,7 +50,9 @@ def run_training(request: TrainRequest) -> TrainResult:
     with StopSignals() as signals, find_start(request) as start:
         if start.run is not None and start.checkpoint is not None and start.checkpoint.state.progress.done:
             return _report_finished(start, start.run, start.checkpoint.state.progress)
-        title = f"{'train' if start.run is None else 'resume'} {start.task} ({start.recipe.algo})"
+        engine = start.recipe.env_specs(start.task, named_by=RUN if start.run else "")[-1].engine
+        how = ", ".join(filter(None, [start.recipe.algo, engine]))
+        title = f"{'train' if start.run is None else 'resume'} {start.task} ({how})"
         display = make_display(title, start.recipe.total_timesteps)
         with display, collect() as printed, set_up(start, display, printed) as training:
             signals.begin(training)

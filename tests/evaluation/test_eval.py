@@ -123,9 +123,9 @@ def test_it_says_whether_it_was_randomised(reach_run, evaluation, rlctl):
         each.result.total_reward for each in evaluation.played
     ]
     plain = rlctl("eval", reach_run.path, "--episodes", 2)
-    assert "2 episodes, seed 0, not randomised" in plain.stdout
+    assert "2 episodes, seed 0, PyBullet, not randomised" in plain.stdout
     randomised = rlctl("eval", reach_run.path, "--episodes", 2, "--set", "randomize=true")
-    assert f"2 episodes, seed 0, randomised by {', '.join(offered)}" in randomised.stdout
+    assert f"2 episodes, seed 0, PyBullet, randomised by {', '.join(offered)}" in randomised.stdout
 
 
 def test_stochastic_repeats_with_its_seed(reach_run):
