@@ -102,7 +102,7 @@ def test_check_shows_what_raises_in_a_line_each(importable, monkeypatch):
     assert problems.pop("unreadable").startswith(f"{importable / 'some_robots/unreadable.yaml'}: 'utf-8' codec can't")
     assert problems == {
         "good": None,
-        "leaves": "task 'some_robots.leaves:Task': import failed: SystemExit: 0 (leaves.py:1)",
+        "leaves": "task 'some_robots.leaves:Task': import failed: SystemExit: 0 (some_robots/leaves.py:1)",
         "vanishes": "import ended the process with exit code -9",
         "absent": "module 'some_robots.absent' is missing",
         "nameless": "some_robots.good has no 'Bad'. It defines: Good.",
@@ -133,8 +133,8 @@ def test_a_broken_plugin_harms_only_itself(rlctl, importable, tmp_path):
         env={**os.environ, "PYTHONPATH": str(importable)},
     )
     assert result.stdout.splitlines() == [
-        "raises TaskError task 'raises': import failed: RuntimeError: boom and more (raises.py:2)",
-        "leaves TaskError task 'leaves': import failed: SystemExit: 0 (leaves.py:1)",
+        "raises TaskError task 'raises': import failed: RuntimeError: boom and more (some_robots/raises.py:2)",
+        "leaves TaskError task 'leaves': import failed: SystemExit: 0 (some_robots/leaves.py:1)",
         "absent TaskError task 'absent' of some-robots 1.2: module 'some_robots.absent' is missing",
         "hello from a plugin",
         "good Good",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import shlex
@@ -162,8 +163,11 @@ def _export(source: FoundPolicy, targets: list[Path], sim: str | None) -> list[E
         # The user's run names the classes. A downloaded run has a recipe that others wrote.
         import_named(source.run.recipe().policy_kwargs)
     # The environments are built while torch is imported.
+    n_envs = 1
     spec = source.locate(info.spec if sim is None else dataclasses.replace(info.spec, sim=sim))
-    with Workers(spec, count_envs(spec, EPISODES)) as workers:
+    with contextlib.suppress(UsageError, TaskError):  # `_check_environment` says what does not build
+        n_envs = count_envs(spec, EPISODES)
+    with Workers(spec, n_envs) as workers:
         from rlctl.exporting.actor import build
         from rlctl.exporting.c_source import write_c
         from rlctl.policy.torch_policy import TorchPolicy, pin_threads

@@ -28,7 +28,7 @@ def test_finds_the_mistake_and_only_that(case):
     [
         ("WrongBody", "RL011", "with randomize=true: events.mass: no body 'amr'. Did you mean 'arm'? "),
         ("OwnChance", "RL011", "with randomize=true: equal seeds and actions give unequal episodes"),
-        ("BreaksDown", "RL011", "with randomize=true: RuntimeError: a gear broke (broken_variants.py:"),
+        ("BreaksDown", "RL011", "with randomize=true: RuntimeError: a gear broke (tests/checking/broken_variants.py:"),
         ("WrongKey", "RL012", "stages: stage 1: no key 'taks'. Did you mean 'task'?"),
         ("WrongParameter", "RL012", "stage 1 of 2: task.tolerence: WrongParameter has no parameter 'tolerence'."),
         ("WrongEvent", "RL012", "stage 2 of 2: events: this task has no event 'masss'. Did you mean 'mass'?"),

@@ -126,7 +126,7 @@ def test_no_arguments_show_the_help(rlctl):
             2,
             "error: total_timesteps: expected a whole number in [1, 1e12], ",
         ),
-        (["eval", "--set", "seed=1"], 2, "error: --set seed: only task.NAME, reward_weights.NAME, randomize and "),
+        (["eval", "--set", "seed=1"], 2, "error: --set seed: only task.NAME, reward_weights.NAME, randomize, "),
         (["export"], 5, "error: no run yet under "),
         (
             ["train", "reach", "--device", "gpu"],

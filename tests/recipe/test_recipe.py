@@ -192,8 +192,8 @@ def test_settings_of_verbs_that_take_an_environment():
         randomize=False, events={"mass": {"factor": [0.9, 1.1]}}
     )
     for setting, message in {
-        "taks.tolerance=1": "--set taks: only task.NAME, reward_weights.NAME, randomize and events.NAME can be set "
-        "here. Did you mean 'task'?",
+        "taks.tolerance=1": "--set taks: only task.NAME, reward_weights.NAME, randomize, events.NAME and sim can be "
+        "set here. Did you mean 'task'?",
         "n_envs=3": "--set n_envs: only task.NAME, ",
         "task=1": "--set: task: expected a mapping, got 1",
         "randomize=maybe": "--set: randomize: expected true or false, got 'maybe'",

@@ -105,7 +105,10 @@ def test_a_callback_that_raises(train, run_of, moment):
         train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:Raises": arguments}})
     step = {"on_start": 0, "on_end": 256}.get(moment, 128)
     line, *hint = str(caught.value).splitlines()
-    assert line == f"callback '{FILE}:Raises': {moment} at step {step}: KeyError: 'bonus' (own_callbacks.py:59)"
+    assert (
+        line
+        == f"callback '{FILE}:Raises': {moment} at step {step}: KeyError: 'bonus' (tests/training/own_callbacks.py:59)"
+    )
     assert caught.value.exit_code == 3
     saved = {"on_start": None, "on_end": 256, "on_checkpoint": 128}.get(moment, 64)
     assert [int(folder.name) for folder in run_of().checkpoints()][-1:] == ([] if saved is None else [saved])
