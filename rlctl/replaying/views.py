@@ -95,7 +95,7 @@ class _MujocoTaskView:
         markers = [np.asarray(position) for position in self._env.task.markers().values()]
         low, high = find_mujoco_bounds(sim, shown, markers)
         self._target = (low + high) / 2
-        distance = max(1.5, 2.5 * float(np.linalg.norm(high - low)))
+        distance = max(1.0, 1.6 * float(np.linalg.norm(high - low)))
         self._offset = distance * EYE_DIRECTION / np.linalg.norm(EYE_DIRECTION)
 
     def draw(self) -> Picture:

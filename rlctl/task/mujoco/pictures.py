@@ -52,15 +52,54 @@ def draw(
         for wanted, present in zip(size, (model.vis.global_.offwidth, model.vis.global_.offheight), strict=True)
     )
     try:
-        _choose_opengl(mujoco)
-        with mujoco.Renderer(model, size[1], size[0]) as renderer:
-            renderer.update_scene(data, camera)
-            for marker in markers:
-                _add_marker(renderer.scene, marker)
-            picture: NDArray[np.uint8] = renderer.render()
+        renderer = _find_renderer(model, size)
+        renderer.update_scene(data, camera)
+        for marker in markers:
+            _add_marker(renderer.scene, marker)
+        picture: NDArray[np.uint8] = renderer.render()
     except Exception as error:  # OpenGL raises many kinds
         raise UsageError(f"MuJoCo cannot draw: {describe_exception(error)}\n{_HINT}") from None
     return picture
+
+
+def light_scene(spec: Any) -> None:
+    """Give a world a bright sky and light from the camera."""
+    mujoco = import_mujoco()
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4] * 3, [0.6] * 3
+    sky, gradient = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+    spec.add_texture(
+        name="sky", type=sky, builtin=gradient, rgb1=[0.75, 0.83, 0.92], rgb2=[0.95] * 3, width=64, height=384
+    )
+
+
+def add_checker(spec: Any) -> str:
+    """Add a pattern of squares of 0.5 m to a model, on which motion is seen; return the name of the material."""
+    mujoco = import_mujoco()
+    flat, checker = mujoco.mjtTexture.mjTEXTURE_2D, mujoco.mjtBuiltin.mjBUILTIN_CHECKER
+    colors = {"rgb1": [0.86, 0.88, 0.9], "rgb2": [0.74, 0.77, 0.8]}
+    spec.add_texture(name="checker", type=flat, builtin=checker, width=64, height=64, **colors)
+    material = spec.add_material(name="checker", texuniform=True, texrepeat=[1.0, 1.0])
+    textures = list(material.textures)
+    textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = "checker"
+    material.textures = textures
+    return "checker"
+
+
+_kept: list[Any] = []
+"""The model, the size and the renderer of the last picture: a new renderer takes half a second."""
+
+
+def _find_renderer(model: Any, size: tuple[int, int]) -> Any:
+    if _kept and _kept[0] is model and _kept[1] == size:
+        return _kept[2]
+    if _kept:
+        _kept[2].close()
+        _kept.clear()
+    mujoco = import_mujoco()
+    _choose_opengl(mujoco)
+    renderer = mujoco.Renderer(model, size[1], size[0])
+    _kept[:] = model, size, renderer
+    return renderer
 
 
 def _choose_opengl(mujoco: Any) -> None:

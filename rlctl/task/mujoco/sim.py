@@ -22,7 +22,7 @@ from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.model_files import find_model_file
 from rlctl.task.mujoco.body import WORLD, MujocoBody, Parts
 from rlctl.task.mujoco.files import ModelFile, is_colliding, read_model_file
-from rlctl.task.mujoco.pictures import Marker, draw
+from rlctl.task.mujoco.pictures import Marker, add_checker, draw, light_scene
 from rlctl.task.mujoco.world import Array, Fields, MujocoWorld, Rows
 from rlctl.task.sim import Sim
 
@@ -76,10 +76,14 @@ class MujocoSim(Sim):
         self._pushes: list[_MujocoPush] = []
         self._markers: list[Marker] = []
         self._spec = self.mujoco.MjSpec()
+        light_scene(self._spec)
         option = self._spec.option
         option.timestep = self._control_dt / self.world.substeps
         option.gravity = [0.0, 0.0, -9.81]
-        option.integrator = self.mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # takes the motors' damping implicitly
+        # Both take the motors' damping implicitly. The first solves motors and contacts together, which holds stiff
+        # motors stable; batches take what is faster.
+        kinds = self.mujoco.mjtIntegrator
+        option.integrator = kinds.mjINT_DISCRETE if self.world.count is None else kinds.mjINT_IMPLICITFAST
         if self.world.count is None:
             option.cone = self.mujoco.mjtCone.mjCONE_ELLIPTIC
             option.impratio = 10.0  # otherwise feet that stand slide slowly; batches take what is twice as fast
@@ -166,6 +170,7 @@ class MujocoSim(Sim):
         for geom in filter(is_colliding, grounds):
             geom.pos = [*geom.pos[:2], geom.pos[2] + geom.size[2]]
             geom.type, geom.size = plane, [geom.size[0], geom.size[1], 1.0]
+            geom.material = add_checker(child)
         if grounds:  # recordings draw them themselves
             used = {geom.meshname for geom in child.geoms if is_colliding(geom)}
             unused = [mesh for mesh in child.meshes if mesh.name not in used]
