@@ -71,7 +71,8 @@ def run_cases(rules: Sequence[str]) -> dict[str, str]:
         for finding in verdict.findings:
             if finding.rule == rule and rule not in printed:
                 lines = [f"{finding.severity} {rule}  {finding.name}", f"  {finding.message}"]
-                printed[rule] = "\n".join(lines).replace(f"{TESTS}/", "") + "\n"
+                text = "\n".join(lines).replace(f"{TESTS}/", "")
+                printed[rule] = text.replace(str(Path.cwd()), "FOLDER") + "\n"
     return printed
 
 
