@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from rlctl.replaying.curves import Timelines
 from rlctl.replaying.meshes import load_mesh
 from rlctl.replaying.mjcf import Mesh, Shape, ShapeKind, connect_grid
-from rlctl.replaying.rotations import rotate
 from rlctl.replaying.scene import WORLD, BodyMotion, Line, Scene, Warn
+from rlctl.task.rotations import rotate
 
 _MARKER_COLORS = [(40, 200, 90), (70, 150, 255), (240, 120, 200), (250, 180, 40)]
 _HALO_RADIUS = 0.09  # [m]

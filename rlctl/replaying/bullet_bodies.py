@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.bullet_worlds import find_clients
-from rlctl.replaying.rotations import from_axis, invert, multiply, normalize, rotate
 from rlctl.task.pybullet.library import pybullet
+from rlctl.task.rotations import from_axis, invert, multiply, normalize, rotate
 
 Array = NDArray[np.float64]
 Pose = tuple[tuple[float, ...], tuple[float, ...]]  # position [m], quaternion (x, y, z, w)

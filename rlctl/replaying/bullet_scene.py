@@ -11,11 +11,11 @@ from rlctl.checking.bullet_worlds import MOST_CLIENTS
 from rlctl.replaying.bullet_bodies import list_body_ids, name_bodies, read_body, read_visuals
 from rlctl.replaying.bullet_log import BulletLog
 from rlctl.replaying.bullet_track import Key, Track
-from rlctl.replaying.rotations import normalize, rotate
 from rlctl.replaying.scene import WORLD, BodyMotion, Line, Scene, Warn
 from rlctl.task.env import TaskEnv
 from rlctl.task.pybullet.library import pybullet
 from rlctl.task.pybullet.sim import PybulletSim
+from rlctl.task.rotations import normalize, rotate
 
 Array = NDArray[np.float64]
 

@@ -1,43 +1,65 @@
-"""Rotations as quaternions (x, y, z, w), over any leading axes."""
+"""Rotations as quaternions (x, y, z, w), over any leading axes. SciPy has the same, but its import takes 0.2 s."""
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
 
-def rotate(orientation: Any, vector: Any) -> Array:
+def normalize(quaternions: ArrayLike) -> Array:
+    """Return unit quaternions, which the other functions expect."""
+    rows = np.asarray(quaternions, np.float64)
+    return np.asarray(rows / np.linalg.norm(rows, axis=-1, keepdims=True))
+
+
+def from_axis(axis: Sequence[float] | Array, angles: ArrayLike) -> Array:
+    """Return the rotations about an axis of any length by angles [rad], shape (..., 4) for angles of shape (...)."""
+    halves = np.asarray(angles, np.float64)[..., None] / 2
+    return np.concatenate([np.sin(halves) * np.asarray(axis) / np.linalg.norm(axis), np.cos(halves)], axis=-1)
+
+
+def invert(quaternions: ArrayLike) -> Array:
+    """Return the inverse rotations."""
+    return np.asarray(quaternions, np.float64) * (-1.0, -1.0, -1.0, 1.0)
+
+
+def multiply(first: ArrayLike, second: ArrayLike) -> Array:
+    """Return the rotations that rotate by `second`, then by `first`; shapes (..., 4)."""
+    one, two = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    (u, a), (v, b) = ((rows[..., :3], rows[..., 3:]) for rows in (one, two))
+    axes = a * v + b * u + _cross(u, v)
+    return np.concatenate([axes, a * b - (u * v).sum(axis=-1, keepdims=True)], axis=-1)
+
+
+def rotate(orientation: ArrayLike, vector: ArrayLike) -> Array:
     """Turn vectors by quaternions: from the frame with this orientation to the world; shapes (..., 4) and (..., 3)."""
-    axis, w = np.asarray(orientation)[..., :3], np.asarray(orientation)[..., 3:]
-    twice = 2.0 * np.cross(axis, vector)
-    turned: Array = vector + w * twice + np.cross(axis, twice)
-    return turned
+    quaternions, rows = np.asarray(orientation, np.float64), np.asarray(vector, np.float64)
+    axis, w = quaternions[..., :3], quaternions[..., 3:]
+    twice = 2.0 * _cross(axis, rows)
+    return np.asarray(rows + w * twice + _cross(axis, twice))
 
 
-def rotate_inverse(orientation: Any, vector: Any) -> Array:
+def rotate_inverse(orientation: ArrayLike, vector: ArrayLike) -> Array:
     """Turn vectors from the world to the frame with this orientation; shapes (..., 4) and (..., 3).
 
     `rotate_inverse(body.base_orientation, (0, 0, -1))` is the direction of gravity as an IMU measures it.
     """
-    return rotate(np.asarray(orientation) * (-1.0, -1.0, -1.0, 1.0), vector)
+    return rotate(invert(orientation), vector)
 
 
-def multiply(first: Any, second: Any) -> Array:
-    """Return the rotation `second` followed by `first`; shapes (..., 4)."""
-    a, b = np.asarray(first, float), np.asarray(second, float)
-    axis = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + np.cross(a[..., :3], b[..., :3])
-    w = a[..., 3] * b[..., 3] - np.sum(a[..., :3] * b[..., :3], axis=-1)
-    return np.concatenate([axis, w[..., None]], axis=-1)
+def _cross(a: Array, b: Array) -> Array:
+    # A fifth of the time of `np.cross`, which moves axes.
+    (ax, ay, az), (bx, by, bz) = ((rows[..., 0], rows[..., 1], rows[..., 2]) for rows in (a, b))
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def roll_pitch_yaw(orientation: Sequence[float]) -> tuple[float, float, float]:
     """Return one orientation as angles about x, y, z [rad], as PyBullet's `getEulerFromQuaternion` computes them."""
     x, y, z, w = orientation
-    sine = -2 * (x * z - w * y) / (x * x + y * y + z * z + w * w)
+    sine = -2 * (x * z - w * y)
     if sine <= -0.99999:
         return 0.0, -0.5 * math.pi, 2 * math.atan2(x, -y)
     if sine >= 0.99999:

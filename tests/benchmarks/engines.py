@@ -66,7 +66,7 @@ def many_worlds(repeat: int) -> Row:
     single.close()
     note = f"one core, {WORLDS} worlds; theirs: one world at a time"
     ours, theirs = f"{pair.ours:,.0f} steps/s", f"{pair.theirs:,.0f} steps/s"
-    return Row("walk as a batch", ours, theirs, f"{pair.ratio:.1f}x", ">= 5x", pair.ratio >= 5, note)
+    return Row("walk as a batch", ours, theirs, f"{pair.ratio:.1f}x", ">= 15,000 steps/s", pair.ours >= 15_000, note)
 
 
 def walk(repeat: int) -> Row:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rlctl.replaying import rotations
+from rlctl.task import rotations
 
 
 @pytest.fixture
@@ -28,3 +28,15 @@ def test_a_rotation_about_an_axis():
     quarter = rotations.from_axis((0.0, 0.0, 2.0), np.pi / 2)
     np.testing.assert_allclose(rotations.rotate(quarter, (1.0, 0.0, 0.0)), (0.0, 1.0, 0.0), atol=1e-12)
     assert rotations.from_axis((1.0, 0.0, 0.0), np.zeros(5)).tolist() == [[0.0, 0.0, 0.0, 1.0]] * 5
+
+
+def test_angles_are_those_of_pybullet():
+    pybullet = pytest.importorskip("pybullet")
+    for quaternion in rotations.normalize(np.random.default_rng(0).normal(size=(50, 4))).tolist():
+        assert rotations.roll_pitch_yaw(quaternion) == pybullet.getEulerFromQuaternion(quaternion)
+
+
+def test_gravity_in_the_frame_of_a_robot_that_pitches():
+    down = rotations.rotate_inverse(rotations.from_axis((0, 1, 0), [np.pi / 6]), (0, 0, -1))
+    # Nose down by 30 degrees: gravity points forward by sin 30 degrees.
+    np.testing.assert_allclose(down, [[0.5, 0.0, -np.sqrt(0.75)]], atol=1e-12)
