@@ -43,6 +43,7 @@ def test_what_the_clock_cut_off_is_not_judged():
     assert "time" in verdict.not_judged["RL611"]
 
 
+@pytest.mark.pybullet
 def test_no_call_begins_when_the_time_of_the_process_is_over(tmp_path):
     """An experiment without a look at the clock ends, too; the rules that one step decides come first."""
     resets = tmp_path / "resets"

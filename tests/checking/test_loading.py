@@ -110,6 +110,7 @@ def test_consequences_of_the_old_gym_are_not_reported(monkeypatch, tmp_path):
         space_to_json(old.Box())
 
 
+@pytest.mark.pybullet
 def test_the_model_of_a_failed_call_is_named_as_it_was_computed(tmp_path):
     file = tmp_path / "computes_paths.py"
     file.write_text(

@@ -111,6 +111,7 @@ def test_calls_are_recorded_as_they_are_meant(tmp_path):
     assert inspect.isbuiltin(pybullet.stepSimulation)
 
 
+@pytest.mark.pybullet
 def test_a_frame_without_inertial_is_named():
     (finding,) = findings("broken_models.py:TipWithoutInertial", "RL809")
     assert finding.message == "cart_without_inertial.urdf: links without <inertial> weigh 1 mg: 'tip'"

@@ -439,6 +439,7 @@ def test_the_place_of_an_error_is_a_line_of_the_author(write_module):
         EnvSpec("draws.py:make").make()
 
 
+@pytest.mark.pybullet
 def test_a_window_without_a_display_is_refused(write_module, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     write_module("window.py", "import pybullet as p  # gym\n\ndef make():\n    p.connect(p.GUI)\n")

@@ -111,6 +111,7 @@ def test_tolerance_is_a_parameter(reach_run):
     assert run_evaluation(wide).success_rate == 1.0
 
 
+@pytest.mark.pybullet
 def test_it_says_whether_it_was_randomised(reach_run, evaluation, rlctl):
     shaken = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, changes=EnvChanges(randomize=True)))
     offered = as_json(evaluation)["events"]

@@ -11,6 +11,7 @@ import pytest
 from rlctl.task.env import TaskEnv
 from rlctl_locomotion.robots import Ant, HalfCheetah, Hopper, Humanoid, Walker2D
 
+pytest.importorskip("pybullet", reason="PyBullet is not installed")
 pytest.importorskip("pybullet_envs_gymnasium")  # registers the reference
 
 ROBOTS = [Ant, HalfCheetah, Hopper, Walker2D, Humanoid]

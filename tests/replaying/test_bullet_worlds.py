@@ -6,8 +6,6 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-import pybullet as p
-import pybullet_data
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -22,8 +20,12 @@ from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.rrd import write_rrd
 from rlctl.run.episode import load_episode, save_episode
-from tests.replaying.bullet_envs import ARM, HELD, LOADED, PAINTED, REMOVED, STEPS, TIP
-from tests.replaying.reading import chunks, column, entities, layout, static
+
+p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
+pybullet_data = pytest.importorskip("pybullet_data")
+
+from tests.replaying.bullet_envs import ARM, HELD, LOADED, PAINTED, REMOVED, STEPS, TIP  # noqa: E402
+from tests.replaying.reading import chunks, column, entities, layout, static  # noqa: E402
 
 ENVS = Path(__file__).with_name("bullet_envs.py")
 DATA = Path(pybullet_data.getDataPath())

@@ -30,6 +30,7 @@ def functions(write_module):
     return write_module("functions.py", source)
 
 
+@pytest.mark.pybullet
 def test_it_records_and_reports_without_a_run(replay, tmp_path):
     done = replay(TUMBLE, "--policy", "zero")
     assert done.returncode == 0, done.stderr
@@ -48,6 +49,7 @@ def test_it_records_and_reports_without_a_run(replay, tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == {"Tumble-zero.rrd", "Tumble-zero.npz"}
 
 
+@pytest.mark.pybullet
 def test_a_narrow_terminal_has_fewer_columns(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shown = on_terminal("replay", TUMBLE, "--policy", "zero", columns=60).splitlines()
@@ -56,6 +58,7 @@ def test_a_narrow_terminal_has_fewer_columns(tmp_path, monkeypatch):
     assert max(map(len, tables)) <= 60
 
 
+@pytest.mark.pybullet
 def test_the_recording_has_the_actions_of_the_function(functions, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (episode,) = run_replay(ReplayRequest(TUMBLE, baseline="functions.py:ramp")).episodes
@@ -66,6 +69,7 @@ def test_the_recording_has_the_actions_of_the_function(functions, tmp_path, monk
     assert run_replay(ReplayRequest(None, verify=episode.episode)).verification.difference is None
 
 
+@pytest.mark.pybullet
 def test_a_look_replaces_the_last_one_of_the_same_policy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     request = ReplayRequest(TUMBLE, baseline="random", episodes=2)
@@ -76,6 +80,7 @@ def test_a_look_replaces_the_last_one_of_the_same_policy(tmp_path, monkeypatch):
     assert [first.recording.name, second.recording.name] == ["000000.rrd", "000001.rrd"]
 
 
+@pytest.mark.pybullet
 def test_as_json_it_has_what_the_tables_have(replay):
     world = as_json(replay(TUMBLE, "--policy", "zero", "--json", "-"))["world"]
     assert [body["name"] for body in world["bodies"]] == ["ground", "cube", "car"]
@@ -96,12 +101,14 @@ def test_settings_and_choices_apply(tmp_path):
     assert worst.choice == "the worst of 3 episodes, of which 0 succeeded (seed 0)"
 
 
+@pytest.mark.pybullet
 def test_a_film(tmp_path):
     result = run_replay(ReplayRequest(TUMBLE, baseline="zero", video=tmp_path / "look.gif"))
     assert result.film.file.is_file()
     assert [body.name for body in result.world.bodies] == ["ground", "cube", "car"]
 
 
+@pytest.mark.pybullet
 def test_a_window_shows_it_and_the_world_is_summarised():
     source = TaskSource(ReplayRequest(TUMBLE, baseline="zero"), "zero")
     env = source.spec.make()  # there is no display, and a window is drawn by the environment itself
@@ -110,6 +117,7 @@ def test_a_window_shows_it_and_the_world_is_summarised():
     assert source.report([]).world.bodies[1].name == "cube"
 
 
+@pytest.mark.pybullet
 def test_without_a_display_a_window_is_an_error_of_one_line(replay):
     for task in (TUMBLE, f"{ENVS}:Pixels"):
         done = replay(task, "--policy", "zero", "--gui")
@@ -146,6 +154,7 @@ def test_an_episode_without_an_end_is_cut(tmp_path, capsys, write_module):
     assert "cut after 1,000 steps, because no time limit is known" in capsys.readouterr().err
 
 
+@pytest.mark.pybullet
 def test_an_error_of_the_function_is_one_line_with_the_step(replay, functions):
     done = replay(TUMBLE, "--policy", f"{functions}:breaks")
     assert done.returncode == PolicyError.exit_code

@@ -101,6 +101,7 @@ def test_contacts_have_the_step_in_which_they_began():
     ]
 
 
+@pytest.mark.pybullet
 def test_a_task():
     world = look(f"{ENVS}:Tumble")
     ground, cube, car = world.bodies
@@ -116,6 +117,7 @@ def test_a_task():
     assert {(contact.body, contact.other) for contact in world.contacts} == {("cube", "ground"), ("car", "ground")}
 
 
+@pytest.mark.pybullet
 def test_joints_of_a_task():
     arm = look("reach").bodies[1]
     joint = arm.joints[1]
@@ -125,6 +127,7 @@ def test_joints_of_a_task():
     assert {joint.unit for joint in gripper} == {"rad", "m"}
 
 
+@pytest.mark.pybullet
 def test_a_plain_environment_of_pybullet(write_module):
     file = write_module(
         "plain.py",
@@ -177,6 +180,7 @@ def test_a_plain_environment_of_pybullet(write_module):
     assert motion(removed, ball.name).lowest > 0.2
 
 
+@pytest.mark.pybullet
 def test_a_robot_on_rails_in_pybullet():
     world = look(f"{BULLET_ENVS}:Crawler", file="mjcf/half_cheetah.xml")
     robot = next(body for body in world.bodies if body.joints)

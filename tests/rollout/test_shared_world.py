@@ -9,7 +9,7 @@ from rlctl.rollout.messages import Play, SharedWorld
 from rlctl.rollout.shared_world import check_memory
 from tests.rollout.conftest import ENVS
 
-pytestmark = pytest.mark.usefixtures("no_child_left")
+pytestmark = [pytest.mark.usefixtures("no_child_left"), pytest.mark.pybullet]
 
 BALLS = ENVS.with_name("bullet_envs.py")
 BY_NAME = """

@@ -12,7 +12,7 @@ from rlctl.task.pybullet.sim import PybulletSim
 pytest.importorskip("mujoco")
 STIFFNESS = [300.0, 300.0, 300.0, 300.0, 5.0, 5.0, 0.5]  # [N m/rad]
 DAMPING = [5.0, 5.0, 2.0, 2.0, 0.1, 0.1, 0.01]  # [N m s/rad]
-ENGINES = [PybulletSim, MujocoSim]
+ENGINES = [pytest.param(PybulletSim, marks=pytest.mark.pybullet), MujocoSim]
 
 
 def answer_a_step(engine, substeps=10):
@@ -31,8 +31,9 @@ def answer_a_step(engine, substeps=10):
         return np.array(rows)
 
 
+@pytest.mark.pybullet
 def test_both_engines_move_alike():
-    bullet, mujoco = (answer_a_step(engine) for engine in ENGINES)
+    bullet, mujoco = (answer_a_step(engine) for engine in (PybulletSim, MujocoSim))
     assert np.abs(bullet - mujoco).max() < 0.02  # of 0.2 rad
     np.testing.assert_allclose(bullet[-1, :5], 0.4, atol=0.03)
     np.testing.assert_allclose(mujoco[-1, :5], 0.4, atol=0.03)
@@ -77,6 +78,7 @@ def test_a_stiffness_that_cannot_be(engine, stiffness):
             arm.set_drives(stiffness, 1.0)
 
 
+@pytest.mark.pybullet
 def test_a_damping_that_explicit_steps_cannot_have():
     with closing(PybulletSim(control_dt=0.02, substeps=1)) as sim:
         arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)

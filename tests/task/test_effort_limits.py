@@ -11,7 +11,7 @@ from tests.task import models
 pytest.importorskip("mujoco")
 
 
-@pytest.fixture(params=[PybulletSim, MujocoSim], ids=["pybullet", "mujoco"])
+@pytest.fixture(params=[pytest.param(PybulletSim, marks=pytest.mark.pybullet), MujocoSim], ids=["pybullet", "mujoco"])
 def cart(request, tmp_path):
     """A wheel without `<limit>`, an arm of effort 0, and a lift of effort 50."""
     limit = '<limit lower="-3" upper="3" effort="50" velocity="5"/>'

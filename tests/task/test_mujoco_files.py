@@ -116,6 +116,7 @@ def test_names_that_the_file_has_not(scene):
         robot.set_controls(np.zeros(2))
 
 
+@pytest.mark.pybullet
 def test_pybullet_has_no_controls():
     sim = PybulletSim(control_dt=0.02, substeps=4)
     robot = sim.load("robot", "mjcf/ant.xml")

@@ -16,7 +16,7 @@ from tests.task import mesh_files, models
 pytest.importorskip("mujoco")
 
 
-@pytest.fixture(params=["pybullet", "mujoco"])
+@pytest.fixture(params=[pytest.param("pybullet", marks=pytest.mark.pybullet), "mujoco"])
 def sim(request):
     simulations = {"pybullet": PybulletSim, "mujoco": MujocoSim}
     made = simulations[request.param](control_dt=1 / 60, substeps=4)
@@ -166,6 +166,7 @@ def test_a_file_that_needs_no_change_is_loaded_itself(tmp_path):
     assert read_urdf(file, fixed=False).guessed == ["world"]
 
 
+@pytest.mark.pybullet
 def test_a_changed_file_is_read_again_after_it_was_edited(tmp_path):
     # PyBullet keeps what it has read, by path.
     sim = PybulletSim(control_dt=1 / 60, substeps=4)
@@ -189,6 +190,7 @@ def test_two_joints_of_one_name(sim, tmp_path):
         sim.load("robot", file)
 
 
+@pytest.mark.pybullet
 def test_a_changed_file_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     (tmp_path / "tmp").mkdir()
