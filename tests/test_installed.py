@@ -154,3 +154,14 @@ def test_a_checkout_beside_its_installation_is_one(rlctl, install, tmp_path):
     install("twice", {"twice": "twice_there:Task"}, version="1.3")
     tasks = listed(rlctl("tasks", "--json", "-", path=site))
     assert [task["problem"] for (name, _), task in tasks.items() if name == "twice"] == [None]
+
+
+def test_a_module_is_found_below_a_folder_without_init(tmp_path, monkeypatch):
+    folder = tmp_path / "robots_below" / "envs" / "arms"
+    folder.mkdir(parents=True)
+    for package in ("robots_below", "robots_below/envs"):
+        (tmp_path / package / "__init__.py").touch()
+    (folder / "reach.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    assert installed.find_module_file("robots_below.envs.arms.reach") == folder / "reach.py"
+    assert installed.find_module_file("robots_below.envs.legs.walk") is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections.abc import Mapping
@@ -92,16 +93,30 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
 
 
 def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
-    """Return the MuJoCo `model` and `data` of an environment, or None."""
+    """Return the MuJoCo model and data of an environment, or None.
+
+    They are its `model` and `data`, else the first that fit each other among its attributes, or among theirs.
+    """
     library, inner = sys.modules.get("mujoco"), getattr(env, "unwrapped", env)
     if library is None:
         return None
     sim = getattr(inner, "sim", None)
     world = sim if "MujocoSim" in {cls.__name__ for cls in type(sim).__mro__} else inner
     model, data = (getattr(world, name, None) for name in ("model", "data"))
-    if not isinstance(model, library.MjModel) or not isinstance(data, library.MjData):
-        return None
-    return model, data
+    if isinstance(model, library.MjModel) and isinstance(data, library.MjData):
+        return model, data
+    for holder in (world, *_list_attributes(world)):
+        values = _list_attributes(holder)
+        models = (value for value in values if isinstance(value, library.MjModel))
+        states = [value for value in values if isinstance(value, library.MjData)]
+        for model, data in itertools.product(models, states):
+            if data.qpos.size == model.nq and len(data.xpos) == model.nbody:
+                return model, data
+    return None
+
+
+def _list_attributes(holder: object) -> list[Any]:
+    return list(getattr(holder, "__dict__", {}).values())
 
 
 def describe_model(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:

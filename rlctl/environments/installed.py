@@ -7,8 +7,8 @@ import importlib.util
 import os
 import re
 import sys
-from collections.abc import Iterator
-from importlib.machinery import PathFinder
+from collections.abc import Iterator, Sequence
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -182,12 +182,23 @@ def find_module_file(module: str, *, in_current_folder: bool = False) -> Path | 
             if spec is None:
                 return None
             name = ".".join(module.split(".")[:depth])
-            path = spec.submodule_search_locations
-            specs = (finder.find_spec(name, path) for finder in sys.meta_path if hasattr(finder, "find_spec"))
-            spec = next((candidate for candidate in specs if candidate is not None), None)
+            spec = _find_submodule(name, spec.submodule_search_locations)
     except (ImportError, ValueError):
         return None
     return Path(spec.origin) if spec and spec.origin and spec.has_location else None
+
+
+def _find_submodule(name: str, path: Sequence[str] | None) -> ModuleSpec | None:
+    for finder in sys.meta_path:
+        if not hasattr(finder, "find_spec"):
+            continue
+        try:
+            spec = finder.find_spec(name, path)
+        except KeyError:  # a folder without `__init__.py`: Python looks its parent up in `sys.modules`
+            spec = PathFinder.find_spec(name.rpartition(".")[2], path)
+        if spec is not None:
+            return spec
+    return None
 
 
 def explain_hidden_package(module: str) -> str:

@@ -1,13 +1,15 @@
 """What is read from the model of an environment that MuJoCo simulates."""
 
 from contextlib import closing
+from types import SimpleNamespace
 
+import gymnasium
 import pytest
 
-from rlctl.environments.info import describe, describe_mujoco_model
+from rlctl.environments.info import describe, describe_mujoco_model, find_mujoco
 from rlctl.environments.spec import EnvSpec
 
-pytest.importorskip("mujoco")
+mujoco = pytest.importorskip("mujoco")
 
 
 def about(task: str):
@@ -31,6 +33,26 @@ def test_limits_are_left_out_where_a_joint_has_none():
     assert joints.names == ("joint0", "joint1")
     assert joints.low == ()
     assert joints.max_torque == (200.0, 200.0)
+
+
+def make_model(bodies: int):
+    balls = "".join("<body><freejoint/><geom size='.1'/></body>" for _ in range(bodies))
+    return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{balls}</worldbody></mujoco>")
+
+
+class Held(gymnasium.Env):
+    """Holds its model and data under `attributes`."""
+
+    def __init__(self, **attributes):
+        vars(self).update(attributes)
+
+
+def test_model_and_data_are_found_under_any_name_and_one_object_deep():
+    model, other = make_model(2), make_model(1)
+    data = mujoco.MjData(model)
+    assert find_mujoco(Held(mjModel=model, mjData=data)) == (model, data)
+    assert find_mujoco(Held(planner=other, robot=SimpleNamespace(m=model, d=data))) == (model, data)
+    assert find_mujoco(Held(planner=other, d=data)) is None  # they do not fit each other
 
 
 def test_other_environments_have_no_model():
