@@ -83,6 +83,7 @@ class Body:
     """Points of rough ground [m], world frame, shape (along x, along y, 3); None for any other body."""
     drives: Drives | None
     """What `set_drives` set; None: `drive_to` uses its `gain`."""
+    _chosen: set[int]  # joints whose motors the task has set or disabled
 
     def _refuse(self, what: str) -> NoReturn:
         raise UsageError(f"{what}: not in {self.engine}; use the other engine: --sim")
@@ -365,6 +366,14 @@ class Body:
                 "pass max_force= [N m], or write <limit effort=...> into the model"
             )
         return np.asarray(limits, float)
+
+    def _check_free(self, joints: list[int]) -> None:
+        """Raise `TaskError` if a motor holds one of the joints, against the torque of `set_torques`."""
+        if not self._chosen.issuperset(joints):
+            held = next(self.joint_names[joint] for joint in joints if joint not in self._chosen)
+            raise TaskError(
+                f"set_torques: the motor of {held!r} holds it in place; call disable_motors() in build first"
+            )
 
     def _spread(self, name: str, value: Any) -> Array:
         """Return one number, or one per joint, as an array of shape (joints,)."""

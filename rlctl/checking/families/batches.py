@@ -184,7 +184,7 @@ def _find_kept_values(worlds: _Worlds) -> Iterator[ChildMessage]:
         )
         if differs or len(reference.rows) != len(replayed.rows):
             found[Severity.ERROR].append(f"self.{name}")
-        elif np.shape(later[name])[:1] != (WORLDS,):  # one with a row per world is computed anew in each step
+        elif np.shape(later[name])[:1] != (WORLDS,):  # one with a row per world is computed in each step
             found[Severity.WARNING].append(f"self.{name}")
     for severity, names in found.items():
         if names:

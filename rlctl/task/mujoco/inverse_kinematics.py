@@ -9,7 +9,7 @@ import numpy as np
 from rlctl.task.body import Array
 
 if TYPE_CHECKING:
-    from rlctl.task.mujoco.body import Parts
+    from rlctl.task.mujoco.parts import Parts
     from rlctl.task.mujoco.sim import MujocoSim
 
 _STEPS, _CLOSE, _DAMPING = 100, 1e-4, 0.05  # -, [m] and [rad], -

@@ -13,10 +13,10 @@ import numpy as np
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body, Drives
+from rlctl.task.mujoco.parts import Parts, find_slice
 from rlctl.task.mujoco.world import Rows
 
 if TYPE_CHECKING:
-    from rlctl.task.mujoco.body import Parts
     from rlctl.task.mujoco.sim import MujocoSim
 
 _UNLIMITED = 1e9  # [N m or N]
@@ -140,11 +140,7 @@ class MujocoMotors(Body):
     def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
         mode = self._find_mode("torque", joints, np.inf, 0.0, None)
         given = self._read(torques, mode)
-        if not self._chosen.issuperset(mode.joints):
-            held = next(self.joint_names[joint] for joint in mode.joints if joint not in self._chosen)
-            raise TaskError(
-                f"set_torques: the motor of {held!r} holds it in place; call disable_motors() in build first"
-            )
+        self._check_free(mode.joints)
         self._write_mode(mode)
         self._fields.data("ctrl")[..., mode.motors] = given * self._fields.model("strength")[..., mode.motors]
 
@@ -189,8 +185,7 @@ class MujocoMotors(Body):
     ) -> _Mode:
         chosen = self.find_joints(joints)
         self._chosen.update(chosen if kind != "torque" else ())
-        numbers = self._motors[chosen]
-        motors = slice(numbers[0], numbers[-1] + 1) if (np.diff(numbers) == 1).all() else numbers
+        motors = find_slice(self._motors[chosen])
         if self.parts.inertia is None:
             self.measure_inertia()
         assert self.parts.inertia is not None

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError, UsageError
 from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.model_files import find_model_file
-from rlctl.task.mujoco.body import WORLD, MujocoBody, Parts
+from rlctl.task.mujoco.body import MujocoBody
 from rlctl.task.mujoco.files import ModelFile, is_colliding, read_model_file
+from rlctl.task.mujoco.parts import WORLD, Parts
 from rlctl.task.mujoco.pictures import Marker, add_checker, draw, light_scene
 from rlctl.task.mujoco.world import Array, Fields, MujocoWorld, Rows
 from rlctl.task.sim import Sim

@@ -37,7 +37,7 @@ class Motors(Body):
         self._built_strength: Array | None = None
         self._plans: dict[tuple[str, ...], _Plan] = {}
         self._commanded: list[float] | None = None  # by `set_torques`, of all joints; NaN: the motor's
-        self._chosen: set[int] = set()  # joints whose motors the task has set or disabled
+        self._chosen: set[int] = set()
         self.drives: Drives | None = None
         self._targets: dict[int, tuple[float, float]] = {}  # of springs: position and limit of the force, by joint
 
@@ -195,11 +195,7 @@ class Motors(Body):
     def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
         chosen = self.find_joints(joints)
         given = self._apply_strength(self._read_values("torques", torques, len(chosen)), chosen)
-        if not self._chosen.issuperset(chosen):
-            held = next(self.joint_names[joint] for joint in chosen if joint not in self._chosen)
-            raise TaskError(
-                f"set_torques: the motor of {held!r} holds it in place; call disable_motors() in build first"
-            )
+        self._check_free(chosen)
         if joints:
             self._commanded = self._commanded or [math.nan] * len(self.joint_names)
             for joint, torque in zip(chosen, given, strict=True):
