@@ -29,7 +29,7 @@ def test_the_wheel_trains_reach_from_an_empty_folder(tmp_path):
     empty.mkdir()
     tasks = json.loads(call(scripts / "rlctl", "tasks", "--check", "--json", "-", cwd=empty))["tasks"]
     assert {(task["name"], task["algo"], task["problem"]) for task in tasks} == {
-        ("reach", "ppo", None),
+        *((name, "ppo", None) for name in ("reach", "reach-batch", "walk")),
         *((name, "tqc", None) for name in ("ant", "biped", "half-cheetah", "hopper", "humanoid", "walker2d")),
         *((name, "sac", None) for name in ("biped-3d", "quadruped", "reach-sparse")),
         *((name, "sac", None) for name in ("kuka-grasp", "gear-arm", "peg-insert", "screw-drive")),

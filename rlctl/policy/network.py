@@ -55,6 +55,9 @@ class Network:
         name = "actor.log_std" if algo in SQUASHED_GAUSSIAN else "log_std"
         self.log_std = read.tensors.get(name)
         """The noise parameter of PPO and gSDE; None if there is none, or if a layer computes it."""
+        self._uses_expln = bool(info.policy_kwargs.get("use_sde") and info.policy_kwargs.get("use_expln"))
+        self.std: Array | None = None
+        """Standard deviations of the present `log_std`."""
         self._log_std_layer = read.linear(name) if f"{name}.weight" in read.tensors else None
         self.prepare()
 
@@ -65,7 +68,8 @@ class Network:
         for part in self.parts.values():
             for layer in part:
                 layer.prepare()
-        self._std = None if self.log_std is None else np.exp(self.log_std)
+        if self.log_std is not None:
+            self.std = _expln(self.log_std) if self._uses_expln else np.exp(self.log_std)
 
     def compute_latent(self, observation: object) -> Array:
         """Return the head's input, shape (size,); advances a recurrent state by one step."""
@@ -84,8 +88,13 @@ class Network:
         """Return the standard deviation of a Gaussian action, shape (elements,)."""
         if self._log_std_layer is not None:
             return np.exp(np.clip(self._log_std_layer(latent), -20.0, 2.0))
-        assert self._std is not None  # called for Gaussian heads only
-        return self._std
+        assert self.std is not None  # called for Gaussian heads only
+        return self.std
+
+
+def _expln(log_std: Array) -> Array:
+    """Return SB3's alternative to exp for gSDE; it grows more slowly above 0."""
+    return np.where(log_std <= 0, np.exp(np.minimum(log_std, 0)), np.log1p(np.maximum(log_std, 0) + 1e-6) + 1.0)
 
 
 def _read_actor(algo: str, read: _Reader, *, graph_is_trunk: bool) -> tuple[list[Layer], list[Layer]]:

@@ -4,7 +4,6 @@ The noise of an action depends only on the episode's seed and the step.
 """
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +16,9 @@ from rlctl.errors import ArtifactError, DivergedError, UsageError, short_repr
 from rlctl.policy.file import DETERMINISTIC, PolicyFile
 from rlctl.policy.layers import Array, apply
 from rlctl.policy.network import Network
-from rlctl.policy.players.player import Exploration, Noise, Player, make_generator
+from rlctl.policy.players.player import Exploration, Noise, Player, draw_matrix
 from rlctl.policy.policy import Policy
 
-_MATRIX = 1  # random stream of gSDE's matrices
 _MEAN, _SAMPLE = Exploration(), Exploration(stochastic=True)
 
 
@@ -32,7 +30,6 @@ class PolicyPlayer(Player):
         self.exploration = Exploration()
         self._network = Network(policy)
         _, self._space = info.env.spaces()
-        self._settings: Mapping[str, Any] = info.policy_kwargs
         self._uses_sde = bool(info.policy_kwargs.get("use_sde"))
         self._algo = info.algo
         self._noise = Noise(max(1, math.prod(self._space.shape or ())))
@@ -56,12 +53,8 @@ class PolicyPlayer(Player):
             self._draw_matrix(seed, step)
 
     def _draw_matrix(self, seed: int, step: int) -> None:
-        """Draw gSDE's exploration matrix, shape (latent, actions); `log_std` has one column or one per action."""
-        log_std = self._network.log_std
-        assert log_std is not None  # a parameter of gSDE
-        std = _expln(log_std) if self._settings.get("use_expln") else np.exp(log_std)
-        size = (log_std.shape[0], len(self._low))
-        self._matrix = std * make_generator(seed, _MATRIX, step).standard_normal(size, np.float32)
+        assert self._network.std is not None  # of gSDE's parameter
+        self._matrix = draw_matrix(self._network.std, seed, step, len(self._low))
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
         """Return the action to store, shape (elements,), and the action for the environment; advances an LSTM's state.
@@ -148,11 +141,6 @@ def _count_choices(space: spaces.Space[Any]) -> Array:
     if isinstance(space, spaces.MultiDiscrete):
         return space.nvec.ravel()
     return np.full(math.prod(space.shape or ()), 2)
-
-
-def _expln(log_std: Array) -> Array:
-    """Return SB3's alternative to exp for gSDE; it grows more slowly above 0."""
-    return np.where(log_std <= 0, np.exp(np.minimum(log_std, 0)), np.log1p(np.maximum(log_std, 0) + 1e-6) + 1.0)
 
 
 class NumpyPolicy(Policy):

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from rlctl.errors import DivergedError, in_world, short_repr
 from rlctl.policy.file import DETERMINISTIC, PolicyFile
-from rlctl.policy.layers import Activation, Array, Flatten, Linear, Normalize
+from rlctl.policy.layers import Activation, Array, Flatten, Layer, Linear, Normalize
 from rlctl.policy.network import Network
-from rlctl.policy.players.player import NOISE_BLOCK, Exploration, draw_noise
+from rlctl.policy.players.player import NOISE_BLOCK, Exploration, draw_matrix, draw_noise
 
 _SIZES = (64, 32, 16, 8, 4, 2)
 """Numbers of rows in a matrix product, the fastest first."""
@@ -36,13 +36,17 @@ class RowsPolicy:
         self._drawn = np.full((count, 2), -1, np.int64)  # seed and block of the noise of each environment
         shapes = [layer.weight.shape for layer in self._layers() if isinstance(layer, Linear)]
         self._block = min(find_block(shape) for shape in shapes)
+        self._uses_sde = bool(policy.info.policy_kwargs.get("use_sde"))
+        if self._uses_sde:
+            self._matrices = np.zeros((count, shapes[-1][1], size), np.float32)
+            self._has_matrix = np.zeros(count, bool)
 
     @staticmethod
     def supports(policy: PolicyFile) -> bool:
         """Return whether it acts as this policy does: a Gaussian or deterministic perceptron on a flat observation."""
         info = policy.info
         observed, space = info.env.spaces()
-        if info.policy_kwargs.get("use_sde") or info.algo == "recurrent_ppo" or not isinstance(space, spaces.Box):
+        if info.algo == "recurrent_ppo" or not isinstance(space, spaces.Box):
             return False
         network = Network(policy)
         if not isinstance(observed, spaces.Box) or network.own is not None or network.is_squashed:
@@ -50,12 +54,14 @@ class RowsPolicy:
         layers = [*network.parts[""], *network.trunk, *network.head]
         return info.algo not in DETERMINISTIC and all(isinstance(layer, _ROWWISE) for layer in layers)
 
-    def _layers(self) -> list[Any]:
+    def _layers(self) -> list[Layer]:
         return [*self._network.parts[""], *self._network.trunk, *self._network.head]
 
     def begin_segment(self) -> None:
-        """Use the present weights."""
+        """Use the present weights; gSDE draws new matrices."""
         self._network.prepare()
+        if self._uses_sde:
+            self._has_matrix[:] = False
 
     def act(
         self,
@@ -69,10 +75,15 @@ class RowsPolicy:
 
         Raises `DivergedError` for an action that is not finite.
         """
-        value = self._forward(observations)
+        network = self._network
+        latent = self._apply([*network.parts[""], *network.trunk], observations)
+        value = self._apply(network.head, latent)
         if exploration.stochastic:
-            assert self._network._std is not None  # of a Gaussian policy
-            value = value + self._network._std * self._draw(seeds, steps, rows)
+            assert network.std is not None  # of a Gaussian policy
+            if self._uses_sde:
+                value = value + self._explore(latent, seeds, steps, rows, exploration.sde_every)
+            else:
+                value = value + network.std * self._draw(seeds, steps, rows)
         if not np.isfinite(value.sum()):
             bad = int((~np.isfinite(value)).any(axis=1).argmax())
             with in_world(int(rows[bad])):
@@ -80,11 +91,11 @@ class RowsPolicy:
         action = np.minimum(np.maximum(value, self._low), self._high).astype(self._space.dtype, copy=False)
         return value, action.reshape(len(rows), *self._space.shape)  # type: ignore[misc]
 
-    def _forward(self, observations: NDArray[Any]) -> Array:
-        count, block = len(observations), self._block
-        value = np.zeros((-(-count // block) * block, observations[0].size), np.float32)
-        value[:count] = observations.reshape(count, -1)
-        for layer in self._layers():
+    def _apply(self, layers: list[Layer], inputs: NDArray[Any]) -> Array:
+        count, block = len(inputs), self._block
+        value = np.zeros((-(-count // block) * block, inputs[0].size), np.float32)
+        value[:count] = inputs.reshape(count, -1)
+        for layer in layers:
             if isinstance(layer, Linear):
                 product = np.empty((len(value), len(layer.weight)), np.float32)
                 for start in range(0, len(value), block):
@@ -93,6 +104,22 @@ class RowsPolicy:
             elif not isinstance(layer, Flatten):
                 value = layer(value)
         return value[:count]
+
+    def _explore(
+        self, latent: Array, seeds: NDArray[np.int64], steps: NDArray[np.int64], rows: NDArray[np.int64], period: int
+    ) -> Array:
+        """Return gSDE's noise, shape (k, elements): the latent values times the matrices, new ones each `period`."""
+        std = self._network.std
+        assert std is not None  # of gSDE's parameter
+        new = ~self._has_matrix[rows]
+        if period:
+            new |= steps % period == 0
+        for k in np.flatnonzero(new).tolist():
+            self._matrices[rows[k]] = draw_matrix(std, int(seeds[k]), int(steps[k]), len(self._low))
+        self._has_matrix[rows] = True
+        # A sum over an axis that is not the last one adds in order: its bits do not depend on the other rows.
+        noise: Array = (latent[:, :, None] * self._matrices[rows]).sum(axis=1)
+        return noise
 
     def _draw(self, seeds: NDArray[np.int64], steps: NDArray[np.int64], rows: NDArray[np.int64]) -> Array:
         """Return the noise of the steps of episodes, shape (k, elements): the same numbers as for one environment."""

@@ -10,7 +10,7 @@ from rlctl.replaying.request import Choice
 from rlctl.rollout.collect import play_episodes
 from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import Workers, available_cores
+from rlctl.rollout.workers import Workers, count_envs
 
 
 def choose_episodes(
@@ -18,7 +18,7 @@ def choose_episodes(
 ) -> tuple[list[EpisodeResult], str]:
     """Play the episodes that `rlctl eval` plays; return the chosen ones, the worst or best first, and a description."""
     seeds = episode_seeds(seed, Stream.EVAL, episodes)
-    with Workers(spec, min(episodes, available_cores())) as workers:
+    with Workers(spec, count_envs(spec, episodes)) as workers:
         policy.give_to(workers)
         results = [episode.result for episode in play_episodes(workers, seeds)]
     chosen = select(results, choice)

@@ -27,7 +27,7 @@ from rlctl.printed_lines import PrintedLines
 from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import ON_POLICY, Recipe
 from rlctl.rollout.shared_world import explain_processes
-from rlctl.rollout.workers import Workers, available_cores
+from rlctl.rollout.workers import Workers, count_envs
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory
 from rlctl.training import status
@@ -84,7 +84,7 @@ def set_up(start: Start, display: Display, printed: PrintedLines) -> Iterator[Tr
         if not lock.keeps_out:
             display.message(f"warning: {run.path}: this file system has no locks: let only one process train this run")
         checkpoints = _open_run(run, start, learner, display)
-        n_envs = min(recipe.eval.episodes, available_cores())
+        n_envs = count_envs(specs[-1], recipe.eval.episodes)
         episodes = EvaluationEpisodes(learner, functools.partial(make_workers, specs[-1], n_envs), checkpoints)
         stack.callback(episodes.close)
         evaluator = Evaluator(learner, episodes, checkpoints, display)

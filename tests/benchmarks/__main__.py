@@ -49,6 +49,8 @@ ROWS = {
     "reach-mujoco": "engines:one_world",
     "walk-batch": "engines:many_worlds",
     "walk": "engines:walk",
+    "reach-batch": "engines:reach_batch",
+    "reach-batch-learned": "engines:reach_batch_learns",
     "gear-arm": "robots:gear_arm",
     "reach-sparse": "robots:reach_sparse",
     "checkpoints-ppo": "checkpoints:while_ppo_trains",

@@ -11,7 +11,7 @@ from rlctl.cli.arguments import complete_algorithm, complete_run, complete_task
 def test_tasks_and_files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rear.py").write_text("")
-    assert complete_task("rea") == ["reach", "reach-sparse", "rear.py"]
+    assert complete_task("rea") == ["reach", "reach-batch", "reach-sparse", "rear.py"]
     assert {"ant", "hopper", "reach"} <= set(complete_task(""))
 
 

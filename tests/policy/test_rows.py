@@ -14,11 +14,12 @@ from rlctl.policy.players.player import Exploration
 from rlctl.policy.rows import RowsPolicy
 from tests.policy.test_numpy_policy import BOX, CASES, FLAT, policy  # noqa: F401
 
-SUPPORTED = {"ppo", "ppo, elu", "ppo, silu", "ppo, no layers"}
+SUPPORTED = {"ppo", "ppo, elu", "ppo, silu", "ppo, no layers", "ppo, gSDE"}
 EXPLORATIONS = [Exploration(), Exploration(stochastic=True)]
+SDE = Exploration(stochastic=True, sde_every=4)
 
 
-def make_wide(sizes, observed=45, seed=0) -> PolicyFile:
+def make_wide(sizes, observed=45, seed=0, *, use_sde=False) -> PolicyFile:
     """Return a policy of a multi-layer perceptron for 12 actions, with normalised observations."""
     rng = np.random.default_rng(seed)
     info = EnvInfo(
@@ -32,7 +33,7 @@ def make_wide(sizes, observed=45, seed=0) -> PolicyFile:
         last = size
     tensors["policy/action_net.weight"] = rng.normal(0, last**-0.5, (12, last))
     tensors["policy/action_net.bias"] = rng.normal(0, 0.1, 12)
-    tensors["policy/log_std"] = rng.normal(-1, 0.1, 12)
+    tensors["policy/log_std"] = rng.normal(-1, 0.1, (last, 12) if use_sde else 12)
     tensors = {name: value.astype(np.float32) for name, value in tensors.items()}
     tensors |= {"normalize//mean": rng.normal(0, 1, observed), "normalize//var": rng.uniform(0.5, 2, observed)}
     packed = PolicyInfo(
@@ -40,7 +41,7 @@ def make_wide(sizes, observed=45, seed=0) -> PolicyFile:
         policy="MlpPolicy",
         env=info,
         spec=EnvSpec("test"),
-        policy_kwargs={"net_arch": list(sizes)},
+        policy_kwargs={"net_arch": list(sizes), "use_sde": use_sde},
         normalized_keys=[""],
     )
     return PolicyFile(packed, tensors)
@@ -109,6 +110,41 @@ def test_an_action_does_not_depend_on_the_other_rows(wide, exploration):
     places = np.array([6, 2])
     few, _ = act(other, observations[[128, 5]], seeds[[128, 5]], steps[[128, 5]], places, exploration)
     np.testing.assert_array_equal(few, every[[128, 5]])
+
+
+def test_gsde_explores_as_one_at_a_time():
+    """Its matrices change at the start of a segment and every 4 steps; episodes are at different steps."""
+    count, rng = 11, np.random.default_rng(3)
+    file = make_wide((32, 16), use_sde=True)
+    rows, players = RowsPolicy(file, count), [PolicyPlayer(file) for _ in range(count)]
+    seeds = 50 + np.arange(count)
+    for first_step in (0, 6):  # of two segments of 6 steps
+        rows.begin_segment()
+        steps = first_step + np.arange(count) % 3
+        for k, player in enumerate(players):
+            player.explore(SDE)
+            player.begin_segment(int(seeds[k]), int(steps[k]))
+        for _ in range(6):
+            observations = rng.normal(0, 2, (count, 45)).astype(np.float32)
+            stored, _ = act(rows, observations, seeds, steps, range(count), SDE)
+            for k, player in enumerate(players):
+                expected = player.act(observations[k], int(seeds[k]), int(steps[k]))[0]
+                np.testing.assert_allclose(stored[k], expected, atol=1e-5)
+            steps = steps + 1
+
+
+def test_gsde_does_not_depend_on_the_other_rows():
+    count, rng = 40, np.random.default_rng(4)
+    file = make_wide((64, 64), use_sde=True)
+    rows, other = RowsPolicy(file, count), RowsPolicy(file, count)
+    rows.begin_segment()
+    other.begin_segment()
+    observations = rng.normal(0, 2, (count, 45)).astype(np.float32)
+    seeds, steps = np.arange(count), rng.integers(0, 200, count)
+    every, _ = act(rows, observations, seeds, steps, range(count), SDE)
+    some = rng.permutation(count)[:7]
+    few, _ = act(other, observations[some], seeds[some], steps[some], some, SDE)
+    np.testing.assert_array_equal(few, every[some])
 
 
 def test_new_weights_count_from_the_next_segment_on():

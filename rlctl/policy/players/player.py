@@ -10,7 +10,7 @@ from rlctl.policy.layers import Array
 
 NOISE_BLOCK = 64
 """Number of steps whose random numbers are drawn together."""
-_STEP_NOISE = 0  # random stream of the noise of steps
+_STEP_NOISE, _MATRIX = 0, 1  # random streams: noise of steps, gSDE's matrices
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +55,15 @@ def draw_noise(seed: int, block: int, size: int) -> tuple[Array, Array]:
     generator = make_generator(seed, _STEP_NOISE, block)
     normal = generator.standard_normal((NOISE_BLOCK, 2, size), np.float32)
     return normal, generator.random((NOISE_BLOCK, size + 1))
+
+
+def draw_matrix(std: Array, seed: int, step: int, actions: int) -> Array:
+    """Return gSDE's exploration matrix of a step, shape (latent, actions).
+
+    `std` has a column for each action, or one for all: shape (latent, actions) or (latent, 1).
+    """
+    matrix: Array = std * make_generator(seed, _MATRIX, step).standard_normal((len(std), actions), np.float32)
+    return matrix
 
 
 def make_generator(seed: int, use: int, counter: int) -> np.random.Generator:
