@@ -57,6 +57,23 @@ def test_a_spring_gives_way_to_a_load(engine):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("worlds", [None, 3])
+def test_ideal_motors_hold_an_arm_that_is_told_to_stay_where_it_is(engine, worlds):
+    """Actions that are steps from the measured angle would let it sink, a little in each step."""
+    if worlds is not None and engine is PybulletSim:
+        pytest.skip("PyBullet has one world")
+    with closing(engine(control_dt=0.02, substeps=4, **({} if worlds is None else {"worlds": worlds}))) as sim:
+        arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
+        sim.save()
+        pose = np.array([0.0, 1.0, 0.0, -1.0, 0.0, 0.5, 0.0])
+        arm.set_joints(pose if worlds is None else np.tile(pose, (worlds, 1)))
+        for _ in range(100):
+            arm.drive_to(arm.joint_positions)
+            sim.step()
+        assert np.abs(arm.joint_positions - pose).max() < 0.01  # [rad]; it sank by 0.1 rad without the feed-forward
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 def test_they_describe_themselves_to_controllers(engine):
     with closing(engine(control_dt=0.02, substeps=4)) as sim:
         arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)

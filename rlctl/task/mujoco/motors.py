@@ -110,7 +110,14 @@ class MujocoMotors(Body):
         force = mode.stiffness * targets
         if mode.max_speed is not None:
             force = self._limit_approach(mode, targets, force)
+        if self.parts.drives is None:
+            force = force + self._hold(mode)
         self._fields.data("ctrl")[..., mode.motors] = force
+
+    def _hold(self, mode: _Mode) -> Array:
+        """Return the torques that hold the joints against gravity now, as PyBullet's ideal motors do."""
+        bias: Array = self._fields.derived("qfrc_bias")[..., self.parts.velocities][..., mode.joints]
+        return bias
 
     def _limit_approach(self, mode: _Mode, targets: Array, force: Array) -> Array:
         """Drive joints that are far from their target at their top speed instead, as PyBullet's motors do."""
@@ -132,7 +139,7 @@ class MujocoMotors(Body):
         mode = self._find_mode("velocity", joints, max_force, 0.0, None)
         targets = self._read(velocities, mode)
         self._write_mode(mode)
-        self._fields.data("ctrl")[..., mode.motors] = mode.damping * targets
+        self._fields.data("ctrl")[..., mode.motors] = mode.damping * targets + self._hold(mode)
 
     def disable_motors(self, joints: Sequence[str] = ()) -> None:
         self._chosen.update(self.find_joints(joints))

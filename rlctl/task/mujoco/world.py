@@ -23,8 +23,8 @@ _SERIOUS = {
     "mjWARN_CNSTRFULL": "too many constraints",
 }
 """MuJoCo's warnings that are errors, and what they mean."""
-_DERIVED = ("xpos", "xquat", "xipos")
-"""Arrays that bodies read and the state does not have."""
+_DERIVED = ("xpos", "xquat", "xipos", "qfrc_bias")
+"""Arrays that bodies and motors read and the state does not have."""
 _OF_STEPS = ("sensordata", "actuator_force", "qfrc_actuator")
 """Those that only a step computes; after any other call a world of a batch has those of another world."""
 
