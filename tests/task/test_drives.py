@@ -56,12 +56,12 @@ def test_a_spring_gives_way_to_a_load(engine):
     assert sag == pytest.approx(-torque / STIFFNESS[1], rel=0.1)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("worlds", [None, 3])
+@pytest.mark.parametrize(
+    ("engine", "worlds"),
+    [pytest.param(PybulletSim, None, marks=pytest.mark.pybullet), (MujocoSim, None), (MujocoSim, 3)],
+)
 def test_ideal_motors_hold_an_arm_that_is_told_to_stay_where_it_is(engine, worlds):
     """Actions that are steps from the measured angle would let it sink, a little in each step."""
-    if worlds is not None and engine is PybulletSim:
-        pytest.skip("PyBullet has one world")
     with closing(engine(control_dt=0.02, substeps=4, **({} if worlds is None else {"worlds": worlds}))) as sim:
         arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
         sim.save()
