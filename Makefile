@@ -16,10 +16,7 @@ export PYTHONDONTWRITEBYTECODE =
 .PHONY: demo test test-slow test-crash test-all lint format docs bench compare train-all clean
 
 demo: $(VENV)/.installed
-	$(BIN)/rlctl train reach
-	$(BIN)/rlctl eval reach --min-success 0.95
-	$(BIN)/rlctl export reach --onnx
-	$(BIN)/rlctl replay reach
+	$(BIN)/rlctl demo
 
 # Lint and types are checked beside the tests; what they say comes after the tests' own lines.
 test: $(VENV)/.dev

@@ -195,16 +195,29 @@ def check_name(
 
 
 def explain_missing_package(user: str, missing: str | None, extra: str) -> str:
-    """Return `USER needs MISSING: pip install ...` with the packages of the extra; rlctl itself is not on PyPI."""
-    from importlib import metadata
-
-    try:
-        requirements = metadata.requires("rlctl") or []
-    except metadata.PackageNotFoundError:  # a copy that was not installed
-        requirements = []
+    """Return `USER needs MISSING: pip install ...` with the packages of the extra."""
+    requirements = _read_requirements("rlctl") or _read_requirements("rlctl-core") or []
     suffix = re.compile(rf"""\s*;.*extra == ['"]{extra}['"].*""")
     packages = [suffix.sub("", line) for line in requirements if suffix.search(line)]
     return f"{user} needs {missing}: pip install {shlex.join(packages or [str(missing)])}"
+
+
+def explain_left_out(module: str | None) -> str | None:
+    """Return what to do about a module that rlctl imports and `rlctl-core` leaves out; None if `rlctl` is installed."""
+    if _read_requirements("rlctl-core") is None or _read_requirements("rlctl") is not None:
+        return None
+    needed = (module or "").partition(".")[0]
+    return f"this needs {needed}, which is not part of rlctl-core: pip install rlctl"
+
+
+def _read_requirements(distribution: str) -> list[str] | None:
+    """Return what an installed distribution requires; None if it is not installed."""
+    from importlib import metadata
+
+    try:
+        return metadata.requires(distribution) or []
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def short_repr(value: object, length: int = 80) -> str:

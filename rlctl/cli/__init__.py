@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli import deploy, eval, export, runs, tasks, train
+from rlctl.cli import demo, deploy, eval, export, runs, tasks, train
 from rlctl.errors import UsageError
 from rlctl.processes import error_boundary
 from rlctl.version import __version__
@@ -42,6 +42,8 @@ COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "tasks": tasks.app,
     "recipe": tasks.recipe,
     "runs": runs.app,
+    "demo": demo.demo,
+    "bugreport": runs.report_bug,
 }
 
 

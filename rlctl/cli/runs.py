@@ -166,3 +166,12 @@ def prune_runs(
     from rlctl.runs.listing import plan_prune, remove_with_report
 
     remove_with_report(plan_prune(runs), yes=yes, dry_run=dry_run)
+
+
+@command
+def report_bug(run: RunName = None) -> None:
+    """Print what a bug report needs: versions, recipe, last lines and diagnosis of a run, nothing personal."""
+    from rlctl import output
+    from rlctl.runs.bug_report import write_bug_report
+
+    output.results().write(write_bug_report(run))

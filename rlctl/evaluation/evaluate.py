@@ -87,6 +87,8 @@ def run_evaluation(
     print_notes: Callable[[Sequence[str]], None] = output.print_notes,
 ) -> Evaluation:
     """Find the policy, play its episodes, and return their statistics; `print_notes` as in `find_player`."""
+    import scipy.special  # noqa: F401 (where it is missing, before the episodes are played)
+
     if request.baseline is not None:
         return _evaluate(load_baseline(request.baseline), _choose_task(request), request, gates)
     _, policy, spec = find_player(request, print_notes)

@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Callable
 
-from rlctl.errors import RlctlError, short_repr
+from rlctl.errors import RlctlError, explain_left_out, short_repr
 from rlctl.version import __version__
 
 INTERRUPTED = 130  # exit code after Ctrl-C
@@ -113,6 +113,9 @@ def report_unexpected(error: Exception) -> int:
         place = f"{error.filename}: " if error.filename else ""
         print(f"error: {place}{error.strerror}", file=sys.stderr)
         return 5
+    if isinstance(error, ModuleNotFoundError) and (missing := explain_left_out(error.name)):
+        print(f"error: {missing}", file=sys.stderr)
+        return 2
     import traceback
 
     traceback.print_exc()
