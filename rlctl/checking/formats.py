@@ -15,6 +15,7 @@ from rich.text import Text
 from rlctl import output
 from rlctl.checking.check import CheckReport
 from rlctl.checking.families.speed import format_speed
+from rlctl.checking.junit import to_junit
 from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, find_rule
 from rlctl.checking.tool_formats import Row, action_rows, observation_rows, to_annotations, to_json, to_sarif
 from rlctl.environments.info import describe_randomization
@@ -53,7 +54,7 @@ def to_text(report: CheckReport) -> str:
     return stream.getvalue()
 
 
-FORMATS = {"text": to_text, "json": to_json, "sarif": to_sarif, "github": to_annotations}
+FORMATS = {"text": to_text, "json": to_json, "sarif": to_sarif, "junit": to_junit, "github": to_annotations}
 
 
 def _print(out: Console, report: CheckReport) -> None:

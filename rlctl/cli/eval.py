@@ -19,7 +19,7 @@ from rlctl.replaying.request import ReplayRequest
 @command_in_panels(
     {
         "Options": ["episodes", "seed", "checkpoint", "pretrained", "baseline", "task", "settings", "stage"],
-        "Gates": ["min_success", "min_success_lower", "min_return"],
+        "Gates": ["min_success", "min_success_lower", "min_return", "decide_early"],
         "Robustness": ["vary", "push", "sim", "yes"],
         "How": ["deterministic", "limits", "env_timeout_s"],
         "Where": ["n_envs", "on", "cluster"],
@@ -70,7 +70,12 @@ def evaluate(
     if on is not None and not vary and sim is None:
         raise UsageError("--on needs a robustness map: give --vary or --sim too")
     if vary or push or sim is not None:
-        unsupported = {"--policy": request.baseline, "--limits": request.limits, "--record": request.record}
+        unsupported: dict[str, object] = {
+            "--policy": request.baseline,
+            "--limits": request.limits,
+            "--record": request.record,
+            "--decide-early": request.decide_early or None,
+        }
         if option := next((name for name, value in unsupported.items() if value is not None), None):
             raise UsageError(f"{option} cannot be combined with --vary, --push or --sim")
         from rlctl.cluster.executors import choose_cell_player

@@ -26,7 +26,7 @@ def check_env(
     ignore: Annotated[list[str], Option("Skip these rules: RL106.", metavar="RULES")] = [],
     strict: Annotated[bool, Option("Exit 1 for warnings too.", ("--strict",))] = False,
     form: Annotated[
-        Literal["text", "json", "sarif", "github"] | None,
+        Literal["text", "json", "sarif", "junit", "github"] | None,
         Option("Format of the report.", ("--format",), default_text="text"),
     ] = None,
     output: Annotated[

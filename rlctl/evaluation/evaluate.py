@@ -16,14 +16,18 @@ from rlctl.evaluation import episode_statistics
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, find_player, load_baseline
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
+from rlctl.evaluation.sequential import find_interval, is_decided
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.players.player import Exploration
 from rlctl.policy.shipped import MeasuredScore
 from rlctl.rollout.collect import Episode, play_episodes
+from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers, count_envs
 from rlctl.run.episode import save_episode
 from rlctl.run.group import Group
+
+_PLAYED_TOGETHER = 10  # episodes, before it is asked whether the gate is decided
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +52,7 @@ class Evaluation:
     limited_by: Path | None = None
     unlimited: "Evaluation | None" = None  # the same episodes without limits
     action_change: float | None = None  # mean of |action - previous action|; None if it was not measured
+    planned: int | None = None  # episodes that would have been played to the end, if the gate could be decided early
 
     @property
     def episodes(self) -> list[dict[str, Any]]:
@@ -87,8 +92,6 @@ def run_evaluation(
     print_notes: Callable[[Sequence[str]], None] = output.print_notes,
 ) -> Evaluation:
     """Find the policy, play its episodes, and return their statistics; `print_notes` as in `find_player`."""
-    import scipy.special  # noqa: F401 (where it is missing, before the episodes are played)
-
     if request.baseline is not None:
         return _evaluate(load_baseline(request.baseline), _choose_task(request), request, gates)
     _, policy, spec = find_player(request, print_notes)
@@ -116,13 +119,15 @@ def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:
 def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
     if (folder := request.record) is not None and (folder.is_file() or any(folder.glob("*"))):
         raise UsageError(f"--record {folder}: exists already; give a new folder, or remove this one")
+    if request.decide_early:
+        gates.check_early(request.limits is not None)
     gates.check_reachable(request.episodes)
     with start_workers(spec, request) as workers:
         limits = None if request.limits is None else _read_limits(request.limits, workers.info)
         actor.give_to(workers)
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
-        episodes = _play(workers, request)
+        episodes = _play_until_decided(workers, request, gates) if request.decide_early else _play(workers, request)
         if request.record is not None:
             for number, episode in enumerate(episodes):
                 save_episode(request.record / f"{number:06d}.npz", episode.describe(spec, workers.info, actor.name))
@@ -147,10 +152,38 @@ def _read_limits(file: Path, info: EnvInfo) -> dict[str, Any]:
 
 def _play(workers: Workers, request: EvalRequest) -> list[Episode]:
     seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
+    with output.show_progress("evaluating", len(seeds)) as show:
+        return _play_seeds(workers, request, seeds, show)
+
+
+def _play_seeds(
+    workers: Workers, request: EvalRequest, seeds: Sequence[int], show: Callable[[int], None]
+) -> list[Episode]:
     exploration = Exploration(stochastic=not request.deterministic)
     record = request.measure_actions or request.record is not None
+    return play_episodes(workers, seeds, exploration, record=record, watch=show)
+
+
+def _play_until_decided(workers: Workers, request: EvalRequest, gates: Gates) -> list[Episode]:
+    """Play some episodes at a time; return those up to the one that decides the gate, whatever was played beyond."""
+    rate = gates.min_success
+    assert rate is not None  # `check_early` has seen to it
+    seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
+    episodes: list[Episode] = []
+    successes = 0
     with output.show_progress("evaluating", len(seeds)) as show:
-        return play_episodes(workers, seeds, exploration, record=record, watch=show)
+        while chunk := seeds[len(episodes) : len(episodes) + max(_PLAYED_TOGETHER, workers.n_envs)]:
+            for episode in _play_seeds(workers, request, chunk, functools.partial(_show_more, show, len(episodes))):
+                gates.check_possible(episode.result.success is not None)
+                episodes.append(episode)
+                successes += bool(episode.result.success)
+                if is_decided(successes, len(episodes), rate):
+                    return episodes
+    return episodes
+
+
+def _show_more(show: Callable[[int], None], before: int, count: int) -> None:
+    show(before + count)
 
 
 def _summarize(
@@ -167,7 +200,7 @@ def _summarize(
         deterministic=request.deterministic,
         played=[dataclasses.replace(episode, trajectory=None) for episode in episodes],
         success_rate=episode_statistics.success_rate(results),
-        success_interval=episode_statistics.success_interval(results),
+        success_interval=_find_success_interval(results, request),
         returns=Spread.of([result.total_reward for result in results]),
         lengths=Spread.of([result.length for result in results]),
         terms=episode_statistics.mean_terms(results),
@@ -175,7 +208,14 @@ def _summarize(
         final_distance=Spread.of(distances) if distances else None,
         max_steps=workers.info.max_steps,
         action_change=episode_statistics.mean_action_change(episodes) if request.measure_actions else None,
+        planned=request.episodes if request.decide_early else None,
     )
+
+
+def _find_success_interval(results: list[EpisodeResult], request: EvalRequest) -> tuple[float, float] | None:
+    if not request.decide_early or results[0].success is None:
+        return episode_statistics.success_interval(results)
+    return find_interval(sum(bool(result.success) for result in results), len(results))
 
 
 def measure_score(

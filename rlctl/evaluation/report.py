@@ -13,6 +13,7 @@ from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.evaluate import Evaluation, GroupScore, SeedScore
 from rlctl.evaluation.request import NO_GATES, Gates
 from rlctl.evaluation.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
+from rlctl.evaluation.sequential import is_decided
 from rlctl.evaluation.vary import format_command
 from rlctl.policy.shipped import Interval, MeasuredScore
 from rlctl.version import collect_versions
@@ -39,6 +40,8 @@ def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
     if result.success_rate is not None and result.success_interval is not None:
         low, high = result.success_interval
         out.print(f"success rate {result.success_rate:.1%}  (95 % interval {low:.1%} to {high:.1%})")
+    if result.planned is not None and gates.min_success is not None:
+        out.print(_format_decision(result, result.planned, gates.min_success))
     rows = [("return", *_format_spread(result.returns)), ("length", *_format_spread(result.lengths))]
     if result.final_distance is not None:
         rows.append(("final distance", *_format_spread(result.final_distance)))
@@ -51,6 +54,15 @@ def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
         out.print(f"for {stopped:,} of {answers:,} answers the server held or stopped instead of running the policy")
     if result.unlimited is not None:
         _show_limits(result, result.unlimited)
+
+
+def _format_decision(result: Evaluation, planned: int, rate: float) -> str:
+    count = len(result.played)
+    if not is_decided(sum(bool(episode.result.success) for episode in result.played), count, rate):
+        return (
+            f"not decided after {count} episodes: {rate:g} is in the interval, so the rate itself is compared with it"
+        )
+    return f"decided after {count} of {planned} episodes: {rate:g} is outside the interval, which is valid at any time"
 
 
 def _show_limits(result: Evaluation, unlimited: Evaluation) -> None:

@@ -38,6 +38,12 @@ class EvalOptions:
     limits: Annotated[Path | None, Option("Compare with and without safety limits (YAML).", metavar="FILE")] = None
     record: Annotated[Path | None, Option("New folder for the episodes (.npz), for --demos.", metavar="FOLDER")] = None
     env_timeout_s: EnvTimeout = 60.0
+    decide_early: Annotated[
+        bool,
+        Option(
+            "End as soon as --min-success is decided; wrong in 5 % of the evaluations at most.", ("--decide-early",)
+        ),
+    ] = False
 
 
 def _change_nothing() -> EnvChanges:
@@ -85,6 +91,14 @@ class Gates:
         if lower > highest:
             enough = f"; {math.ceil(math.log(0.025) / math.log(lower)):,} can" if lower < 1 else ""
             raise UsageError(f"--min-success-lower {lower:g}: {episodes} successes reach at most {highest:.3f}{enough}")
+
+    def check_early(self, has_limits: bool) -> None:
+        """Raise `UsageError` where an evaluation cannot end before its last episode."""
+        others = {"--min-success-lower": self.min_success_lower, "--min-return": self.min_return}
+        if self.min_success is None or has_limits or any(value is not None for value in others.values()):
+            raise UsageError(
+                f"--decide-early needs --min-success and cannot be combined with {', '.join(others)} or --limits"
+            )
 
     def check(self, result: Evaluation) -> None:
         """Raise `AnswerIsNo`, naming every gate that was missed."""

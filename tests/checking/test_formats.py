@@ -6,6 +6,7 @@ import os
 import re
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import jsonschema
 import pydantic
@@ -17,7 +18,7 @@ from rlctl.checking import families, tool_formats
 from rlctl.checking.check import CheckReport, CheckVerdict, judge
 from rlctl.checking.formats import FORMATS, to_text
 from rlctl.checking.records import Built, Records
-from rlctl.checking.rules import FAMILIES, RULES, choose_rules, find_rule
+from rlctl.checking.rules import FAMILIES, RULES, Severity, choose_rules, find_rule
 from rlctl.checking.values import find_leaves
 from rlctl.errors import UsageError
 from tests import fork_server
@@ -257,6 +258,27 @@ def test_command_writes_a_file_whole_and_says_so(tmp_path):
     assert (run.returncode, run.stdout) == (1, "")
     assert run.stderr.rstrip().endswith(f"written to {file}")
     assert sarif_pydantic.Sarif.model_validate_json(file.read_text()).runs[0].results[0].rule_id == "RL601"
+
+
+def test_junit_counts_what_it_lists(report):
+    (suite,) = ElementTree.fromstring(FORMATS["junit"](report))
+    cases = suite.findall("testcase")
+    assert int(suite.get("tests")) == len(cases) > 0
+    failed = [case for case in cases if case.find("failure") is not None]
+    assert int(suite.get("failures")) == len(failed)
+    errors = {finding.rule for finding in report.verdict.findings if finding.severity == "error"}
+    assert {case.get("name")[:5] for case in failed} == errors
+    assert int(suite.get("errors")) == len(report.verdict.crashed)
+    assert int(suite.get("skipped")) <= len({**report.verdict.not_applicable, **report.verdict.not_judged})
+
+
+def test_in_junit_warnings_fail_with_strict_only(broken):
+    warning = dataclasses.replace(broken.verdict.findings[0], severity=Severity.WARNING)
+    for strict, failures in ((False, "0"), (True, "1")):
+        verdict = CheckVerdict(findings=[warning], judged=[warning.rule])
+        text = FORMATS["junit"](dataclasses.replace(broken, verdict=verdict, strict=strict))
+        assert ElementTree.fromstring(text)[0].get("failures") == failures
+    assert "warning: " in FORMATS["junit"](dataclasses.replace(broken, verdict=verdict, strict=False))
 
 
 @pytest.mark.parametrize("form", sorted(FORMATS))
