@@ -20,7 +20,7 @@ LAYERS = [
     {"tuning"},
     {"training"},
     {"runs"},
-    {"exporting", "replaying", "tasks", "importing"},
+    {"exporting", "replaying", "tasks", "importing", "deploy.robot"},
     {"checking", "evaluation"},
     {"deploy.identify"},
     {"rollout"},

@@ -38,6 +38,7 @@ COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "replay": eval.replay,
     "push": export.push,
     "serve": deploy.serve,
+    "robot": deploy.robot,
     "identify": deploy.identify,
     "tasks": tasks.app,
     "recipe": tasks.recipe,

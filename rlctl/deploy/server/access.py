@@ -41,12 +41,12 @@ def _read_key(file: Path | None) -> str | None:
     return key
 
 
-def is_websocket(request: web.Request) -> bool:
+def is_websocket(request: web.BaseRequest) -> bool:
     """Return whether a request asks for a WebSocket."""
     return request.headers.get("Upgrade", "").lower() == "websocket"
 
 
-def find_problem(request: web.Request, is_local: bool, key: str | None) -> tuple[int, str] | None:
+def find_problem(request: web.BaseRequest, is_local: bool, key: str | None) -> tuple[int, str] | None:
     """Return the status and the text with which to refuse a request; None if it may be answered."""
     host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
     try:
