@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.deploy.robot.comparison import Difference
+from rlctl.deploy.robot.comparison import CommandDifference
 from rlctl.errors import short_repr
 
 
@@ -27,7 +27,7 @@ class CommandCounts:
     robot_late_s: list[float] = dataclasses.field(default_factory=list)
     """How much later than its time the robot itself began each step of `--realtime` [s]."""
     compared: int = 0
-    differences: list[Difference] = dataclasses.field(default_factory=list)
+    differences: list[CommandDifference] = dataclasses.field(default_factory=list)
 
     def quantiles(self) -> tuple[float, float, float]:
         """Return the median, the 99 % quantile and the largest of the response times [s]; NaN without any."""

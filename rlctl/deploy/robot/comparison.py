@@ -14,7 +14,7 @@ from rlctl.policy.policy import Policy
 
 
 @dataclasses.dataclass(frozen=True)
-class Difference:
+class CommandDifference:
     """The differences of one element of the action, in its own unit."""
 
     name: str
@@ -68,9 +68,9 @@ class Comparison:
         for index in np.flatnonzero(difference > self._largest):
             self._largest[index], self._where[index] = difference[index], (episode, step)
 
-    def differences(self) -> list[Difference]:
+    def differences(self) -> list[CommandDifference]:
         """Return the differences per element of the action; empty if nothing was compared."""
         if not self.count:
             return []
         rows = zip(self._names, (self._sum / self.count).tolist(), self._largest.tolist(), self._where, strict=True)
-        return [Difference(name, mean, largest, *where) for name, mean, largest, where in rows]
+        return [CommandDifference(name, mean, largest, *where) for name, mean, largest, where in rows]

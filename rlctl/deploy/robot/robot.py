@@ -181,7 +181,8 @@ class _Test:
             except AnswerIsNo as error:
                 where = f", with {fault.text}" if fault.text else ""
                 return controller.name, scores, f"{error}{where}"
-            await controller.end()
+            finally:
+                await controller.end()
             return controller.name, scores, ""
 
     async def _score(self, player: RobotPlayer, faults: Faults) -> FaultScore:
