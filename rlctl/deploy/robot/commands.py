@@ -56,7 +56,7 @@ def read_action(values: Any, space: spaces.Space[Any]) -> NDArray[Any]:
     return action
 
 
-class Network:
+class CommandQueue:
     """Commands on their way to the robot. They may overtake each other: an older one never replaces a newer one."""
 
     def __init__(self) -> None:

@@ -24,7 +24,7 @@ class CommandDifference:
     step: int
 
 
-class Comparison:
+class CommandComparison:
     """Lets the policy act on every observation that is sent, and compares the command for it.
 
     Observations that are not finite are left out: the policy has no answer to them.

@@ -8,8 +8,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from rlctl.deploy.filter.observation import ObservationLayout
-from rlctl.deploy.robot.commands import CommandCounts, Network, read_action
-from rlctl.deploy.robot.comparison import Comparison
+from rlctl.deploy.robot.commands import CommandCounts, CommandQueue, read_action
+from rlctl.deploy.robot.comparison import CommandComparison
 from rlctl.deploy.robot.controller import Arrival, Controller, SentObservation
 from rlctl.deploy.robot.faults import EpisodeFaults, Faults
 from rlctl.environments.info import EnvInfo
@@ -38,7 +38,7 @@ class RobotPlayer:
         task: str,
         timeout_s: float,
         realtime: bool,
-        comparison: Comparison | None,
+        comparison: CommandComparison | None,
     ) -> None:
         metrics = [name for name, weight in info.reward_weights.items() if weight == 0]
         self._episode = RunningEpisode(env, 0, metrics)
@@ -72,7 +72,7 @@ class RobotPlayer:
 
     async def _play_episode(self, number: int, seed: int, faults: Faults) -> EpisodeResult:
         self._drawn = EpisodeFaults(faults, seed, self._info)
-        self._network, self._number = Network(), number
+        self._queue, self._number = CommandQueue(), number
         self._waiting: dict[int, tuple[float, float, bool]] = {}  # by sequence: when it was sent, delay, loss
         self._controller.arrivals.clear()
         action = self._first_action
@@ -120,7 +120,7 @@ class RobotPlayer:
             await self._wait_for_clock(self._begin_s + (step + 1) * self._dt)
         elif not lost:
             await self._wait_for_command(sent)
-        return self._network.take((step + 1) * self._dt)
+        return self._queue.take((step + 1) * self._dt)
 
     async def _wait_for_clock(self, end_s: float) -> None:
         while self._loop.time() < end_s:
@@ -175,4 +175,4 @@ class RobotPlayer:
         if not is_lost:
             # In lock-step the simulated clock stands still while the program computes.
             step_s = (self._episode.step * self._dt) if not self._realtime else arrival.at - self._begin_s
-            self._network.put((step_s if self._dt < math.inf else 0.0) + delay_s, arrival.sequence, action)
+            self._queue.put((step_s if self._dt < math.inf else 0.0) + delay_s, arrival.sequence, action)

@@ -18,7 +18,7 @@ from rlctl import output
 from rlctl.deploy.filter.observation import ObservationLayout
 from rlctl.deploy.robot import packets
 from rlctl.deploy.robot.commands import CommandCounts
-from rlctl.deploy.robot.comparison import Comparison
+from rlctl.deploy.robot.comparison import CommandComparison
 from rlctl.deploy.robot.faults import Faults, parse_faults, set_stuck_joints
 from rlctl.deploy.robot.player import RobotPlayer
 from rlctl.deploy.robot.request import RobotRequest
@@ -111,7 +111,7 @@ def run_robot(
             set_stuck_joints(env, spec, fault.stuck)  # raises before a program connects
         if policy is not None and file is not None and policy.info.spec.frame_stack == 1:
             policy.info.check_fits(info, file)
-        comparison = None if policy is None else Comparison(policy, layout, name_actions(info, env))
+        comparison = None if policy is None else CommandComparison(policy, layout, name_actions(info, env))
         test = _Test(request, env, info, spec, comparison)
         with asyncio.Runner(loop_factory=_make_loop) as runner:
             name, scores, problem = runner.run(test.run(faults, on_start))
@@ -150,7 +150,7 @@ def name_actions(info: EnvInfo, env: Any) -> list[str]:
 
 class _Test:
     def __init__(
-        self, request: RobotRequest, env: Any, info: EnvInfo, spec: EnvSpec, comparison: Comparison | None
+        self, request: RobotRequest, env: Any, info: EnvInfo, spec: EnvSpec, comparison: CommandComparison | None
     ) -> None:
         self._request, self._env, self._info, self._spec = request, env, info, spec
         self._comparison = comparison

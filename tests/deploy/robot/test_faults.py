@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rlctl.deploy.robot.commands import Network
+from rlctl.deploy.robot.commands import CommandQueue
 from rlctl.deploy.robot.faults import Faults, parse_faults, set_stuck_joints
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
@@ -30,12 +30,12 @@ def test_what_is_no_fault(text, problem):
 
 
 def test_an_older_command_does_not_replace_a_newer_one():
-    network, (first, second) = Network(), np.eye(2)
-    network.put(0.25, 1, first)
-    network.put(0.15, 2, second)
-    assert network.take(0.1) is None
-    assert network.take(0.2) is second
-    assert network.take(0.3) is None  # the first arrives now
+    queue, (first, second) = CommandQueue(), np.eye(2)
+    queue.put(0.25, 1, first)
+    queue.put(0.15, 2, second)
+    assert queue.take(0.1) is None
+    assert queue.take(0.2) is second
+    assert queue.take(0.3) is None  # the first arrives now
 
 
 def test_a_stuck_joint():
