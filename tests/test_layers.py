@@ -20,6 +20,7 @@ LAYERS = [
     {"tuning"},
     {"training"},
     {"runs"},
+    {"playing"},
     {"exporting", "replaying", "tasks", "importing", "deploy.robot"},
     {"checking", "evaluation"},
     {"deploy.identify"},

@@ -39,6 +39,7 @@ COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "push": export.push,
     "serve": deploy.serve,
     "robot": deploy.robot,
+    "play": deploy.play,
     "identify": deploy.identify,
     "tasks": tasks.app,
     "recipe": tasks.recipe,

@@ -1,4 +1,4 @@
-"""`rlctl serve`, `rlctl robot` and `rlctl identify`."""
+"""`rlctl serve`, `rlctl robot`, `rlctl play` and `rlctl identify`."""
 
 import dataclasses
 from pathlib import Path
@@ -10,6 +10,7 @@ from rlctl.deploy.server.request import ServeRequest
 from rlctl.errors import UsageError
 from rlctl.evaluation.request import Gates, MinReturn, MinSuccess, MinSuccessLower
 from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName, Settings, Sim, TaskName
+from rlctl.playing.request import PlayRequest
 
 
 @command
@@ -87,6 +88,25 @@ def robot(
     )
     show(report, json, gates)
     return report.check(gates)
+
+
+@command_in_panels(
+    {
+        "Options": ["checkpoint", "pretrained", "task", "settings", "sim", "seed", "port"],
+        "Output": ["record", "output", "json"],
+    }
+)
+def play(request: PlayRequest, pretrained: Pretrained = False, json: Json = None) -> None:
+    """Steer a policy's robot in a browser: commands, pushes, friction, pause, slow motion, recordings."""
+    from rlctl import output
+    from rlctl.playing.play import run_play, show
+
+    checkpoint = choose_checkpoint(request.checkpoint, pretrained)
+    result = run_play(
+        dataclasses.replace(request, checkpoint=checkpoint),
+        lambda address: output.print_notes([f"open {address} in a browser; Ctrl-C ends"]),
+    )
+    show(result, json)
 
 
 @command
