@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rlctl.task import Box, Command, Event, Joints, Sim, TaskError, events, rewards
+from rlctl.task import Box, CommandTerm, Event, Joints, Sim, TaskError, events, rewards
 from rlctl_locomotion.legged import Legged
 
 LEGS = ("FR", "FL", "RR", "RL")  # front right and so on, as in the model
@@ -134,9 +134,9 @@ class Quadruped(Legged):
         mean_speed = self.trunk.position[0] / max(self.steps * self.control_dt, self.control_dt)
         return not self.is_fallen() and abs(mean_speed - self.command) <= self.tolerance
 
-    def commands(self) -> dict[str, Command]:
+    def commands(self) -> dict[str, CommandTerm]:
         """Return the commanded speed forwards."""
-        return {"lin_vel_x": Command(self.command, self.slowest, self.fastest, "m/s")}
+        return {"lin_vel_x": CommandTerm(self.command, self.slowest, self.fastest, "m/s")}
 
     def set_commands(self, values: Mapping[str, float]) -> None:
         """Set the commanded speed."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rlctl.task import BatchTask, Box, Command, Event, Joints, Sim, WorldRngs, events, rewards
+from rlctl.task import BatchTask, Box, CommandTerm, Event, Joints, Sim, WorldRngs, events, rewards
 from rlctl.task.rotations import rotate_inverse
 from rlctl_locomotion.quadruped import JOINTS
 
@@ -136,10 +136,10 @@ class Walk(BatchTask):
         """It is up, and on average within `tolerance` of the commanded velocity."""
         return ~self.fallen & (self.error_sum <= self.tolerance * np.maximum(self.steps, 1))
 
-    def commands(self) -> dict[str, Command]:
+    def commands(self) -> dict[str, CommandTerm]:
         """Return the commanded velocities: forwards, to the left, and of turning to the left."""
         rows = zip(VELOCITIES.items(), self.command.T, LOWEST.tolist(), HIGHEST.tolist(), strict=True)
-        return {name: Command(values, low, high, unit, True) for (name, unit), values, low, high in rows}
+        return {name: CommandTerm(values, low, high, unit, True) for (name, unit), values, low, high in rows}
 
     def set_commands(self, values: Mapping[str, np.ndarray]) -> None:
         """Set commanded velocities."""

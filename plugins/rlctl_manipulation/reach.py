@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rlctl.task import Box, Command, Event, Joints, Sim, Task, TaskError, events, rewards
+from rlctl.task import Box, CommandTerm, Event, Joints, Sim, Task, TaskError, events, rewards
 
 HOME = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])  # [rad], elbow bent
 SPEED_LIMIT = np.radians([85, 85, 100, 75, 130, 135, 135])  # [rad/s], LBR iiwa 14 R820 data sheet
@@ -102,10 +102,10 @@ class Reach(Task):
         """The goal."""
         return {"goal": self.goal}
 
-    def commands(self) -> dict[str, Command]:
+    def commands(self) -> dict[str, CommandTerm]:
         """Return the position of the goal."""
         rows = zip("xyz", self.goal.tolist(), self.goal_low, self.goal_high, strict=True)
-        return {f"goal_{axis}": Command(value, low, high, "m") for axis, value, low, high in rows}
+        return {f"goal_{axis}": CommandTerm(value, low, high, "m") for axis, value, low, high in rows}
 
     def set_commands(self, values: Mapping[str, float]) -> None:
         """Move the goal."""

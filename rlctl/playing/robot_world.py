@@ -10,7 +10,7 @@ import numpy as np
 from rlctl.errors import TaskError, short_repr
 from rlctl.playing.controls import Wishes
 from rlctl.task.body import Body
-from rlctl.task.commands import Command
+from rlctl.task.commands import CommandTerm
 from rlctl.task.env import TaskEnv
 
 _PUSH_S = 0.1
@@ -45,7 +45,7 @@ class RobotWorld:
         if self._env is not None:
             self._env.max_steps = sys.maxsize
 
-    def commands(self) -> dict[str, Command]:
+    def commands(self) -> dict[str, CommandTerm]:
         """Return the task's commands; raises `TaskError` for one that is not finite or has no range."""
         commands = {} if self._env is None else self._env.task.commands()
         for name, command in commands.items():

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import ShapeError, TaskError
-from rlctl.task.commands import Command
+from rlctl.task.commands import CommandTerm
 from rlctl.task.joints import Joints
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, TaskDefinition
@@ -73,7 +73,7 @@ class BatchTask(TaskDefinition):
         """Return points to draw: name -> world positions of shape (worlds, 3) [m]. Optional."""
         return {}
 
-    def commands(self) -> dict[str, Command]:
+    def commands(self) -> dict[str, CommandTerm]:
         """Return what a person may command, by name, in the order of the keys; values of shape (worlds,). Optional."""
         return {}
 
@@ -131,7 +131,7 @@ class OneWorld(Task):
     def _name(self) -> str:
         return type(self).__name__
 
-    def commands(self) -> dict[str, Command]:
+    def commands(self) -> dict[str, CommandTerm]:
         return {name: command._replace(value=command.value[0]) for name, command in self.batch.commands().items()}
 
     def set_commands(self, values: Mapping[str, float]) -> None:

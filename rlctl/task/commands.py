@@ -1,9 +1,9 @@
-"""`Command`: a quantity that a person may command while a robot acts."""
+"""`CommandTerm`: a quantity that a person may command while a robot acts."""
 
 from typing import Any, NamedTuple
 
 
-class Command(NamedTuple):
+class CommandTerm(NamedTuple):
     """A commanded quantity of a task, for `Task.commands`: a velocity to walk with, a coordinate of a goal.
 
     Names of velocities are those of the field: `lin_vel_x`, `lin_vel_y`, `ang_vel_z`.

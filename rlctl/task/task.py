@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
-from rlctl.task.commands import Command
+from rlctl.task.commands import CommandTerm
 from rlctl.task.events import Event
 from rlctl.task.joints import Joints
 from rlctl.task.sim import Sim
@@ -126,7 +126,7 @@ class Task(TaskDefinition):
         """Return points to draw, such as the goal: name -> world position of shape (3,) [m]. Optional."""
         return {}
 
-    def commands(self) -> dict[str, Command]:
+    def commands(self) -> dict[str, CommandTerm]:
         """Return what a person may command in `rlctl play`, by name, in the order of the keys. Optional."""
         return {}
 
