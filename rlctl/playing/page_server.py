@@ -20,7 +20,7 @@ from rlctl.playing.controls import Controls, PageMessage
 _HOST = "127.0.0.1"
 _LARGEST_MESSAGE = 64 * 1024  # [bytes]
 _MOST_PAGES = 16
-_POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'"
+_POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; img-src data:"
 
 
 class PageServer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import itertools
 import signal
@@ -112,7 +113,8 @@ class Game:
         self._controls, self._server = controls, server
         self._dt = find_dt(env) or DEFAULT_DT
         self._world = RobotWorld(env)
-        self._reader = make_reader(env, print_warning)
+        self._warned: set[str] = set()
+        self._reader = make_reader(env, self._warn)
         self._info = describe(env)
         if not spec.time_feature:  # else the policy observes how much time is left
             self._world.remove_time_limit()
@@ -138,6 +140,12 @@ class Game:
                 self._controls.wait(_SHOW_END_S)
         raise AssertionError
 
+    def _warn(self, text: str) -> None:
+        """Print a warning once: the world is read for each picture."""
+        if text not in self._warned:
+            self._warned.add(text)
+            print_warning(text)
+
     def _play_episode(self, seed: int) -> Rollout:
         policy = self._source.begin(self._env, seed)
         self._log: list[LogEntry] = []
@@ -145,7 +153,7 @@ class Game:
         self._shown_s = -1.0
         self._world.begin()
         self._controls.keep_commands(self._velocities)
-        draw = print_warning if self._recording else None
+        draw = self._warn if self._recording else None
         name = f"{self._source.name}, steered by a person"
         return play_episode(self._env, self._spec, seed, self._steer(policy), policy=name, draw=draw, watch=self._watch)
 
@@ -210,6 +218,7 @@ class Game:
         self._server.show(
             {
                 "poses": list_poses(scene),
+                "picture": base64.b64encode(scene.pictures[-1][1]).decode() if scene.pictures else None,
                 "markers": {name: positions[-1].tolist() for name, positions in scene.markers.items()},
                 "center": self._world.find_center(),
                 "time": round(self._step * self._dt, 3),
@@ -253,7 +262,7 @@ class Game:
         recording = self._source.choose_recording(len(self.result.recordings))
         save_episode(recording.with_suffix(".npz"), steered.episode)
         title = f"{self._spec.task} / episode {recording.stem}, steered by a person"
-        write_rrd(recording, steered, title=title, warn=print_warning)
+        write_rrd(recording, steered, title=title, warn=self._warn)
         self.result.recordings.append(recording)
         output.print_notes([f"recording: {recording}"])
 

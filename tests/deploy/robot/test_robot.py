@@ -169,6 +169,16 @@ def test_what_is_no_action_is_refused_and_the_last_one_acts(action, problem):
     assert report.scores[0].episodes[0].total_reward == pytest.approx(-2 * (0.75 + 4 * 0.5))
 
 
+def test_discrete_actions_have_no_udp():
+    start = Started(control_by_websocket, lambda request: {"actions": [request["sequence"] % 3]})
+    request = RobotRequest("CartPole-v1", port=0, episodes=1)
+    counts = run_robot(request, start, changes=UNCHANGED, gates=NO_GATES).scores[0].commands
+    start.join()
+    assert [address[:5] for address in start.addresses] == ["ws://"]
+    assert counts.first_problem == "2 is not in Discrete(2)"
+    assert counts.refused == len(counts.response_s) // 3  # every third
+
+
 def test_actions_beyond_their_bounds_are_clipped():
     report = play(control_by_udp, lambda values: np.array([-3.0, 0.0], np.float32), episodes=1)
     # -1 each time: places 0, -1, -2, -3, -4.
@@ -205,7 +215,7 @@ def test_real_time():
     report = play(control_by_udp, act, realtime=True)
     [score] = report.scores
     assert score.seconds >= 2 * 0.5
-    assert score.commands.unanswered == 2
+    assert score.commands.unanswered >= 2
     # Without the third command the second acts again, so nothing changes; on a busy machine others may be late too.
     assert score.commands.held >= 2
     assert len(score.commands.robot_late_s) == 10
