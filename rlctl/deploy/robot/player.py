@@ -109,7 +109,7 @@ class RobotPlayer:
         parts = self._drawn.disturb(self._layout.name_parts(observation), step)
         sent = SentObservation(self._sequence, self._number, step, parts)
         if self._realtime:
-            self._counts.robot_late_s.append(max(0.0, self._loop.time() - self._begin_s - step * self._dt))
+            self._check_clock(step)
         self._counts.lost += lost or command_lost
         if not lost:
             self._waiting[self._sequence] = self._loop.time(), delay_s, command_lost
@@ -122,14 +122,21 @@ class RobotPlayer:
             await self._wait_for_command(sent)
         return self._queue.take((step + 1) * self._dt)
 
+    def _check_clock(self, step: int) -> None:
+        late = max(0.0, self._loop.time() - self._begin_s - step * self._dt)
+        self._counts.robot_late_s.append(late)
+        if late > self._dt:  # the simulation is too slow: the program has a whole step nevertheless
+            self._begin_s += late
+
     async def _wait_for_clock(self, end_s: float) -> None:
-        while self._loop.time() < end_s:
+        while True:
             await self._controller.wait(end_s)
             self._read_arrivals()
             self._check_present()
+            if self._loop.time() >= end_s:
+                return
 
     async def _wait_for_command(self, sent: SentObservation) -> None:
-        self._heard = self._loop.time()  # the simulation may have taken long
         while sent.sequence in self._waiting:
             again_s = self._loop.time() + _RESEND_S
             await self._controller.wait(again_s)
@@ -143,7 +150,8 @@ class RobotPlayer:
         where = f"in episode {self._number}, step {self._episode.step}"
         if self._controller.closed:
             raise AnswerIsNo(f"the program has disconnected {where}")
-        if self._loop.time() - self._heard > self._timeout_s:
+        first_sent_s = next(iter(self._waiting.values()))[0] if self._waiting else math.inf
+        if self._loop.time() - max(self._heard, first_sent_s) > self._timeout_s:
             raise AnswerIsNo(f"the program has sent nothing for {self._timeout_s:g} s, {where}")
 
     def _read_arrivals(self) -> None:

@@ -221,6 +221,15 @@ def test_real_time():
     assert len(score.commands.robot_late_s) == 10
 
 
+def test_a_simulation_that_is_slower_than_the_clock():
+    report = play(
+        control_by_udp, step_down, task=f"{Path(__file__).with_name('slow.py')}:SlowSlider", episodes=1, realtime=True
+    )
+    counts = report.scores[0].commands
+    assert (len(counts.response_s), counts.unanswered) == (5, 0)  # the program has time to answer nevertheless
+    assert min(counts.robot_late_s[1:]) > 0.1
+
+
 def test_a_task_that_fails_names_the_episode():
     start, request = Started(control_by_udp, step_down), RobotRequest(SLIDER, port=0)
     with pytest.raises(EpisodeFailed, match=r"reward term 'effort' is nan at step 3\nin environment 0, episode seed"):
