@@ -149,8 +149,11 @@ class Game:
     def _play_episode(self, seed: int) -> Rollout:
         policy = self._source.begin(self._env, seed)
         self._log: list[LogEntry] = []
-        self._seed, self._logged, self._speed = seed, {"": 0.0}, 1.0
-        self._shown_s = -1.0
+        self._logged: dict[str, float] = {}  # commands that are in the log
+        self._logged_s = (
+            self._shown_s
+        ) = -1.0  # when the last ones were written [s of the episode], the last frame shown
+        self._seed, self._speed = seed, 1.0
         self._world.begin()
         self._controls.keep_commands(self._velocities)
         draw = self._warn if self._recording else None
@@ -191,10 +194,10 @@ class Game:
 
     def _log_commands(self, step: int, commands: dict[str, float]) -> None:
         """Write changed commands into the log of a recording, twice a second at most."""
-        last = self._logged.get("", 0.0)
+        now_s = step * self._dt
         changed = {name: value for name, value in commands.items() if self._logged.get(name) != value}
-        if changed and (step == 0 or step * self._dt >= last + _LOG_EVERY_S):
-            self._logged |= commands | {"": step * self._dt}
+        if changed and now_s >= self._logged_s + _LOG_EVERY_S:
+            self._logged, self._logged_s = dict(commands), now_s
             text = ", ".join(f"{name} {value:.3g}" for name, value in changed.items())
             self._log.append(LogEntry(step, f"command {text}"))
 
