@@ -1,10 +1,11 @@
 """Quadruped: Unitree's A1 trots at a commanded speed."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from rlctl.task import Box, Event, Joints, Sim, TaskError, events, rewards
+from rlctl.task import Box, CommandTerm, Event, Joints, Sim, TaskError, events, rewards
 from rlctl_locomotion.legged import Legged
 
 LEGS = ("FR", "FL", "RR", "RL")  # front right and so on, as in the model
@@ -132,6 +133,14 @@ class Quadruped(Legged):
         """It has walked at the commanded speed, on average within `tolerance`, and is up."""
         mean_speed = self.trunk.position[0] / max(self.steps * self.control_dt, self.control_dt)
         return not self.is_fallen() and abs(mean_speed - self.command) <= self.tolerance
+
+    def commands(self) -> dict[str, CommandTerm]:
+        """Return the commanded speed forwards."""
+        return {"lin_vel_x": CommandTerm(self.command, self.slowest, self.fastest, "m/s")}
+
+    def set_commands(self, values: Mapping[str, float]) -> None:
+        """Set the commanded speed."""
+        self.command = values.get("lin_vel_x", self.command)
 
     def describe_joints(self) -> Joints:
         """The legs', leg by leg."""

@@ -1,10 +1,11 @@
 """Walk: Unitree's A1 follows velocity commands in every direction, in many worlds at once."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from rlctl.task import BatchTask, Box, Event, Joints, Sim, WorldRngs, events, rewards
+from rlctl.task import BatchTask, Box, CommandTerm, Event, Joints, Sim, WorldRngs, events, rewards
 from rlctl.task.rotations import rotate_inverse
 from rlctl_locomotion.quadruped import JOINTS
 
@@ -14,6 +15,7 @@ STIFFNESS, DAMPING, ARMATURE = 35.0, 0.7, 0.01  # [N m/rad], [N m s/rad], [kg m^
 START_HEIGHT, HEIGHT, FALLEN = 0.30, 0.28, 0.14  # [m], of the trunk
 LOWEST = np.array([-0.5, -0.4, -0.8])  # commanded velocities forwards and sideways [m/s], and of turning [rad/s]
 HIGHEST = np.array([1.0, 0.4, 0.8])
+VELOCITIES = {"lin_vel_x": "m/s", "lin_vel_y": "m/s", "ang_vel_z": "rad/s"}  # their names and units
 SCALE = 0.5  # [m/s] and [rad/s]; so far from the command, tracking is worth 1/e
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -133,6 +135,16 @@ class Walk(BatchTask):
     def is_success(self) -> np.ndarray:
         """It is up, and on average within `tolerance` of the commanded velocity."""
         return ~self.fallen & (self.error_sum <= self.tolerance * np.maximum(self.steps, 1))
+
+    def commands(self) -> dict[str, CommandTerm]:
+        """Return the commanded velocities: forwards, to the left, and of turning to the left."""
+        rows = zip(VELOCITIES.items(), self.command.T, LOWEST.tolist(), HIGHEST.tolist(), strict=True)
+        return {name: CommandTerm(values, low, high, unit, True) for (name, unit), values, low, high in rows}
+
+    def set_commands(self, values: Mapping[str, np.ndarray]) -> None:
+        """Set commanded velocities."""
+        for name, value in values.items():
+            self.command[:, list(VELOCITIES).index(name)] = value
 
     def describe_joints(self) -> Joints:
         """The legs', leg by leg."""

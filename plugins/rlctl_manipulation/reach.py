@@ -1,10 +1,11 @@
 """Reach: a KUKA LBR iiwa brings its hand to a goal."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from rlctl.task import Box, Event, Joints, Sim, Task, TaskError, events, rewards
+from rlctl.task import Box, CommandTerm, Event, Joints, Sim, Task, TaskError, events, rewards
 
 HOME = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])  # [rad], elbow bent
 SPEED_LIMIT = np.radians([85, 85, 100, 75, 130, 135, 135])  # [rad/s], LBR iiwa 14 R820 data sheet
@@ -100,6 +101,16 @@ class Reach(Task):
     def markers(self) -> dict[str, np.ndarray]:
         """The goal."""
         return {"goal": self.goal}
+
+    def commands(self) -> dict[str, CommandTerm]:
+        """Return the position of the goal."""
+        rows = zip("xyz", self.goal.tolist(), self.goal_low, self.goal_high, strict=True)
+        return {f"goal_{axis}": CommandTerm(value, low, high, "m") for axis, value, low, high in rows}
+
+    def set_commands(self, values: Mapping[str, float]) -> None:
+        """Move the goal."""
+        for name, value in values.items():
+            self.goal["xyz".index(name[-1])] = value
 
     def describe_joints(self) -> Joints:
         """The arm's. Actions are steps from where a joint is, so they have no scale about the home position."""

@@ -38,6 +38,8 @@ COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "replay": eval.replay,
     "push": export.push,
     "serve": deploy.serve,
+    "robot": deploy.robot,
+    "play": deploy.play,
     "identify": deploy.identify,
     "tasks": tasks.app,
     "recipe": tasks.recipe,

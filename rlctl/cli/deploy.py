@@ -1,13 +1,16 @@
-"""`rlctl serve` and `rlctl identify`."""
+"""`rlctl serve`, `rlctl robot`, `rlctl play` and `rlctl identify`."""
 
 import dataclasses
 from pathlib import Path
 from typing import Annotated
 
-from rlctl.cli.arguments import choose_checkpoint, command, parse_changes
+from rlctl.cli.arguments import choose_checkpoint, command, command_in_panels, parse_changes
+from rlctl.deploy.robot.request import RobotRequest
 from rlctl.deploy.server.request import ServeRequest
 from rlctl.errors import UsageError
+from rlctl.evaluation.request import Gates, MinReturn, MinSuccess, MinSuccessLower
 from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName, Settings, Sim, TaskName
+from rlctl.playing.request import PlayRequest
 
 
 @command
@@ -50,6 +53,60 @@ def serve(
         out.file.flush()
 
     return run_server(make_server(policy.file, request), show)
+
+
+@command_in_panels(
+    {
+        "Options": ["policy", "pretrained", "episodes", "seed", "realtime", "fault", "settings", "sim"],
+        "Gates": ["min_success", "min_success_lower", "min_return"],
+        "Where": ["host", "port", "key_file", "timeout_s"],
+        "Output": ["json"],
+    }
+)
+def robot(
+    request: RobotRequest,
+    pretrained: Pretrained = False,
+    settings: Settings = [],
+    sim: Sim = None,
+    min_success: MinSuccess = None,
+    min_success_lower: MinSuccessLower = None,
+    min_return: MinReturn = None,
+    json: Json = None,
+) -> None:
+    """Play the robot: a program connects by WebSocket or UDP, gets observations and sends commands."""
+    from rlctl import output
+    from rlctl.deploy.robot.report import show
+    from rlctl.deploy.robot.robot import run_robot
+
+    gates = Gates(min_success, min_success_lower, min_return)
+    report = run_robot(
+        request,
+        lambda addresses: output.print_notes([f"waiting for a program at {' or '.join(addresses)}"]),
+        pretrained=pretrained,
+        changes=parse_changes(settings, sim),
+        gates=gates,
+    )
+    show(report, json, gates)
+    return report.check(gates)
+
+
+@command_in_panels(
+    {
+        "Options": ["checkpoint", "pretrained", "task", "settings", "sim", "seed", "port"],
+        "Output": ["record", "output", "json"],
+    }
+)
+def play(request: PlayRequest, pretrained: Pretrained = False, json: Json = None) -> None:
+    """Steer a policy's robot in a browser: commands, pushes, friction, pause, slow motion, recordings."""
+    from rlctl import output
+    from rlctl.playing.play import run_play, show
+
+    checkpoint = choose_checkpoint(request.checkpoint, pretrained)
+    result = run_play(
+        dataclasses.replace(request, checkpoint=checkpoint),
+        lambda address: output.print_notes([f"open {address} in a browser; Ctrl-C ends"]),
+    )
+    show(result, json)
 
 
 @command

@@ -11,7 +11,7 @@ from typer.core import TyperCommand
 
 from rlctl.cli.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.errors import UsageError
-from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates
+from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates, MinReturn, MinSuccess, MinSuccessLower
 from rlctl.options import Cluster, Json, On, Option, Pretrained, Settings, Yes
 from rlctl.replaying.request import ReplayRequest
 
@@ -30,11 +30,9 @@ def evaluate(
     options: EvalOptions,
     pretrained: Pretrained = False,
     settings: Settings = [],
-    min_success: Annotated[float | None, Option("Gate: exit 1 below this success rate.", metavar="RATE")] = None,
-    min_success_lower: Annotated[
-        float | None, Option("Gate: exit 1 if the 95 % interval begins below this rate.", metavar="RATE")
-    ] = None,
-    min_return: Annotated[float | None, Option("Gate: exit 1 below this mean return.", metavar="RETURN")] = None,
+    min_success: MinSuccess = None,
+    min_success_lower: MinSuccessLower = None,
+    min_return: MinReturn = None,
     vary: Annotated[
         list[str],
         Option(

@@ -125,6 +125,11 @@ def choose_task(task: str | None, policy: str, command: str) -> EnvSpec:
             f"--policy {policy} plays a task, and {task} is {what}: leave out --policy, "
             f"or name its task: rlctl {command} TASK --policy {policy}"
         )
+    return resolve_task(task)
+
+
+def resolve_task(task: str) -> EnvSpec:
+    """Return a task as its recipe would train it, in the last stage; observations are not stacked."""
     from rlctl.recipe.sources import resolve_with_stages
 
     spec = resolve_with_stages(task).env_specs(task)[-1].resolve()

@@ -118,3 +118,9 @@ class Gates:
 
 
 NO_GATES = Gates()
+
+MinSuccess = Annotated[float | None, Option("Gate: exit 1 below this success rate.", metavar="RATE")]
+MinSuccessLower = Annotated[
+    float | None, Option("Gate: exit 1 if the 95 % interval begins below this rate.", metavar="RATE")
+]
+MinReturn = Annotated[float | None, Option("Gate: exit 1 below this mean return.", metavar="RETURN")]

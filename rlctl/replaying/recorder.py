@@ -60,10 +60,14 @@ class Rollout:
         return len(self.episode.rewards)
 
 
-class _SceneReader(Protocol):
-    def read(self, step: int) -> None: ...
+class SceneReader(Protocol):
+    """Reads the scene of an environment step by step."""
 
-    def scene(self) -> Scene: ...
+    def read(self, step: int) -> None:
+        """Read the world after a step; 0 is the reset, and forgets what was read before."""
+
+    def scene(self) -> Scene:
+        """Return what was read."""
 
 
 class _PlainReader:
@@ -78,7 +82,7 @@ class _PlainReader:
             self._reader = self._choose()
         self._reader.read(step)
 
-    def _choose(self) -> _SceneReader:
+    def _choose(self) -> SceneReader:
         env = self._env
         if isinstance(env, DrawableEnv):
             worlds = WorldsReader(env.bullet_log, self._warn)
@@ -92,7 +96,8 @@ class _PlainReader:
         return self._reader.scene()
 
 
-def _make_reader(env: Env, warn: Warn) -> _SceneReader:
+def make_reader(env: Env, warn: Warn) -> SceneReader:
+    """Return the reader for an environment; `warn` receives the reasons for missing parts."""
     if find_mujoco(env):
         return MujocoReader(env)
     inner = env.unwrapped
@@ -127,7 +132,7 @@ def play_episode(
     seed and step, for any exception of the environment.
     """
     about, space = describe(env), env.observation_space
-    reader = _make_reader(env, draw) if draw is not None else None
+    reader = make_reader(env, draw) if draw is not None else None
     read = (lambda step: None) if reader is None else reader.read
     cast = int if isinstance(env.action_space, spaces.Discrete) else partial(np.array, dtype=env.action_space.dtype)
     steps: list[_Step] = []

@@ -9,6 +9,7 @@ from rlctl.checking.bullet_worlds import find_clients
 from rlctl.environments.info import describe
 from rlctl.environments.registry import make_slug
 from rlctl.environments.spec import EnvChanges, EnvSpec
+from rlctl.errors import UsageError
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, load_baseline, load_player
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.policy.players.named import SERVER
@@ -102,7 +103,7 @@ class _NewEpisodes:
             for number, seed in enumerate(self.seeds):
                 choose = self.begin(env, seed)
                 rollout = play_episode(env, spec, seed, choose, policy=self.name, draw=print_warning, watch=self.watch)
-                recording = self._choose_recording(number)
+                recording = self.choose_recording(number)
                 episode = recording.with_suffix(".npz")
                 save_episode(episode, rollout.episode)
                 title, several = f"{spec.task} / episode {recording.stem}", len(self.seeds) > 1
@@ -120,7 +121,7 @@ class _NewEpisodes:
                 print_warning(f"warning: seed {episode.seed}: {returns}; {advice}")
         return ReplayResult(self.spec.task, self.name, episodes, policy_file=self.described, choice=self._choice)
 
-    def _choose_recording(self, number: int) -> Path:
+    def choose_recording(self, number: int) -> Path:
         """Return `--output`, or the next number in that folder, or the default for the episode of a number."""
         if self._output is None:
             return self._default_recording(number)
@@ -216,8 +217,13 @@ class TaskSource(_NewEpisodes):
 
 
 def load_located(path: Path) -> RecordedEpisode:
-    """Read an episode, with the absolute path of its task's file."""
+    """Read an episode, with the absolute path of its task's file; raises `UsageError` for one that a person steered."""
     episode = load_episode(path)
+    if episode.info.steered:
+        raise UsageError(
+            f"{path}: a person steered this episode, so its seed and actions do not reproduce it\n"
+            f"see its recording: rerun {path.with_suffix('.rrd')}"
+        )
     spec = dataclasses.replace(episode.info.spec, task=locate_task(episode.info.spec.task, find_owner(path)))
     return dataclasses.replace(episode, info=episode.info.model_copy(update={"spec": spec}))
 

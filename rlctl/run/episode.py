@@ -28,6 +28,8 @@ class EpisodeInfo(pydantic.BaseModel, extra="forbid"):
     success: bool | None = None
     total_reward: float
     term_names: list[str] = []
+    steered: bool = False
+    """Whether a person changed commands or the world while it was played: then seed and actions do not reproduce it."""
     failure: str = ""  # the error with which the environment failed; then only the actions are known
     versions: dict[str, str] = {}
 

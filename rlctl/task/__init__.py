@@ -12,6 +12,7 @@ from rlctl.task.attachments import Attachment as Attachment
 from rlctl.task.batch import BatchTask as BatchTask
 from rlctl.task.batch import WorldRngs as WorldRngs
 from rlctl.task.body import Body as Body
+from rlctl.task.commands import CommandTerm as CommandTerm
 from rlctl.task.events import Event as Event
 from rlctl.task.joints import Joints as Joints
 from rlctl.task.sim import Sim as Sim

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import ShapeError, TaskError
+from rlctl.task.commands import CommandTerm
 from rlctl.task.joints import Joints
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, TaskDefinition
@@ -72,6 +73,14 @@ class BatchTask(TaskDefinition):
         """Return points to draw: name -> world positions of shape (worlds, 3) [m]. Optional."""
         return {}
 
+    def commands(self) -> dict[str, CommandTerm]:
+        """Return what a person may command, by name, in the order of the keys; values of shape (worlds,). Optional."""
+        return {}
+
+    def set_commands(self, values: Mapping[str, Array]) -> None:
+        """Set some of the `commands`, values of shape (worlds,), within their ranges; `reset` may draw others."""
+        raise NotImplementedError
+
     def prepare(self, sim: Sim, worlds: int) -> None:
         """Set the number of worlds and the attributes of `per_world`, and build the world. rlctl calls it."""
         self.sim, self.worlds = sim, worlds
@@ -121,6 +130,12 @@ class OneWorld(Task):
     @property
     def _name(self) -> str:
         return type(self).__name__
+
+    def commands(self) -> dict[str, CommandTerm]:
+        return {name: command._replace(value=command.value[0]) for name, command in self.batch.commands().items()}
+
+    def set_commands(self, values: Mapping[str, float]) -> None:
+        self.batch.set_commands({name: np.array([value]) for name, value in values.items()})
 
     def _read(self, method: str, values: Any, axes: int) -> Any:
         """Return the row of each array; what is not a dict is left to `TaskEnv`."""

@@ -282,6 +282,13 @@ class Body:
         """Scale the force of the joints' motors by `factor`, until the next reset."""
         raise NotImplementedError
 
+    def lock_joints(self, joints: Sequence[str] = ()) -> None:
+        """Hold joints where they are, against motors and loads, until the next reset: as a jammed gear does.
+
+        In PyBullet a joint that the task never drives is free after that reset.
+        """
+        self._refuse("lock_joints")
+
     def cap_joint_speed(self, speed: float) -> None:
         """Limit the speed of all joints to `speed` [rad/s or m/s], even under external forces.
 

@@ -1,4 +1,4 @@
-"""Reads mesh files that MuJoCo does not: COLLADA (`.dae`), STL as text, and STL of more triangles than it accepts."""
+"""Reads mesh files: OBJ, and those that MuJoCo does not: COLLADA (`.dae`), STL as text, STL of too many triangles."""
 
 from __future__ import annotations
 
@@ -38,13 +38,43 @@ def convert_mesh(file: Path) -> bytes | None:
     return None
 
 
+def read_mesh(file: Path) -> tuple[Array, Triangles]:
+    """Return the points [m], shape (points, 3), and triangles, shape (triangles, 3), of an STL, OBJ or COLLADA file.
+
+    Raises `ValueError` for another one or a damaged one.
+    """
+    readers = {".stl": _read_any_stl, ".obj": _read_obj, ".dae": read_collada}
+    if (reader := readers.get(file.suffix.lower())) is None:
+        raise ValueError(f"{file}: not an STL, OBJ or DAE file")
+    try:
+        return reader(file)
+    except (OSError, IndexError, KeyError, ElementTree.ParseError) as error:
+        raise ValueError(f"{file}: {error}") from error
+
+
+def _read_any_stl(file: Path) -> tuple[Array, Triangles]:
+    return (_read_stl if _is_binary_stl(file) else _read_stl_text)(file)
+
+
+def _read_obj(file: Path) -> tuple[Array, Triangles]:
+    lines = [line.split() for line in file.read_text(encoding="utf-8", errors="replace").splitlines()]
+    points = np.array([words[1:4] for words in lines if words[:1] == ["v"]], float).reshape(-1, 3)
+    polygons = [[int(word.split("/")[0]) for word in words[1:]] for words in lines if words[:1] == ["f"]]
+    corners = np.array([corner for polygon in polygons for corner in polygon], int)
+    # Numbers count from 1, or backwards from the last point.
+    corners = np.where(corners > 0, corners - 1, len(points) + corners)
+    if not len(corners) or corners.min() < 0 or corners.max() >= len(points):
+        raise ValueError(f"{file}: no triangles, or of points that it does not have")
+    return points, _split_polygons(corners, np.array([len(polygon) for polygon in polygons]))
+
+
 def count_vertices(file: Path) -> int:
     """Return the number of different vertices of an STL, OBJ or COLLADA file; raises `ValueError` for another one."""
     suffix = file.suffix.lower()
     if suffix == ".obj":
         return sum(line.startswith(b"v ") for line in file.read_bytes().splitlines())
     if suffix == ".stl":
-        return len((_read_stl if _is_binary_stl(file) else _read_stl_text)(file)[0])
+        return len(_read_any_stl(file)[0])
     if suffix == ".dae":
         return len(np.unique(read_collada(file)[0], axis=0))
     raise ValueError(f"{file}: not an STL, OBJ or DAE file")

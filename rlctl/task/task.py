@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
+from rlctl.task.commands import CommandTerm
 from rlctl.task.events import Event
 from rlctl.task.joints import Joints
 from rlctl.task.sim import Sim
@@ -124,6 +125,14 @@ class Task(TaskDefinition):
     def markers(self) -> dict[str, NDArray[np.float64]]:
         """Return points to draw, such as the goal: name -> world position of shape (3,) [m]. Optional."""
         return {}
+
+    def commands(self) -> dict[str, CommandTerm]:
+        """Return what a person may command in `rlctl play`, by name, in the order of the keys. Optional."""
+        return {}
+
+    def set_commands(self, values: Mapping[str, float]) -> None:
+        """Set some of the `commands`, within their ranges; `reset` may draw others."""
+        raise NotImplementedError
 
 
 def check_parameters(task: type[TaskDefinition]) -> None:

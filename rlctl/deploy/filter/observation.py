@@ -65,6 +65,13 @@ class ObservationLayout:
             raise ObservationError(f"observation names {'; '.join(problems)}")
         return {name: _convert(values[name], name, shape, self._dtypes[name]) for name, shape in known.items()}
 
+    def name_parts(self, observation: Any) -> dict[str, Array]:
+        """Return the parts of an observation by name, for `read`; the arrays share its memory."""
+        if isinstance(self.space, spaces.Dict):
+            return {name: np.asarray(observation[name]) for name in self.shapes}
+        flat = np.asarray(observation).ravel()
+        return {name: flat[part].reshape(self.shapes[name]) for name, part in self.slices.items()}
+
     def flatten(self, observation: Any) -> NDArray[np.float64]:
         """Return the numbers of an observation without its images, shape (size,); raises `ObservationError`."""
         parts = split(observation)

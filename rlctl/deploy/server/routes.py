@@ -1,7 +1,6 @@
 """The server's connections and HTTP routes: actions as JSON, orders, another policy, metrics, the live page."""
 
 import asyncio
-import hmac
 import math
 import os
 import re
@@ -11,11 +10,11 @@ import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from aiohttp import web
 
 from rlctl.deploy.server import messages
+from rlctl.deploy.server.access import find_problem, is_websocket
 from rlctl.deploy.server.request import LOOPBACK
 from rlctl.deploy.server.server import PolicyServer
 from rlctl.errors import RlctlError, UsageError, did_you_mean
@@ -70,7 +69,7 @@ class Connections:
         """Answer a request, and count its connection as active until then. A middleware of aiohttp."""
         connection = request.protocol
         self._until.pop(connection, None)
-        self._until[connection] = None if _is_websocket(request) else math.inf
+        self._until[connection] = None if is_websocket(request) else math.inf
         try:
             return await handler(request)
         except (ConnectionError, web.RequestPayloadError, RuntimeError):
@@ -143,7 +142,7 @@ class Routes:
         """Refuse requests without the key (`Authorization: Api-Key KEY`) and requests from other sites' pages."""
         if "Content-Encoding" in request.headers:
             return _refuse(415, "compressed bodies are refused")
-        problem = _find_problem(request, self.server.request.host in LOOPBACK, self.server.api_key)
+        problem = find_problem(request, self.server.request.host in LOOPBACK, self.server.api_key)
         if problem is None:
             try:
                 return await handler(request)
@@ -164,7 +163,7 @@ class Routes:
         self.server.close()
 
     async def _serve_root(self, request: web.Request) -> web.StreamResponse:
-        if _is_websocket(request):
+        if is_websocket(request):
             return await self.server.serve_client(request)
         policy = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'"
         return web.Response(text=self.page, content_type="text/html", headers={"Content-Security-Policy": policy})
@@ -228,10 +227,6 @@ class Routes:
         return web.json_response(messages.as_json(self.server.describe()))
 
 
-def _is_websocket(request: web.Request) -> bool:
-    return request.headers.get("Upgrade", "").lower() == "websocket"
-
-
 async def _answer_health(request: web.Request) -> web.Response:
     return web.Response(text="OK\n")
 
@@ -246,21 +241,3 @@ async def _read_body(request: web.Request, max_size: int) -> bytes:
 
 def _refuse(status: int, text: str) -> web.Response:
     return web.json_response({"error": text}, status=status)
-
-
-def _find_problem(request: web.Request, is_local: bool, key: str | None) -> tuple[int, str] | None:
-    host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-    try:
-        name, page_host = urlsplit(f"//{host}").hostname, urlsplit(origin or "").netloc
-    except ValueError:  # `[::1`
-        return 400, "Host or Origin is not an address"
-    # Another site's domain can resolve to this machine (DNS rebinding); its pages could then send requests.
-    if is_local and name not in LOOPBACK:
-        return 403, "this server answers to localhost only"
-    if origin is not None and page_host != host:
-        return 403, "requests from other sites are refused"
-    if key is None or request.path == "/healthz" or (request.path == "/" and not _is_websocket(request)):
-        return None
-    if hmac.compare_digest(request.headers.get("Authorization", "").encode(), f"Api-Key {key}".encode()):
-        return None
-    return 401, "this server needs a key: Authorization: Api-Key KEY"

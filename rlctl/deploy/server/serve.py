@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import gc
 import logging
-import os
 import signal
 import sys
 from collections.abc import Callable
@@ -14,15 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rlctl.deploy.filter.limits import Limits, read_limits
-from rlctl.deploy.server.request import KEY_VARIABLE, LOOPBACK, ServeRequest
+from rlctl.deploy.server.request import ServeRequest
 from rlctl.deploy.server.session import load_served_policy
-from rlctl.errors import ArtifactError, RlctlError, UsageError, explain_missing_package
-from rlctl.storage import untrusted
+from rlctl.errors import RlctlError, UsageError, explain_missing_package
 
 if TYPE_CHECKING:
     from rlctl.deploy.server.server import PolicyServer
-
-_LONGEST_KEY = 4096  # [bytes]
 
 
 def make_server(file: Path, request: ServeRequest) -> PolicyServer:
@@ -30,32 +26,15 @@ def make_server(file: Path, request: ServeRequest) -> PolicyServer:
     try:
         import uvloop  # noqa: F401
 
+        from rlctl.deploy.server.access import find_key
         from rlctl.deploy.server.server import PolicyServer
     except ModuleNotFoundError as error:
         raise UsageError(explain_missing_package("rlctl serve", error.name, "serve")) from None
-    key = _read_key(request.key_file)
-    if request.host not in LOOPBACK and key is None:
-        raise UsageError(
-            f"--host {request.host}: other machines can reach this server and could move the robot; set a key: "
-            f"--key-file FILE, or {KEY_VARIABLE} in the environment"
-        )
+    key = find_key(request.host, request.key_file)
     limits = Limits() if request.limits is None else read_limits(request.limits)
     if not request.watchdog:
         limits = limits.model_copy(update={"watchdog_periods": 0.0})
     return PolicyServer(load_served_policy(file), request, limits, key)
-
-
-def _read_key(file: Path | None) -> str | None:
-    if file is None:
-        key = os.environ.get(KEY_VARIABLE)
-        return key.strip() if key else None
-    try:
-        key = untrusted.read_bytes(file, _LONGEST_KEY).decode().strip()
-    except UnicodeDecodeError:
-        raise ArtifactError(f"{file}: not a key: it is no text") from None
-    if not key or not key.isprintable() or not key.isascii():
-        raise UsageError(f"--key-file {file}: the file contains no key; write the key as one line of ASCII text")
-    return key
 
 
 def run_server(server: PolicyServer, on_start: Callable[[str], None]) -> None:

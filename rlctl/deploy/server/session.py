@@ -124,6 +124,8 @@ class Session:
             answer["reason"] = self.safety.reason
         if error:
             answer["error"] = error
+        if isinstance(request, dict) and isinstance(number := request.get("sequence"), int):
+            answer["sequence"] = number  # `rlctl robot` numbers its observations
         self._last_s = time.monotonic()  # the watchdog measures the client, not this answer
         return answer
 
@@ -131,7 +133,7 @@ class Session:
         """Return the observation of a request and its age [s]; reset if it asks for that."""
         if not isinstance(request, dict):
             raise ObservationError("a request is a map: observations by name, or observation: the flat vector")
-        fields = dict(request)
+        fields = {key: value for key, value in request.items() if key != "sequence"}
         reset, age_s = fields.pop("reset", False), fields.pop("age_s", 0.0)
         if not isinstance(reset, bool | int | np.bool_):
             raise ObservationError(f"reset is {short_repr(reset)}, not true or false")

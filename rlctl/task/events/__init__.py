@@ -2,6 +2,7 @@
 
 from rlctl.task.events.changes import delay as delay
 from rlctl.task.events.changes import kick as kick
+from rlctl.task.events.changes import lock_joints as lock_joints
 from rlctl.task.events.changes import noise as noise
 from rlctl.task.events.changes import offset_joints as offset_joints
 from rlctl.task.events.changes import push as push

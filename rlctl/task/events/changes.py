@@ -76,6 +76,13 @@ def scale_motor_strength(sim: Sim, rng: Rng, *, body: str, factor: NotNegative, 
     return {"factor": drawn}
 
 
+@acts_at("start", "interval")
+def lock_joints(sim: Sim, rng: Rng, *, body: str, joints: Sequence[str]) -> Drawn:
+    """Hold `joints` where they are until the end of the episode, whatever the motors do."""
+    sim.body(body).lock_joints(joints)
+    return {}
+
+
 @acts_at("reset", "start", "interval")
 def set_color(
     sim: Sim, rng: Rng, *, body: str, red: Fraction, green: Fraction, blue: Fraction, links: Sequence[str] = ()

@@ -24,6 +24,7 @@ XYZW, WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
 """Indices that reorder MuJoCo's quaternions (w, x, y, z) for rlctl, and back."""
 _RAIL = 100.0  # [m]
 _FAR = 100.0  # [m]
+_LOCK_DAMPING = 1e7  # [N m s/rad or N s/m]; a motor of 100 N m moves such a joint by 1e-5 rad in a second
 
 
 class MujocoBody(MujocoMotors):
@@ -283,6 +284,9 @@ class MujocoBody(MujocoMotors):
     def set_joint_damping(self, damping: float, joints: Sequence[str] = ()) -> None:
         self._fields.model("dof_damping")[..., self._dofs(joints)] = damping
         self._fields.touch()
+
+    def lock_joints(self, joints: Sequence[str] = ()) -> None:
+        self.set_joint_damping(_LOCK_DAMPING, joints)
 
     def _dofs(self, joints: Sequence[str]) -> NDArray[np.int64]:
         numbers = np.arange(self._sim.model.nv)[self._velocities]

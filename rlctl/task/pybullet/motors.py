@@ -11,6 +11,7 @@ from rlctl.task.body import Array, Body, Drives
 from rlctl.task.pybullet.library import pybullet
 
 _NUMBER = (int, float, np.number)
+_LOCK_FORCE = 1e6  # [N m or N], more than any motor or load
 _MOST_DAMPING = 1.5  # of a velocity that an explicit damper may remove in a physics step; it is unstable above 2
 
 
@@ -40,6 +41,7 @@ class Motors(Body):
         self._chosen: set[int] = set()
         self.drives: Drives | None = None
         self._targets: dict[int, tuple[float, float]] = {}  # of springs: position and limit of the force, by joint
+        self._locked: dict[int, float] = {}  # positions of joints that cannot move
 
     def _save_nominal(self) -> None:
         self._built_strength = self.motor_strength
@@ -48,6 +50,9 @@ class Motors(Body):
         self.motor_strength = self._built_strength
         self._commanded = None
         self._targets.clear()
+        if self._locked:
+            self._switch_off([*self._locked])
+            self._locked.clear()
 
     def drive_to(
         self,
@@ -189,8 +194,27 @@ class Motors(Body):
     def disable_motors(self, joints: Sequence[str] = ()) -> None:
         chosen = self.find_joints(joints)
         self._chosen.update(chosen)
-        gains = [0.1] * len(chosen)
-        self._command(chosen, "POSITION_CONTROL", forces=[0.0] * len(chosen), positionGains=gains, velocityGains=gains)
+        self._switch_off(chosen)
+
+    def _switch_off(self, joints: list[int]) -> None:
+        gains = [0.1] * len(joints)
+        self._command(joints, "POSITION_CONTROL", forces=[0.0] * len(joints), positionGains=gains, velocityGains=gains)
+
+    def lock_joints(self, joints: Sequence[str] = ()) -> None:
+        chosen = self.find_joints(joints)
+        self._locked |= dict(zip(chosen, self.joint_positions[chosen].tolist(), strict=True))
+
+    def apply_locks(self) -> None:
+        """Hold the locked joints in the next step, whatever the task has commanded."""
+        if self._locked:
+            count = len(self._locked)
+            self._command(
+                [*self._locked],
+                "POSITION_CONTROL",
+                targetPositions=[*self._locked.values()],
+                forces=[_LOCK_FORCE] * count,
+                positionGains=[0.5] * count,
+            )
 
     def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
         chosen = self.find_joints(joints)

@@ -138,6 +138,8 @@ class PybulletSim(Constraints):
                 self._apply_pushes()
             for body in self._driven:
                 body.apply_drives()
+            for body in self.bodies.values():
+                body.apply_locks()
             pybullet.stepSimulation(physicsClientId=self.client)
         for body in self.bodies.values():
             body._cache.clear()

@@ -1,0 +1,76 @@
+"""How much the commands of a program differ from the actions of the policy that it should run."""
+
+import collections
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.deploy.filter.observation import ObservationLayout
+from rlctl.deploy.robot.controller import SentObservation
+from rlctl.policy.policy import Policy
+
+
+@dataclasses.dataclass(frozen=True)
+class CommandDifference:
+    """The differences of one element of the action, in its own unit."""
+
+    name: str
+    mean: float  # of the absolute differences
+    largest: float
+    episode: int  # of the largest
+    step: int
+
+
+class CommandComparison:
+    """Lets the policy act on every observation that is sent, and compares the command for it.
+
+    Observations that are not finite are left out: the policy has no answer to them.
+    """
+
+    def __init__(self, policy: Policy, layout: ObservationLayout, names: Sequence[str]) -> None:
+        self._policy, self._layout, self._names = policy, layout, names
+        self._frames: collections.deque[Any] = collections.deque(maxlen=policy.info.spec.frame_stack)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all differences."""
+        self._actions: dict[int, tuple[NDArray[Any], int, int]] = {}  # by sequence: with episode and step
+        self._sum = np.zeros(len(self._names))
+        self._largest = np.full(len(self._names), -1.0)
+        self._where = [(0, 0)] * len(self._names)
+        self.count = 0
+
+    def observe(self, sent: SentObservation) -> None:
+        """Let the policy act on an observation, as the program should."""
+        if sent.step == 0:
+            self._policy.reset()
+            self._frames.clear()
+            self._actions.clear()
+        if not all(np.isfinite(part).all() for part in sent.parts.values()):
+            return
+        observation = self._layout.read(sent.parts)
+        if (frames := self._frames.maxlen or 1) > 1:
+            self._frames.extend([observation] * (1 if self._frames else frames))
+            observation = np.concatenate(self._frames, axis=-1)
+        self._actions[sent.sequence] = self._policy.predict(observation), sent.episode, sent.step
+
+    def compare(self, sequence: int, command: NDArray[Any]) -> None:
+        """Compare the command for an observation."""
+        if (expected := self._actions.pop(sequence, None)) is None:
+            return
+        action, episode, step = expected
+        difference = np.abs(np.ravel(command).astype(float) - np.ravel(action))
+        self.count += 1
+        self._sum += difference
+        for index in np.flatnonzero(difference > self._largest):
+            self._largest[index], self._where[index] = difference[index], (episode, step)
+
+    def differences(self) -> list[CommandDifference]:
+        """Return the differences per element of the action; empty if nothing was compared."""
+        if not self.count:
+            return []
+        rows = zip(self._names, (self._sum / self.count).tolist(), self._largest.tolist(), self._where, strict=True)
+        return [CommandDifference(name, mean, largest, *where) for name, mean, largest, where in rows]

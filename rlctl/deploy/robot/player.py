@@ -1,0 +1,186 @@
+"""Plays the episodes of a robot whose actions a connected program commands, in lock-step or by the clock."""
+
+import asyncio
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from numpy.typing import NDArray
+
+from rlctl.deploy.filter.observation import ObservationLayout
+from rlctl.deploy.robot.commands import CommandCounts, CommandQueue, read_action
+from rlctl.deploy.robot.comparison import CommandComparison
+from rlctl.deploy.robot.controller import Arrival, Controller, SentObservation
+from rlctl.deploy.robot.faults import EpisodeFaults, Faults
+from rlctl.environments.info import EnvInfo
+from rlctl.errors import AnswerIsNo
+from rlctl.policy.players.named import ZeroPlayer
+from rlctl.rollout.messages import EpisodeResult, FailedInEpisode, describe_failure, make_error
+from rlctl.rollout.running_episode import RunningEpisode
+
+_RESEND_S = 0.25  # after which an observation that is not answered is sent again: a UDP packet may be lost
+
+
+class RobotPlayer:
+    """A robot that sends what it measures at every step, and does what the newest command says.
+
+    A command that arrives within its control step acts in that step, as in training. Without a newer one the last
+    action acts again; before the first one it is 0, or the nearest to it. In lock-step the robot waits for each
+    command, and delays are delays of the simulated time.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        info: EnvInfo,
+        controller: Controller,
+        *,
+        task: str,
+        timeout_s: float,
+        realtime: bool,
+        comparison: CommandComparison | None,
+    ) -> None:
+        metrics = [name for name, weight in info.reward_weights.items() if weight == 0]
+        self._episode = RunningEpisode(env, 0, metrics)
+        self._info, self._layout, self._space = info, ObservationLayout(info), env.action_space
+        self._task, self._timeout_s, self._realtime = task, timeout_s, realtime
+        self._controller, self._comparison = controller, comparison
+        self._dt = info.control_dt or math.inf
+        self._loop = asyncio.get_running_loop()
+        self._first_action, _ = ZeroPlayer(self._space).act(None, 0, 0)
+        self._sequence = 0
+        self._heard = self._loop.time()  # when the program last sent something
+
+    async def play(
+        self, seeds: Sequence[int], faults: Faults, watch: Callable[[int], None]
+    ) -> tuple[list[EpisodeResult], CommandCounts]:
+        """Play an episode per seed; `watch` is called with the number of finished ones.
+
+        Raises `AnswerIsNo` if the program disconnects or sends nothing for `timeout_s`, `TaskError` if the environment
+        fails.
+        """
+        self._counts = counts = CommandCounts()
+        if self._comparison is not None:
+            self._comparison.reset()
+        results = []
+        for number, seed in enumerate(seeds):
+            results.append(await self._play_episode(number, seed, faults))
+            watch(number + 1)
+        if self._comparison is not None:
+            counts.compared, counts.differences = self._comparison.count, self._comparison.differences()
+        return results, counts
+
+    async def _play_episode(self, number: int, seed: int, faults: Faults) -> EpisodeResult:
+        self._drawn = EpisodeFaults(faults, seed, self._info)
+        self._queue, self._number = CommandQueue(), number
+        self._waiting: dict[int, tuple[float, float, bool]] = {}  # by sequence: when it was sent, delay, loss
+        self._controller.arrivals.clear()
+        action = self._first_action
+        observation = self._call(lambda: self._episode.start(seed))
+        self._begin_s = self._loop.time()
+        while True:
+            step = self._episode.step
+            command = await self._exchange(observation, step)
+            self._counts.held += command is None
+            action = action if command is None else command
+            self._episode.step = step + 1
+            # `chosen` is bound now: the next step has another action.
+            observation, _, terminated, truncated, info = self._call(
+                lambda chosen=action: self._episode.take_step(chosen)  # type: ignore[misc]
+            )
+            if terminated or truncated:
+                self._counts.unanswered += len(self._waiting)
+                return self._episode.summarize(info, 0, {})
+
+    def _call(self, simulate: Callable[[], Any]) -> Any:
+        try:
+            return simulate()
+        except BaseException as error:  # a plugin may raise anything, SystemExit too
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            failure = FailedInEpisode(0, self._episode.seed, self._episode.step)
+            failure.__cause__ = error
+            raise make_error(describe_failure(failure), self._task) from error
+
+    async def _exchange(self, observation: Any, step: int) -> NDArray[Any] | None:
+        """Send what the sensors measure; return the newest command at the end of the step, None if there is none."""
+        self._sequence += 1
+        lost, command_lost, delay_s = self._drawn.draw()
+        parts = self._drawn.disturb(self._layout.name_parts(observation), step)
+        sent = SentObservation(self._sequence, self._number, step, parts)
+        if self._realtime:
+            self._check_clock(step)
+        self._counts.lost += lost or command_lost
+        if not lost:
+            self._waiting[self._sequence] = self._loop.time(), delay_s, command_lost
+            await self._controller.send(sent)
+            if self._comparison is not None:
+                self._comparison.observe(sent)
+        if self._realtime:
+            await self._wait_for_clock(self._begin_s + (step + 1) * self._dt)
+        elif not lost:
+            await self._wait_for_command(sent)
+        return self._queue.take((step + 1) * self._dt)
+
+    def _check_clock(self, step: int) -> None:
+        late = max(0.0, self._loop.time() - self._begin_s - step * self._dt)
+        self._counts.robot_late_s.append(late)
+        if late > self._dt:  # the simulation is too slow: the program has a whole step nevertheless
+            self._begin_s += late
+
+    async def _wait_for_clock(self, end_s: float) -> None:
+        while True:
+            await self._controller.wait(end_s)
+            self._read_arrivals()
+            self._check_present()
+            if self._loop.time() >= end_s:
+                return
+
+    async def _wait_for_command(self, sent: SentObservation) -> None:
+        while sent.sequence in self._waiting:
+            again_s = self._loop.time() + _RESEND_S
+            await self._controller.wait(again_s)
+            self._read_arrivals()
+            self._check_present()
+            if self._loop.time() >= again_s and sent.sequence in self._waiting and self._controller.resends:
+                await self._controller.send(sent)
+
+    def _check_present(self) -> None:
+        """Raise `AnswerIsNo` if the program is no longer there."""
+        where = f"in episode {self._number}, step {self._episode.step}"
+        if self._controller.closed:
+            raise AnswerIsNo(f"the program has disconnected {where}")
+        first_sent_s = next(iter(self._waiting.values()))[0] if self._waiting else math.inf
+        if self._loop.time() - max(self._heard, first_sent_s) > self._timeout_s:
+            raise AnswerIsNo(f"the program has sent nothing for {self._timeout_s:g} s, {where}")
+
+    def _read_arrivals(self) -> None:
+        while self._controller.arrivals:
+            arrival = self._controller.arrivals.popleft()
+            self._heard = arrival.at
+            self._read(arrival)
+
+    def _read(self, arrival: Arrival) -> None:
+        counts = self._counts
+        problem, action = arrival.problem, None
+        if not problem:
+            try:
+                action = read_action(arrival.values, self._space)
+            except ValueError as error:
+                problem = str(error)
+        if problem:
+            counts.refused += 1
+            counts.first_problem = counts.first_problem or problem
+        if (waiting := self._waiting.pop(arrival.sequence, None)) is None:
+            return  # a second command for the same observation, or one for an episode that is over
+        sent_s, delay_s, is_lost = waiting
+        counts.response_s.append(arrival.at - sent_s)
+        counts.late += counts.response_s[-1] > self._dt
+        if action is None:
+            return
+        if self._comparison is not None:
+            self._comparison.compare(arrival.sequence, action)
+        if not is_lost:
+            # In lock-step the simulated clock stands still while the program computes.
+            step_s = (self._episode.step * self._dt) if not self._realtime else arrival.at - self._begin_s
+            self._queue.put((step_s if self._dt < math.inf else 0.0) + delay_s, arrival.sequence, action)

@@ -1,0 +1,1 @@
+"""`rlctl play`: a person steers a policy's robot, in a browser."""
