@@ -109,7 +109,7 @@ def test_no_arguments_show_the_help(rlctl):
         (
             ["check-env", "reach", "--format", "xml"],
             2,
-            "Invalid value for '--format': Value error, 'xml' is not one of 'text', 'json', 'sarif', 'github'",
+            "Invalid value for '--format': Value error, 'xml' is not one of 'text', 'json', 'sarif', 'junit', 'github'",
         ),
         (["train", "reech"], 2, "error: no task 'reech'. Did you mean 'reach'? Installed: "),
         (["train", ""], 2, "error: no task ''. Installed: "),
