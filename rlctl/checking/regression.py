@@ -1,4 +1,4 @@
-"""Whether numbers are exactly a sum of some quantities in nearly all steps; rare terms, such as a bonus, are left out."""
+"""Whether numbers are exactly a sum of some quantities in nearly all steps; rare terms, as a bonus is, are left out."""
 
 import dataclasses
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.records import SUCCESS, CheckedEpisode, Records
 from rlctl.checking.rules import NotJudged
+from rlctl.checking.values import Leaf
 
 ROLES = ("episodes", "seeds", "starts", "search")  # each plays other states; the other roles repeat an episode
 MOST_ELEMENTS = 64
@@ -40,10 +41,15 @@ class Transitions:
         return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in fields})
 
 
-def collect_transitions(records: Records) -> Transitions:
+def find_float_leaves(leaves: Sequence[Leaf]) -> list[int]:
+    """Return the places of the leaves that observations are read from."""
+    return [index for index, leaf in enumerate(leaves) if leaf.supported and leaf.dtype.startswith("float")]
+
+
+def collect_transitions(records: Records, *, with_constants: bool = False) -> Transitions:
     """Return the steps of all episodes that differ; raises `NotJudged` where there are too few, or too many numbers."""
     built = records.require_built()
-    leaves = [index for index, leaf in enumerate(built.leaves) if leaf.supported and leaf.dtype.startswith("float")]
+    leaves = find_float_leaves(built.leaves)
     sizes = [int(np.prod(built.leaves[index].shape)) for index in leaves]
     if not leaves or sum(sizes) > MOST_ELEMENTS:
         raise NotJudged(f"the observation has no numbers, or more than {MOST_ELEMENTS}")
@@ -52,7 +58,7 @@ def collect_transitions(records: Records) -> Transitions:
         raise NotJudged(f"fewer than {FEWEST_STEPS} steps were recorded")
     observed = [np.hstack([episode.observations[index].rows for index in leaves]) for episode in episodes]
     names = [built.element(index, flat) for index, size in zip(leaves, sizes, strict=True) for flat in range(size)]
-    table = _join(episodes, observed, names)
+    table = _join(episodes, observed, names, with_constants)
     finite = np.isfinite(table.before).all(axis=1) & np.isfinite(table.after).all(axis=1) & np.isfinite(table.rewards)
     return table.select(finite)
 
@@ -62,10 +68,12 @@ def _is_whole(episode: CheckedEpisode, leaves: Sequence[int]) -> bool:
     return episode.steps > 0 and all(one is not None and len(one.values) == episode.steps + 1 for one in series)
 
 
-def _join(episodes: Sequence[CheckedEpisode], observed: Sequence[Numbers], names: Sequence[str]) -> Transitions:
+def _join(
+    episodes: Sequence[CheckedEpisode], observed: Sequence[Numbers], names: Sequence[str], with_constants: bool
+) -> Transitions:
     lengths = [episode.steps for episode in episodes]
     everything = np.concatenate(observed)
-    changes = (everything != everything[0]).any(axis=0)
+    changes = (everything != everything[0]).any(axis=0) | with_constants
     ends = np.cumsum(lengths) - 1
     has_ended = np.array([episode.has_ended for episode in episodes])
     is_last = np.zeros(sum(lengths), np.bool_)

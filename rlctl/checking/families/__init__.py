@@ -42,7 +42,17 @@ DECIDED_BY = {rule: experiment for experiment in EXPERIMENTS.values() for rule i
 
 PROCESSES = {
     "probe": (
-        *("build", "comparisons", "global random", "speed", "episodes", "starts", "search", "unseeded generators"),
+        *(
+            "build",
+            "comparisons",
+            "global random",
+            "speed",
+            "episodes",
+            "starts",
+            "search",
+            "goals",
+            "unseeded generators",
+        ),
         *("hindsight", "leaks"),
     ),
     "instances": (

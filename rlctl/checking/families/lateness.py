@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 from rlctl.checking.families import rewards
 from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.regression import EXACT, Fit, action_terms, fit_observation, fit_terms
-from rlctl.checking.rules import NotJudged, RuleFinding, Severity, check
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check
 from rlctl.checking.transitions import Quantities, Transitions, collect_transitions, find_differences, find_simple
 
 MOST_ROWS = 1_200  # steps that rewards are fitted to
@@ -26,7 +26,8 @@ ACTS = "action effects"  # The experiment that knows when the first action chang
 def _find_late_reward(records: Records) -> Iterator[RuleFinding]:
     rewards.require_rewarded(records)
     built, fit = records.require_built(), None
-    has_goal = rewards.reports_success(records.alone)
+    if not rewards.reports_success(records.alone):
+        raise NotApplicable("no success is reported: a cost of the state and the action chosen in it is a convention")
     # Too few steps, or too many numbers, leave the other way. For so small matrices threads take longer.
     with contextlib.suppress(NotJudged), threadpool_limits(1, "blas"):
         fit = _fit_before(sample_ordinary_steps(collect_transitions(records)))
@@ -37,13 +38,12 @@ def _find_late_reward(records: Records) -> Iterator[RuleFinding]:
             f"the reward is a function of the observation before the step{of}, {exact}, "
             "and not of the observation that the step returns"
         )
-        # Without a goal, a cost of the state and the action chosen in it is an accepted convention.
-        yield RuleFinding("RL616", message, {"value": fit.error}, None if has_goal else Severity.INFO)
+        yield RuleFinding("RL616", message, {"value": fit.error})
     elif records.facts.get(ACTS) == {"observation": 1, "reward": 2}:
         message = "the first action changes the observation at step 1, but the reward only from step 2 on"
         evidence = {"seed": FIRST_SEED, "value": 2, "expected": 1, "step": 1}
         # Engines move what they accelerate in the same step.
-        is_certain = has_goal and (built.uses_pybullet or built.model)
+        is_certain = built.uses_pybullet or built.model
         yield RuleFinding("RL616", message, evidence, None if is_certain else Severity.INFO)
 
 
