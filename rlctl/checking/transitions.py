@@ -115,14 +115,19 @@ class Quantities:
         return Quantities(np.hstack([self.values, other.values]), [*self.names, *other.names])
 
 
-def find_simple(rows: Numbers, names: Sequence[str]) -> Quantities:
-    """Return each element, its square and its size, and the lengths of two and three consecutive elements."""
+def find_lengths(rows: Numbers, names: Sequence[str]) -> Quantities:
+    """Return the size of each element, and the lengths of two and three consecutive elements."""
     size = rows.shape[1]
     blocks = [(i, i + k) for k in range(2, LONGEST_BLOCK + 1) for i in range(size - k + 1)]
-    lengths = [np.linalg.norm(rows[:, i:j], axis=1) for i, j in blocks]
-    columns = [*rows.T, *np.square(rows).T, *np.abs(rows).T, *lengths]
-    named = [*names, *(f"{name} squared" for name in names), *(f"|{name}|" for name in names)]
-    return Quantities(np.array(columns).T, [*named, *(f"length of {_span(names[i:j])}" for i, j in blocks)])
+    columns = [*np.abs(rows).T, *(np.linalg.norm(rows[:, i:j], axis=1) for i, j in blocks)]
+    named = [*(f"|{name}|" for name in names), *(f"length of {_span(names[i:j])}" for i, j in blocks)]
+    return Quantities(np.array(columns).reshape(len(columns), len(rows)).T, named)
+
+
+def find_simple(rows: Numbers, names: Sequence[str]) -> Quantities:
+    """Return each element, its square and its size, and the lengths of two and three consecutive elements."""
+    squares = Quantities(np.square(rows), [f"{name} squared" for name in names])
+    return Quantities(rows, names) + squares + find_lengths(rows, names)
 
 
 def find_differences(rows: Numbers, names: Sequence[str]) -> Quantities:
@@ -146,11 +151,12 @@ def find_differences(rows: Numbers, names: Sequence[str]) -> Quantities:
 
 def find_functions(rows: Numbers, names: Sequence[str]) -> Quantities:
     """Return what falls from 1 to 0 with the length of consecutive elements, or of their differences."""
-    simple, differences = find_simple(rows, names), find_differences(rows, names)
-    lengths = [i for i, name in enumerate(simple.names) if name.startswith(("length", "|"))]
+    differences = find_differences(rows, names)
     others = [i for i, name in enumerate(differences.names) if name.startswith(("length", "|"))]
-    values = np.hstack([simple.values[:, lengths], differences.values[:, others]])
-    of = [simple.names[i] for i in lengths] + [differences.names[i] for i in others]
+    lengths = find_lengths(rows, names) + Quantities(
+        differences.values[:, others], [differences.names[i] for i in others]
+    )
+    values, of = lengths.values, lengths.names
     columns, named = [1 / (1 + values)], [f"1 / (1 + {name})" for name in of]
     for scale in SCALES:
         columns += [np.exp(-scale * values), np.exp(-scale * np.square(values)), np.tanh(scale * values)]

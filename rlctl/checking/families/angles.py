@@ -45,7 +45,7 @@ def _find_jumps_of_angles(records: Records) -> Iterator[RuleFinding]:
 def _find_passes(steps: Transitions) -> dict[str, NDArray[np.bool_]]:
     """Return for each observed angle in which steps it passes from pi to -pi or back, by name. Shape (n,) each."""
     angles = {name: (steps.before[:, i], steps.after[:, i]) for i, name in enumerate(steps.names)}
-    for i, j in _find_unit_pairs(steps.before):
+    for i, j in find_unit_pairs(steps.before):
         names = f"({steps.names[i]}, {steps.names[j]})"
         angles[f"the angle of {names}"] = (_angle(steps.before, i, j), _angle(steps.after, i, j))
         angles[f"the angle of {names} from its sine"] = (_angle(steps.before, j, i), _angle(steps.after, j, i))
@@ -58,7 +58,8 @@ def _find_passes(steps: Transitions) -> dict[str, NDArray[np.bool_]]:
     return passes
 
 
-def _find_unit_pairs(rows: NDArray[np.float64]) -> list[tuple[int, int]]:
+def find_unit_pairs(rows: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Return pairs of elements that are a cosine and a sine, or the other way. Shape of rows: (n, elements)."""
     sums = [(i, j, rows[:, i] ** 2 + rows[:, j] ** 2) for i in range(rows.shape[1]) for j in range(i)]
     return [(j, i) for i, j, total in sums if np.abs(total[:100] - 1).max() < UNIT and np.abs(total - 1).max() < UNIT]
 
