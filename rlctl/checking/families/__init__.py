@@ -42,18 +42,8 @@ DECIDED_BY = {rule: experiment for experiment in EXPERIMENTS.values() for rule i
 
 PROCESSES = {
     "probe": (
-        *(
-            "build",
-            "comparisons",
-            "global random",
-            "speed",
-            "episodes",
-            "starts",
-            "search",
-            "goals",
-            "unseeded generators",
-        ),
-        *("hindsight", "leaks"),
+        *("build", "comparisons", "global random", "speed", "episodes", "starts", "search", "unseeded generators"),
+        *("hindsight", "leaks", "goals"),
     ),
     "instances": (
         *("instances", "worlds", "batches", "unseeded", "action effects"),

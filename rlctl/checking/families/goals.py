@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.families import rewards
 from rlctl.checking.families.episodes import EPISODES
 from rlctl.checking.families.incentives import FIRST, STARTS
@@ -17,18 +17,21 @@ from rlctl.checking.regression import action_terms, fit_terms
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, check, experiment
 from rlctl.checking.transitions import Transitions, collect_transitions, find_float_leaves
 from rlctl.checking.values import Attribute, pick, read_attributes
+from rlctl.checking.workspaces import Reach, find_chains, find_reach, measure_reach
 
 SIZES = (2, 3)  # of a place [numbers]
 MOST_CANDIDATES = 6
 STEPS = 3  # in which a goal does not change
 SHIFT = np.array([0.013, -0.021, 0.034])  # of a goal, to see what of the observation follows it
 ROUNDING = 1e-5  # of observations to float32
-FEWEST_DIRECTIONS, FEWEST_EPISODES = 6, 6  # in which the robot comes as far
-SHARP = 0.005  # part of the reach: what is as far
+COMPARED = 4  # resets after which the places of links are compared with the observation
+NEAR = 2e-3  # how near they are [m]
 MARGIN = 0.02  # part of the reach that the robot may get further
 UNKNOWN_TOLERANCE = 0.1  # part of the reach
 FEWEST_FAR, FEWEST_SUCCESSES = 2, 3
 Numbers = NDArray[np.float64]
+Source = tuple[int, int]
+"""The element of an observation from which on it has a place, and the sign with which the goal is in it, or 0."""
 
 
 @experiment("goals", share=0.5)
@@ -45,7 +48,8 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
                     break
                 instance.reset(seed)
                 goals[seed] = read_attributes(instance.env)[name].numbers.tolist()
-            yield Fact("goals", DrawnGoal(name, copies, goals))
+            reaches = _find_reaches(instance, name, copies)
+            yield Fact("goals", DrawnGoal(name, copies, goals, reaches))
             return
     raise NotApplicable("the observation follows no attribute that reset draws")
 
@@ -62,14 +66,13 @@ def _find_drawn(instance: Instance) -> list[str]:
     for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=STEPS):
         pass
     after = read_attributes(instance.env)
-    return sorted(n for n in names if n in after and np.array_equal(after[n].numbers, drawn[1][n].numbers))[
-        :MOST_CANDIDATES
-    ]
+    stays = [name for name in names if name in after and np.array_equal(after[name].numbers, drawn[1][name].numbers)]
+    return sorted(stays)[:MOST_CANDIDATES]
 
 
 def _is_place(one: Attribute, two: Attribute) -> bool:
     sizes = one.numbers.size, two.numbers.size
-    return sizes[0] == sizes[1] and sizes[0] in SIZES and not (one.numbers == two.numbers).any()
+    return sizes[0] == sizes[1] and sizes[0] in SIZES and int((one.numbers != two.numbers).sum()) > 1
 
 
 def _find_copies(instance: Instance, name: str) -> list[tuple[int, int]]:
@@ -91,9 +94,35 @@ def _observe(instance: Instance, name: str, shift: float) -> Numbers:
     attribute = read_attributes(instance.env)[name]
     moved = attribute.numbers + shift * SHIFT[: attribute.numbers.size]
     attribute.assign(moved if isinstance(attribute.value, np.ndarray) else type(attribute.value)(moved.tolist()))
-    observation = episode.step().observation
-    parts = [np.ravel(pick(observation, instance.leaves[index].path)) for index in find_float_leaves(instance.leaves)]
+    return _flatten(instance, episode.step())
+
+
+def _flatten(instance: Instance, moment: Moment) -> Numbers:
+    leaves = [instance.leaves[index] for index in find_float_leaves(instance.leaves)]
+    parts = [np.ravel(pick(moment.observation, leaf.path)) for leaf in leaves]
     return np.concatenate([np.zeros(0), *parts])
+
+
+def _find_reaches(instance: Instance, name: str, copies: Sequence[Source]) -> dict[Source, Reach]:
+    """Return how far the links of fixed robots get whose places are observed, by where they are observed."""
+    rows, goals, links = [], [], []
+    for seed in range(FIRST_SEED, FIRST_SEED + COMPARED):
+        rows.append(_flatten(instance, EpisodePlayer(instance, seed, max_steps=0).reset()))
+        goals.append(read_attributes(instance.env)[name].numbers)
+        chains = list(find_chains(instance.env))
+        if not chains:
+            return {}
+        links.append([chain.read() for chain in chains])
+    observed, drawn = np.array(rows), np.array(goals)
+    reaches = {}
+    for source in find_sources(copies, observed, drawn):
+        places = read_place(source, observed, drawn)
+        for number, chain in enumerate(chains):
+            off = np.abs(np.array([one[number] for one in links])[:, :, : drawn.shape[1]] - places[:, None])
+            link = int(off.max(axis=(0, 2)).argmin())
+            if off[:, link].max() < NEAR and source not in reaches:
+                reaches[source] = measure_reach(chain, link, drawn.shape[1])
+    return reaches
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,8 +130,9 @@ class DrawnGoal:
     """A place that each reset draws."""
 
     name: str  # of the attribute
-    copies: Sequence[tuple[int, int]]  # Elements of the observation from which on it, or a difference to it, is; signs
+    copies: Sequence[Source]  # Where the observation has it, or its difference to something
     goals: Mapping[int, Sequence[float]]  # by seed
+    reaches: Mapping[Source, Reach]  # of links of a fixed robot, by where the observation has their places
 
 
 @check("RL619", *rewards.WITH_SEARCH, "goals")
@@ -114,65 +144,54 @@ def _find_goals_out_of_reach(records: Records) -> Iterator[RuleFinding]:
     steps = collect_transitions(records, with_constants=True)
     steps = steps.select(np.isin(steps.seeds, list(drawn.goals)))
     goals = np.array([drawn.goals[seed] for seed in steps.seeds.tolist()])
-    places, tolerance = _find_robot(steps, goals, drawn)
-    centre, reach = find_reach(places, steps.episodes)
+    places, of, tolerance = _find_robot(steps, goals, drawn)
+    reach = drawn.reaches.get(of) or find_reach(places, steps.episodes)
     if tolerance is None:
-        tolerance = UNKNOWN_TOLERANCE * reach
-    all_goals = np.array(list(drawn.goals.values()))
-    distances = np.linalg.norm(all_goals - centre, axis=1)
-    far = distances > (1 + MARGIN) * reach + tolerance
+        tolerance = UNKNOWN_TOLERANCE * reach.distance
+    distances = np.linalg.norm(np.array(list(drawn.goals.values())) - np.array(reach.centre), axis=1)
+    far = distances > (1 + MARGIN) * reach.distance + tolerance
     if far.sum() >= FEWEST_FAR:
         seed, farthest = list(drawn.goals)[int(distances.argmax())], float(distances.max())
-        reached = f"no step of {len(np.unique(steps.episodes))} episodes brought the robot more than {reach:.4g}"
+        where = f"up to {farthest:.4g} from {np.round(reach.centre, 3).tolist()}"
         message = (
-            f"{int(far.sum())} of {len(far)} goals ({drawn.name}) are out of reach: up to {farthest:.4g} away from "
-            f"{np.round(centre, 3).tolist()}; {reached} away from it, and it came as far in many directions"
+            f"{int(far.sum())} of {len(far)} goals ({drawn.name}) are out of reach: they are {where}, and {reach.how} "
+            f"{reach.distance:.4g} away from there and no farther"
         )
-        evidence = {"seed": seed, "value": farthest, "expected": f"up to {reach + tolerance:.4g}"}
-        yield RuleFinding("RL619", message, {**evidence, "element": drawn.name})
+        expected = f"up to {reach.distance + tolerance:.4g}"
+        yield RuleFinding(
+            "RL619", message, {"element": drawn.name, "seed": seed, "value": farthest, "expected": expected}
+        )
 
 
-def _find_robot(steps: Transitions, goals: Numbers, drawn: DrawnGoal) -> tuple[Numbers, float | None]:
-    """Return where what has to reach the goal is after each step, and at what distance that is a success; None if no
-    success was seen. Shape of the places: (n, size). Raises `NotJudged` if it is not observed."""
-    size, rows = goals.shape[1], steps.after
-    relative = [goals - sign * rows[:, i : i + size] for i, sign in drawn.copies]
-    moving = [places for places in relative if np.ptp(places[steps.episodes == steps.episodes[0]], axis=0).any()]
-    for places in moving or [rows[:, i : i + size] for i in range(rows.shape[1] - size + 1)]:
+def _find_robot(steps: Transitions, goals: Numbers, drawn: DrawnGoal) -> tuple[Numbers, Source, float | None]:
+    """Return where what has to reach the goal is after each step, where that was read, and at what distance it is a
+    success; None if no success was seen. Shape of the places: (n, size). Raises `NotJudged` if it is not observed."""
+    first = steps.episodes == steps.episodes[0]
+    read = {source: read_place(source, steps.after, goals) for source in find_sources(drawn.copies, steps.after, goals)}
+    moving = {source: places for source, places in read.items() if np.ptp(places[first], axis=0).any()}
+    is_relative = any(sign for _, sign in moving)
+    for source, places in moving.items():
+        if is_relative and not source[1]:
+            continue
         distances = np.linalg.norm(places - goals, axis=1)
         reached, rest = distances[steps.success], distances[~steps.success]
-        if len(reached) >= (1 if moving else FEWEST_SUCCESSES) and reached.max() < rest.min():
-            return places, float(reached.max() + rest.min()) / 2
+        if len(reached) >= (1 if is_relative else FEWEST_SUCCESSES) and reached.max() < rest.min():
+            return places, source, float(reached.max() + rest.min()) / 2
         chosen = sample_ordinary_steps(dataclasses.replace(steps, before=distances[:, None]))
         terms = np.hstack([action_terms(chosen), chosen.before, np.square(chosen.before)])
         if np.ptp(chosen.rewards) > 0 and fit_terms(terms, chosen.rewards).is_exact:
-            return places, None
+            return places, source, None
     raise NotJudged("the distance between the goal and the robot is not observed")
 
 
-def find_reach(places: Numbers, episodes: NDArray[np.int64]) -> tuple[Numbers, float]:
-    """Return a centre and how far from it the robot comes, if it came as far in many directions: a workspace has such a
-    limit, a path has not. Shapes of places: (n, size), of episodes: (n,). Raises `NotJudged` if there is none."""
-    size = places.shape[1]
-    directions = _spread_directions(size)
-    for centre in (np.zeros(size), _fit_centre(places, directions)):
-        from_centre = places - centre
-        radii = np.linalg.norm(from_centre, axis=1)
-        nearest = np.argmax(from_centre @ directions.T, axis=1)
-        is_far = radii >= (1 - SHARP) * radii.max()
-        if len(np.unique(nearest[is_far])) >= FEWEST_DIRECTIONS and len(np.unique(episodes[is_far])) >= FEWEST_EPISODES:
-            return centre, float(radii.max())
-    raise NotJudged("nothing limits where the robot gets")
+def find_sources(copies: Sequence[Source], rows: Numbers, goals: Numbers) -> list[Source]:
+    """Return where an observation may have the place of the robot: relative to the goal, and then by itself."""
+    size = goals.shape[1]
+    return [*copies, *((element, 0) for element in range(rows.shape[1] - size + 1))]
 
 
-def _spread_directions(size: int) -> Numbers:
-    grid = np.array(np.meshgrid(*[(-1.0, -0.5, 0.0, 0.5, 1.0)] * size)).reshape(size, -1).T
-    grid = grid[np.abs(grid).max(axis=1) == 1.0]
-    return np.asarray(grid / np.linalg.norm(grid, axis=1, keepdims=True))
-
-
-def _fit_centre(places: Numbers, directions: Numbers) -> Numbers:
-    """Return the centre of the sphere that is nearest to the outermost places: |p|^2 = 2 p c + rest."""
-    outermost = places[np.unique(np.argmax(places @ directions.T, axis=0))]
-    columns = np.hstack([2 * outermost, np.ones((len(outermost), 1))])
-    return np.asarray(np.linalg.lstsq(columns, np.square(outermost).sum(axis=1), rcond=1e-6)[0][:-1])
+def read_place(source: Source, rows: Numbers, goals: Numbers) -> Numbers:
+    """Return the place of the robot. Shapes of rows: (n, elements), of goals and the result: (n, size)."""
+    element, sign = source
+    part = rows[:, element : element + goals.shape[1]]
+    return goals - sign * part if sign else part
