@@ -16,6 +16,7 @@ MOST_COMPARED = 16  # numbers of an observation whose differences are looked at:
 LONGEST_BLOCK = 3  # consecutive numbers that may be a vector
 FEWEST_STEPS = 100
 SCALES = (1, 2, 3, 4, 5, 10, 20)  # [1/m] as rewards use them
+UNIT = 1e-4  # how far from 1 the squares of a cosine and a sine may add up
 Numbers = NDArray[np.float64]
 
 
@@ -125,9 +126,23 @@ def find_lengths(rows: Numbers, names: Sequence[str]) -> Quantities:
 
 
 def find_simple(rows: Numbers, names: Sequence[str]) -> Quantities:
-    """Return each element, its square and its size, and the lengths of two and three consecutive elements."""
+    """Return each element, its square and its size, the lengths of two and three consecutive elements, and angles."""
     squares = Quantities(np.square(rows), [f"{name} squared" for name in names])
-    return Quantities(rows, names) + squares + find_lengths(rows, names)
+    angles = []
+    for i, j in find_unit_pairs(rows):
+        for one, two in ((i, j), (j, i)):
+            name, angle = f"the angle of ({names[one]}, {names[two]})", np.arctan2(rows[:, two], rows[:, one])
+            angles += [(angle, name), (np.abs(angle), f"|{name}|"), (np.square(angle), f"{name} squared")]
+    columns = np.array([angle for angle, _ in angles]).reshape(len(angles), len(rows)).T
+    angular = Quantities(columns, [name for _, name in angles])
+    return Quantities(rows, names) + squares + find_lengths(rows, names) + angular
+
+
+def find_unit_pairs(rows: Numbers) -> list[tuple[int, int]]:
+    """Return pairs of elements that are a cosine and a sine, or the other way. Shape of rows: (n, elements)."""
+    few, squares = np.square(rows[:50]), np.square(rows)
+    pairs = [(i, j) for j in range(rows.shape[1]) for i in range(j) if np.abs(few[:, i] + few[:, j] - 1).max() < UNIT]
+    return [(i, j) for i, j in pairs if np.abs(squares[:, i] + squares[:, j] - 1).max() < UNIT]
 
 
 def find_differences(rows: Numbers, names: Sequence[str]) -> Quantities:

@@ -16,6 +16,8 @@ FEWEST_JOINTS, MOST_JOINTS = 2, 12
 SAMPLES, SWEEPS, VALUES = 200, 3, 9  # random joint positions; then each joint in turn at so many positions
 FEWEST_DIRECTIONS, FEWEST_EPISODES = 6, 6  # in which the robot came as far
 SHARP = 0.005  # part of the reach: what is as far
+FEWEST_STOPS = 3  # episodes that come to the same bits
+EDGE = 1e-5  # part of the range: what is at a stop
 Numbers = NDArray[np.float64]
 
 
@@ -111,16 +113,30 @@ def find_reach(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
     """Return a centre and how far from it the robot came, if it came as far in many directions: workspaces have such an
     edge, paths have not. Shapes of places: (n, size), of episodes: (n,). Raises `NotJudged` if there is none."""
     size = places.shape[1]
+    if size == 1:
+        return _find_stops(places[:, 0], episodes)
     directions = _spread_directions(size)
-    for centre in (np.zeros(size), _fit_centre(places, directions)) if size > 1 else ():
+    for centre in (np.zeros(size), _fit_centre(places, directions)):
         from_centre = places - centre
         radii = np.linalg.norm(from_centre, axis=1)
         nearest = np.argmax(from_centre @ directions.T, axis=1)
         is_far = radii >= (1 - SHARP) * radii.max()
         if len(np.unique(nearest[is_far])) >= FEWEST_DIRECTIONS and len(np.unique(episodes[is_far])) >= FEWEST_EPISODES:
-            how = f"in {len(np.unique(episodes))} episodes it came in many directions"
+            how = f"in {len(np.unique(episodes))} episodes it came, in many directions,"
             return Reach(centre.tolist(), float(radii.max()), how)
     raise NotJudged("nothing limits where the robot gets")
+
+
+def _find_stops(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
+    """Return the middle of two stops, and their distance from it: a robot on a rail comes as far in many episodes."""
+    low, high = float(places.min()), float(places.max())
+    starts = places[np.searchsorted(episodes, episodes)]
+    for stop in (low, high):
+        is_there = (np.abs(places - stop) <= EDGE * (high - low)) & (np.abs(starts - stop) > SHARP * (high - low))
+        if len(np.unique(episodes[is_there])) < FEWEST_STOPS:
+            raise NotJudged("nothing limits where the robot gets")
+    how = f"in {len(np.unique(episodes))} episodes it was stopped on both sides"
+    return Reach([(low + high) / 2], (high - low) / 2, how)
 
 
 def _spread_directions(size: int) -> Numbers:

@@ -154,3 +154,62 @@ class DroneTurns(Drone):
 class DroneTurnsBack(DroneTurns):
     def error(self):
         return self.pitch - self.wanted
+
+
+class DroneLeaves(Drone):
+    """Its flight ends where it leaves its area, which costs more than all steps to come."""
+
+    def is_outside(self):
+        return bool(np.abs(self.place).max() > 1.0)
+
+    def step(self, action):
+        observation, reward, terminated, *rest = super().step(action)
+        return self.end(observation, reward, terminated, self.is_outside(), rest)
+
+    def end(self, observation, reward, terminated, is_outside, rest):
+        return observation, reward - 50.0 * is_outside, terminated or is_outside, *rest
+
+
+class DroneLeavesLate(DroneLeaves):
+    def step(self, action):
+        is_outside = self.is_outside()
+        observation, reward, terminated, *rest = Drone.step(self, action)
+        return self.end(observation, reward, terminated, is_outside, rest)
+
+
+class RoverMillimetres(Rover):
+    def observe(self):
+        observation = super().observe()
+        observation[:2] *= 1000
+        return observation
+
+
+class DroneRadians(Drone):
+    def pitch_angle(self):
+        return self.pitch
+
+    def observe(self):
+        return np.append(super().observe(), np.float32(self.pitch_angle()))
+
+
+class DroneDegrees(DroneRadians):
+    def pitch_angle(self):
+        return np.rad2deg(self.pitch)
+
+
+class RoverInPond(Rover):
+    """A round pond of 1 m in radius, whose shore nothing passes."""
+
+    farthest = 1.0
+
+    def draw_goal(self):
+        direction = self.np_random.uniform(-np.pi, np.pi)
+        return self.np_random.uniform(0.2, self.farthest) * np.array([np.cos(direction), np.sin(direction)])
+
+    def move(self, action):
+        super().move(action)
+        self.place = self.place / max(1.0, float(np.linalg.norm(self.place)))
+
+
+class RoverBehindTheShore(RoverInPond):
+    farthest = 1.6

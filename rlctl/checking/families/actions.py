@@ -99,10 +99,12 @@ def _late_effects(trials: Trials, dimensions: Sequence[ActionNumber]) -> Iterato
     if {min(steps.values(), default=0) for steps in first} == {2}:
         message = "the first action does not change the observation before step 2: the observation is one step old"
         yield RuleFinding("RL115", message, {"seed": FIRST_SEED, "value": 2, "expected": 1, "step": 1})
-    # An element that answers later, such as a position with explicit Euler, may be what the reward depends on.
-    elif {step for steps in first for step in steps.values()} == {1}:
-        is_late = {2} in (_find_first_rewards(pairs), _find_first_rewards(opposites))
-        yield Fact("action effects", {"observation": 1, "reward": 2 if is_late else 1})
+        return
+    # Whatever the integrator: an element that answers later, such as a position, may be what the reward depends on.
+    last = {max(steps.values(), default=0) for steps in first}
+    for observed in last if len(last) == 1 and 0 not in last else ():
+        is_late = {observed + 1} in (_find_first_rewards(pairs), _find_first_rewards(opposites))
+        yield Fact("action effects", {"observation": observed, "reward": observed + 1 if is_late else observed})
 
 
 def _play_opposites(trials: Trials, dimensions: Sequence[ActionNumber], seed: int) -> list[list[Frame]]:

@@ -1,6 +1,7 @@
 """RL618: rewards that jump where an angle passes from pi to -pi."""
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,15 +9,16 @@ from numpy.typing import NDArray
 from rlctl.checking.families import rewards
 from rlctl.checking.records import Records
 from rlctl.checking.rules import NotApplicable, RuleFinding, check
-from rlctl.checking.transitions import Transitions, collect_transitions
+from rlctl.checking.transitions import Transitions, collect_transitions, find_unit_pairs
 
 NEAR_TURN = 1.0  # an angle that passes pi changes by 2 pi +- NEAR_TURN [rad]
 SMALL_TURN = 1.5  # and by less than this in all other steps [rad]
-UNIT = 1e-4  # how far from 1 the squares of a cosine and a sine may add up
 NEIGHBOURS = 3  # steps before and after a jump that it is compared with
 JUMP = 3.0  # times the largest change of its neighbours
 FEWEST_JUMPS, FEWEST_SEEDS = 4, 3
 MOST_PASSES = 0.4  # part of the passes with a jump: those near a difference of 0 have none
+LEAST_ROOM, SPREAD = 0.2, 1.5  # of pi - |e|: least [rad], and how much the largest of them exceed the smallest
+SAME_FACTOR, MOST_FIT = 0.15, 0.7  # how equal factors are, and what part of all jumps they explain
 RARE = 0.05  # the same of all other steps, relative to that of the passes
 
 
@@ -24,22 +26,59 @@ RARE = 0.05  # the same of all other steps, relative to that of the passes
 def _find_jumps_of_angles(records: Records) -> Iterator[RuleFinding]:
     rewards.require_rewarded(records)
     steps = collect_transitions(records)
-    passes = _find_passes(steps)
-    if not passes:
-        raise NotApplicable("no angle that was observed passes pi often enough")
-    is_jump, is_judged, sizes = _find_jumps(steps)
+    passes, pairs = _find_passes(steps), find_unit_pairs(steps.before)
+    if not passes and not pairs:
+        raise NotApplicable("no angle is observed that passes pi")
+    jumps = _find_jumps(steps)
+    message = _judge_passes(steps, passes, jumps) or _judge_errors(steps, pairs, jumps)
+    if message:
+        yield RuleFinding("RL618", f"the reward jumps by {message}", {"expected": "no jump"})
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Jumps:
+    """Where the reward changes much more than in the steps around."""
+
+    is_jump: NDArray[np.bool_]  # Shape (n,)
+    is_judged: NDArray[np.bool_]  # Whether the steps around are known. Shape (n,)
+    sizes: NDArray[np.float64]  # of the changes. Shape (n,)
+
+    def are_many(self, steps: Transitions, rows: NDArray[np.bool_]) -> bool:
+        return rows.sum() >= FEWEST_JUMPS and len(np.unique(steps.seeds[rows])) >= FEWEST_SEEDS
+
+
+def _judge_passes(steps: Transitions, passes: Mapping[str, NDArray[np.bool_]], jumps: _Jumps) -> str:
+    """Return how the reward jumps where an angle passes pi; empty if it does not."""
     for name, is_pass in passes.items():
-        judged = is_pass & is_judged
-        jumps = judged & is_jump
-        others = float((is_jump & ~is_pass).sum() / max(1, (is_judged & ~is_pass).sum()))
-        share = float(jumps.sum() / max(1, judged.sum()))
-        is_rare = share >= MOST_PASSES and others <= RARE * share
-        if jumps.sum() >= FEWEST_JUMPS and len(np.unique(steps.seeds[jumps])) >= FEWEST_SEEDS and is_rare:
-            size = float(np.median(sizes[jumps]))
-            where = f"in {int(jumps.sum())} of {int(judged.sum())} steps in which {name} passes pi"
-            message = f"the reward jumps by {size:.3g} (median) {where}, and in {others:.1%} of all other steps"
-            yield RuleFinding("RL618", message, {"element": name, "value": size, "expected": "no jump"})
-            return
+        judged, elsewhere = is_pass & jumps.is_judged, ~is_pass & jumps.is_judged
+        jumping = judged & jumps.is_jump
+        others = float((elsewhere & jumps.is_jump).sum() / max(1, elsewhere.sum()))
+        share = float(jumping.sum() / max(1, judged.sum()))
+        if jumps.are_many(steps, jumping) and share >= MOST_PASSES and others <= RARE * share:
+            size = float(np.median(jumps.sizes[jumping]))
+            where = f"in {int(jumping.sum())} of {int(judged.sum())} steps in which {name} passes pi"
+            return f"{size:.3g} (median) {where}, and in {others:.1%} of all other steps"
+    return ""
+
+
+def _judge_errors(steps: Transitions, pairs: Sequence[tuple[int, int]], jumps: _Jumps) -> str:
+    """Return how the reward jumps as an error e that becomes e - 2 pi would make it, |e| and e^2 alike: by a constant
+    times pi - |e|, where only the cosine and the sine of e are observed. Empty if it does not."""
+    for cosine, sine in [pair for i, j in pairs for pair in ((i, j), (j, i))]:
+        room = np.pi - np.abs(_angle(steps.after, cosine, sine))
+        rows = jumps.is_jump & (room > LEAST_ROOM)
+        if not jumps.are_many(steps, rows):
+            continue
+        factors = jumps.sizes[rows] / room[rows]
+        fits = np.abs(factors / np.median(factors) - 1) < SAME_FACTOR
+        low, high = np.quantile(room[rows][fits], (0.1, 0.9)) if fits.any() else (1.0, 1.0)
+        rows[rows] = fits
+        if jumps.are_many(steps, rows) and fits.mean() >= MOST_FIT and high > SPREAD * low:
+            name = f"({steps.names[cosine]}, {steps.names[sine]})"
+            factor = float(np.median(factors))
+            where = f"in {int(rows.sum())} steps in which the angle e of {name} changes little"
+            return f"{factor:.3g} times pi - |e| {where}, as if e were e + 2 pi there"
+    return ""
 
 
 def _find_passes(steps: Transitions) -> dict[str, NDArray[np.bool_]]:
@@ -58,18 +97,11 @@ def _find_passes(steps: Transitions) -> dict[str, NDArray[np.bool_]]:
     return passes
 
 
-def find_unit_pairs(rows: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """Return pairs of elements that are a cosine and a sine, or the other way. Shape of rows: (n, elements)."""
-    sums = [(i, j, rows[:, i] ** 2 + rows[:, j] ** 2) for i in range(rows.shape[1]) for j in range(i)]
-    return [(j, i) for i, j, total in sums if np.abs(total[:100] - 1).max() < UNIT and np.abs(total - 1).max() < UNIT]
-
-
 def _angle(rows: NDArray[np.float64], cosine: int, sine: int) -> NDArray[np.float64]:
     return np.arctan2(rows[:, sine], rows[:, cosine])
 
 
-def _find_jumps(steps: Transitions) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
-    """Return in which steps the reward jumps, in which that can be told, and its changes. Shape (n,) each."""
+def _find_jumps(steps: Transitions) -> _Jumps:
     changes = np.abs(np.diff(steps.rewards, prepend=np.nan))
     is_ordinary = ~(steps.success | steps.terminated | steps.is_last)
     is_ordinary &= np.r_[False, np.diff(steps.episodes) == 0]
@@ -79,7 +111,8 @@ def _find_jumps(steps: Transitions) -> tuple[NDArray[np.bool_], NDArray[np.bool_
     neighbours = np.max(around, axis=0)  # NaN where one of them is
     is_judged = np.isfinite(neighbours) & np.isfinite(changes)
     with np.errstate(invalid="ignore"):
-        return is_judged & (changes > JUMP * neighbours) & (changes > 0), is_judged, changes
+        is_jump = is_judged & (changes > JUMP * neighbours) & (changes > 0)
+    return _Jumps(is_jump, is_judged, changes)
 
 
 _SHIFTS = [shift for shift in range(-NEIGHBOURS, NEIGHBOURS + 1) if shift]

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from rlctl.checking.transitions import Transitions, collect_transitions, find_fl
 from rlctl.checking.values import Attribute, pick, read_attributes
 from rlctl.checking.workspaces import Reach, find_chains, find_reach, measure_reach
 
-SIZES = (2, 3)  # of a place [numbers]
+SIZES = (1, 2, 3)  # of a place [numbers]
 MOST_CANDIDATES = 6
 STEPS = 3  # in which a goal does not change
 SHIFT = np.array([0.013, -0.021, 0.034])  # of a goal, to see what of the observation follows it
@@ -72,7 +73,7 @@ def _find_drawn(instance: Instance) -> list[str]:
 
 def _is_place(one: Attribute, two: Attribute) -> bool:
     sizes = one.numbers.size, two.numbers.size
-    return sizes[0] == sizes[1] and sizes[0] in SIZES and int((one.numbers != two.numbers).sum()) > 1
+    return sizes[0] == sizes[1] and sizes[0] in SIZES and int((one.numbers != two.numbers).sum()) >= min(2, sizes[0])
 
 
 def _find_copies(instance: Instance, name: str) -> list[tuple[int, int]]:
@@ -93,8 +94,15 @@ def _observe(instance: Instance, name: str, shift: float) -> Numbers:
     episode.reset()
     attribute = read_attributes(instance.env)[name]
     moved = attribute.numbers + shift * SHIFT[: attribute.numbers.size]
-    attribute.assign(moved if isinstance(attribute.value, np.ndarray) else type(attribute.value)(moved.tolist()))
+    attribute.assign(_like(attribute.value, moved))
     return _flatten(instance, episode.step())
+
+
+def _like(value: Any, numbers: Numbers) -> Any:
+    """Return numbers in the form of a value: an array, a list, a tuple or a number."""
+    if isinstance(value, np.ndarray):
+        return numbers.reshape(value.shape)
+    return type(value)(numbers.tolist()) if isinstance(value, list | tuple) else float(numbers[0])
 
 
 def _flatten(instance: Instance, moment: Moment) -> Numbers:

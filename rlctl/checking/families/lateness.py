@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from rlctl.checking.families import rewards
+from rlctl.checking.families.units import find_rates
 from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.regression import EXACT, Fit, action_terms, fit_observation, fit_terms
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check
@@ -16,21 +17,26 @@ from rlctl.checking.transitions import Quantities, Transitions, collect_transiti
 
 MOST_ROWS = 1_200  # steps that rewards are fitted to
 FEWEST_ROWS = 300
-CLEARLY = 1_000.0  # how much worse the observation after the step has to fit than the one before
+ROUNDED = 1e4  # to so many parts of 1
+CLEARLY = 100.0  # how much worse the observation after the step has to fit than the one before
 FEWEST_SEEDS, MANY_SEEDS = 3, 8  # that events come from: few need one step that leaves the limit again
 MOST_LIMITS = 2
+JUMP = 1.5  # times nearly all other changes
 ACTS = "action effects"  # The experiment that knows when the first action changes what
 
 
 @check("RL616", *rewards.WITH_SEARCH, ACTS)
 def _find_late_reward(records: Records) -> Iterator[RuleFinding]:
     rewards.require_rewarded(records)
-    built, fit = records.require_built(), None
     if not rewards.reports_success(records.alone):
         raise NotApplicable("no success is reported: a cost of the state and the action chosen in it is a convention")
+    first = records.facts.get(ACTS, {"observation": 0, "reward": 0})
+    fit, is_certain = None, bool(records.require_built().uses_pybullet or records.require_built().model)
     # Too few steps, or too many numbers, leave the other way. For so small matrices threads take longer.
     with contextlib.suppress(NotJudged), threadpool_limits(1, "blas"):
-        fit = _fit_before(sample_ordinary_steps(collect_transitions(records)))
+        steps = collect_transitions(records)
+        fit = _fit_before(sample_ordinary_steps(steps))
+        is_certain |= first["reward"] > first["observation"] and any(find_rates(steps))
     if fit is not None:
         of = f" ({', '.join(fit.picked)})" if fit.picked else ""
         exact = f"to within {max(fit.error, 1e-9):.0e} of its spread"
@@ -39,12 +45,19 @@ def _find_late_reward(records: Records) -> Iterator[RuleFinding]:
             "and not of the observation that the step returns"
         )
         yield RuleFinding("RL616", message, {"value": fit.error})
-    elif records.facts.get(ACTS) == {"observation": 1, "reward": 2}:
-        message = "the first action changes the observation at step 1, but the reward only from step 2 on"
-        evidence = {"seed": FIRST_SEED, "value": 2, "expected": 1, "step": 1}
-        # Engines move what they accelerate in the same step.
-        is_certain = built.uses_pybullet or built.model
+    elif first["reward"] > first["observation"] and not _are_rounded(records):
+        observed, late = first["observation"], first["reward"]
+        message = (
+            f"the first action changes the observation by step {observed}, but the reward only from step {late} on"
+        )
+        evidence = {"seed": FIRST_SEED, "value": late, "expected": observed, "step": 1}
         yield RuleFinding("RL616", message, evidence, None if is_certain else Severity.INFO)
+
+
+def _are_rounded(records: Records) -> bool:
+    """Say whether small changes of rewards are lost."""
+    values = np.concatenate([episode.rewards for episode in records.role("episodes")])
+    return bool(np.abs(values * ROUNDED - np.round(values * ROUNDED)).max(initial=0.0) < 1e-6)
 
 
 def sample_ordinary_steps(steps: Transitions) -> Transitions:
@@ -114,7 +127,7 @@ def _find_late_limits(steps: Transitions, is_event: NDArray[np.bool_], most: int
         return ""
     for limit in limits:  # a goal that moves when it is reached is not late
         changes = np.abs(after.values[:, limit.column] - before.values[:, limit.column])
-        if changes[is_event].max() > changes[~is_event].max():
+        if np.median(changes[is_event]) > JUMP * np.quantile(changes[~is_event], 0.99):
             return ""
     return " or ".join(
         f"{before.names[limit.column]} {'<' if limit.sign > 0 else '>'} {limit.sign * limit.limit:.4g}"
