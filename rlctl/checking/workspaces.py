@@ -38,7 +38,7 @@ class Reach:
 
     centre: Sequence[float]  # [m]
     distance: float  # [m]
-    how: str  # it was found out
+    how: str  # this was found out, as a sentence
 
 
 def find_chains(env: Any) -> Iterator[Chain]:
@@ -105,8 +105,9 @@ def measure_reach(chain: Chain, link: int, size: int) -> Reach:
             others = np.tile(best, (VALUES + 1, 1))
             others[1:, joint] = np.linspace(low[joint], high[joint], VALUES)
             best = max(others, key=distance)
-    how = f"with joints anywhere within their limits, {chain.names[link]} gets"
-    return Reach(chain.base[:size].tolist(), distance(best), how)
+    reach = distance(best)
+    how = f"with all joints anywhere within their limits, {chain.names[link]} gets {reach:.4g} away from there at most"
+    return Reach(chain.base[:size].tolist(), reach, how)
 
 
 def find_reach(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
@@ -122,7 +123,7 @@ def find_reach(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
         nearest = np.argmax(from_centre @ directions.T, axis=1)
         is_far = radii >= (1 - SHARP) * radii.max()
         if len(np.unique(nearest[is_far])) >= FEWEST_DIRECTIONS and len(np.unique(episodes[is_far])) >= FEWEST_EPISODES:
-            how = f"in {len(np.unique(episodes))} episodes it came, in many directions,"
+            how = f"the robot came {radii.max():.4g} away from there in many directions, and never farther"
             return Reach(centre.tolist(), float(radii.max()), how)
     raise NotJudged("nothing limits where the robot gets")
 
@@ -135,7 +136,7 @@ def _find_stops(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
         is_there = (np.abs(places - stop) <= EDGE * (high - low)) & (np.abs(starts - stop) > SHARP * (high - low))
         if len(np.unique(episodes[is_there])) < FEWEST_STOPS:
             raise NotJudged("nothing limits where the robot gets")
-    how = f"in {len(np.unique(episodes))} episodes it was stopped on both sides"
+    how = f"the robot was stopped {(high - low) / 2:.4g} away from there on both sides"
     return Reach([(low + high) / 2], (high - low) / 2, how)
 
 

@@ -161,10 +161,8 @@ def _find_goals_out_of_reach(records: Records) -> Iterator[RuleFinding]:
     if far.sum() >= FEWEST_FAR:
         seed, farthest = list(drawn.goals)[int(distances.argmax())], float(distances.max())
         where = f"up to {farthest:.4g} from {np.round(reach.centre, 3).tolist()}"
-        message = (
-            f"{int(far.sum())} of {len(far)} goals ({drawn.name}) are out of reach: they are {where}, and {reach.how} "
-            f"{reach.distance:.4g} away from there and no farther"
-        )
+        goals_far = f"{int(far.sum())} of {len(far)} goals ({drawn.name}) are out of reach"
+        message = f"{goals_far}: they are {where}; {reach.how}"
         expected = f"up to {reach.distance + tolerance:.4g}"
         yield RuleFinding(
             "RL619", message, {"element": drawn.name, "seed": seed, "value": farthest, "expected": expected}

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from rlctl.checking.families import rewards
 from rlctl.checking.families.units import find_rates
@@ -30,6 +29,8 @@ def _find_late_reward(records: Records) -> Iterator[RuleFinding]:
     rewards.require_rewarded(records)
     if not rewards.reports_success(records.alone):
         raise NotApplicable("no success is reported: a cost of the state and the action chosen in it is a convention")
+    from threadpoolctl import threadpool_limits  # takes 20 ms, in each process
+
     first = records.facts.get(ACTS, {"observation": 0, "reward": 0})
     fit, is_certain = None, bool(records.require_built().uses_pybullet or records.require_built().model)
     # Too few steps, or too many numbers, leave the other way. For so small matrices threads take longer.
@@ -56,7 +57,7 @@ def _find_late_reward(records: Records) -> Iterator[RuleFinding]:
 
 def _are_rounded(records: Records) -> bool:
     """Say whether small changes of rewards are lost."""
-    values = np.concatenate([episode.rewards for episode in records.role("episodes")])
+    values = np.concatenate([episode.rewards for episode in records.alone])
     return bool(np.abs(values * ROUNDED - np.round(values * ROUNDED)).max(initial=0.0) < 1e-6)
 
 
@@ -93,8 +94,9 @@ def _find_late_success(records: Records) -> Iterator[RuleFinding]:
     ends = steps.terminated & ~steps.success
     for what, is_event, most in (("is_success", steps.success, 1), ("terminated", ends, MOST_LIMITS)):
         if len(np.unique(steps.seeds[is_event])) >= FEWEST_SEEDS and (late := _find_late_limits(steps, is_event, most)):
-            how = f"true where {late} of the observation before the step, whatever the step returns"
-            message = f"{what} is judged one step late: in {int(is_event.sum())} steps it is {how}"
+            count = f"in all {int(is_event.sum())} steps where it is true, and in no other step"
+            where = f"{count}, the observation before the step has {late}"
+            message = f"{what} is judged one step late: {where}; no limit of the new observation tells"
             yield RuleFinding("RL617", message, {"element": what, "value": int(is_event.sum())})
             return
 
