@@ -1,9 +1,12 @@
 """Numbers that do not mean what they should: each mistake is found in two robots, and nothing in their twins."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from rlctl.checking.rules import NotJudged
+from rlctl.checking.values import read_attributes
 from rlctl.checking.workspaces import find_reach
 from tests.checking.judging import case, check_case, findings
 
@@ -23,6 +26,12 @@ CASES = [
     broken("DroneTurnsBack", ("RL618", "warning"), twin="DroneTurns"),
     broken("RoverBehindTheShore", ("RL619", "warning"), twin="RoverInPond"),
     broken("ArmFarGoals", ("RL619", "warning"), twin="Arm", file=REACH),
+    case(
+        "broken_reach_bullet.py:ReacherFarGoals",
+        ("RL619", "warning"),
+        twin="broken_reach_bullet.py:Reacher",
+        pybullet=True,
+    ),
     broken("RoverMillimetres", ("RL118", "info"), ("RL119", "warning"), twin="Rover"),
     broken("DroneDegrees", ("RL119", "warning"), twin="DroneRadians"),
 ]
@@ -31,6 +40,12 @@ CASES = [
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
+
+
+def test_attributes_of_mixed_shapes_are_left_out():
+    # gym_electric_motor keeps an array of one number next to a number.
+    attributes = read_attributes(SimpleNamespace(mixed=[np.zeros(1), 0.5], goal=[0.1, 0.2]))
+    assert list(attributes) == ["self.goal"]
 
 
 def test_units_are_told_apart_by_the_time_of_a_step():
