@@ -142,7 +142,7 @@ class Recording:
             truncated=np.array([flag for _, flag in self._flags], np.bool_),
             infos={name: _to_series(*recorded) for name, recorded in self._infos.items()},
             forms=[Form(what, kind, step, count, *more) for (what, kind, *more), (step, count) in forms],
-            taken=np.array(self._taken, np.float64).reshape(len(self._taken), -1),
+            taken=np.stack(self._taken) if self._taken else np.zeros((0, 0)),
         )
 
 
