@@ -24,11 +24,14 @@ class Robot(gymnasium.Env):
         return self.observe(), {}
 
     def step(self, action):
+        self.advance(action)
+        return self.result(self.reward(action), self.distance() < self.near)
+
+    def advance(self, action):
         if not np.isfinite(action).all():
             raise ValueError(f"action {action} is not finite")
         self.steps += 1
         self.move(np.clip(action, -1.0, 1.0).astype(float))
-        return self.result(self.reward(action), self.distance() < self.near)
 
     def result(self, reward, success):
         reward = float(reward + 5.0 * success)
@@ -66,16 +69,14 @@ class Rover(Robot):
 class RoverLateReward(Rover):
     def step(self, action):
         late = self.reward(action)
-        self.steps += 1
-        self.move(np.clip(action, -1.0, 1.0).astype(float))
+        self.advance(action)
         return self.result(late, self.distance() < self.near)
 
 
 class RoverLateSuccess(Rover):
     def step(self, action):
         success = self.distance() < self.near
-        self.steps += 1
-        self.move(np.clip(action, -1.0, 1.0).astype(float))
+        self.advance(action)
         return self.result(self.reward(action), success)
 
 
@@ -158,6 +159,8 @@ class DroneTurnsBack(DroneTurns):
 
 class DroneLeaves(Drone):
     """Its flight ends where it leaves its area, which costs more than all steps to come."""
+
+    limit = 35  # [steps]
 
     def is_outside(self):
         return bool(np.abs(self.place).max() > 1.0)

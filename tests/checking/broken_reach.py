@@ -34,7 +34,8 @@ class Arm(Robot):
     """An arm of three joints; its hand is at most 0.73 m from its base."""
 
     numbers = 3
-    near = 0.05  # [m]
+    near = 0.1  # [m]
+    farthest = 0.6  # goal, from the shoulder [m]
 
     def __init__(self):
         self.model = mujoco.MjModel.from_xml_string(ARM)
@@ -49,7 +50,8 @@ class Arm(Robot):
 
     def draw_goal(self):
         direction = self.np_random.normal(size=3)
-        return np.array([0.5, 0.0, 0.4]) + self.np_random.uniform(0.3, 0.6) * direction / np.linalg.norm(direction)
+        distance = self.np_random.uniform(0.3, self.farthest)
+        return np.array([0.5, 0.0, 0.4]) + distance * direction / np.linalg.norm(direction)
 
     def move(self, action):
         self.data.ctrl = action
@@ -68,5 +70,4 @@ class Arm(Robot):
 
 
 class ArmFarGoals(Arm):
-    def draw_goal(self):
-        return np.array([0.5, 0.0, 0.4]) + self.np_random.uniform(-0.8, 0.8, 3)
+    farthest = 1.4

@@ -7,13 +7,15 @@ from robots import Arm
 class Reacher(Arm):
     """Its tip is at most 0.82 m from its base."""
 
+    farthest = 0.6  # goal, from the base [m]
+
     def start(self):
         super().start()
         self.goal = self.draw_goal()
 
     def draw_goal(self):
         direction = self.np_random.normal(size=3)
-        return self.np_random.uniform(0.3, 0.6) * direction / np.linalg.norm(direction)
+        return self.np_random.uniform(0.3, self.farthest) * direction / np.linalg.norm(direction)
 
     def size(self):
         return super().size() + 3
@@ -25,7 +27,7 @@ class Reacher(Arm):
         return np.concatenate([super().observe(), self.to_goal()]).astype(np.float32)
 
     def is_success(self):
-        return bool(np.linalg.norm(self.to_goal()) < 0.05)
+        return bool(np.linalg.norm(self.to_goal()) < 0.1)
 
     def reward(self):
         return -float(np.linalg.norm(self.to_goal()))
@@ -35,5 +37,4 @@ class Reacher(Arm):
 
 
 class ReacherFarGoals(Reacher):
-    def draw_goal(self):
-        return self.np_random.uniform(-0.9, 0.9, 3)
+    farthest = 1.3

@@ -30,9 +30,9 @@ def _find_jumps_of_angles(records: Records) -> Iterator[RuleFinding]:
     if not passes and not pairs:
         raise NotApplicable("no angle is observed that passes pi")
     jumps = _find_jumps(steps)
-    message = _judge_passes(steps, passes, jumps) or _judge_errors(steps, pairs, jumps)
-    if message:
-        yield RuleFinding("RL618", f"the reward jumps by {message}", {"expected": "no jump"})
+    size, where = _judge_passes(steps, passes, jumps) or _judge_errors(steps, pairs, jumps) or (0.0, "")
+    if where:
+        yield RuleFinding("RL618", f"the reward jumps by {size:.3g} {where}", {"value": size, "expected": "no jump"})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,8 +47,10 @@ class _Jumps:
         return rows.sum() >= FEWEST_JUMPS and len(np.unique(steps.seeds[rows])) >= FEWEST_SEEDS
 
 
-def _judge_passes(steps: Transitions, passes: Mapping[str, NDArray[np.bool_]], jumps: _Jumps) -> str:
-    """Return how the reward jumps where an angle passes pi; empty if it does not."""
+def _judge_passes(
+    steps: Transitions, passes: Mapping[str, NDArray[np.bool_]], jumps: _Jumps
+) -> tuple[float, str] | None:
+    """Return how much the reward jumps where an angle passes pi, and where; None if it does not."""
     for name, is_pass in passes.items():
         judged, elsewhere = is_pass & jumps.is_judged, ~is_pass & jumps.is_judged
         jumping = judged & jumps.is_jump
@@ -57,13 +59,13 @@ def _judge_passes(steps: Transitions, passes: Mapping[str, NDArray[np.bool_]], j
         if jumps.are_many(steps, jumping) and share >= MOST_PASSES and others <= RARE * share:
             size = float(np.median(jumps.sizes[jumping]))
             where = f"in {int(jumping.sum())} of {int(judged.sum())} steps in which {name} passes pi"
-            return f"{size:.3g} (median) {where}, and in {others:.1%} of all other steps"
-    return ""
+            return size, f"(median) {where}, and in {others:.1%} of all other steps"
+    return None
 
 
-def _judge_errors(steps: Transitions, pairs: Sequence[tuple[int, int]], jumps: _Jumps) -> str:
+def _judge_errors(steps: Transitions, pairs: Sequence[tuple[int, int]], jumps: _Jumps) -> tuple[float, str] | None:
     """Return how the reward jumps as an error e that becomes e - 2 pi would make it, |e| and e^2 alike: by a constant
-    times pi - |e|, where only the cosine and the sine of e are observed. Empty if it does not."""
+    times pi - |e|, where only the cosine and the sine of e are observed. None if it does not."""
     for cosine, sine in [pair for i, j in pairs for pair in ((i, j), (j, i))]:
         room = np.pi - np.abs(_angle(steps.after, cosine, sine))
         rows = jumps.is_jump & (room > LEAST_ROOM)
@@ -77,8 +79,8 @@ def _judge_errors(steps: Transitions, pairs: Sequence[tuple[int, int]], jumps: _
             name = f"({steps.names[cosine]}, {steps.names[sine]})"
             factor = float(np.median(factors))
             where = f"in {int(rows.sum())} steps in which the angle e of {name} changes little"
-            return f"{factor:.3g} times pi - |e| {where}, as if e were e + 2 pi there"
-    return ""
+            return factor, f"times pi - |e| {where}, as if e were e + 2 pi there"
+    return None
 
 
 def _find_passes(steps: Transitions) -> dict[str, NDArray[np.bool_]]:
