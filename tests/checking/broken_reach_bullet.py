@@ -27,7 +27,7 @@ class Reacher(Arm):
         return np.concatenate([super().observe(), self.to_goal()]).astype(np.float32)
 
     def is_success(self):
-        return bool(np.linalg.norm(self.to_goal()) < 0.1)
+        return bool(np.linalg.norm(self.to_goal()) < 0.2)
 
     def reward(self):
         return -float(np.linalg.norm(self.to_goal()))
@@ -37,4 +37,4 @@ class Reacher(Arm):
 
 
 class ReacherFarGoals(Reacher):
-    farthest = 1.3
+    farthest = 1.4

@@ -28,7 +28,6 @@ CASES = [
     broken("ArmFarGoals", ("RL619", "warning"), twin="Arm", file=REACH),
     case(
         "broken_reach_bullet.py:ReacherFarGoals",
-        ("RL611", "info"),
         ("RL619", "warning"),
         twin="broken_reach_bullet.py:Reacher",
         pybullet=True,
