@@ -18,7 +18,7 @@ CHECKED_ROWS = 500  # that were not fitted
 
 
 @dataclasses.dataclass(frozen=True)
-class Fit:
+class RewardFit:
     """How well a sum of quantities gives some numbers that it was not fitted to."""
 
     error: float  # Exceeded in one step of five; relative to the numbers' standard deviation
@@ -39,7 +39,7 @@ def action_terms(steps: Transitions) -> NDArray[np.float64]:
     return np.array([*columns, np.abs(change).sum(axis=1)]).T
 
 
-def fit_observation(steps: Transitions, rows: NDArray[np.float64]) -> Fit:
+def fit_observation(steps: Transitions, rows: NDArray[np.float64]) -> RewardFit:
     """Fit the rewards by terms of the action, and quantities of the given observations. Shape of rows: (n, elements).
 
     Differences, and functions of lengths, are added one by one: what explains most of what is left."""
@@ -56,12 +56,12 @@ def fit_observation(steps: Transitions, rows: NDArray[np.float64]) -> Fit:
     return dataclasses.replace(fit, picked=tuple(picked))
 
 
-def fit_terms(columns: NDArray[np.float64], target: NDArray[np.float64]) -> Fit:
+def fit_terms(columns: NDArray[np.float64], target: NDArray[np.float64]) -> RewardFit:
     """Fit numbers by given columns. Shapes (n, terms) and (n,)."""
     return _fit(columns, target)[0]
 
 
-def _fit(columns: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[Fit, NDArray[np.intp]]:
+def _fit(columns: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[RewardFit, NDArray[np.intp]]:
     scale = np.abs(columns).max(axis=0)
     columns = columns / np.where(scale > 0, scale, 1.0)
     fitted = min(len(target) * 2 // 3, int(ROWS_PER_COLUMN * columns.shape[1]) + 50)
@@ -72,7 +72,7 @@ def _fit(columns: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[Fit
         inliers = np.argsort(errors)[: int(KEPT * fitted)]
     checked = slice(fitted, fitted + CHECKED_ROWS)
     errors = np.abs(target[checked] - columns[checked] @ weights) / max(float(target.std()), 1e-12)
-    return Fit(float(np.quantile(errors, KEPT)), float(np.median(errors))), inliers
+    return RewardFit(float(np.quantile(errors, KEPT)), float(np.median(errors))), inliers
 
 
 def _solve(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rlctl.checking.families import rewards
 from rlctl.checking.families.units import find_rates
 from rlctl.checking.records import FIRST_SEED, Records
-from rlctl.checking.regression import EXACT, Fit, action_terms, fit_observation, fit_terms
+from rlctl.checking.regression import EXACT, RewardFit, action_terms, fit_observation, fit_terms
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check
 from rlctl.checking.transitions import Quantities, Transitions, collect_transitions, find_differences, find_simple
 
@@ -68,7 +68,7 @@ def sample_ordinary_steps(steps: Transitions) -> Transitions:
     return steps.select(order[:MOST_ROWS])
 
 
-def _fit_before(steps: Transitions) -> Fit | None:
+def _fit_before(steps: Transitions) -> RewardFit | None:
     """Return how the observation before the step gives the reward, if it does, and nothing else explains that."""
     if len(steps.rewards) < FEWEST_ROWS or not steps.names:
         return None
