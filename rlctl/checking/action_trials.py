@@ -1,7 +1,6 @@
 """Plays one episode again with some of its actions changed, and compares what comes back bit for bit."""
 
 import dataclasses
-import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_actions
+from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_actions, zero_action
 from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rules import NotJudged, OutOfTime
@@ -92,17 +91,25 @@ class Trials:
     ) -> list[Frame]:
         """Play an episode with some numbers of the action set to values, in one step or in all."""
 
-        def change(action: Any, leaf: Leaf) -> Any:
+        chosen = self.actions(seed, steps)
+        for step in range(len(chosen)) if at is None else [at]:
+            chosen[step] = self._change(chosen[step], values)
+        return self.play(seed, chosen)
+
+    def with_first(self, seed: int, steps: int, values: Mapping[ActionNumber, Any]) -> list[Frame]:
+        """Play an episode of zero actions but for some numbers of the first one."""
+        nothing = zero_action(self.instance.env.action_space)
+        return self.play(seed, [self._change(nothing, values), *[nothing] * (steps - 1)])
+
+    def _change(self, action: Any, values: Mapping[ActionNumber, Any]) -> Any:
+        def value_of(leaf: Leaf) -> Any:
             part = np.array(pick(action, leaf.path))
             for dimension, value in values.items():
                 if dimension.leaf.path == leaf.path:
                     part.flat[dimension.index] = value
             return part
 
-        space, chosen = self.instance.env.action_space, self.actions(seed, steps)
-        for step in range(len(chosen)) if at is None else [at]:
-            chosen[step] = build_action(space, functools.partial(change, chosen[step]))
-        return self.play(seed, chosen)
+        return build_action(self.instance.env.action_space, value_of)
 
     def play(self, seed: int, chosen: Sequence[Any], after_reset: Callable[[], None] = lambda: None) -> list[Frame]:
         """Play an episode with given actions, to its end at most; the first frame is that of reset."""
@@ -141,14 +148,14 @@ def _to_frame(moment: Moment) -> Frame:
     return np.concatenate([flatten(moment.observation).astype(np.float64), [reward, *moment.flags]])
 
 
-def find_differences(one: Sequence[Frame], two: Sequence[Frame]) -> dict[int, NDArray[np.intp]]:
+def find_differences(one: Sequence[Frame], two: Sequence[Frame], tolerance: float = 0.0) -> dict[int, NDArray[np.intp]]:
     """Return the columns that differ, by step; NaN equals NaN. Columns are counted from the end: -1 and -2 are the
     flags, then `REWARD`, then the elements of the observation."""
     differences = {}
     for step, (a, b) in enumerate(zip(one, two, strict=False)):
         if a.shape != b.shape:
             differences[step] = np.arange(REWARD, 0)
-        elif (differ := (a != b) & ~(np.isnan(a) & np.isnan(b))).any():
+        elif (differ := ~(np.abs(a - b) <= tolerance) & (a != b) & ~(np.isnan(a) & np.isnan(b))).any():
             differences[step] = np.flatnonzero(differ) - len(a)
     return differences
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.instance import EnvironmentRaised, describe_failure
 from rlctl.checking.records import MOST_INFOS, CallFailure, CheckedEpisode, Form, Series
-from rlctl.checking.values import Leaf, find_numbers, name_type, pick
+from rlctl.checking.values import Leaf, find_numbers, flatten_action, name_type, pick
 
 
 class Recording:
@@ -25,6 +25,7 @@ class Recording:
         self._rewards: list[float] = []
         self._values: dict[int, tuple[list[int], list[Any]]] = {}
         self._is_number: list[bool] = []
+        self._taken: list[NDArray[np.float64]] = []
         self._flags: list[tuple[bool, bool]] = []
         self._forms: dict[tuple[Any, ...], list[int]] = {}
         self._infos: dict[str, tuple[list[int], list[float]]] = {}
@@ -64,6 +65,7 @@ class Recording:
             self._count_form("truncated", name_type(moment.truncated))
             self._flags.append(moment.flags)
             self._add_reward(moment.reward)
+            self._taken.append(flatten_action(self.episode.instance.action_leaves, moment.action))
         self._add_info(moment.info)
         self._add_observation(moment.observation)
 
@@ -140,6 +142,7 @@ class Recording:
             truncated=np.array([flag for _, flag in self._flags], np.bool_),
             infos={name: _to_series(*recorded) for name, recorded in self._infos.items()},
             forms=[Form(what, kind, step, count, *more) for (what, kind, *more), (step, count) in forms],
+            taken=np.stack(self._taken) if self._taken else np.zeros((0, 0)),
         )
 
 

@@ -101,6 +101,7 @@ class CheckedEpisode:
     truncated: NDArray[np.bool_]
     infos: Mapping[str, Series]  # number in info -> values; `reward_terms/distance` if nested
     forms: list[Form]
+    taken: NDArray[np.float64]  # The actions' numbers, see `values.flatten_action`. Shape (T, numbers)
 
     @property
     def steps(self) -> int:

@@ -5,6 +5,7 @@ import contextlib
 import copy
 import dataclasses
 import inspect
+import math
 import random
 import re
 import sys
@@ -211,8 +212,8 @@ def _is_quantity(value: Any) -> bool:
         return value.dtype.kind in "biuf" and 0 < value.size <= MOST_NUMBERS
     if not isinstance(value, list | tuple | collections.deque) or not 0 < len(value) <= MOST_NUMBERS:
         return False
-    sizes = [np.size(item) for item in value if isinstance(item, (*NUMBERS, np.ndarray))]
-    return len(sizes) == len(value) and len(set(sizes)) == 1 and sum(sizes) <= MOST_NUMBERS
+    shapes = [np.shape(item) for item in value if isinstance(item, (*NUMBERS, np.ndarray))]
+    return len(shapes) == len(value) and len(set(shapes)) == 1 and len(shapes) * math.prod(shapes[0]) <= MOST_NUMBERS
 
 
 def _is_own(value: Any) -> bool:

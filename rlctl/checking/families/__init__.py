@@ -43,7 +43,7 @@ DECIDED_BY = {rule: experiment for experiment in EXPERIMENTS.values() for rule i
 PROCESSES = {
     "probe": (
         *("build", "comparisons", "global random", "speed", "episodes", "starts", "search", "unseeded generators"),
-        *("hindsight", "leaks"),
+        *("hindsight", "leaks", "goals"),
     ),
     "instances": (
         *("instances", "worlds", "batches", "unseeded", "action effects"),

@@ -3,26 +3,28 @@
 import contextlib
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking import action_trials
-from rlctl.checking.action_trials import REWARD, ActionNumber, Trials
+from rlctl.checking.action_trials import REWARD, ActionNumber, Frame, Trials
 from rlctl.checking.instance import Context, EnvironmentRaised
-from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact
 from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFinding, Severity, experiment, list_names
 
 MOST_DIMENSIONS = 64
 STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows
 DELAY_STEPS, NAN_STEPS = 4, 4  # Of episodes whose first action is changed, or NaN
+ROUNDING = 1e-9  # up to which rewards may differ where a robot mirrors itself
 LONGEST_DELAY = 4  # steps; for earlier actions in observations and for penalties on changes
 Effect = Literal["lasting", "reward", "cost", "copy", "none"]
 """Of a number of the action: on what follows; only on its step's reward, up or, as a cost, down; only on its own copy
 in the observation; or nothing."""
 
 
-@experiment("action effects", "RL701", "RL115", "RL616", share=4.0)
+@experiment("action effects", "RL701", "RL115", share=4.0)
 def compare_actions(context: Context) -> Iterator[ChildMessage]:
     """Play the same episode with each number of the action at other values."""
     with context.fresh() as instance:
@@ -84,22 +86,45 @@ def _play_nan(trials: Trials) -> tuple[str, bool]:
     return f"the {' and the '.join(names)} {verb}", not all(np.isfinite(frame).all() for frame in later)
 
 
-def _late_effects(trials: Trials, dimensions: Sequence[ActionNumber]) -> Iterator[RuleFinding]:
-    pairs = []
+def _late_effects(trials: Trials, dimensions: Sequence[ActionNumber]) -> Iterator[ChildMessage]:
+    pairs, opposites = [], []
     for seed in (FIRST_SEED, SECOND_SEED, SECOND_SEED + 1):
         plain = trials.plain(seed, DELAY_STEPS)
         for end in (0, 1):
             values = {dimension: dimension.ends[end] for dimension in dimensions}
             pairs.append(action_trials.find_differences(plain, trials.with_values(seed, DELAY_STEPS, values, at=0)))
-    rewarded = [{step for step, columns in pair.items() if REWARD in columns} for pair in pairs]
-    observed = [{step for step, columns in pair.items() if columns.min() < REWARD} for pair in pairs]
-    evidence: dict[str, Any] = {"seed": FIRST_SEED, "value": 2, "expected": 1}
-    if all(min(steps, default=0) == 2 for steps in observed):
+        low, high = _play_opposites(trials, dimensions, seed)
+        opposites.append(action_trials.find_differences(low, high, ROUNDING))
+    first = [_first_changes(pair) for pair in pairs]
+    if {min(steps.values(), default=0) for steps in first} == {2}:
         message = "the first action does not change the observation before step 2: the observation is one step old"
-        yield RuleFinding("RL115", message, {**evidence, "step": 1})
-    elif all(min(steps, default=0) == 1 for steps in observed) and all(min(s, default=0) == 2 for s in rewarded):
-        message = "the first action changes the observation at step 1, but the reward only from step 2 on"
-        yield RuleFinding("RL616", message, {**evidence, "step": 1})
+        yield RuleFinding("RL115", message, {"seed": FIRST_SEED, "value": 2, "expected": 1, "step": 1})
+        return
+    # Whatever the integrator: an element that answers later, such as a position, may be what the reward depends on.
+    last = {max(steps.values(), default=0) for steps in first}
+    for observed in last if len(last) == 1 and 0 not in last else ():
+        is_late = {observed + 1} in (_find_first_rewards(pairs), _find_first_rewards(opposites))
+        yield Fact("action effects", {"observation": observed, "reward": observed + 1 if is_late else observed})
+
+
+def _play_opposites(trials: Trials, dimensions: Sequence[ActionNumber], seed: int) -> list[list[Frame]]:
+    """Play two episodes of zero actions, but for the first ones, which are as far from 0 to one side as to the other: a
+    cost of acting, or of changing the action, is the same in both."""
+    sizes = {dimension: min(map(abs, dimension.ends)) for dimension in dimensions if min(dimension.ends) < 0}
+    return [
+        trials.with_first(seed, DELAY_STEPS, {dimension: sign * size for dimension, size in sizes.items()})
+        for sign in (-1, 1)
+    ]
+
+
+def _find_first_rewards(pairs: Sequence[Mapping[int, NDArray[np.intp]]]) -> set[int]:
+    return {min((step for step, columns in pair.items() if REWARD in columns), default=0) for pair in pairs}
+
+
+def _first_changes(differences: Mapping[int, NDArray[np.intp]]) -> dict[int, int]:
+    """Return the first step at which each element of the observation differs, by column."""
+    steps = sorted(differences, reverse=True)
+    return {column: step for step in steps for column in differences[step].tolist() if column < REWARD}
 
 
 def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:

@@ -1,0 +1,153 @@
+"""How far a robot gets: from the joints of its model, set at random in either engine, or from where it came."""
+
+import dataclasses
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.bullet_worlds import ClientCalls, WorldBody, find_clients, read_world
+from rlctl.checking.records import FIRST_SEED
+from rlctl.checking.rules import NotJudged
+
+FEWEST_JOINTS, MOST_JOINTS = 2, 12
+SAMPLES, SWEEPS, VALUES = 200, 3, 9  # random joint positions; then each joint in turn at so many positions
+FEWEST_DIRECTIONS, FEWEST_EPISODES = 6, 6  # in which the robot came as far
+SHARP = 0.005  # part of the reach: what is as far
+FEWEST_STOPS = 3  # episodes that come to the same bits
+EDGE = 1e-5  # part of the range: what is at a stop
+Numbers = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Chain:
+    """A robot whose base is fixed: its joints can be set and its links be read, without a step of the simulation."""
+
+    ranges: Sequence[tuple[float, float]]  # of its joints [rad], [m]
+    base: Numbers  # Position of the base [m]. Shape (3,)
+    set_joints: Callable[[Numbers], None]
+    read: Callable[[], Numbers]  # Positions of its links [m]. Shape (links, 3)
+    names: Sequence[str]  # of the links
+
+
+@dataclasses.dataclass(frozen=True)
+class Reach:
+    """Places that are within a distance of a centre."""
+
+    centre: Sequence[float]  # [m]
+    distance: float  # [m]
+    how: str  # this was found out, as a sentence
+
+
+def find_chains(env: Any) -> Iterator[Chain]:
+    """Yield the robots of an environment that are fixed to the world, in PyBullet or MuJoCo."""
+    for client in find_clients():
+        for body in read_world(client).bodies:
+            if not body.is_free and FEWEST_JOINTS <= len(body.joints) <= MOST_JOINTS:
+                yield _bullet_chain(ClientCalls(client), body)
+    model, data = (getattr(getattr(env, "unwrapped", env), name, None) for name in ("model", "data"))
+    mujoco = sys.modules.get("mujoco")
+    if mujoco is not None and isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+        yield from _mujoco_chains(mujoco, model, data)
+
+
+def _bullet_chain(p: ClientCalls, body: WorldBody) -> Chain:
+    links = list(range(len(body.links) - 1))
+
+    def set_joints(values: Numbers) -> None:
+        for joint, value in zip(body.joints, values.tolist(), strict=True):
+            p.resetJointState(body.id, joint.index, value)
+
+    def read() -> Numbers:
+        states = p.getLinkStates(body.id, links, computeForwardKinematics=1)
+        return np.array([place for state in states for place in (state[0], state[4])])
+
+    names = [f"{name}{of}" for name in body.links[1:] for of in (" (centre of mass)", "")]
+    ranges = [(joint.low, joint.high) if joint.has_limits else (-np.pi, np.pi) for joint in body.joints]
+    return Chain(ranges, np.array(p.getBasePositionAndOrientation(body.id)[0]), set_joints, read, names)
+
+
+def _mujoco_chains(mujoco: Any, model: Any, data: Any) -> Iterator[Chain]:
+    copy = mujoco.MjData(model)
+    copy.qpos[:] = data.qpos
+    single = [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)]
+    joints = [j for j in range(model.njnt) if model.jnt_type[j] in single]
+    if len(joints) != model.njnt or not FEWEST_JOINTS <= len(joints) <= MOST_JOINTS:
+        return  # something is free, and may be the robot
+    mujoco.mj_kinematics(model, copy)
+
+    def set_joints(values: Numbers) -> None:
+        copy.qpos[model.jnt_qposadr[joints]] = values
+
+    def read() -> Numbers:
+        mujoco.mj_kinematics(model, copy)
+        return np.vstack([copy.xpos, copy.site_xpos]).copy()
+
+    limits = [tuple(model.jnt_range[j].tolist()) if model.jnt_limited[j] else (-np.pi, np.pi) for j in joints]
+    names = [model.body(i).name for i in range(model.nbody)] + [model.site(i).name for i in range(model.nsite)]
+    yield Chain(limits, copy.xpos[model.jnt_bodyid[joints[0]]].copy(), set_joints, read, names)
+
+
+def measure_reach(chain: Chain, link: int, size: int) -> Reach:
+    """Return how far from the base a link gets, in the first `size` axes: at random, and then joint by joint."""
+    low, high = np.array(chain.ranges).T
+    rng = np.random.default_rng(FIRST_SEED)
+
+    def distance(values: Numbers) -> float:
+        chain.set_joints(values)
+        return float(np.linalg.norm((chain.read()[link] - chain.base)[:size]))
+
+    best = max(rng.uniform(low, high, (SAMPLES, len(low))), key=distance)
+    for _ in range(SWEEPS):
+        for joint in range(len(low)):
+            others = np.tile(best, (VALUES + 1, 1))
+            others[1:, joint] = np.linspace(low[joint], high[joint], VALUES)
+            best = max(others, key=distance)
+    reach = distance(best)
+    how = f"with all joints anywhere within their limits, {chain.names[link]} gets {reach:.4g} away from there at most"
+    return Reach(chain.base[:size].tolist(), reach, how)
+
+
+def find_reach(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
+    """Return a centre and how far from it the robot came, if it came as far in many directions: workspaces have such an
+    edge, paths have not. Shapes of places: (n, size), of episodes: (n,). Raises `NotJudged` if there is none."""
+    size = places.shape[1]
+    if size == 1:
+        return _find_stops(places[:, 0], episodes)
+    directions = _spread_directions(size)
+    for centre in (np.zeros(size), _fit_centre(places, directions)):
+        from_centre = places - centre
+        radii = np.linalg.norm(from_centre, axis=1)
+        nearest = np.argmax(from_centre @ directions.T, axis=1)
+        is_far = radii >= (1 - SHARP) * radii.max()
+        if len(np.unique(nearest[is_far])) >= FEWEST_DIRECTIONS and len(np.unique(episodes[is_far])) >= FEWEST_EPISODES:
+            how = f"the robot came {radii.max():.4g} away from there in many directions, and never farther"
+            return Reach(centre.tolist(), float(radii.max()), how)
+    raise NotJudged("nothing limits where the robot gets")
+
+
+def _find_stops(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
+    """Return the middle of two stops, and their distance from it: a robot on a rail comes as far in many episodes."""
+    low, high = float(places.min()), float(places.max())
+    starts = places[np.searchsorted(episodes, episodes)]
+    for stop in (low, high):
+        is_there = (np.abs(places - stop) <= EDGE * (high - low)) & (np.abs(starts - stop) > SHARP * (high - low))
+        if len(np.unique(episodes[is_there])) < FEWEST_STOPS:
+            raise NotJudged("nothing limits where the robot gets")
+    how = f"the robot was stopped {(high - low) / 2:.4g} away from there on both sides"
+    return Reach([(low + high) / 2], (high - low) / 2, how)
+
+
+def _spread_directions(size: int) -> Numbers:
+    grid = np.array(np.meshgrid(*[(-1.0, -0.5, 0.0, 0.5, 1.0)] * size)).reshape(size, -1).T
+    grid = grid[np.abs(grid).max(axis=1) == 1.0]
+    return np.asarray(grid / np.linalg.norm(grid, axis=1, keepdims=True))
+
+
+def _fit_centre(places: Numbers, directions: Numbers) -> Numbers:
+    """Return the centre of the sphere that is nearest to the outermost places: |p|^2 = 2 p c + rest."""
+    outermost = places[np.unique(np.argmax(places @ directions.T, axis=0))]
+    columns = np.hstack([2 * outermost, np.ones((len(outermost), 1))])
+    return np.asarray(np.linalg.lstsq(columns, np.square(outermost).sum(axis=1), rcond=1e-6)[0][:-1])

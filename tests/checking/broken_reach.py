@@ -1,0 +1,73 @@
+"""A robot arm in MuJoCo that brings its hand to a place; some places are out of its reach."""
+
+import mujoco
+import numpy as np
+from broken_meaning import Robot
+
+ARM = """
+<mujoco>
+  <option gravity="0 0 0" timestep="0.01"/>
+  <default><joint damping="1"/><geom type="capsule" size="0.03" contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body pos="0.5 0 0.2">
+      <joint name="turn" axis="0 0 1"/>
+      <geom fromto="0 0 0 0 0 0.2"/>
+      <body pos="0 0 0.2">
+        <joint name="shoulder" axis="0 1 0" range="-100 100" limited="true"/>
+        <geom fromto="0 0 0 0.4 0 0"/>
+        <body pos="0.4 0 0">
+          <joint name="elbow" axis="0 1 0" range="-120 120" limited="true"/>
+          <geom fromto="0 0 0 0.3 0 0"/>
+          <site name="hand" pos="0.3 0 0"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="turn" gear="2"/><motor joint="shoulder" gear="2"/><motor joint="elbow" gear="2"/>
+  </actuator>
+</mujoco>
+"""
+
+
+class Arm(Robot):
+    """An arm of three joints; its hand is at most 0.73 m from its base."""
+
+    numbers = 3
+    near = 0.1  # [m]
+    farthest = 0.6  # goal, from the shoulder [m]
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(ARM)
+        self.data = mujoco.MjData(self.model)
+        super().__init__()
+
+    def start(self):
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos = self.np_random.uniform(-1.0, 1.0, 3)
+        mujoco.mj_forward(self.model, self.data)
+        self.goal = self.draw_goal()
+
+    def draw_goal(self):
+        direction = self.np_random.normal(size=3)
+        distance = self.np_random.uniform(0.3, self.farthest)
+        return np.array([0.5, 0.0, 0.4]) + distance * direction / np.linalg.norm(direction)
+
+    def move(self, action):
+        self.data.ctrl = action
+        mujoco.mj_step(self.model, self.data, 4)
+        mujoco.mj_forward(self.model, self.data)
+
+    def distance(self):
+        return float(np.linalg.norm(self.goal - self.data.site("hand").xpos))
+
+    def observe(self):
+        to_goal = self.goal - self.data.site("hand").xpos
+        return np.concatenate([self.data.qpos, self.data.qvel, to_goal]).astype(np.float32)
+
+    def reward(self, action):
+        return -self.distance() - 0.02 * np.square(action).sum()
+
+
+class ArmFarGoals(Arm):
+    farthest = 1.4

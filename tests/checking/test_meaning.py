@@ -1,0 +1,74 @@
+"""Numbers that do not mean what they should: each mistake is found in two robots, and nothing in their twins."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rlctl.checking.rules import NotJudged
+from rlctl.checking.values import read_attributes
+from rlctl.checking.workspaces import find_reach
+from tests.checking.judging import case, check_case, findings
+
+MEANING, REACH = "broken_meaning.py", "broken_reach.py"
+
+
+def broken(name, *expected, twin, file=MEANING):
+    return case(f"{file}:{name}", *expected, twin=f"{file}:{twin}")
+
+
+CASES = [
+    broken("RoverLateReward", ("RL616", "warning"), twin="Rover"),
+    broken("DroneLateReward", ("RL616", "warning"), twin="Drone"),
+    broken("RoverLateSuccess", ("RL617", "warning"), twin="Rover"),
+    broken("DroneLeavesLate", ("RL617", "warning"), twin="DroneLeaves"),
+    broken("RoverLooksRound", ("RL618", "warning"), twin="RoverLooks"),
+    broken("DroneTurnsBack", ("RL618", "warning"), twin="DroneTurns"),
+    broken("RoverBehindTheShore", ("RL619", "warning"), twin="RoverInPond"),
+    broken("ArmFarGoals", ("RL619", "warning"), twin="Arm", file=REACH),
+    case(
+        "broken_reach_bullet.py:ReacherFarGoals",
+        ("RL619", "warning"),
+        twin="broken_reach_bullet.py:Reacher",
+        pybullet=True,
+    ),
+    broken("RoverMillimetres", ("RL118", "info"), ("RL119", "warning"), twin="Rover"),
+    broken("DroneDegrees", ("RL119", "warning"), twin="DroneRadians"),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+def test_attributes_of_mixed_shapes_are_left_out():
+    # gym_electric_motor keeps an array of one number next to a number.
+    attributes = read_attributes(SimpleNamespace(mixed=[np.zeros(1), 0.5], goal=[0.1, 0.2]))
+    assert list(attributes) == ["self.goal"]
+
+
+def test_units_are_told_apart_by_the_time_of_a_step():
+    (finding,) = findings(f"{MEANING}:RoverMillimetres", "RL119")
+    # 0.1 m in a step at 1 m/s are 100 mm; the heading changes by 0.1 times the turning rate.
+    assert finding.evidence["value"] == pytest.approx(100.0, rel=1e-3)
+    assert "millimetres" in finding.message
+
+
+def test_jump_of_an_angle_is_measured():
+    (finding,) = findings(f"{MEANING}:RoverLooksRound", "RL618")
+    # 0.3 times a change of the difference by 2 pi, at most.
+    assert 0.1 < finding.evidence["value"] < 0.3 * 2 * np.pi
+
+
+def test_edge_of_a_workspace_is_found_and_a_path_has_none():
+    rng = np.random.default_rng(0)
+    angles, radii = rng.uniform(-np.pi, np.pi, 2000), np.sqrt(rng.uniform(0, 4.0, 2000))
+    disk = np.array([1.0 + radii * np.cos(angles), radii * np.sin(angles) - 1.0]).T
+    episodes = np.repeat(np.arange(20), 100)
+    reach = find_reach(disk, episodes)
+    assert reach.centre == pytest.approx([1.0, -1.0], abs=0.05)
+    assert reach.distance == pytest.approx(2.0, abs=0.05)
+    walk = np.cumsum(rng.normal(size=(20, 100, 2)), axis=1).reshape(-1, 2)
+    with pytest.raises(NotJudged):
+        find_reach(walk, episodes)
