@@ -8,18 +8,21 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Joint, Jump, Pair, WorldBody, find_clients
+from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.families.robots import find_misuses
 from rlctl.checking.instance import Context, EnvironmentRaised, describe_failure
+from rlctl.checking.mujoco_calls import MujocoCalls, join_calls
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, experiment, list_names
 from rlctl.checking.values import is_task
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
+from rlctl.checking.worlds import ANGULAR, JOINTS, VELOCITY, Array, Joint, Jump, Pair, WorldBody
 from rlctl.environments.bullet_calls import record_calls
 
-EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))  # actions and logged steps
+ENGINES = {"pybullet", "mujoco"}
+EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60)) + (("random", 2),) * 16
+"""Actions and logged steps. The last ones are for what resets draw."""
 LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved yet
 PART_OF_RANGE, LEAST_ANGLE, LEAST_LENGTH = 0.1, 0.05, 0.01
 """How far outside its limits a joint may be: part of the range, and at least so much [rad], [m]."""
@@ -30,20 +33,20 @@ FASTEST_JUMP = 1.0  # above falling, 0.1 s after a reset: ten times gravity [m/s
 LONGEST_TIME_STEP = 0.02  # PyBullet's own is 1/240 [s]
 
 
-@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, 9, 10, 11, 12, 13, 14, 15)), share=4.0)
+@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, *range(9, 20))), share=4.0)
 def watch_worlds(context: Context) -> Iterator[ChildMessage]:
-    """Log the worlds of an instance through a few episodes, then let them fall alone, which changes them."""
-    if "pybullet" not in sys.modules:
+    """Log the worlds of an instance through a few episodes, then let them fall alone, which may change them."""
+    if not ENGINES & sys.modules.keys():
         with context.fresh():
             pass  # what it imports is imported now
-    if "pybullet" not in sys.modules:
-        raise NotApplicable("no PyBullet world")
-    older = set(find_clients())
-    with record_calls() as calls, context.fresh() as instance:
+    if not ENGINES & sys.modules.keys():
+        raise NotApplicable("no world of PyBullet or MuJoCo")
+    older, mujoco_calls = set(find_clients()), MujocoCalls()
+    with _join(mujoco_calls), record_calls() as calls, context.fresh() as instance:
         with contextlib.suppress(EnvironmentRaised):  # the first episode raises it again
             instance.reset(FIRST_SEED)
         yield from _model_faults(instance.env)
-        logger = WorldLogger(instance, older, calls)
+        logger = WorldLogger(instance, older, calls, mujoco_calls)
         for number, (kind, steps) in enumerate(EPISODES):
             if number and (not logger.worlds or context.budget.is_over()):
                 break
@@ -51,16 +54,22 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
                 logger.play(number, kind, steps)
             except EnvironmentRaised as error:
                 yield describe_failure(error, context.progress)
-        yield from find_misuses(logger.worlds, calls)
+        bounds = [leaf.flat_bounds for leaf in instance.action_leaves if leaf.supported]
+        low, high = (np.concatenate([pair[end] for pair in bounds] or [np.zeros(0)]) for end in (0, 1))
+        yield from find_misuses(logger.worlds, calls, low, high)
         if logger.worlds and not context.budget.is_over():
             with contextlib.suppress(EnvironmentRaised):  # its resets were logged by now
                 logger.simulate_alone(len(EPISODES))
     if not logger.resets:
         raise NotJudged("no episode could be logged")
     if not logger.worlds:
-        raise NotApplicable("no PyBullet world")
+        raise NotApplicable("no world of PyBullet or MuJoCo")
     for world in logger.worlds:
         yield from _judge(world)
+
+
+def _join(calls: MujocoCalls) -> contextlib.AbstractContextManager[None]:
+    return join_calls(calls) if "mujoco" in sys.modules else contextlib.nullcontext()
 
 
 def _model_faults(env: Any) -> Iterator[ChildMessage]:
@@ -153,7 +162,7 @@ def _joint_limits(world: LoggedWorld) -> Iterator[RuleFinding]:
         yield RuleFinding("RL804", message, {**evidence, "other_joints": names[1:]})
 
 
-def _outside(joint: Joint, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _outside(joint: Joint, values: Array) -> Array:
     """Return how far a joint is outside its limits, in parts of their width; 0 where that is little."""
     if not joint.has_limits:
         return np.zeros(len(values))
@@ -172,7 +181,7 @@ def _explosion(world: LoggedWorld) -> Iterator[RuleFinding]:
         yield RuleFinding("RL805", message + more, evidence)
 
 
-def _fast(log: WorldLog, body: WorldBody, states: NDArray[np.float64]) -> Iterator[tuple[float, str, str, Place]]:
+def _fast(log: WorldLog, body: WorldBody, states: Array) -> Iterator[tuple[float, str, str, Place]]:
     for row, column in np.argwhere(~np.isfinite(states))[:1].tolist():
         value, place = str(states[row, column]), log.places[row]
         message = f"the state of {body.name} is {value} {_when(place)}"
