@@ -9,6 +9,7 @@ from typing import Any
 from rlctl.environments.bullet_calls import LIBRARIES
 
 STEPS, RESETS = ("mj_step", "mj_step2"), ("mj_resetData", "mj_resetDataKeyframe")
+FORCES = "mj_rnePostConstraint"  # computes forces from what a step left
 LOOKUPS = ("body", "geom", "site")  # methods of MjModel and MjData that find a part by its name
 
 
@@ -23,6 +24,8 @@ class MujocoCalls:
     before_step: Callable[[Any, Any, int], None] = _nothing  # with model, data and the number of steps
     after_step: Callable[[Any, Any], None] = _nothing
     after_reset: Callable[[Any, Any], None] = _nothing  # of the data, as by mj_resetData
+    as_stepped: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext
+    """Gives back, for a `with` block, what a step left and `after_step` changed."""
     other_names: dict[tuple[str, str], str] = dataclasses.field(default_factory=dict)
     """Other names that a look-up finds, by kind (of `LOOKUPS`) and asked name."""
     asked: dict[tuple[str, str], None] = dataclasses.field(default_factory=dict)  # kind and name of every look-up
@@ -39,7 +42,7 @@ class MujocoCalls:
 def join_calls(calls: MujocoCalls) -> Iterator[None]:
     """Call the functions of `calls` around those of MuJoCo inside the `with` block, and rename what is looked up."""
     library = sys.modules["mujoco"]
-    functions = {name: getattr(library, name) for name in (*STEPS, *RESETS, "mj_name2id")}
+    functions = {name: getattr(library, name) for name in (*STEPS, *RESETS, FORCES, "mj_name2id")}
     with contextlib.ExitStack() as stack:
         for name, function in functions.items():
             for holder in (library, *_find_importers(name, function)):
@@ -73,12 +76,20 @@ def _join(calls: MujocoCalls, name: str, function: Any) -> Any:
         calls.after_reset(*_read_arguments(arguments, keywords))
         return result
 
-    def find(model: Any, kind: int, name: Any) -> Any:
+    def find(*arguments: Any, **keywords: Any) -> Any:
+        named = dict(zip(("m", "type", "name"), arguments, strict=False)) | keywords
         objects = sys.modules["mujoco"].mjtObj
         kinds = {int(getattr(objects, f"mjOBJ_{word.upper()}")): word for word in LOOKUPS}
-        word = kinds.get(int(kind))
-        return function(model, kind, calls.rename(word, name) if word else name)
+        if word := kinds.get(int(named["type"])):
+            named["name"] = calls.rename(word, named["name"])
+        return function(*named.values())
 
+    def compute(*arguments: Any, **keywords: Any) -> Any:
+        with calls.as_stepped():
+            return function(*arguments, **keywords)
+
+    if name == FORCES:
+        return compute
     return step if name in STEPS else reset if name in RESETS else find
 
 

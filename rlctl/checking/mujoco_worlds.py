@@ -104,6 +104,7 @@ class MujocoStateReader:
         self._now = library().MjData(model)
         self._before: tuple[Array, Array] | None = None  # qpos and qvel before the last call that advanced the physics
         self._first: tuple[Array, Array] | None = None  # The same before the first call of a control step
+        self.touched: list[set[int]] = []  # The geoms that touch another one, at each update
         self._calls = 0
         """Calls since the last update that advanced the physics by one substep each; -1 if one took several."""
         self._links = {body.id: _links(model, body.id) for body in self.world.bodies if body.id}
@@ -114,6 +115,8 @@ class MujocoStateReader:
         """See `StateReader`."""
         library().mj_copyData(self._now, self.model, self.data)
         refresh(self.model, self._now)
+        contacts = self._now.contact
+        self.touched.append(set(contacts.geom[contacts.dist <= 0].ravel().tolist()))
 
     def remember(self, nstep: int) -> None:
         """Keep positions and velocities as those before the next step of the physics."""
@@ -172,11 +175,6 @@ class MujocoStateReader:
                 pair = self._link(one), self._link(two)
                 deepest[pair] = min(deepest.get(pair, math.inf), distance)
         return deepest
-
-    def read_touching_geoms(self) -> set[int]:
-        """Return the geoms that touch another one."""
-        contacts = self._now.contact
-        return set(contacts.geom[contacts.dist <= 0].ravel().tolist())
 
     def _link(self, geom: int) -> Link:
         body = int(self.model.geom_bodyid[geom])
