@@ -11,6 +11,7 @@ from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import Array, Motor, WrittenCommand
 
 FEWEST_ROWS = 40
+MORE_ROWS = 15  # than a fit has parameters, so that it proves something
 SAME = 1e-5  # relative; a command is a function of something if it differs by no more
 
 
@@ -83,16 +84,17 @@ class MotorCommands:
                 spans.append(CommandSpan(motor, number, element, min(ends), max(ends)))
         return spans
 
-    def find_rest(self, motor: int, joint: int | None) -> float:
-        """Return the part of a command that the action, and the state of the joint of a motor, do not explain."""
+    def find_rest(self, motor: int, position: int | None, *speeds_of: int) -> float:
+        """Return the part of a command that the action, the position of one motor's joint, and the speeds of some, do
+        not explain."""
         free = self._free_rows(motor)
-        values, design = self.values[free, motor], np.hstack([self.actions, self.starts])[free]
-        rests = []
+        values, rests = self.values[free, motor], []
+        is_few = len(values) < MORE_ROWS + self.actions.shape[1] + self.starts.shape[1] + 3
+        design = np.column_stack([self.actions, np.ones(len(free)) if is_few else self.starts])[free]
         for positions, speeds in self.states:
-            columns = (
-                design if joint is None else np.column_stack([design, positions[free, joint], speeds[free, joint]])
-            )
-            if len(values) < FEWEST_ROWS + columns.shape[1] or values.std() == 0:
+            own = [] if position is None else [positions[free, position]]
+            columns = np.column_stack([design, *own, speeds[free][:, list(speeds_of)]])
+            if len(values) < MORE_ROWS + columns.shape[1] or values.std() == 0:
                 return math.nan
             fitted = np.linalg.lstsq(columns, values, rcond=None)[0]
             rests.append(float(np.abs(values - columns @ fitted).max() / values.std()))

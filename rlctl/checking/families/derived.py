@@ -37,7 +37,7 @@ NEVER_COMPUTED = {
 }  # fmt: skip
 """Arrays that mj_step leaves at zero unless a sensor needs them, and what computes them."""
 POLLUTION = 0.37  # An offset of what was derived before a reset
-TINY = 0.01  # of what a control step changes; less is an info
+TINY = 0.02  # of what a control step changes; less is an info
 FEWEST_LOOKS, LEAST_MOTION = 4, 1e-4
 EXACT = 2e-6  # relative; the last bits of float32
 

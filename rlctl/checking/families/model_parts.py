@@ -133,8 +133,7 @@ def _find_neighbours(calls: MujocoCalls, reader: MujocoStateReader) -> dict[tupl
         if kind not in ("geom", "body") or not (part := _find_part(model, kind, name)):
             continue
         body = int(model.geom_bodyid[part]) if kind == "geom" else part
-        near = [body, int(model.body_parentid[body]), *np.flatnonzero(model.body_parentid == body).tolist()]
-        near = [other for other in near if other]  # not the world
+        near = _find_near(model, body)
         if kind == "geom":
             candidates = [g for g in np.flatnonzero(np.isin(model.geom_bodyid, near)).tolist() if g != part]
             own, rate_of = rates[part], {g: rates[g] for g in candidates}
@@ -147,6 +146,17 @@ def _find_neighbours(calls: MujocoCalls, reader: MujocoStateReader) -> dict[tupl
         if own <= NEVER and best and names[best] >= OFTEN:
             swapped[kind, name] = best, names[best]
     return swapped
+
+
+def _find_near(model: Any, body: int) -> list[int]:
+    """Return a body, its parent, its siblings and what is beyond it; not the world."""
+    parents = model.body_parentid
+    near = {body, int(parents[body])} | set(np.flatnonzero(parents == parents[body]).tolist())
+    beyond = {body}
+    for other in range(body + 1, model.nbody):  # children come after their parents
+        if int(parents[other]) in beyond:
+            beyond.add(other)
+    return sorted((near | beyond) - {0})
 
 
 def _find_part(model: Any, kind: str, name: str) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking.motor_commands import SAME, CommandSpan, MotorCommands
-from rlctl.checking.rules import RuleFinding, list_names
+from rlctl.checking.rules import RuleFinding, Severity, list_names
 from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import JOINTS, Array, JointKey, Motor, MotorTarget
 from rlctl.environments.bullet_calls import FULL_TURN, BulletCalls
@@ -17,13 +17,14 @@ FEWEST_JOINTS = 3
 NEAR, APART = 0.05, 0.2  # of sorted targets and positions; of a target and its own joint's position [rad], [m]
 DEGREE = math.pi / 180
 UNLIKE = 1e-2  # relative; a command is no function of what leaves so much unexplained
+ROUNDED = 1e-3  # the same; for what people round
 BEYOND = 0.05  # part of a motor's range
 
 
 def find_wrong_motors(world: LoggedWorld, calls: BulletCalls, low: Array, high: Array) -> Iterator[RuleFinding]:
     """Yield what is wrong with the targets and commands of a world; `low` and `high` bound the action, shape (n,)."""
     in_degrees = [*_find_far_targets(world, calls), *_find_targets_in_degrees(world)][:1]
-    yield from in_degrees
+    yield from in_degrees or _find_ctrlrange_in_degrees(world)
     orders = [] if in_degrees else list(_find_wrong_order(world))
     commands = MotorCommands.read(world, low, high)
     if commands is not None and not in_degrees:
@@ -54,6 +55,20 @@ def _find_far_targets(world: LoggedWorld, calls: BulletCalls) -> Iterator[RuleFi
             evidence = {"element": name, "value": target.value, "expected": [low, high]}
             yield RuleFinding("RL810", message, evidence, where=target.where)
             return
+
+
+def _find_ctrlrange_in_degrees(world: LoggedWorld) -> Iterator[RuleFinding]:
+    """Yield an actuator whose range is that of its joint in degrees: MuJoCo converts the joint's, and not the other."""
+    for motor in world.world.motors:
+        joint, width = motor.joint, motor.high - motor.low
+        if motor.holds_position and joint.is_angle and joint.has_limits and math.isfinite(width):
+            ends = np.sort(np.degrees([joint.low, joint.high]) * motor.gear)
+            if np.abs(ends - [motor.low, motor.high]).max() <= ROUNDED * width:
+                limits = f"the limits of joint {joint.name}, [{joint.low:.3g}, {joint.high:.3g}] rad, in degrees"
+                message = f"ctrlrange of actuator {motor.name} is [{motor.low:.4g}, {motor.high:.4g}]: {limits}"
+                evidence = {"element": motor.name, "value": [motor.low, motor.high]}
+                yield RuleFinding("RL810", message, {**evidence, "expected": [joint.low, joint.high]}, Severity.WARNING)
+                return
 
 
 def _list_positions(world: LoggedWorld, calls: BulletCalls) -> Iterator[tuple[JointKey, MotorTarget]]:
@@ -137,11 +152,11 @@ def _find_weak_motors(world: LoggedWorld) -> Iterator[RuleFinding]:
 def _find_other_state(commands: MotorCommands) -> Iterator[RuleFinding]:
     """Yield a motor whose command follows the state of another joint than its own."""
     for number, motor in enumerate(commands.motors):
-        if not commands.find_rest(number, None) > UNLIKE or not commands.find_rest(number, number) > UNLIKE:
+        if not commands.find_rest(number, None) > UNLIKE or not commands.find_rest(number, number, number) > UNLIKE:
             continue
         for other, another in enumerate(commands.motors):
-            if another.joint.index != motor.joint.index and commands.find_rest(number, other) < SAME:
-                follows = f"follows position and speed of joint {another.joint.name}"
+            if another.joint.index != motor.joint.index and commands.find_rest(number, other, other, number) < SAME:
+                follows = f"follows the position of joint {another.joint.name}"
                 message = (
                     f"ctrl[{number}], of the actuator of joint {motor.joint.name}, {follows}, not of its own joint"
                 )
@@ -171,7 +186,7 @@ def _covers(span: CommandSpan, motor: Motor, factor: float = 1.0) -> bool:
     """Say whether a span is the limits of a motor's joint times a factor."""
     joint = motor.joint
     ends = np.array([joint.low, joint.high]) * factor * motor.gear
-    return bool(np.abs(np.sort(ends) - [span.low, span.high]).max() <= 1e-3 * np.ptp(ends))
+    return bool(np.abs(np.sort(ends) - [span.low, span.high]).max() <= ROUNDED * np.ptp(ends))
 
 
 def _find_ranges_in_degrees(spans: Sequence[CommandSpan]) -> Iterator[RuleFinding]:

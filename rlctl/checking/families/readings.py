@@ -78,7 +78,7 @@ def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
             yield _misread(world.world, f"observation[{column}:{column + 2}]", "roll and pitch", link, order)
             return
     columns = sorted({column for column, *_ in wrong})
-    rows = [column for column in columns if {column + 1, column + 2} <= set(columns)]
+    rows = [column for column in range(observed.shape[1] - 2) if sum(column + i in columns for i in range(3)) >= 2]
     yield from _find_misread_axes(world.world, observed, rows, quaternions)
 
 
