@@ -27,6 +27,7 @@ from rlctl.checking.worlds import (
     Link,
     MotorTarget,
     Pair,
+    Poses,
     World,
     WorldBody,
     WrittenCommand,
@@ -99,20 +100,18 @@ def read_states(world: World) -> list[Array]:
     return states
 
 
-def read_bases(world: World) -> dict[Link, list[float]]:
-    """Return the quaternion (x, y, z, w) of each base that is free."""
-    get = ClientCalls(world.client).getBasePositionAndOrientation
-    return {(body.id, -1): list(get(body.id)[1]) for body in world.bodies if body.is_free}
-
-
-def read_orientations(world: World) -> dict[Link, list[float]]:
-    """Return the quaternion (x, y, z, w) of each base that is free, and of each link of a robot."""
-    p, orientations = ClientCalls(world.client), read_bases(world)
+def read_poses(world: World) -> Poses:
+    """Return the pose of each base that is free, and of each link of a robot, as `Poses` has them."""
+    p = ClientCalls(world.client)
+    poses: dict[Link, Array] = {}
     for body in world.bodies:
+        if body.is_free:
+            position, quaternion = p.getBasePositionAndOrientation(body.id)
+            poses[body.id, -1] = np.array([*position, *quaternion, *position])
         links = range(min(MOST_LINKS, len(body.links) - 1)) if body.joints else ()
         for link, state in zip(links, p.getLinkStates(body.id, links, computeForwardKinematics=1) or (), strict=False):
-            orientations[body.id, link] = list(state[5])
-    return orientations
+            poses[body.id, link] = np.array([*state[4], *state[5], *state[0]])
+    return poses
 
 
 def read_physics(client: int) -> tuple[list[float], float]:
@@ -176,7 +175,7 @@ class BulletStateReader:
     def __init__(self, world: World, calls: BulletCalls) -> None:
         self.world = world
         self._calls = calls
-        self._before: tuple[list[Array], dict[Link, list[float]]] | None = None
+        self._before: tuple[list[Array], Poses] | None = None
 
     @property
     def errors(self) -> tuple[type[Exception], ...]:
@@ -192,9 +191,9 @@ class BulletStateReader:
 
     def remember(self) -> None:
         """Keep the present values as those before the next step of the physics."""
-        self._before = read_states(self.world), read_bases(self.world)
+        self._before = read_states(self.world), read_poses(self.world)
 
-    def read_before(self) -> tuple[list[Array], dict[Link, list[float]]] | None:
+    def read_before(self) -> tuple[list[Array], Poses] | None:
         """See `StateReader`; only what `remember` kept."""
         return self._before
 
@@ -202,9 +201,9 @@ class BulletStateReader:
         """See `StateReader`."""
         return read_states(self.world)
 
-    def read_orientations(self) -> dict[Link, list[float]]:
+    def read_poses(self) -> Poses:
         """See `StateReader`."""
-        return read_orientations(self.world)
+        return read_poses(self.world)
 
     def read_contacts(self) -> dict[Pair, float]:
         """See `StateReader`."""

@@ -24,6 +24,7 @@ from rlctl.checking.worlds import (
     Motor,
     MotorTarget,
     Pair,
+    Poses,
     World,
     WorldBody,
     WrittenCommand,
@@ -101,7 +102,7 @@ class MujocoStateReader:
     def __init__(self, model: Any, data: Any) -> None:
         self.model, self.data = model, data
         self.world = read_world(model)
-        self._now = library().MjData(model)
+        self._now, self._other = library().MjData(model), library().MjData(model)
         self._before: tuple[Array, Array] | None = None  # qpos and qvel before the last call that advanced the physics
         self._first: tuple[Array, Array] | None = None  # The same before the first call of a control step
         self.touched: list[set[int]] = []  # The geoms that touch another one, at each update
@@ -142,29 +143,30 @@ class MujocoStateReader:
         now = self._now
         return [self._read_state(body, now.qpos, now.qvel, now.xpos[body.id]) for body in self.world.bodies]
 
-    def read_orientations(self) -> dict[Link, list[float]]:
+    def read_poses(self) -> Poses:
         """See `StateReader`."""
-        orientations = {}
+        return self._read_poses(self._now)
+
+    def _read_poses(self, data: Any) -> Poses:
+        poses = {}
         for body in self.world.bodies:
             if body.is_free or body.joints:
                 for number, link in enumerate(self._links[body.id][: MOST_LINKS + 1]):
-                    w, *xyz = self._now.xquat[link].tolist()
-                    orientations[body.id, number - 1] = [*xyz, w]
-        return orientations
+                    quaternion = np.roll(data.xquat[link], -1)  # w last
+                    poses[body.id, number - 1] = np.concatenate([data.xpos[link], quaternion, data.xipos[link]])
+        return poses
 
-    def read_before(self) -> tuple[list[Array], dict[Link, list[float]]] | None:
-        """See `StateReader`; None where the environment could not read them: all substeps were one call."""
+    def read_before(self) -> tuple[list[Array], Poses] | None:
+        """See `StateReader`; None where all substeps were one call."""
         if self._before is None or self._calls < 2:
             return None
-        (qpos, qvel), states, orientations = self._before, [], {}
-        for body in self.world.bodies:
-            position = self._now.xpos[body.id]
-            if body.is_free:
-                (first,) = self.model.jnt_qposadr[self.model.body_jntadr[[body.id]]]
-                position, (w, *xyz) = qpos[first : first + 3], qpos[first + 3 : first + 7].tolist()
-                orientations[body.id, -1] = [*xyz, w]
-            states.append(self._read_state(body, qpos, qvel, position))
-        return states, orientations
+        mujoco, before, (qpos, qvel) = library(), self._other, self._before
+        mujoco.mj_copyData(before, self.model, self._now)
+        before.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, before)
+        mujoco.mj_comPos(self.model, before)
+        states = [self._read_state(body, qpos, qvel, before.xpos[body.id]) for body in self.world.bodies]
+        return states, self._read_poses(before)
 
     def read_contacts(self) -> dict[Pair, float]:
         """See `StateReader`."""
@@ -213,7 +215,7 @@ class MujocoStateReader:
 
     def read_weights(self) -> dict[JointKey, float]:
         """See `StateReader`; empty for robots that stand on something, or are bound by an equality."""
-        mujoco, model, still = library(), self.model, library().MjData(self.model)
+        mujoco, model, still = library(), self.model, self._other
         mujoco.mj_copyData(still, model, self._now)
         still.qvel[:] = 0
         refresh(model, still)
@@ -244,7 +246,7 @@ class MujocoStateReader:
 
     def find_jumps(self, seed: int) -> list[Jump]:
         """See `StateReader`; the environment's data are not changed."""
-        mujoco, model, alone = library(), self.model, library().MjData(self.model)
+        mujoco, model, alone = library(), self.model, self._other
         mujoco.mj_copyData(alone, model, self.data)
         gravity, dt = float(np.linalg.norm(model.opt.gravity)), float(model.opt.timestep)
         free = {b.name: int(model.jnt_dofadr[model.body_jntadr[b.id]]) for b in self.world.bodies if b.is_free}

@@ -23,9 +23,9 @@ from rlctl.checking.worlds import (
     Array,
     JointKey,
     Jump,
-    Link,
     MotorTarget,
     Pair,
+    Poses,
     StateReader,
     World,
     WorldBody,
@@ -52,10 +52,10 @@ class WorldLog:
     states: list[list[Array]] = dataclasses.field(default_factory=list)  # by look and body
     deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)  # depth and limit [m]
     touching: list[set[Pair]] = dataclasses.field(default_factory=list)  # Links that touch
-    orientations: list[dict[Link, list[float]]] = dataclasses.field(default_factory=list)  # quaternions, x y z w
+    poses: list[Poses] = dataclasses.field(default_factory=list)
     observed: list[Array] = dataclasses.field(default_factory=list)  # flat observations
     given: list[Array] = dataclasses.field(default_factory=list)  # flat actions; of reset empty
-    before: list[tuple[list[Array], dict[Link, list[float]]] | None] = dataclasses.field(default_factory=list)
+    before: list[tuple[list[Array], Poses] | None] = dataclasses.field(default_factory=list)
     """What the reader has of the moment before the last call that advanced the physics."""
     targets: list[dict[JointKey, MotorTarget]] = dataclasses.field(default_factory=list)
     commands: list[WrittenCommand | None] = dataclasses.field(default_factory=list)
@@ -68,7 +68,7 @@ class WorldLog:
         try:
             reader.update()
             states, contacts = reader.read_states(), reader.read_contacts()
-            orientations, targets = reader.read_orientations(), reader.read_targets()
+            poses, targets = reader.read_poses(), reader.read_targets()
             deep = {pair: (-d, self._limit(pair)) for pair, d in contacts.items() if d < -LEAST_LIMIT}
             if not self.places:
                 self.weights = reader.read_weights()
@@ -77,7 +77,7 @@ class WorldLog:
         self.places.append(place)
         self.states.append(states)
         self.touching.append(set(contacts))
-        self.orientations.append(orientations)
+        self.poses.append(poses)
         self.observed.append(flatten(observation))
         self.given.append(action)
         self.before.append(reader.read_before())

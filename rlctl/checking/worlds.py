@@ -18,6 +18,10 @@ Array = NDArray[np.float64]
 Link = tuple[int, int]  # Body id and link index; the base is link -1
 Pair = tuple[Link, Link]
 JointKey = tuple[int, int]  # Body id and joint index
+Poses = dict[Link, Array]
+"""By link: the position of its frame [m], its quaternion x, y, z, w, and the position of its centre of mass [m]. Shape
+(10,) each."""
+ORIENTATION = slice(3, 7)
 VELOCITY, ANGULAR, JOINTS = slice(3, 6), slice(6, 9), 9
 """Where in a body's state its base's velocity [m/s] and angular velocity [rad/s] are, after its position, and where its
 joints' begin: all positions, then all speeds [rad, rad/s; m, m/s]."""
@@ -132,11 +136,12 @@ class StateReader(Protocol):
     def read_states(self) -> list[Array]:
         """Return the state of each body. Shape (9 + 2 * joints,) each."""
 
-    def read_orientations(self) -> dict[Link, list[float]]:
-        """Return the quaternion (x, y, z, w) of each base that is free, and of each link of a robot."""
+    def read_poses(self) -> Poses:
+        """Return the pose of each base that is free, and of each link of a robot."""
 
-    def read_before(self) -> tuple[list[Array], dict[Link, list[float]]] | None:
-        """Return states, and orientations of free bases, before the last call that advanced the physics."""
+    def read_before(self) -> tuple[list[Array], Poses] | None:
+        """Return states and poses before the last call that advanced the physics; None where they are not known, or the
+        environment could not read them."""
 
     def read_contacts(self) -> dict[Pair, float]:
         """Return the deepest distance per pair of links that touch [m]; below zero they are inside each other."""

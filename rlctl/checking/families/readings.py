@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rlctl.checking import attitudes
 from rlctl.checking.rules import RuleFinding, Severity
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
-from rlctl.checking.worlds import ANGULAR, VELOCITY, Array, Link, World, WorldBody
+from rlctl.checking.worlds import ANGULAR, ORIENTATION, VELOCITY, Array, Link, Poses, World, WorldBody
 
 FEWEST_LOOKS = 30
 SAME = 5e-5  # An element is equal to a value if it differs by no more [rad], [m], [m/s], and relative to the value
@@ -51,9 +51,9 @@ def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
         return
     logs, observed = joined
     moving = np.flatnonzero(_find_moved(observed).sum(axis=0) >= FEWEST_MOVED)
-    looks = [orientations for log in logs for orientations in log.orientations]
-    links = sorted(set.intersection(*(set(orientations) for orientations in looks)))
-    quaternions = {link: np.array([orientations[link] for orientations in looks]) for link in links}
+    looks = [poses for log in logs for poses in log.poses]
+    links = sorted(set.intersection(*(set(poses) for poses in looks)))
+    quaternions = {link: np.array([poses[link][ORIENTATION] for poses in looks]) for link in links}
     velocities = _find_velocities(logs)
     wrong: list[tuple[int, Link, str, int, int]] = []  # element, link, order, feature and sign
     orders = ORDERS[world.world.engine]
@@ -191,18 +191,19 @@ def find_old_elements(world: LoggedWorld) -> Iterator[RuleFinding]:
 def _read_log(log: WorldLog) -> tuple[Array, Array, Array]:
     looks = [i for i, before in enumerate(log.before) if i and before is not None]
     observed = np.stack([log.observed[i] for i in looks]).astype(np.float64)
-    now = [(log.states[i], log.orientations[i]) for i in looks]
+    now = [(log.states[i], log.poses[i]) for i in looks]
     before = [entry for entry in (log.before[i] for i in looks) if entry is not None]
     present, earlier = (np.stack([_features(log, *entry) for entry in entries]) for entries in (now, before))
     return np.nan_to_num(observed), present, earlier
 
 
-def _features(log: WorldLog, states: Sequence[Array], orientations: Mapping[Link, list[float]]) -> Array:
+def _features(log: WorldLog, states: Sequence[Array], poses: Poses) -> Array:
     parts = []
     for body, state in zip(log.world.bodies, states, strict=True):
         parts += [state] if body.joints or body.is_free else []
         if body.is_free:
-            parts.append(attitudes.compute_attitudes(np.array([orientations[body.id, -1]]))[0])
+            parts.append(attitudes.compute_attitudes(poses[body.id, -1][None, ORIENTATION])[0])
+    parts += [np.delete(pose, ORIENTATION) for pose in poses.values()]
     return np.nan_to_num(np.concatenate(parts)) if parts else np.zeros(0)
 
 
@@ -212,7 +213,7 @@ def _name_features(log: WorldLog) -> list[str]:
         if body.joints or body.is_free:
             names += _name_state(body)
         names += [f"{angle} of {body.name}" for angle in attitudes.NAMES] if body.is_free else []
-    return names
+    return names + [f"position of {log.world.link_name(link)}" for link in log.poses[0] for _ in range(6)]
 
 
 def _name_state(body: WorldBody) -> list[str]:

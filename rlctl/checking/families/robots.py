@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from rlctl.checking.bullet_worlds import ClientCalls
 from rlctl.checking.families.motors import find_wrong_motors
 from rlctl.checking.families.readings import find_misread_quaternions, find_old_elements
-from rlctl.checking.rules import RuleFinding, Severity
+from rlctl.checking.rules import RuleFinding, Severity, list_names
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import Array
 from rlctl.environments.bullet_calls import BulletCalls, ContactQuery
@@ -31,7 +31,7 @@ def _find_empty_queries(world: LoggedWorld, calls: BulletCalls) -> Iterator[Rule
         if client != world.world.client or total < FEWEST_QUERIES or any(query.contacts for query in queries):
             continue
         for query in queries:
-            if why := _explain_empty(world, query):
+            if why := _explain_empty(world, query) or _explain_alone(world, query, calls):
                 text, severity = why
                 message = f"{total} calls of getContactPoints returned no contact: {text}"
                 evidence = {"element": f"bodies {query.bodies}, links {query.links}", "value": 0}
@@ -57,6 +57,39 @@ def _explain_empty(world: LoggedWorld, query: ContactQuery) -> tuple[str, Severi
     text = f"{world.world.link_name(asked)} (link {asked[1]}) never touched, but {world.world.link_name(other)} did"
     is_next = any(_are_joined(query.client, asked, link) for link in others)
     return f"{text} (link {other[1]})", Severity.WARNING if is_next else Severity.INFO
+
+
+def _explain_alone(world: LoggedWorld, query: ContactQuery, calls: BulletCalls) -> tuple[str, Severity] | None:
+    """Explain an empty query of one of several links that are alike, of which no other is ever asked."""
+    side = 0 if query.links[0] is not None else 1
+    (body, link), other = (query.bodies[side], query.links[side]), query.bodies[1 - side]
+    if link is None or link < 0 or query.links[1 - side] is not None:
+        return None
+    asked = {
+        (asked.bodies[end], asked.links[end])
+        for asked in calls.queries.values()
+        for end in (0, 1)
+        if asked.client == query.client and asked.bodies[1 - end] in (other, -1) and asked.call.file == query.call.file
+    }
+    twins = _find_twins(query.client, body, link)
+    if not twins or asked & {(body, twin) for twin in (*twins, None, -1)}:
+        return None
+    names = list_names([f"{world.world.link_name((body, twin))} (link {twin})" for twin in twins])
+    text = f"it asks for {world.world.link_name((body, link))} (link {link}) alone, and nothing asks for {names}"
+    return f"{text}, which are like it: same parent, mass and inertia", Severity.WARNING
+
+
+def _find_twins(client: int, body: int, link: int) -> list[int]:
+    """Return the other links with the same parent, mass and inertia."""
+    p = ClientCalls(client)
+
+    def describe(number: int) -> tuple[object, ...]:
+        mass, _, inertia, *_ = p.getDynamicsInfo(body, number)
+        return p.getJointInfo(body, number)[16], mass, inertia
+
+    others = [number for number in range(p.getNumJoints(body)) if number != link]
+    weighs = p.getDynamicsInfo(body, link)[0] > 0
+    return [number for number in others if weighs and describe(number) == describe(link)]
 
 
 def _has_shape(world: LoggedWorld, body: int, link: int) -> bool:
