@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rlctl.checking.values import Attribute
 from rlctl.checking.worlds import (
     LONGEST_S,
     MOST_BODIES,
@@ -29,16 +30,33 @@ from rlctl.checking.worlds import (
     WorldBody,
     WrittenCommand,
 )
+from rlctl.environments.info import find_mujoco
 
 FREE, BALL, SLIDE = 0, 1, 2  # MuJoCo's types of joints; 3 is a hinge
 PLANES = (0, 1)  # Types of geoms without a thickness: planes and height fields
 ON_JOINT, FIXED_GAIN, AFFINE = (0, 1), 0, 1  # Types of actuators: what they move, and how they compute their force
+FIELDS = ("data.", "model.")
+KEPT = (
+    *("data.time", "data.act", "data.ctrl", "data.qfrc_applied", "data.xfrc_applied", "data.mocap_pos"),
+    *("data.qacc_warmstart", "model.body_mass", "model.geom_friction", "model.dof_damping", "model.actuator_gainprm"),
+)
+"""What mj_resetData sets back besides positions and velocities, and what is randomised most often."""
 UNSTABLE = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 
 def library() -> Any:
     """Return MuJoCo, which the environment has loaded."""
     return sys.modules["mujoco"]
+
+
+def read_kept_fields(env: Any) -> dict[str, Attribute]:
+    """Return copies of the fields of `KEPT` of an environment that MuJoCo simulates; empty for any other."""
+    if (simulation := find_mujoco(env)) is None:
+        return {}
+    owners = dict(zip(FIELDS, reversed(simulation), strict=True))
+    pairs = [(name, owners[f"{name.partition('.')[0]}."], name.partition(".")[2]) for name in KEPT]
+    copies = [(name, owner, key, np.array(getattr(owner, key))) for name, owner, key in pairs]
+    return {name: Attribute(name, owner, key, value) for name, owner, key, value in copies if value.size}
 
 
 def refresh(model: Any, data: Any) -> None:

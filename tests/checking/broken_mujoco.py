@@ -271,3 +271,31 @@ class ArmInverse(MujocoArm):
 class ArmActuator(MujocoArm):
     def reward(self):
         return super().reward() - 0.001 * np.abs(self.data.qfrc_actuator).sum()
+
+
+# RL301, RL302
+
+
+class ArmKeepsActivation(MujocoArm):
+    xml = ARM.replace('<position name="bend"', '<position timeconst=".2" name="bend"')
+
+    def clear(self):
+        self.data.qpos[:], self.data.qvel[:] = self.model.qpos0, 0.0
+
+
+class ArmResets(ArmKeepsActivation):
+    def clear(self):
+        mujoco.mj_resetData(self.model, self.data)
+
+
+class HopperKeepsTime(MujocoHopper):
+    def clear(self):
+        self.data.qpos[:], self.data.qvel[:], self.data.qacc_warmstart[:] = self.model.qpos0, 0.0, 0.0
+
+    def observe(self):
+        return np.append(super().observe(), np.sin(self.data.time))
+
+
+class HopperResets(HopperKeepsTime):
+    def clear(self):
+        mujoco.mj_resetData(self.model, self.data)

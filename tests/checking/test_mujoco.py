@@ -38,6 +38,8 @@ CASES = [
     broken("HopperTorqueBeyondRange", "RL816", twin="HopperTorque"),
     broken("ArmGrowsHeavy", "RL817", "error", "ArmNominalMass"),
     broken("HopperSlips", "RL817", "error", "HopperFriction"),
+    broken("ArmKeepsActivation", "RL302", "error", "ArmResets"),
+    broken("HopperKeepsTime", "RL301", "error", "HopperResets"),
     broken("HopperForces", "RL818", twin="HopperRightForces"),
     broken("ArmInverse", "RL818", twin="ArmActuator"),
 ]
@@ -62,6 +64,7 @@ def test_finds_the_mistake_and_only_that(case):
         ("HopperStateInTheLoop", "RL815", ("observation[0] (position of body)",)),
         ("ArmBeyondRange", "RL816", ("only", "of the action's range")),
         ("ArmGrowsHeavy", "RL817", ("body_mass[1] (upper)",)),
+        ("ArmKeepsActivation", "RL302", ("reset keeps state (data.act",)),
         ("HopperForces", "RL818", ("data.cfrc_ext", "mj_rnePostConstraint")),
     ],
 )
