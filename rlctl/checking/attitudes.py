@@ -16,9 +16,15 @@ NAMES = (
 )
 """Of the columns of `compute_attitudes`. The last three are the
 vertical in the body's frame."""
+ANGLES = ((0, 1, 2), (3, 4, 5))
+"""Columns with the angles of one convention."""
 NEVER_NEGATED = (9, 10, 11, 12)
 """Columns whose negative nobody means: cosines, and the tilt."""
-OF_VECTOR = (*(f"{axis} in its frame of" for axis in AXES), *(f"{axis} in the world of" for axis in AXES))
+OF_VECTOR = (
+    *(f"{axis} in its frame of" for axis in AXES),
+    *(f"{axis} in the world of" for axis in AXES),
+    *(f"{axis} by its yaw of" for axis in "xy"),
+)
 """Of the columns of `rotate`, to be followed by the vector."""
 
 
@@ -48,7 +54,11 @@ def _clip(values: Array) -> Array:
 
 
 def rotate(quaternions: Array, vectors: Array) -> Array:
-    """Return vectors of the world, shape (n, 3), in the frame of a body, and vectors of the body's frame in the world.
-    Shape (n, 6)."""
+    """Return vectors of the world, shape (n, 3), in the frame of a body; vectors of the body's frame in the world; and
+    the level part of vectors of the world, turned back by the body's yaw. Shape (n, 8)."""
     matrices = compute_matrices(quaternions)
-    return np.hstack([np.einsum("nij,ni->nj", matrices, vectors), np.einsum("nij,nj->ni", matrices, vectors)])
+    yaw = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
+    cosine, sine, (x, y, _) = np.cos(yaw), np.sin(yaw), vectors.T
+    level = np.column_stack([cosine * x + sine * y, cosine * y - sine * x])
+    inside, outside = (np.einsum(form, matrices, vectors) for form in ("nij,ni->nj", "nij,nj->ni"))
+    return np.hstack([inside, outside, level])

@@ -9,6 +9,7 @@ from typing import Any
 from rlctl.environments.bullet_calls import LIBRARIES
 
 STEPS, RESETS = ("mj_step", "mj_step2"), ("mj_resetData", "mj_resetDataKeyframe")
+FORWARD = "mj_forward"
 FORCES = "mj_rnePostConstraint"  # computes forces from what a step left
 LOOKUPS = ("body", "geom", "site")  # methods of MjModel and MjData that find a part by its name
 
@@ -24,6 +25,7 @@ class MujocoCalls:
     before_step: Callable[[Any, Any, int], None] = _nothing  # with model, data and the number of steps
     after_step: Callable[[Any, Any], None] = _nothing
     after_reset: Callable[[Any, Any], None] = _nothing  # of the data, as by mj_resetData
+    after_forward: Callable[[Any, Any], None] = _nothing
     as_stepped: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext
     """Gives back, for a `with` block, what a step left and `after_step` changed."""
     other_names: dict[tuple[str, str], str] = dataclasses.field(default_factory=dict)
@@ -42,7 +44,7 @@ class MujocoCalls:
 def join_calls(calls: MujocoCalls) -> Iterator[None]:
     """Call the functions of `calls` around those of MuJoCo inside the `with` block, and rename what is looked up."""
     library = sys.modules["mujoco"]
-    functions = {name: getattr(library, name) for name in (*STEPS, *RESETS, FORCES, "mj_name2id")}
+    functions = {name: getattr(library, name) for name in (*STEPS, *RESETS, FORWARD, FORCES, "mj_name2id")}
     with contextlib.ExitStack() as stack:
         for name, function in functions.items():
             for holder in (library, *_find_importers(name, function)):
@@ -71,9 +73,9 @@ def _join(calls: MujocoCalls, name: str, function: Any) -> Any:
         calls.after_step(model, data)
         return result
 
-    def reset(*arguments: Any, **keywords: Any) -> Any:
+    def forward(*arguments: Any, **keywords: Any) -> Any:
         result = function(*arguments, **keywords)
-        calls.after_reset(*_read_arguments(arguments, keywords))
+        (calls.after_forward if name == FORWARD else calls.after_reset)(*_read_arguments(arguments, keywords))
         return result
 
     def find(*arguments: Any, **keywords: Any) -> Any:
@@ -90,7 +92,7 @@ def _join(calls: MujocoCalls, name: str, function: Any) -> Any:
 
     if name == FORCES:
         return compute
-    return step if name in STEPS else reset if name in RESETS else find
+    return step if name in STEPS else find if name == "mj_name2id" else forward
 
 
 def _read_arguments(arguments: tuple[Any, ...], keywords: dict[str, Any]) -> tuple[Any, Any]:

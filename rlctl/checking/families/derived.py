@@ -10,13 +10,14 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.families.model_parts import find_drift, find_untouched_parts
 from rlctl.checking.instance import EnvironmentRaised, Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_trials import STEPS, Look, are_equal, name_columns, pair_rows, play
-from rlctl.checking.mujoco_worlds import MujocoStateReader, library
+from rlctl.checking.mujoco_worlds import MujocoStateReader, library, refresh
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rules import RuleFinding, Severity, list_names
 from rlctl.checking.values import flatten
@@ -37,7 +38,7 @@ NEVER_COMPUTED = {
 }  # fmt: skip
 """Arrays that mj_step leaves at zero unless a sensor needs them, and what computes them."""
 POLLUTION = 0.37  # An offset of what was derived before a reset
-TINY = 0.02  # of what a control step changes; less is an info
+TINY = 0.01  # of what a control step changes; less is an info
 FEWEST_LOOKS, LEAST_MOTION = 4, 1e-4
 EXACT = 2e-6  # relative; the last bits of float32
 
@@ -99,8 +100,8 @@ FORWARD_AT_RESET = "Call mujoco.mj_forward(model, data) in reset, after qpos and
 
 
 def _find_stale(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> Iterator[RuleFinding]:
-    refresh = _Refresh()
-    changed = play(instance, calls, after_step=refresh, as_stepped=refresh.as_stepped)
+    refreshing = _Refresh()
+    changed = play(instance, calls, after_step=refreshing, as_stepped=refreshing.as_stepped)
     pair = pair_rows(plain, changed)
     if pair is None or len(pair[0]) < FEWEST_LOOKS:
         return
@@ -165,18 +166,43 @@ def _find_unforwarded(instance: Instance, calls: MujocoCalls, plain: Sequence[Lo
         for name in DERIVED:
             getattr(data, name)[:] += POLLUTION
 
+    def pollute_stale(_: Any, data: Any) -> None:
+        for name, is_stale in stale.items():
+            getattr(data, name)[is_stale] += POLLUTION
+
     if (simulation := find_mujoco(instance.env)) is None:
         return
     pollute(*simulation)
     pair = pair_rows(plain, play(instance, calls, 0, after_reset=pollute))
     columns = [] if pair is None else np.flatnonzero(pair[0][0] != pair[1][0]).tolist()
-    if columns:
-        size = pair[0].shape[1] - 1 if pair is not None else 0
+    if not columns:  # there is a call of mj_forward, but it may come too early
+        play(instance, calls, 0)
+        if stale := _find_stale_fields(instance):
+            pair = pair_rows(plain, play(instance, calls, 0, after_forward=pollute_stale))
+            columns = [] if pair is None else np.flatnonzero(pair[0][0] != pair[1][0]).tolist()
+    if columns and pair is not None:
+        size = pair[0].shape[1] - 1
         verb = "is" if len(columns) == 1 else "are"
         what = f"{name_columns(columns, size)} of reset {verb} computed before mj_forward"
         message = f"{what}: from poses and sensors as they were before qpos was written"
         evidence = {"element": name_columns(columns[:1], size), "call": "reset", "seed": FIRST_SEED}
         yield RuleFinding("RL815", message, evidence, Severity.WARNING, fix=FORWARD_AT_RESET)
+
+
+def _find_stale_fields(instance: Instance) -> dict[str, NDArray[np.bool_]]:
+    """Return which values are not what follows from the present positions and velocities, by array."""
+    if (simulation := find_mujoco(instance.env)) is None:
+        return {}
+    model, data = simulation
+    fresh = library().MjData(model)
+    library().mj_copyData(fresh, model, data)
+    refresh(model, fresh)
+    differ = {name: ~np.isclose(getattr(data, name), getattr(fresh, name), 1e-6, 1e-6) for name in DERIVED}
+    for number in range(model.nsensor):  # those that only a step computes
+        sensor = model.sensor(number)
+        if int(sensor.needstage[0]) == int(library().mjtStage.mjSTAGE_ACC):
+            differ["sensordata"][int(sensor.adr[0]) : int(sensor.adr[0]) + int(sensor.dim[0])] = False
+    return {name: is_stale for name, is_stale in differ.items() if is_stale.any()}
 
 
 def _find_never_computed(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> Iterator[RuleFinding]:

@@ -1,16 +1,16 @@
 """RL812 and RL817 of MuJoCo: which parts of the model an environment looks up and changes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from rlctl.checking.instance import EnvironmentRaised, Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
-from rlctl.checking.mujoco_trials import name_columns, pair_rows, play
+from rlctl.checking.mujoco_trials import Look, name_columns, pair_rows, play
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
-from rlctl.checking.rules import RuleFinding
+from rlctl.checking.rules import RuleFinding, list_names
 from rlctl.checking.worlds import Array
 from rlctl.environments.info import find_mujoco
 
@@ -74,35 +74,39 @@ def find_drift(instance: Instance) -> Iterator[RuleFinding]:
 def find_untouched_parts(instance: Instance, calls: MujocoCalls, reader: MujocoStateReader) -> Iterator[RuleFinding]:
     """Yield parts that the environment looks up by name and that touch nothing, while their neighbours do, if flags in
     the observation, or a part of the reward, wait for these contacts."""
-    swapped = _find_neighbours(calls, reader)
-    if not swapped:
-        return
-    plain = play(instance, calls, CONTACT_STEPS)
-    calls.other_names = {(kind, name): other for (kind, name), (other, _) in swapped.items()}
+    plain: list[Look] = []
+    for kind in ("geom", "body"):
+        if swapped := _find_neighbours(calls, reader, kind):
+            plain = plain or play(instance, calls, CONTACT_STEPS)
+            columns, size = _play_swapped(instance, calls, kind, swapped, plain)
+            if columns == [size] and any((kind, other) in calls.asked for other, _ in swapped.values()):
+                columns = []  # the reward may count the neighbour's contacts, too
+            if columns:
+                yield _untouched(kind, swapped, name_columns(columns, size), name_columns(columns[:1], size))
+                return
+
+
+def _play_swapped(
+    instance: Instance, calls: MujocoCalls, kind: str, swapped: dict[str, tuple[str, float]], plain: Sequence[Look]
+) -> tuple[list[int], int]:
+    """Return the flags that begin to change where parts are their neighbours, and the observation's size."""
+    calls.other_names = {(kind, name): other for name, (other, _) in swapped.items()}
     try:
         with instance.context.fresh() as another:
             changed = play(another, calls, CONTACT_STEPS)
     except EnvironmentRaised:  # it needs something of the part that its neighbour does not have
-        return
+        return [], 0
     finally:
         calls.other_names = {}
-    if (pair := pair_rows(plain, changed)) is None:
-        return
-    columns, size = _find_flags(*pair), pair[0].shape[1] - 1
-    if columns == [size] and any((kind, other) in calls.asked for (kind, _), (other, _) in swapped.items()):
-        return  # the reward may count the neighbour's contacts, too
-    if columns:
-        (kind, name), (other, part) = next(iter(swapped.items()))
-        verb = "is" if len(columns) == 1 else "are"
-        waits = f"{name_columns(columns, size)} {verb} about contacts of {_list(swapped)}"
-        touches = f"{kind} {name} touches nothing, but its neighbour {other} does in {100 * part:.0f} % of all steps"
-        evidence = {"element": name_columns(columns[:1], size), "value": name, "expected": other}
-        yield RuleFinding("RL812", f"{waits}: {touches}", evidence)
+    pair = pair_rows(plain, changed)
+    return ([], 0) if pair is None else (_find_flags(*pair), pair[0].shape[1] - 1)
 
 
-def _list(swapped: dict[tuple[str, str], tuple[str, float]]) -> str:
-    names = [name for _, name in swapped]
-    return f"{next(iter(swapped))[0]} {names[0]}" + (f" and {len(names) - 1} more" if len(names) > 1 else "")
+def _untouched(kind: str, swapped: dict[str, tuple[str, float]], elements: str, first: str) -> RuleFinding:
+    name, (other, part) = next(iter(swapped.items()))
+    waits = f"{elements} {'are' if ',' in elements else 'is'} about contacts of {kind} {list_names(list(swapped), 4)}"
+    touches = f"{name} touches nothing, but its neighbour {other} does in {100 * part:.0f} % of all steps"
+    return RuleFinding("RL812", f"{waits}: {touches}", {"element": first, "value": name, "expected": other})
 
 
 def _find_flags(plain: Array, changed: Array) -> list[int]:
@@ -121,30 +125,27 @@ def _find_flags(plain: Array, changed: Array) -> list[int]:
     return [*flags, *([plain.shape[1] - 1] if is_counted else [])]
 
 
-def _find_neighbours(calls: MujocoCalls, reader: MujocoStateReader) -> dict[tuple[str, str], tuple[str, float]]:
+def _find_neighbours(calls: MujocoCalls, reader: MujocoStateReader, kind: str) -> dict[str, tuple[str, float]]:
     """Return, for each geom or body that was looked up and hardly ever touches anything, the neighbour that does most
     often, and in which part of all looks; empty where that is not often."""
     model, looks = reader.model, reader.touched
     rates = np.zeros(model.ngeom)
     for touched in looks:
         rates[list(touched)] += 1.0 / len(looks)
-    swapped = {}
-    for kind, name in calls.asked:
-        if kind not in ("geom", "body") or not (part := _find_part(model, kind, name)):
+    bodies, swapped = model.geom_bodyid, {}
+    for name in [name for asked, name in calls.asked if asked == kind]:
+        if not (part := _find_part(model, kind, name)):
             continue
-        body = int(model.geom_bodyid[part]) if kind == "geom" else part
-        near = _find_near(model, body)
+        near = _find_near(model, int(bodies[part]) if kind == "geom" else part)
         if kind == "geom":
-            candidates = [g for g in np.flatnonzero(np.isin(model.geom_bodyid, near)).tolist() if g != part]
-            own, rate_of = rates[part], {g: rates[g] for g in candidates}
+            rate_of = {geom: float(rates[geom]) for geom in np.flatnonzero(np.isin(bodies, near)).tolist()}
         else:
-            rate = {b: float(rates[model.geom_bodyid == b].max(initial=0.0)) for b in near}
-            own, rate_of = rate.pop(body), rate
-        names = {getattr(model, kind)(other).name: value for other, value in rate_of.items()}
-        names = {other: float(value) for other, value in names.items() if other}
-        best = max(names, key=lambda other: names[other], default="")
+            rate_of = {body: float(rates[bodies == body].max(initial=0.0)) for body in near}
+        own = rate_of.pop(part)
+        names = {getattr(model, kind)(other).name: rate for other, rate in rate_of.items()}
+        best = max((other for other in names if other), key=lambda other: names[other], default="")
         if own <= NEVER and best and names[best] >= OFTEN:
-            swapped[kind, name] = best, names[best]
+            swapped[name] = best, names[best]
     return swapped
 
 

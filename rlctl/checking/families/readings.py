@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from rlctl.checking import attitudes
 from rlctl.checking.rules import RuleFinding, Severity
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
-from rlctl.checking.worlds import ANGULAR, ORIENTATION, VELOCITY, Array, Link, Poses, World, WorldBody
+from rlctl.checking.worlds import ANGULAR, JOINTS, ORIENTATION, VELOCITY, Array, Link, Poses, World, WorldBody
 
 FEWEST_LOOKS = 30
 SAME = 5e-5  # An element is equal to a value if it differs by no more [rad], [m], [m/s], and relative to the value
 NEARLY_ALL = 0.98  # in so many of all looks: angles near a pole have larger errors
 MOVED, FEWEST_MOVED = 20, 15  # in so many looks a value is away from its median by so many times that, or it is calm
+LEAST_TURN = 0.02  # standard deviation; calmer positions may be equal by chance [rad]
 FIRST_LOOKS = 5  # Values that differ in these are not compared further
 MOST_ELEMENTS = 400
 READ, CONVERTED, REVERSED = (1, 2, 3, 0), (3, 0, 1, 2), (2, 1, 0, 3)
@@ -72,11 +73,14 @@ def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
         if column not in known:
             yield _misread(world.world, f"observation[{column}]", names[feature], link, order)
             return
+    matches = set(wrong)
     for column, link, order, feature, sign in sorted(wrong, key=lambda entry: entry[0]):
         is_right = any({(column, other), (column + 1, other)} <= signs for other in (1, -1))
-        if feature == 0 and (column + 1, link, order, 1, sign) in wrong and not is_right:
-            yield _misread(world.world, f"observation[{column}:{column + 2}]", "roll and pitch", link, order)
-            return
+        for other in () if is_right else next((angles for angles in attitudes.ANGLES if feature in angles), ()):
+            if other != feature and (column + 1, link, order, other, sign) in matches:
+                what = f"{names[feature]} and {names[other]}"
+                yield _misread(world.world, f"observation[{column}:{column + 2}]", what, link, order)
+                return
     columns = sorted({column for column, *_ in wrong})
     rows = [column for column in range(observed.shape[1] - 2) if sum(column + i in columns for i in range(3)) >= 2]
     yield from _find_misread_axes(world.world, observed, rows, quaternions)
@@ -161,6 +165,24 @@ def _find_moved(values: Array) -> NDArray[np.bool_]:
     """Say in which looks a value is away from its median by much more than the tolerance. Shape of `values`."""
     moved: NDArray[np.bool_] = np.abs(values - np.median(values, axis=0)) > MOVED * SAME
     return moved
+
+
+def find_shrunk_angles(world: LoggedWorld) -> Iterator[RuleFinding]:
+    """Yield an element of the observation that is a joint's position taken for degrees, and converted to radians."""
+    if (joined := _join_logs(world)) is None:
+        return
+    logs, observed = joined
+    for i, body in enumerate(world.world.bodies):
+        states = np.array([state[i] for log in logs for state in log.states])
+        for j, joint in enumerate(body.joints):
+            positions = states[:, JOINTS + j] if joint.is_angle else np.zeros(len(states))
+            shrunk = np.radians(positions)[:, None]
+            is_shrunk = (np.abs(observed - shrunk) <= EXACT * np.abs(positions).max()).mean(axis=0) >= NEARLY_ALL
+            if positions.std() > LEAST_TURN and is_shrunk.any():
+                name = f"observation[{int(is_shrunk.argmax())}]"
+                message = f"{name} is the position of joint {joint.name} times pi / 180: it was in radians already"
+                yield RuleFinding("RL810", message, {"element": name, "value": joint.name, "expected": "radians"})
+                return
 
 
 def find_old_elements(world: LoggedWorld) -> Iterator[RuleFinding]:
