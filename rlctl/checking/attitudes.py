@@ -18,8 +18,6 @@ NAMES = (
 vertical in the body's frame."""
 ANGLES = ((0, 1, 2), (3, 4, 5))
 """Columns with the angles of one convention."""
-NEVER_NEGATED = (9, 10, 11, 12)
-"""Columns whose negative nobody means: cosines, and the tilt."""
 OF_VECTOR = (
     *(f"{axis} in its frame of" for axis in AXES),
     *(f"{axis} in the world of" for axis in AXES),

@@ -135,7 +135,7 @@ class MujocoStateReader:
         library().mj_copyData(self._now, self.model, self.data)
         refresh(self.model, self._now)
         contacts = self._now.contact
-        self.touched.append(set(contacts.geom[contacts.dist <= 0].ravel().tolist()))
+        self.touched.append(set(contacts.geom[(contacts.dist <= 0) & (contacts.exclude == 0)].ravel().tolist()))
 
     def remember(self, nstep: int) -> None:
         """Keep positions and velocities as those before the next step of the physics."""
@@ -190,7 +190,9 @@ class MujocoStateReader:
         """See `StateReader`."""
         deepest: dict[Pair, float] = {}
         contacts = self._now.contact
-        for (one, two), distance in zip(contacts.geom.tolist(), contacts.dist.tolist(), strict=True):
+        is_active = contacts.exclude == 0  # the others push nothing, as between parts that are welded together
+        pairs = contacts.geom[is_active].tolist(), contacts.dist[is_active].tolist()
+        for (one, two), distance in zip(*pairs, strict=True):
             if one >= 0 and two >= 0:  # flexible bodies have none
                 pair = self._link(one), self._link(two)
                 deepest[pair] = min(deepest.get(pair, math.inf), distance)

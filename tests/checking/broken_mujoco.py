@@ -27,6 +27,22 @@ class HopperRightVelocity(MujocoHopper):
         return np.concatenate([forward, self.data.qpos[7:], self.touches()])
 
 
+class HopperHeading(MujocoHopper):
+    def turn(self):
+        x, y, z, w = self.data.qpos[3:7]
+        return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+    def observe(self):
+        cosine, sine, (x, y) = np.cos(self.turn()), np.sin(self.turn()), self.data.qvel[:2]
+        return np.array([cosine * x + sine * y, cosine * y - sine * x, *self.data.qpos[7:]])
+
+
+class HopperRightHeading(HopperHeading):
+    def turn(self):
+        w, x, y, z = self.data.qpos[3:7]
+        return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
 class ArmQuaternion(MujocoArm):
     def observe(self):
         angles = Rotation.from_quat(self.data.body("hand").xquat).as_euler("xyz")
@@ -95,6 +111,11 @@ class ArmRange(MujocoArm):
 
 class ArmRangeOfActuatorInDegrees(MujocoArm):
     xml = ARM.replace('ctrlrange="-1.04 2.61"', 'ctrlrange="-60 150"')
+
+
+class ArmObservesRadiansOfRadians(MujocoArm):
+    def observe(self):
+        return np.concatenate([np.radians(self.data.qpos), self.data.qvel, self.goal - self.tip()])
 
 
 class HopperStartsInDegrees(MujocoHopper):
@@ -179,6 +200,13 @@ class ArmResetsWithoutForward(MujocoArm):
         mujoco.mj_resetData(self.model, self.data)
         self.start()
         return self.observe().astype(np.float32), {}
+
+
+class ArmForwardTooEarly(MujocoArm):
+    def forward(self):
+        super().forward()
+        if self.data.time == 0:
+            self.data.qpos[0] += 0.2
 
 
 class HopperStateInTheLoop(MujocoHopper):

@@ -15,6 +15,7 @@ def broken(name, rule, severity="warning", twin=None):
 CASES = [
     broken("HopperQuaternion", "RL116", "error"),
     broken("HopperVelocity", "RL116", "error", "HopperRightVelocity"),
+    broken("HopperHeading", "RL116", "error", "HopperRightHeading"),
     broken("ArmQuaternion", "RL116", "error", "ArmRightQuaternion"),
     broken("ArmBeyondLimits", "RL804"),
     broken("HopperExplodes", "RL805"),
@@ -24,6 +25,7 @@ CASES = [
     broken("ArmDegrees", "RL810", "error"),
     broken("ArmRangeInDegrees", "RL810", "error", "ArmRange"),
     broken("ArmRangeOfActuatorInDegrees", "RL810"),
+    broken("ArmObservesRadiansOfRadians", "RL810", "error"),
     broken("HopperStartsInDegrees", "RL810", "error"),
     broken("ArmOrder", "RL811", "error"),
     broken("ArmOrderOfRanges", "RL811", "error", "ArmRange"),
@@ -33,6 +35,7 @@ CASES = [
     broken("ArmOldTip", "RL815"),
     broken("ArmOldSensor", "RL815", twin="ArmRightSensor"),
     broken("ArmResetsWithoutForward", "RL815"),
+    broken("ArmForwardTooEarly", "RL815"),
     broken("HopperStateInTheLoop", "RL815"),
     broken("ArmBeyondRange", "RL816"),
     broken("HopperTorqueBeyondRange", "RL816", twin="HopperTorque"),

@@ -1,7 +1,7 @@
 """RL116 and a part of RL815: what the observation has of a robot's pose, compared with what the engine has."""
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,8 +67,8 @@ def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
         return
     right = np.hstack([_compute_all(values, velocities)[1] for values in quaternions.values()])
     equal = _find_equal(observed, right)
-    signs = {(column, sign) for column, feature, sign in equal if feature % len(names) not in attitudes.NEVER_NEGATED}
-    known = {column for column, _ in signs} | {column for column, _, sign in equal if sign > 0}
+    signs = {(column, sign) for column, _, sign in equal}
+    known = {column for column, _ in signs} | _find_turned(observed, {entry[0] for entry in wrong}, quaternions)
     for column, link, order, feature, _ in sorted(wrong, key=lambda entry: entry[0]):
         if column not in known:
             yield _misread(world.world, f"observation[{column}]", names[feature], link, order)
@@ -84,6 +84,19 @@ def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
     columns = sorted({column for column, *_ in wrong})
     rows = [column for column in range(observed.shape[1] - 2) if sum(column + i in columns for i in range(3)) >= 2]
     yield from _find_misread_axes(world.world, observed, rows, quaternions)
+
+
+def _find_turned(observed: Array, columns: Collection[int], quaternions: Mapping[Link, Array]) -> set[int]:
+    """Return elements that are a right angle up to its sign and quarter turns: a gripper's that points down, say."""
+    of_all = [attitudes.compute_attitudes(values)[:, : len(attitudes.ANGLES) * 3] for values in quaternions.values()]
+    right = np.hstack(of_all)
+    turned = set()
+    for column in columns:
+        values = observed[:, [column]]
+        for off in (values - right, values + right):
+            if ((np.abs(np.sin(2 * off)) <= 4 * SAME).mean(axis=0) >= NEARLY_ALL).any():
+                turned.add(column)
+    return turned
 
 
 def _misread(world: World, element: str, what: str, link: Link, order: str) -> RuleFinding:
