@@ -155,7 +155,8 @@ def _find_other_state(commands: MotorCommands) -> Iterator[RuleFinding]:
         if not commands.find_rest(number, None) > UNLIKE or not commands.find_rest(number, number, number) > UNLIKE:
             continue
         for other, another in enumerate(commands.motors):
-            if another.joint.index != motor.joint.index and commands.find_rest(number, other, other, number) < SAME:
+            is_other = another.joint.index != motor.joint.index
+            if is_other and commands.find_rest(number, other, other, number) < SAME and _is_missing(commands, other):
                 follows = f"follows the position of joint {another.joint.name}"
                 message = (
                     f"ctrl[{number}], of the actuator of joint {motor.joint.name}, {follows}, not of its own joint"
@@ -163,6 +164,12 @@ def _find_other_state(commands: MotorCommands) -> Iterator[RuleFinding]:
                 evidence = {"element": motor.name, "value": another.joint.name, "expected": motor.joint.name}
                 yield RuleFinding("RL811", message, evidence)
                 return
+
+
+def _is_missing(commands: MotorCommands, motor: int) -> bool:
+    """Say whether a motor's command does not follow its own joint, or nothing but the action: a finger that follows the
+    other one is meant."""
+    return not min(commands.find_rest(motor, None), commands.find_rest(motor, motor, motor)) <= UNLIKE
 
 
 def _find_other_ranges(spans: Sequence[CommandSpan]) -> Iterator[RuleFinding]:
