@@ -65,6 +65,12 @@ class ArmBeyondLimits(MujocoArm):
 
 
 class HopperExplodes(MujocoHopper):
+    rlctl_ignore = {
+        "RL603": "a consequence",
+        "RL118": "a consequence",
+        "RL610": "a consequence",
+        "RL803": "a consequence",
+    }
     gains = 30.0, 60.0
     xml = HOPPER.replace('ctrlrange="-12 12"', 'ctrlrange="-9000 9000"').replace('armature=".01"', 'armature=".0001"')
 
@@ -75,6 +81,8 @@ class HopperExplodes(MujocoHopper):
 
 
 class HopperInTheGround(MujocoHopper):
+    rlctl_ignore = {"RL117": "a consequence", "RL610": "a consequence", "RL803": "a consequence"}
+
     def start(self):
         super().start()
         self.data.qpos[2] = 0.15
@@ -93,11 +101,15 @@ class ArmWeakMotors(MujocoArm):
 
 
 class ArmDegrees(MujocoArm):
+    rlctl_ignore = {"RL701": "a consequence", "RL804": "a consequence"}
+
     def targets(self, action):
         return np.degrees(super().targets(action))
 
 
 class ArmRangeInDegrees(MujocoArm):
+    rlctl_ignore = {"RL611": "a consequence"}
+
     def targets(self, action):
         low, high = np.radians(self.model.jnt_range.T)
         return low + (action + 1) / 2 * (high - low)
@@ -119,6 +131,16 @@ class ArmObservesRadiansOfRadians(MujocoArm):
 
 
 class HopperStartsInDegrees(MujocoHopper):
+    rlctl_ignore = {
+        "RL610": "a consequence",
+        "RL805": "a consequence",
+        "RL118": "a consequence",
+        "RL807": "a consequence",
+        "RL603": "a consequence",
+        "RL804": "a consequence",
+        "RL803": "a consequence",
+    }
+
     def start(self):
         super().start()
         self.data.qpos[8] = -57.0
@@ -128,6 +150,8 @@ class HopperStartsInDegrees(MujocoHopper):
 
 
 class ArmOrder(MujocoArm):
+    rlctl_ignore = {"RL701": "a consequence"}
+
     def __init__(self):
         super().__init__()
         self.motors = [0, 1, 2]
@@ -140,6 +164,8 @@ class ArmOrderOfRanges(ArmRange):
 
 
 class HopperOrder(MujocoHopper):
+    rlctl_ignore = {"RL701": "a consequence", "RL803": "a consequence", "RL804": "a consequence"}
+
     def positions(self):
         return self.data.qpos[7:][[0, 2, 4, 1, 3, 5]]
 
@@ -148,6 +174,7 @@ class HopperOrder(MujocoHopper):
 
 
 class HopperOtherSoles(MujocoHopper):
+    rlctl_ignore = {"RL110": "a consequence"}
     soles = ("left_thigh", "right_thigh", "back_thigh")
 
 
@@ -160,6 +187,7 @@ class HopperThighs(MujocoHopper):
 
 
 class ArmTouchesWithPalm(MujocoArm):
+    rlctl_ignore = {"RL611": "a consequence"}
     home = np.array([1.6, 1.2, 0.3])
     part = "palm"
 
@@ -231,6 +259,7 @@ class HopperStateInTheLoop(MujocoHopper):
 
 
 class ArmBeyondRange(MujocoArm):
+    rlctl_ignore = {"RL805": "a consequence"}
     home, gain = np.zeros(3), 4.0
 
 
@@ -250,6 +279,8 @@ class HopperTorque(HopperTorqueBeyondRange):
 
 
 class ArmGrowsHeavy(MujocoArm):
+    rlctl_ignore = {"RL302": "a consequence"}
+
     def start(self):
         super().start()
         self.model.body_mass[:] *= self.np_random.uniform(0.8, 1.2)
@@ -266,6 +297,8 @@ class ArmNominalMass(MujocoArm):
 
 
 class HopperSlips(MujocoHopper):
+    rlctl_ignore = {"RL302": "a consequence"}
+
     def start(self):
         super().start()
         self.model.geom_friction[0, 0] *= self.np_random.uniform(0.7, 1.3)
@@ -281,6 +314,8 @@ class HopperFriction(MujocoHopper):
 
 
 class HopperForces(MujocoHopper):
+    rlctl_ignore = {"RL110": "a consequence"}
+
     def observe(self):
         return np.concatenate([super().observe(), np.clip(self.data.cfrc_ext[1:].ravel(), -1, 1)])
 

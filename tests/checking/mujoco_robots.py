@@ -141,7 +141,7 @@ class MujocoHopper(MujocoRobot):
         self.ground = self.model.geom("ground").id
 
     def start(self):
-        self.data.qpos[2] = 0.46
+        self.data.qpos[2] = 0.49
         turn = Rotation.from_euler("xyz", self.np_random.uniform([-0.1, -0.1, -3.0], [0.1, 0.1, 3.0]))
         self.data.qpos[3:7] = turn.as_quat(scalar_first=True)
         self.data.qpos[7:] = self.home + self.np_random.uniform(-0.1, 0.1, 6)

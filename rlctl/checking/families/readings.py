@@ -65,10 +65,11 @@ def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
         wrong += [(int(moving[column]), link, order, feature, sign) for column, feature, sign in equal]
     if not wrong:
         return
-    right = np.hstack([_compute_all(values, velocities)[1] for values in quaternions.values()])
+    computed = [_compute_all(values, velocities)[1] for values in quaternions.values()]
+    right = np.hstack([*computed, *_read_joints(logs)])
     equal = _find_equal(observed, right)
     signs = {(column, sign) for column, _, sign in equal}
-    known = {column for column, _ in signs} | _find_turned(observed, {entry[0] for entry in wrong}, quaternions)
+    known = {column for column, _ in signs} | _find_turned(observed, {entry[0] for entry in wrong}, quaternions, logs)
     for column, link, order, feature, _ in sorted(wrong, key=lambda entry: entry[0]):
         if column not in known:
             yield _misread(world.world, f"observation[{column}]", names[feature], link, order)
@@ -86,10 +87,20 @@ def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
     yield from _find_misread_axes(world.world, observed, rows, quaternions)
 
 
-def _find_turned(observed: Array, columns: Collection[int], quaternions: Mapping[Link, Array]) -> set[int]:
-    """Return elements that are a right angle up to its sign and quarter turns: a gripper's that points down, say."""
+def _read_joints(logs: Sequence[WorldLog]) -> list[Array]:
+    """Return the positions and speeds of the joints of each body. Shape (looks, 2 * joints) each."""
+    bodies = range(len(logs[0].world.bodies))
+    return [np.array([state[i][JOINTS:] for log in logs for state in log.states]) for i in bodies]
+
+
+def _find_turned(
+    observed: Array, columns: Collection[int], quaternions: Mapping[Link, Array], logs: Sequence[WorldLog]
+) -> set[int]:
+    """Return elements that are a right angle up to its sign and quarter turns (a gripper's that points down, say), the
+    angle of a whole rotation, or a joint's position: where all turns about one axis, wrong orders give these too."""
     of_all = [attitudes.compute_attitudes(values)[:, : len(attitudes.ANGLES) * 3] for values in quaternions.values()]
-    right = np.hstack(of_all)
+    whole = [2 * np.arccos(np.clip(np.abs(values[:, 3:]), 0.0, 1.0)) for values in quaternions.values()]
+    right = np.hstack([*of_all, *whole, *_read_joints(logs)])
     turned = set()
     for column in columns:
         values = observed[:, [column]]
