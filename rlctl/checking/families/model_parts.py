@@ -141,7 +141,7 @@ def _find_neighbours(calls: MujocoCalls, reader: MujocoStateReader, kind: str) -
             rate_of = {geom: float(rates[geom]) for geom in np.flatnonzero(np.isin(bodies, near)).tolist()}
         else:
             rate_of = {body: float(rates[bodies == body].max(initial=0.0)) for body in near}
-        own = rate_of.pop(part)
+        own = rate_of.pop(part, 1.0)  # a geom of the world itself is among none of them
         names = {getattr(model, kind)(other).name: rate for other, rate in rate_of.items()}
         best = max((other for other in names if other), key=lambda other: names[other], default="")
         if own <= NEVER and best and names[best] >= OFTEN:
