@@ -12,22 +12,32 @@ import sys
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from rlctl.checking.worlds import (
+    LONGEST_S,
+    MOST_BODIES,
+    MOST_JOINTS,
+    MOST_LINKS,
+    MOST_STEPS,
+    VELOCITY,
+    Array,
+    Joint,
+    JointKey,
+    Jump,
+    Link,
+    MotorTarget,
+    Pair,
+    Poses,
+    World,
+    WorldBody,
+    WrittenCommand,
+)
+from rlctl.environments.bullet_calls import BulletCalls
 
 MOST_CLIENTS = 1024  # So many physics clients a process may have, in the wheels of PyBullet 3.2
-MOST_BODIES, MOST_JOINTS = 20, 60  # So many of a world, and of a body, are read; robots and free bodies first
-MOST_LINKS = 30  # So many links of a robot are read for their orientation
-WIDEST_RANGE = 1e3  # wider limits are none: some models write 1e16
 
 GRAVITY, WEIGHT_STEPS = -9.81, 20  # [m/s^2]
 UNMOVED = 1e-6  # smaller differences are no effect of gravity [m, rad, m/s, rad/s]; stiff motors leave little
-LONGEST_S, MOST_STEPS = 0.1, 100  # simulated without the environment: overlapping bodies are thrown out by then
-
-Link = tuple[int, int]  # Body id and link index; the base is link -1
-Pair = tuple[Link, Link]
-VELOCITY, ANGULAR, JOINTS = slice(3, 6), slice(6, 9), 9
-"""Where in a body's state its base's velocity [m/s] and angular velocity [rad/s] are, after its position, and where its
-joints' begin: all positions, then all speeds [rad, rad/s; m, m/s]."""
 
 
 def bullet() -> Any:
@@ -50,55 +60,6 @@ def find_clients(most: int = MOST_CLIENTS) -> list[int]:
     """Return the ids below `most` of the clients that are connected, whoever did it; empty without PyBullet."""
     ids = range(min(most, MOST_CLIENTS) if "pybullet" in sys.modules else 0)
     return [client for client in ids if ClientCalls(client).getConnectionInfo()["isConnected"]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Joint:
-    """A joint that moves, of one degree of freedom."""
-
-    index: int
-    name: str
-    is_angle: bool
-    low: float
-    high: float
-
-    @property
-    def has_limits(self) -> bool:
-        """Whether its model declares limits."""
-        return self.low < self.high and self.high - self.low < WIDEST_RANGE
-
-
-@dataclasses.dataclass(frozen=True)
-class WorldBody:
-    """A body of a world, as it was loaded."""
-
-    id: int
-    name: str
-    links: tuple[str, ...]  # The base first: link `i` of PyBullet is `links[i + 1]`
-    joints: tuple[Joint, ...]
-    is_free: bool  # Whether its base is not fixed to the world
-    has_heavy_links: bool  # Whether it has joints, and anything beside its base has a mass
-
-
-@dataclasses.dataclass(frozen=True)
-class World:
-    """The bodies of one client."""
-
-    client: int
-    bodies: tuple[WorldBody, ...]
-
-    @property
-    def key(self) -> tuple[Any, ...]:
-        """Equal for worlds that are built alike."""
-        return tuple((body.name, body.links) for body in self.bodies)
-
-    def link_name(self, link: Link) -> str:
-        """Return how to write a link: `tip of arm`."""
-        for body in self.bodies:
-            if body.id == link[0]:
-                part = f"{body.links[link[1] + 1] or 'base'} of " if len(body.links) > 1 else ""
-                return f"{part}{body.name}"
-        return f"link {link[1]} of body {link[0]}"
 
 
 def read_world(client: int) -> World:
@@ -127,7 +88,7 @@ def _body(client: int, body: int) -> WorldBody:
     return WorldBody(body, name, tuple(links), tuple(joints[:MOST_JOINTS]), base_mass > 0, has_heavy_links)
 
 
-def read_states(world: World) -> list[NDArray[np.float64]]:
+def read_states(world: World) -> list[Array]:
     """Return the state of each body. Shape (9 + 2 * joints,) each."""
     p = ClientCalls(world.client)
     states = []
@@ -139,17 +100,18 @@ def read_states(world: World) -> list[NDArray[np.float64]]:
     return states
 
 
-def read_orientations(world: World) -> dict[Link, list[float]]:
-    """Return the quaternion (x, y, z, w) of each base that is free, and of each link of a robot."""
+def read_poses(world: World) -> Poses:
+    """Return the pose of each base that is free, and of each link of a robot, as `Poses` has them."""
     p = ClientCalls(world.client)
-    orientations = {}
+    poses: dict[Link, Array] = {}
     for body in world.bodies:
         if body.is_free:
-            orientations[body.id, -1] = list(p.getBasePositionAndOrientation(body.id)[1])
+            position, quaternion = p.getBasePositionAndOrientation(body.id)
+            poses[body.id, -1] = np.array([*position, *quaternion, *position])
         links = range(min(MOST_LINKS, len(body.links) - 1)) if body.joints else ()
         for link, state in zip(links, p.getLinkStates(body.id, links, computeForwardKinematics=1) or (), strict=False):
-            orientations[body.id, link] = list(state[5])
-    return orientations
+            poses[body.id, link] = np.array([*state[4], *state[5], *state[0]])
+    return poses
 
 
 def read_physics(client: int) -> tuple[list[float], float]:
@@ -185,17 +147,6 @@ def weight_matters(world: World) -> bool:
     return bool(np.abs(ends[0] - ends[1]).max(initial=0.0) > UNMOVED)
 
 
-@dataclasses.dataclass(frozen=True)
-class Jump:
-    """How fast a free body became right after a reset, without any action."""
-
-    body: str
-    speed: float  # [m/s]
-    explained: float  # The speed that it had, and that falling adds [m/s]
-    after_s: float
-    seed: int
-
-
 def find_jumps(world: World, seed: int) -> list[Jump]:
     """Simulate a world without its environment, and return how fast each free body became."""
     p = ClientCalls(world.client)
@@ -216,3 +167,84 @@ def _free_speeds(world: World) -> dict[str, float]:
     states = zip(world.bodies, read_states(world), strict=True)
     speeds = {body.name: float(np.linalg.norm(state[VELOCITY])) for body, state in states if body.is_free}
     return {name: min(speed, 1e6) if math.isfinite(speed) else 1e6 for name, speed in speeds.items()}
+
+
+class BulletStateReader:
+    """Reads one client: a `StateReader`."""
+
+    def __init__(self, world: World, calls: BulletCalls) -> None:
+        self.world = world
+        self._calls = calls
+        self._before: tuple[list[Array], Poses] | None = None
+
+    @property
+    def errors(self) -> tuple[type[Exception], ...]:
+        """See `StateReader`."""
+        return (bullet().error,)
+
+    def update(self) -> None:
+        """See `StateReader`; every value is read when it is asked for."""
+
+    def read_command(self) -> WrittenCommand | None:
+        """See `StateReader`; not known for PyBullet."""
+        return None
+
+    def remember(self) -> None:
+        """Keep the present values as those before the next step of the physics."""
+        self._before = read_states(self.world), read_poses(self.world)
+
+    def read_before(self) -> tuple[list[Array], Poses] | None:
+        """See `StateReader`; only what `remember` kept."""
+        return self._before
+
+    def read_states(self) -> list[Array]:
+        """See `StateReader`."""
+        return read_states(self.world)
+
+    def read_poses(self) -> Poses:
+        """See `StateReader`."""
+        return read_poses(self.world)
+
+    def read_contacts(self) -> dict[Pair, float]:
+        """See `StateReader`."""
+        return read_contacts(self.world.client)
+
+    def find_thickness(self, pair: Pair) -> float:
+        """See `StateReader`."""
+        boxes = [ClientCalls(self.world.client).getAABB(*link) for link in pair]
+        return min(float(b - a) for low, high in boxes for a, b in zip(low, high, strict=True))
+
+    def read_targets(self) -> dict[JointKey, MotorTarget]:
+        """See `StateReader`; only what was set by a position."""
+        targets = self._calls.targets.values()
+        own = [target for target in targets if target.client == self.world.client]
+        return {(t.body, t.joint): MotorTarget(t.value, t.force, t.call.name, (t.call.file, t.call.line)) for t in own}
+
+    def read_weights(self) -> dict[JointKey, float]:
+        """See `StateReader`; empty where a constraint may carry a robot."""
+        p = ClientCalls(self.world.client)
+        weights: dict[JointKey, float] = {}
+        for body, state in zip(self.world.bodies, read_states(self.world), strict=True):
+            still = [0.0] * len(body.joints)
+            if body.is_free or not still or p.getNumConstraints():
+                continue
+            with contextlib.suppress(p.error):  # it has joints of several degrees of freedom
+                torques = p.calculateInverseDynamics(body.id, state[9 : 9 + len(still)].tolist(), still, still)
+                weights |= {(body.id, joint.index): abs(t) for joint, t in zip(body.joints, torques, strict=True)}
+        return weights
+
+    def read_physics(self) -> tuple[list[float], float]:
+        """See `StateReader`."""
+        return read_physics(self.world.client)
+
+    def read_failure(self) -> str:
+        """See `StateReader`; PyBullet reports nothing."""
+        return ""
+
+    def weight_matters(self) -> bool:
+        """See `StateReader`."""
+        return weight_matters(self.world)
+
+    def find_jumps(self, seed: int) -> list[Jump]:
+        """See `StateReader`; the world is changed."""
+        return find_jumps(self.world, seed)

@@ -8,15 +8,31 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rlctl.checking import bullet_worlds
-from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Jump, Link, Pair, World, WorldBody
+from rlctl.checking.bullet_worlds import BulletStateReader, find_clients, read_world
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Instance
+from rlctl.checking.mujoco_calls import MujocoCalls
+from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED
-from rlctl.checking.values import flatten
-from rlctl.environments.bullet_calls import BulletCalls, Target
+from rlctl.checking.values import flatten, flatten_action
+from rlctl.checking.worlds import (
+    ANGULAR,
+    JOINTS,
+    VELOCITY,
+    Array,
+    JointKey,
+    Jump,
+    MotorTarget,
+    Pair,
+    Poses,
+    StateReader,
+    World,
+    WorldBody,
+    WrittenCommand,
+)
+from rlctl.environments.bullet_calls import BulletCalls
+from rlctl.environments.info import find_mujoco
 
 DEEPEST_FINE = 0.02  # [m]; Bullet pushes links apart over several steps, heavy robots leave up to 2 cm
 LEAST_LIMIT = 0.005  # The same for the smallest things [m]: collision margins alone are 1 to 4 mm
@@ -29,36 +45,53 @@ Place = dict[str, Any]
 class WorldLog:
     """One world in one episode: an entry per look."""
 
+    reader: StateReader
     world: World
     actions: str  # The kind of the episode's actions
     places: list[Place] = dataclasses.field(default_factory=list)
-    states: list[list[NDArray[np.float64]]] = dataclasses.field(default_factory=list)  # by look and body
+    states: list[list[Array]] = dataclasses.field(default_factory=list)  # by look and body
     deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)  # depth and limit [m]
     touching: list[set[Pair]] = dataclasses.field(default_factory=list)  # Links that touch
-    orientations: list[dict[Link, list[float]]] = dataclasses.field(default_factory=list)  # quaternions, x y z w
-    observed: list[NDArray[np.float64]] = dataclasses.field(default_factory=list)  # flat observations
-    first_targets: dict[tuple[int, int, int], Target] = dataclasses.field(default_factory=dict)
-    """Motor targets that the first step sets, with the zero action only."""
+    poses: list[Poses] = dataclasses.field(default_factory=list)
+    observed: list[Array] = dataclasses.field(default_factory=list)  # flat observations
+    given: list[Array] = dataclasses.field(default_factory=list)  # flat actions; of reset empty
+    before: list[tuple[list[Array], Poses] | None] = dataclasses.field(default_factory=list)
+    """What the reader has of the moment before the last call that advanced the physics."""
+    targets: list[dict[JointKey, MotorTarget]] = dataclasses.field(default_factory=list)
+    commands: list[WrittenCommand | None] = dataclasses.field(default_factory=list)
+    weights: dict[JointKey, float] = dataclasses.field(default_factory=dict)  # at reset
+    failure: str = ""  # What the engine itself reported
 
-    def look(self, place: Place, observation: Any) -> bool:
+    def look(self, place: Place, observation: Any, action: Array) -> bool:
         """Add the present state; return False if the world is gone or has other bodies."""
-        client = self.world.client
+        reader = self.reader
         try:
-            states, contacts = bullet_worlds.read_states(self.world), bullet_worlds.read_contacts(client)
-            orientations = bullet_worlds.read_orientations(self.world)
-            deep = {pair: (-d, _limit(client, pair)) for pair, d in contacts.items() if d < -LEAST_LIMIT}
-        except bullet_worlds.bullet().error:
+            reader.update()
+            states, contacts = reader.read_states(), reader.read_contacts()
+            poses, targets = reader.read_poses(), reader.read_targets()
+            deep = {pair: (-d, self._limit(pair)) for pair, d in contacts.items() if d < -LEAST_LIMIT}
+            if not self.places:
+                self.weights = reader.read_weights()
+        except reader.errors:
             return False
         self.places.append(place)
         self.states.append(states)
         self.touching.append(set(contacts))
-        self.orientations.append(orientations)
+        self.poses.append(poses)
         self.observed.append(flatten(observation))
+        self.given.append(action)
+        self.before.append(reader.read_before())
+        self.targets.append(targets)
+        self.commands.append(reader.read_command())
         self.deep.append({pair: depth for pair, depth in deep.items() if depth[0] > depth[1]})
+        self.failure = self.failure or reader.read_failure()
         return True
 
+    def _limit(self, pair: Pair) -> float:
+        return min(DEEPEST_FINE, max(LEAST_LIMIT, PART_OF_LINK * self.reader.find_thickness(pair)))
+
     @property
-    def bodies(self) -> list[tuple[WorldBody, NDArray[np.float64]]]:
+    def bodies(self) -> list[tuple[WorldBody, Array]]:
         """The bodies, and the state of each at every look. Shape (looks, 9 + 2 * joints) each."""
         series = zip(*self.states, strict=True)
         return [(body, np.array(states)) for body, states in zip(self.world.bodies, series, strict=False)]
@@ -72,17 +105,12 @@ class WorldLog:
         )
 
 
-def _limit(client: int, pair: Pair) -> float:
-    boxes = [bullet_worlds.ClientCalls(client).getAABB(*link) for link in pair]
-    thinner = min(float(b - a) for low, high in boxes for a, b in zip(low, high, strict=True))  # smallest extent [m]
-    return min(DEEPEST_FINE, max(LEAST_LIMIT, PART_OF_LINK * thinner))
-
-
 @dataclasses.dataclass
 class LoggedWorld:
     """Everything about one world."""
 
     world: World
+    reader: StateReader  # Of the last episode
     gravity: list[float]  # The strongest [m/s^2]
     time_step: float  # At the last reset [s]
     logs: list[WorldLog] = dataclasses.field(default_factory=list)
@@ -105,8 +133,9 @@ class WorldLogger:
     """Logs the worlds of one instance."""
 
     instance: Instance
-    older: set[int]  # The clients that were connected before it was built
+    older: set[int]  # The clients of PyBullet that were connected before it was built
     calls: BulletCalls  # Records how it calls PyBullet
+    mujoco_calls: MujocoCalls
     resets: int = 0
     _worlds: dict[int, LoggedWorld] = dataclasses.field(default_factory=dict)  # by index: ids of clients may change
 
@@ -120,38 +149,73 @@ class WorldLogger:
         """Log an episode. If the environment raises, the log keeps what came before."""
         seed = FIRST_SEED + number
         logs: list[WorldLog] = []
+        self._watch([])
         for moment in EpisodePlayer(self.instance, seed, kind, number=number, max_steps=steps):
             place = {"seed": seed, "episode": number, "actions": kind, "step": moment.step}
             logs = logs if moment.step else self._begin(kind)
-            logs = [log for log in logs if log.look(place, moment.observation)]
+            leaves = self.instance.action_leaves if moment.step else []
+            action = flatten_action(leaves, moment.action)
+            logs = [log for log in logs if log.look(place, moment.observation, action)]
             if moment.step == 0:
                 self.calls.targets.clear()
-            elif moment.step == 1 and kind == "zero":
-                for log in logs:
-                    log.first_targets = dict(self.calls.targets)
+            self._watch(logs)
             if not logs:
                 return
+
+    def _watch(self, logs: list[WorldLog]) -> None:
+        """Let readers remember the state before each step of the physics."""
+        bullet = [log.reader for log in logs if isinstance(log.reader, BulletStateReader)]
+        mujoco = [log.reader for log in logs if isinstance(log.reader, MujocoStateReader)]
+
+        def before_bullet(client: int) -> None:
+            for reader in bullet:
+                if reader.world.client == client:
+                    with contextlib.suppress(*reader.errors):
+                        reader.remember()
+
+        def before_mujoco(_: Any, data: Any, nstep: int) -> None:
+            for reader in mujoco:
+                if reader.data is data:
+                    reader.remember(nstep)
+
+        for reader in mujoco:
+            reader.forget()
+        watched = logs and logs[0].actions == "random"  # enough, and it takes time
+        self.calls.before_step = before_bullet if watched and bullet else None
+        self.mujoco_calls.before_step = before_mujoco
 
     def _begin(self, kind: str) -> list[WorldLog]:
         self.resets += 1
         logs = []
-        for i, world in enumerate(self._read()):
-            gravity, time_step = bullet_worlds.read_physics(world.client)
-            logged = self._worlds.setdefault(i, LoggedWorld(world, gravity, time_step))
-            logged.time_step = time_step
+        for i, reader in enumerate(self._read()):
+            world = reader.world
+            gravity, time_step = reader.read_physics()
+            logged = self._worlds.setdefault(i, LoggedWorld(world, reader, gravity, time_step))
+            logged.time_step, logged.reader = time_step, reader
             logged.gravity = max(logged.gravity, gravity, key=np.linalg.norm)
             if world.key == logged.world.key:
                 logged.world = world
-            logs.append(WorldLog(world, kind))
+            logs.append(WorldLog(reader, world, kind))
             logged.logs.append(logs[-1])
         return logs
 
-    def _read(self) -> list[World]:
-        ids = bullet_worlds.find_clients()
-        own = [bullet_worlds.read_world(id) for id in ids if id not in self.older]
+    def _read(self) -> list[StateReader]:
+        readers: list[StateReader] = []
+        if (simulation := find_mujoco(self.instance.env)) is not None:
+            readers.append(self._read_mujoco(*simulation))
+        ids = find_clients()
+        own = [read_world(id) for id in ids if id not in self.older]
         if not any(world.bodies for world in own):
-            own = [bullet_worlds.read_world(id) for id in ids]
-        return [self._without_meaningless_limits(world) for world in own if world.bodies][:4]
+            own = [read_world(id) for id in ids]
+        worlds = [self._without_meaningless_limits(world) for world in own if world.bodies][:4]
+        return [*readers, *(BulletStateReader(world, self.calls) for world in worlds)]
+
+    def _read_mujoco(self, model: Any, data: Any) -> MujocoStateReader:
+        for logged in self._worlds.values():
+            reader = logged.reader
+            if isinstance(reader, MujocoStateReader) and reader.model is model and reader.data is data:
+                return reader
+        return MujocoStateReader(model, data)
 
     def _without_meaningless_limits(self, world: World) -> World:
         bodies = []
@@ -166,10 +230,10 @@ class WorldLogger:
         return dataclasses.replace(world, bodies=tuple(bodies))
 
     def simulate_alone(self, number: int) -> None:
-        """Reset, and simulate every world without the environment, which leaves them unusable."""
+        """Reset, and simulate every world without the environment, which may leave them unusable."""
         self.play(number, "none", 0)
         for logged in self._worlds.values():
-            with contextlib.suppress(bullet_worlds.bullet().error):
+            with contextlib.suppress(*logged.reader.errors):
                 if not any(logged.gravity):
-                    logged.weight_matters = bullet_worlds.weight_matters(logged.world)
-                logged.jumps += bullet_worlds.find_jumps(logged.world, FIRST_SEED + number)
+                    logged.weight_matters = logged.reader.weight_matters()
+                logged.jumps += logged.reader.find_jumps(FIRST_SEED + number)

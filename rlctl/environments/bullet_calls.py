@@ -55,7 +55,7 @@ POSITION = 2  # PyBullet's POSITION_CONTROL
 FULL_TURN = 2 * math.pi
 
 
-class Target(NamedTuple):
+class GivenPosition(NamedTuple):
     """A position that a joint was given [rad], [m]."""
 
     client: int
@@ -83,12 +83,13 @@ class BulletCalls:
 
     def __init__(self) -> None:
         self.without_client: set[BulletCall] = set()
-        self.targets: dict[tuple[int, int, int], Target] = {}  # last motor target by client, body and joint
-        self.far_targets: list[Target] = []  # Positions of more than a full turn
+        self.targets: dict[tuple[int, int, int], GivenPosition] = {}  # last motor target by client, body and joint
+        self.far_targets: list[GivenPosition] = []  # Positions of more than a full turn
         self.queries: dict[tuple[Any, ...], ContactQuery] = {}
         self.late_links: dict[BulletCall, float] = {}  # how far getLinkState was from the present position [m]
         self.models: dict[tuple[int, int], str] = {}  # the file of a URDF, by client and body
         self.search_paths: list[str] = []
+        self.before_step: Callable[[int], None] | None = None  # called with the client before each stepSimulation
         self._known: set[tuple[CodeType, int]] = set()
 
     def note_call(self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
@@ -127,7 +128,7 @@ class BulletCalls:
             query.calls, query.contacts = query.calls + 1, query.contacts + len(result or ())
             return
         for body, joint, value, force in _read_positions(name, arguments, keywords):
-            target = Target(client, body, joint, value, force, call)
+            target = GivenPosition(client, body, joint, value, force, call)
             if name != "resetJointState":
                 self.targets[client, body, joint] = target
             if abs(value) > FULL_TURN and len(self.far_targets) < 1_000:
@@ -198,6 +199,8 @@ def record_calls(with_results: Collection[str] = RECORDED) -> Iterator[BulletCal
         def call(self: Any, *arguments: Any, **keywords: Any) -> Any:
             frame = sys._getframe(1)
             calls.note_call(name, frame, arguments, keywords)
+            if name == "stepSimulation" and calls.before_step is not None:
+                calls.before_step(int(keywords.get("physicsClientId", arguments[0] if arguments else 0)))
             result = function(*arguments, **keywords)
             if name in with_results:
                 calls.note_result(name, frame, arguments, keywords, result)

@@ -8,6 +8,7 @@ import numpy as np
 
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Context, Instance
+from rlctl.checking.mujoco_worlds import FIELDS, read_kept_fields
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, SUCCESS, CheckedEpisode, ChildMessage, Fact, Records, Series
 from rlctl.checking.rules import Check, NotJudged, RuleFinding, Severity, check, experiment, list_names
@@ -76,7 +77,7 @@ def _find_kept(instance: Instance) -> list[str]:
     read = []
     for steps in (0, KEPT_STEPS, 0):
         instance.reset(FIRST_SEED)
-        read.append(read_attributes(instance.env))
+        read.append(read_attributes(instance.env) | read_kept_fields(instance.env))
         for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=steps):
             pass
     kept, every_time = find_unequal(*read[1:]), find_unequal(*read[:2])  # a clock differs every time
@@ -119,7 +120,7 @@ def _find_cause(records: Records) -> tuple[str, str]:
     if find_difference(records, records.require_role("reused"), records.require_role("dirty")) is None:
         fix = "Let every reset do what the first one does: restore a saved state before anything reads it."
         return "; the first episode of an instance differs from all later ones", fix
-    kept = list_names(names, most=3)
+    kept = list_names(names, most=5)
     what = kept or "every attribute that step changes, and the whole simulation"
     shown = f" ({kept})" if kept else ""
     return f"; a new process repeats it, so reset keeps state{shown}", f"Set back in reset: {what}."
@@ -141,7 +142,9 @@ def _compare_other(rule: str, first: str, second: str, what: str, *needs: str) -
         if (difference := compare(records, first, second)) is not None:
             if compare(records, "alone", "reused") is not None:
                 raise NotJudged("the same instance already differs from itself (RL301, RL302)")
-            yield report(rule, records, difference, what, mild=second == "dirty" and difference.step > LATE)
+            fields = [name for name in records.facts.get("kept", []) if name.startswith(FIELDS) and second == "dirty"]
+            cause = f"; reset keeps {list_names(fields)} of MuJoCo" if fields else ""
+            yield report(rule, records, difference, what, cause, mild=second == "dirty" and difference.step > LATE)
 
     return compare_other
 

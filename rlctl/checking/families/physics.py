@@ -8,19 +8,24 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rlctl.checking.bullet_worlds import ANGULAR, JOINTS, VELOCITY, Joint, Jump, Pair, WorldBody, find_clients
+from rlctl.checking.bullet_worlds import find_clients
+from rlctl.checking.families.derived import find_wrong_reads
 from rlctl.checking.families.robots import find_misuses
 from rlctl.checking.instance import Context, EnvironmentRaised, describe_failure
+from rlctl.checking.mujoco_calls import MujocoCalls, join_calls
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, experiment, list_names
 from rlctl.checking.values import is_task
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
+from rlctl.checking.worlds import ANGULAR, JOINTS, VELOCITY, Array, Joint, Jump, Pair, WorldBody
 from rlctl.environments.bullet_calls import record_calls
 
-EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60))  # actions and logged steps
+ENGINES = {"pybullet", "mujoco"}
+EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60)) + (("random", 2),) * 16
+"""Actions and logged steps. The last ones are for what resets draw."""
 LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved yet
+LASTING_SOFT = 10  # the same for contacts of MuJoCo, which are soft by design, if they begin after a reset
 PART_OF_RANGE, LEAST_ANGLE, LEAST_LENGTH = 0.1, 0.05, 0.01
 """How far outside its limits a joint may be: part of the range, and at least so much [rad], [m]."""
 FASTEST_BASE = 50.0  # [m/s]; PyBullet stops at 100 per axis, and no robot is faster than a car
@@ -30,20 +35,20 @@ FASTEST_JUMP = 1.0  # above falling, 0.1 s after a reset: ten times gravity [m/s
 LONGEST_TIME_STEP = 0.02  # PyBullet's own is 1/240 [s]
 
 
-@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, 9, 10, 11, 12, 13, 14, 15)), share=4.0)
+@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, *range(9, 19))), share=4.0)
 def watch_worlds(context: Context) -> Iterator[ChildMessage]:
-    """Log the worlds of an instance through a few episodes, then let them fall alone, which changes them."""
-    if "pybullet" not in sys.modules:
+    """Log the worlds of an instance through a few episodes, then let them fall alone, which may change them."""
+    if not ENGINES & sys.modules.keys():
         with context.fresh():
             pass  # what it imports is imported now
-    if "pybullet" not in sys.modules:
-        raise NotApplicable("no PyBullet world")
-    older = set(find_clients())
-    with record_calls() as calls, context.fresh() as instance:
+    if not ENGINES & sys.modules.keys():
+        raise NotApplicable("no world of PyBullet or MuJoCo")
+    older, mujoco_calls = set(find_clients()), MujocoCalls()
+    with _join(mujoco_calls), record_calls() as calls, context.fresh() as instance:
         with contextlib.suppress(EnvironmentRaised):  # the first episode raises it again
             instance.reset(FIRST_SEED)
         yield from _model_faults(instance.env)
-        logger = WorldLogger(instance, older, calls)
+        logger = WorldLogger(instance, older, calls, mujoco_calls)
         for number, (kind, steps) in enumerate(EPISODES):
             if number and (not logger.worlds or context.budget.is_over()):
                 break
@@ -51,16 +56,23 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
                 logger.play(number, kind, steps)
             except EnvironmentRaised as error:
                 yield describe_failure(error, context.progress)
-        yield from find_misuses(logger.worlds, calls)
+        bounds = [leaf.flat_bounds for leaf in instance.action_leaves if leaf.supported]
+        low, high = (np.concatenate([pair[end] for pair in bounds] or [np.zeros(0)]) for end in (0, 1))
+        yield from find_misuses(logger.worlds, calls, low, high)
+        yield from find_wrong_reads(instance, mujoco_calls, logger.worlds)
         if logger.worlds and not context.budget.is_over():
             with contextlib.suppress(EnvironmentRaised):  # its resets were logged by now
                 logger.simulate_alone(len(EPISODES))
     if not logger.resets:
         raise NotJudged("no episode could be logged")
     if not logger.worlds:
-        raise NotApplicable("no PyBullet world")
+        raise NotApplicable("no world of PyBullet or MuJoCo")
     for world in logger.worlds:
         yield from _judge(world)
+
+
+def _join(calls: MujocoCalls) -> contextlib.AbstractContextManager[None]:
+    return join_calls(calls) if "mujoco" in sys.modules else contextlib.nullcontext()
 
 
 def _model_faults(env: Any) -> Iterator[ChildMessage]:
@@ -113,12 +125,13 @@ def _penetration(world: LoggedWorld) -> Iterator[RuleFinding]:
             names = [log.world.link_name(link) for link in pair]
             # What is inside each other since the reset and is thrown out is RL807.
             is_thrown = log.places[row[0]]["step"] <= 1 and any(body in name for body in thrown for name in names)
-            if len(row) >= LASTING_STEPS and not is_thrown and depth > worst.get(pair, (0.0,))[0]:
+            lasting = LASTING_SOFT if world.world.engine == "MuJoCo" and log.places[row[0]]["step"] else LASTING_STEPS
+            if len(row) >= lasting and not is_thrown and depth > worst.get(pair, (0.0,))[0]:
                 worst[pair] = depth, log, row
     for pair, (depth, log, row) in sorted(worst.items(), key=lambda item: -item[1][0])[:1]:
         at = max(row, key=lambda i: log.deep[i][pair][0])
         limit, place = log.deep[at][pair][1], log.places[at]
-        names = [log.world.link_name(link) for link in pair]
+        names = [log.world.link_name(link) for link in sorted(pair, reverse=True)]  # what is fixed comes last
         more = f"; so are {len(worst) - 1} other pairs of links" if len(worst) > 1 else ""
         lasts = f"deeper than {100 * limit:.1f} cm for {len(row)} steps in a row{more}"
         message = f"{names[0]} is {100 * depth:.1f} cm inside {names[1]} {_when(place)}, and {lasts}"
@@ -138,7 +151,7 @@ def _joint_limits(world: LoggedWorld) -> Iterator[RuleFinding]:
                 positions = states[:, JOINTS + j]
                 outside = _outside(joint, positions)
                 steps, row = int((outside > 0).sum()), int(outside.argmax())
-                if steps >= LASTING_STEPS:
+                if _is_kept_there(log, outside):
                     name, place = f"{joint.name} of {body.name}", log.places[row]
                     joints.append((float(outside[row]), name, joint, steps, place, float(positions[row])))
     joints.sort(key=lambda record: -record[0])
@@ -153,7 +166,17 @@ def _joint_limits(world: LoggedWorld) -> Iterator[RuleFinding]:
         yield RuleFinding("RL804", message, {**evidence, "other_joints": names[1:]})
 
 
-def _outside(joint: Joint, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _is_kept_there(log: WorldLog, outside: Array) -> bool:
+    """Say whether a joint is beyond its limits for more than a moment. MuJoCo's limits are soft by design: what counts
+    there is where a reset puts a joint, or where it mostly is."""
+    steps = int((outside > 0).sum())
+    if log.world.engine == "MuJoCo":
+        is_mostly = steps > max(LASTING_STEPS, len(outside) // 2)
+        return bool(outside[0] > 0) or (is_mostly and log.actions != "extreme")
+    return steps >= LASTING_STEPS
+
+
+def _outside(joint: Joint, values: Array) -> Array:
     """Return how far a joint is outside its limits, in parts of their width; 0 where that is little."""
     if not joint.has_limits:
         return np.zeros(len(values))
@@ -167,12 +190,15 @@ def _explosion(world: LoggedWorld) -> Iterator[RuleFinding]:
     fastest = [record for log in world.logs for body, states in log.bodies for record in _fast(log, body, states)]
     fastest.sort(key=lambda record: -record[0])
     parts = {part for _, part, *_ in fastest}
-    for _, _, message, evidence in fastest[:1]:
+    failed = [log for log in world.logs if log.failure and log.actions != "extreme"]
+    for log in failed[:1]:
+        yield RuleFinding("RL805", log.failure, {**log.places[-1], "actions": log.actions})
+    for _, _, message, evidence in fastest[:1] if not failed else ():
         more = f", and {len(parts) - 1} more" if len(parts) > 1 else ""  # its consequences
         yield RuleFinding("RL805", message + more, evidence)
 
 
-def _fast(log: WorldLog, body: WorldBody, states: NDArray[np.float64]) -> Iterator[tuple[float, str, str, Place]]:
+def _fast(log: WorldLog, body: WorldBody, states: Array) -> Iterator[tuple[float, str, str, Place]]:
     for row, column in np.argwhere(~np.isfinite(states))[:1].tolist():
         value, place = str(states[row, column]), log.places[row]
         message = f"the state of {body.name} is {value} {_when(place)}"

@@ -1,85 +1,19 @@
-"""RL116 and RL810 to RL815: how an environment drives and reads the robots of a PyBullet world."""
+"""RL812 and RL815 of PyBullet, and all that `find_misuses` joins: how an environment drives and reads its robots."""
 
 import itertools
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from rlctl.checking.bullet_worlds import JOINTS, ClientCalls
-from rlctl.checking.rules import RuleFinding, Severity
+from rlctl.checking.bullet_worlds import ClientCalls
+from rlctl.checking.families.motors import find_wrong_motors
+from rlctl.checking.families.readings import find_misread_quaternions, find_old_elements, find_shrunk_angles
+from rlctl.checking.rules import RuleFinding, Severity, list_names
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
-from rlctl.environments.bullet_calls import FULL_TURN, BulletCalls, ContactQuery
+from rlctl.checking.worlds import Array
+from rlctl.environments.bullet_calls import BulletCalls, ContactQuery
 
-FAR_RANGES = 3.0  # a target farther outside the limits is not just out of reach
-FEWEST_JOINTS, FEWEST_QUERIES, FEWEST_LOOKS = 3, 50, 30
+FEWEST_QUERIES = 50
 LATE_LINK = 0.001  # [m]
-NEAR, APART = 0.05, 0.2  # of sorted targets and positions; of a target and its own joint's position [rad], [m]
 MOSTLY = 0.3  # Part of all looks in which bodies have to touch, so that a query should have seen it
-SAME = 2e-4  # An element of the observation is an angle if it differs by no more in any look [rad]
-LEAST_MOTION = 0.02  # standard deviation; calmer angles may be equal by chance [rad]
-ORDERS = {"w, x, y, z": (1, 2, 3, 0), "w first, passed on as x, y, z, w": (3, 0, 1, 2)}  # where x, y, z, w come from
-ANGLES = (*("roll", "pitch", "yaw") * 3, "", "", "")
-
-
-def _find_far_targets(worlds: Sequence[LoggedWorld], calls: BulletCalls) -> Iterator[RuleFinding]:
-    bodies = [(world.world.client, body) for world in worlds for body in world.world.bodies]
-    joints = {(client, body.id, joint.index): joint for client, body in bodies for joint in body.joints}
-    for target in calls.far_targets:
-        joint = joints.get((target.client, target.body, target.joint))
-        if joint is None or not joint.is_angle or not joint.has_limits:
-            continue
-        outside = max(joint.low - target.value, target.value - joint.high)
-        if outside > FAR_RANGES * (joint.high - joint.low) and abs(target.value) > FULL_TURN:
-            limits = f"its limits are [{joint.low:.3g}, {joint.high:.3g}] rad: degrees?"
-            message = f"{target.call.name} gives joint {joint.name} the position {target.value:.4g} rad; {limits}"
-            evidence = {"element": joint.name, "value": target.value, "expected": [joint.low, joint.high]}
-            yield RuleFinding("RL810", message, evidence, where=(target.call.file, target.call.line))
-            return
-
-
-def _find_wrong_order(world: LoggedWorld) -> Iterator[RuleFinding]:
-    for log in world.logs:
-        for body, states in log.bodies if log.first_targets else ():
-            keys = [(world.world.client, body.id, joint.index) for joint in body.joints]
-            driven = {j: log.first_targets[key] for j, key in enumerate(keys) if key in log.first_targets}
-            if len(driven) < FEWEST_JOINTS:
-                continue
-            positions = states[0, [JOINTS + j for j in driven]]
-            values = np.array([target.value for target in driven.values()])
-            order = np.argsort(values, kind="stable")
-            is_sorted_same = np.abs(values[order] - np.sort(positions)).max() <= NEAR
-            wrong = np.flatnonzero(np.abs(values - positions) > APART)
-            if is_sorted_same and wrong.size >= 2:
-                (index, target), position = list(driven.items())[wrong[0]], float(positions[wrong[0]])
-                targets, joint = f"the {len(driven)} motor targets of {body.name}", body.joints[index].name
-                what = f"with the zero action {targets} are its joint positions at reset in another order"
-                message = f"{what}: {joint} is at {position:.3g} and gets {target.value:.3g}"
-                evidence = {"element": joint, "value": target.value, "expected": position}
-                yield RuleFinding("RL811", message, evidence, where=(target.call.file, target.call.line))
-                return
-
-
-def _find_weak_motors(world: LoggedWorld, calls: BulletCalls) -> Iterator[RuleFinding]:
-    p = ClientCalls(world.world.client)
-    for body, states in world.logs[0].bodies:
-        still = [0.0] * len(body.joints)
-        positions = states[0, JOINTS : JOINTS + len(body.joints)].tolist()
-        try:
-            if body.is_free or not still or p.getNumConstraints():  # a constraint may carry it
-                continue
-            torques = p.calculateInverseDynamics(body.id, positions, still, still)
-        except p.error:  # it has joints of several degrees of freedom
-            continue
-        for joint, torque in zip(body.joints, np.abs(torques).tolist(), strict=True):
-            target = calls.targets.get((world.world.client, body.id, joint.index))
-            if target is not None and 0 < target.force < torque:
-                unit = "N m" if joint.is_angle else "N"
-                needed = f"to hold the weight at reset takes {torque:.4g} {unit}"
-                message = f"the motor of {joint.name} has at most {target.force:.4g} {unit}, and {needed}"
-                evidence = {"element": joint.name, "value": target.force, "expected": torque}
-                yield RuleFinding("RL814", message, evidence, where=(target.call.file, target.call.line))
-                return
 
 
 def _find_late_links(calls: BulletCalls) -> Iterator[RuleFinding]:
@@ -97,7 +31,7 @@ def _find_empty_queries(world: LoggedWorld, calls: BulletCalls) -> Iterator[Rule
         if client != world.world.client or total < FEWEST_QUERIES or any(query.contacts for query in queries):
             continue
         for query in queries:
-            if why := _explain_empty(world, query):
+            if why := _explain_empty(world, query) or _explain_alone(world, query, calls):
                 text, severity = why
                 message = f"{total} calls of getContactPoints returned no contact: {text}"
                 evidence = {"element": f"bodies {query.bodies}, links {query.links}", "value": 0}
@@ -125,6 +59,39 @@ def _explain_empty(world: LoggedWorld, query: ContactQuery) -> tuple[str, Severi
     return f"{text} (link {other[1]})", Severity.WARNING if is_next else Severity.INFO
 
 
+def _explain_alone(world: LoggedWorld, query: ContactQuery, calls: BulletCalls) -> tuple[str, Severity] | None:
+    """Explain an empty query of one of several links that are alike, of which no other is ever asked."""
+    side = 0 if query.links[0] is not None else 1
+    (body, link), other = (query.bodies[side], query.links[side]), query.bodies[1 - side]
+    if link is None or link < 0 or query.links[1 - side] is not None:
+        return None
+    asked = {
+        (asked.bodies[end], asked.links[end])
+        for asked in calls.queries.values()
+        for end in (0, 1)
+        if asked.client == query.client and asked.bodies[1 - end] in (other, -1) and asked.call.file == query.call.file
+    }
+    twins = _find_twins(query.client, body, link)
+    if not twins or asked & {(body, twin) for twin in (*twins, None, -1)}:
+        return None
+    names = list_names([f"{world.world.link_name((body, twin))} (link {twin})" for twin in twins])
+    text = f"it asks for {world.world.link_name((body, link))} (link {link}) alone, and nothing asks for {names}"
+    return f"{text}, which are like it: same parent, mass and inertia", Severity.WARNING
+
+
+def _find_twins(client: int, body: int, link: int) -> list[int]:
+    """Return the other links with the same parent, mass and inertia."""
+    p = ClientCalls(client)
+
+    def describe(number: int) -> tuple[object, ...]:
+        mass, _, inertia, *_ = p.getDynamicsInfo(body, number)
+        return p.getJointInfo(body, number)[16], mass, inertia
+
+    others = [number for number in range(p.getNumJoints(body)) if number != link]
+    weighs = p.getDynamicsInfo(body, link)[0] > 0
+    return [number for number in others if weighs and describe(number) == describe(link)]
+
+
 def _has_shape(world: LoggedWorld, body: int, link: int) -> bool:
     p, others = ClientCalls(world.world.client), [other.id for other in world.world.bodies if other.id != body]
     return not others or any(p.getClosestPoints(other, body, 1e3, linkIndexB=link) for other in others)
@@ -147,50 +114,13 @@ def _are_joined(client: int, one: tuple[int, int], two: tuple[int, int]) -> bool
     return any(link >= 0 and p.getJointInfo(body, link)[16] == parent for (body, link), (_, parent) in pairs)
 
 
-def _find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
-    logs = [log for log in world.logs if log.observed and len({row.size for row in log.observed}) == 1]
-    if sum(len(log.observed) for log in logs) < FEWEST_LOOKS or len({log.observed[0].size for log in logs}) != 1:
-        return
-    observed = np.concatenate([np.stack(log.observed) for log in logs]).astype(np.float64)
-    moving = np.flatnonzero(observed.std(axis=0) > LEAST_MOTION)
-    links = set.intersection(*(set(orientations) for log in logs for orientations in log.orientations))
-    right, wrong = [], []
-    for link in sorted(links):
-        quaternions = np.array([orientations[link] for log in logs for orientations in log.orientations])
-        right.append(find_angles(quaternions))
-        wrong += [(link, name, find_angles(quaternions[:, order])) for name, order in ORDERS.items()]
-    for column in moving:
-        values = observed[:, column, None]
-        if any((np.abs(np.abs(values) - np.abs(angles)).max(axis=0) <= SAME).any() for angles in right):
-            continue
-        for link, order, angles in wrong:
-            is_same = (np.abs(values - angles).max(axis=0) <= SAME) & (angles.std(axis=0) > LEAST_MOTION)
-            for which in np.flatnonzero(is_same)[:1]:
-                angle = f"{('', 'the sine of ', 'the cosine of ', 'gravity')[which // 3]}{ANGLES[which]}"
-                name = f"observation[{column}]"
-                message = f"{name} is {angle} of {world.world.link_name(link)} with its quaternion read as {order}"
-                yield RuleFinding("RL116", message, {"element": name, "value": order, "expected": "x, y, z, w"})
-                return
-
-
-def find_angles(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return roll, pitch and yaw, their sines and cosines, and the direction of gravity in the body's frame, shape
-    (n, 12), of quaternions x, y, z, w, shape (n, 4)."""
-    x, y, z, w = quaternions.T
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    angles = np.stack([roll, pitch, yaw], axis=1)
-    down = -np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
-    return np.concatenate([angles, np.sin(angles), np.cos(angles), down], axis=1)
-
-
-def find_misuses(worlds: Sequence[LoggedWorld], calls: BulletCalls) -> Iterator[RuleFinding]:
-    """Yield what is wrong with how the robots of some worlds are driven and read; the worlds have to be there still."""
-    yield from _find_far_targets(worlds, calls)
+def find_misuses(worlds: Sequence[LoggedWorld], calls: BulletCalls, low: Array, high: Array) -> Iterator[RuleFinding]:
+    """Yield what is wrong with how the robots of some worlds are driven and read; the worlds have to be there still.
+    `low` and `high` bound the action, shape (n,)."""
     yield from _find_late_links(calls)
     for world in worlds:
-        yield from _find_wrong_order(world)
-        yield from _find_weak_motors(world, calls)
-        yield from _find_empty_queries(world, calls)
-        yield from _find_misread_quaternions(world)
+        yield from find_wrong_motors(world, calls, low, high)
+        yield from find_misread_quaternions(world)
+        yield from find_old_elements(world)
+        yield from find_shrunk_angles(world)
+        yield from _find_empty_queries(world, calls) if world.world.engine == "PyBullet" else ()

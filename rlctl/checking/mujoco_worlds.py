@@ -1,0 +1,286 @@
+"""Reads the model and the data of an environment that MuJoCo simulates, without changing either.
+
+`MjData` has what is derived from positions (poses of bodies, contacts) as of the last substep's beginning. A copy is
+brought up to date at each `update`, and read.
+"""
+
+import math
+import sys
+from typing import Any
+
+import numpy as np
+
+from rlctl.checking.values import Attribute
+from rlctl.checking.worlds import (
+    LONGEST_S,
+    MOST_BODIES,
+    MOST_JOINTS,
+    MOST_LINKS,
+    MOST_STEPS,
+    Array,
+    Joint,
+    JointKey,
+    Jump,
+    Link,
+    Motor,
+    MotorTarget,
+    Pair,
+    Poses,
+    World,
+    WorldBody,
+    WrittenCommand,
+)
+from rlctl.environments.info import find_mujoco
+
+FREE, BALL, SLIDE = 0, 1, 2  # MuJoCo's types of joints; 3 is a hinge
+PLANES = (0, 1)  # Types of geoms without a thickness: planes and height fields
+ON_JOINT, FIXED_GAIN, AFFINE = (0, 1), 0, 1  # Types of actuators: what they move, and how they compute their force
+FIELDS = ("data.", "model.")
+KEPT = (
+    *("data.time", "data.act", "data.ctrl", "data.qfrc_applied", "data.xfrc_applied", "data.mocap_pos"),
+    *("data.qacc_warmstart", "model.body_mass", "model.geom_friction", "model.dof_damping", "model.actuator_gainprm"),
+)
+"""What mj_resetData sets back besides positions and velocities, and what is randomised most often."""
+UNSTABLE = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+
+
+def library() -> Any:
+    """Return MuJoCo, which the environment has loaded."""
+    return sys.modules["mujoco"]
+
+
+def read_kept_fields(env: Any) -> dict[str, Attribute]:
+    """Return copies of the fields of `KEPT` of an environment that MuJoCo simulates; empty for any other."""
+    if (simulation := find_mujoco(env)) is None:
+        return {}
+    owners = dict(zip(FIELDS, reversed(simulation), strict=True))
+    pairs = [(name, owners[f"{name.partition('.')[0]}."], name.partition(".")[2]) for name in KEPT]
+    copies = [(name, owner, key, np.array(getattr(owner, key))) for name, owner, key in pairs]
+    return {name: Attribute(name, owner, key, value) for name, owner, key, value in copies if value.size}
+
+
+def refresh(model: Any, data: Any) -> None:
+    """Compute what follows from positions and velocities: poses, contacts, their sensors. No callback is called."""
+    mujoco = library()
+    mujoco.mj_fwdPosition(model, data)
+    mujoco.mj_sensorPos(model, data)
+    mujoco.mj_fwdVelocity(model, data)
+    mujoco.mj_sensorVel(model, data)
+
+
+def read_world(model: Any) -> World:
+    """Return the bodies of a model: one for each tree of MuJoCo's bodies, and the world itself."""
+    roots = [body for body in range(1, model.nbody) if int(model.body_parentid[body]) == 0]
+    bodies = sorted((_body(model, root) for root in roots), key=lambda body: (not body.joints, not body.is_free))
+    world = WorldBody(0, "the world", ("",), (), is_free=False, has_heavy_links=False)
+    motors = [_motor(model, actuator) for actuator in range(model.nu)]
+    known = tuple(motor for motor in motors if motor is not None)
+    return World(0, (*bodies[:MOST_BODIES], world), "MuJoCo", known if len(known) == len(motors) else ())
+
+
+def _links(model: Any, root: int) -> list[int]:
+    return [int(body) for body in np.flatnonzero(model.body_rootid == root)]
+
+
+def _body(model: Any, root: int) -> WorldBody:
+    links = _links(model, root)
+    names = [model.body(link).name for link in links]
+    numbers = [joint for joint in range(model.njnt) if int(model.jnt_bodyid[joint]) in links]
+    joints = [_joint(model, joint) for joint in numbers if int(model.jnt_type[joint]) >= SLIDE][:MOST_JOINTS]
+    is_free = any(int(model.jnt_type[j]) == FREE for j in numbers)
+    heavy = bool(joints) and bool((model.body_mass[links[1:]] > 0).any())
+    return WorldBody(root, names[0] or f"body {root}", tuple(names), tuple(joints), is_free, heavy)
+
+
+def _joint(model: Any, joint: int) -> Joint:
+    low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (0.0, -1.0)
+    name = model.joint(joint).name or f"joint {joint}"
+    return Joint(joint, name, int(model.jnt_type[joint]) != SLIDE, float(low), float(high))
+
+
+def _motor(model: Any, actuator: int) -> Motor | None:
+    joint = int(model.actuator_trnid[actuator, 0])
+    if int(model.actuator_trntype[actuator]) not in ON_JOINT or int(model.jnt_type[joint]) < SLIDE:
+        return None
+    gain, bias = float(model.actuator_gainprm[actuator, 0]), float(model.actuator_biasprm[actuator, 1])
+    kinds = int(model.actuator_gaintype[actuator]), int(model.actuator_biastype[actuator])
+    holds = kinds == (FIXED_GAIN, AFFINE) and gain > 0 and math.isclose(bias, -gain)
+    has_range = bool(model.actuator_ctrllimited[actuator])
+    low, high = model.actuator_ctrlrange[actuator] if has_range else (-math.inf, math.inf)
+    name = model.actuator(actuator).name or f"actuator {actuator}"
+    root, gear = int(model.body_rootid[model.jnt_bodyid[joint]]), float(model.actuator_gear[actuator, 0]) or 1.0
+    return Motor(name, _joint(model, joint), root, holds, gear, float(low), float(high))
+
+
+class MujocoStateReader:
+    """Reads one model and its data: a `StateReader`."""
+
+    errors = ()
+
+    def __init__(self, model: Any, data: Any) -> None:
+        self.model, self.data = model, data
+        self.world = read_world(model)
+        self._now, self._other = library().MjData(model), library().MjData(model)
+        self._before: tuple[Array, Array] | None = None  # qpos and qvel before the last call that advanced the physics
+        self._first: tuple[Array, Array] | None = None  # The same before the first call of a control step
+        self.touched: list[set[int]] = []  # The geoms that touch another one, at each update
+        self._calls = 0
+        """Calls since the last update that advanced the physics by one substep each; -1 if one took several."""
+        self._links = {body.id: _links(model, body.id) for body in self.world.bodies if body.id}
+        self._link_of = {body: (root, i - 1) for root, links in self._links.items() for i, body in enumerate(links)}
+        self._joints = np.array([motor.joint.index for motor in self.world.motors], np.intp)
+
+    def update(self) -> None:
+        """See `StateReader`."""
+        library().mj_copyData(self._now, self.model, self.data)
+        refresh(self.model, self._now)
+        contacts = self._now.contact
+        self.touched.append(set(contacts.geom[(contacts.dist <= 0) & (contacts.exclude == 0)].ravel().tolist()))
+
+    def remember(self, nstep: int) -> None:
+        """Keep positions and velocities as those before the next step of the physics."""
+        self._before = self.data.qpos.copy(), self.data.qvel.copy()
+        self._first = self._first or self._before
+        self._calls = -1 if nstep > 1 or self._calls < 0 else self._calls + 1
+
+    def forget(self) -> None:
+        """Begin another control step."""
+        self._before, self._first, self._calls = None, None, 0
+
+    def _read_state(self, body: WorldBody, qpos: Array, qvel: Array, xpos: Array) -> Array:
+        joints = [joint.index for joint in body.joints]
+        positions, speeds = self.model.jnt_qposadr[joints], self.model.jnt_dofadr[joints]
+        base = np.zeros(6)
+        if body.is_free:
+            (first,) = self.model.jnt_dofadr[self.model.body_jntadr[[body.id]]]
+            base = qvel[first : first + 6]
+        return np.concatenate([xpos, base, qpos[positions], qvel[speeds]])
+
+    def read_states(self) -> list[Array]:
+        """See `StateReader`."""
+        now = self._now
+        return [self._read_state(body, now.qpos, now.qvel, now.xpos[body.id]) for body in self.world.bodies]
+
+    def read_poses(self) -> Poses:
+        """See `StateReader`."""
+        return self._read_poses(self._now)
+
+    def _read_poses(self, data: Any) -> Poses:
+        poses = {}
+        for body in self.world.bodies:
+            if body.is_free or body.joints:
+                for number, link in enumerate(self._links[body.id][: MOST_LINKS + 1]):
+                    quaternion = np.roll(data.xquat[link], -1)  # w last
+                    poses[body.id, number - 1] = np.concatenate([data.xpos[link], quaternion, data.xipos[link]])
+        return poses
+
+    def read_before(self) -> tuple[list[Array], Poses] | None:
+        """See `StateReader`; None where all substeps were one call."""
+        if self._before is None or self._calls < 2:
+            return None
+        mujoco, before, (qpos, qvel) = library(), self._other, self._before
+        mujoco.mj_copyData(before, self.model, self._now)
+        before.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, before)
+        mujoco.mj_comPos(self.model, before)
+        states = [self._read_state(body, qpos, qvel, before.xpos[body.id]) for body in self.world.bodies]
+        return states, self._read_poses(before)
+
+    def read_contacts(self) -> dict[Pair, float]:
+        """See `StateReader`."""
+        deepest: dict[Pair, float] = {}
+        contacts = self._now.contact
+        is_active = contacts.exclude == 0  # the others push nothing, as between parts that are welded together
+        pairs = contacts.geom[is_active].tolist(), contacts.dist[is_active].tolist()
+        for (one, two), distance in zip(*pairs, strict=True):
+            if one >= 0 and two >= 0:  # flexible bodies have none
+                pair = self._link(one), self._link(two)
+                deepest[pair] = min(deepest.get(pair, math.inf), distance)
+        return deepest
+
+    def _link(self, geom: int) -> Link:
+        body = int(self.model.geom_bodyid[geom])
+        return self._link_of.get(body, (int(self.model.body_rootid[body]), -1))
+
+    def find_thickness(self, pair: Pair) -> float:
+        """See `StateReader`."""
+        bodies = [self._links[root][number + 1] if root in self._links else root for root, number in pair]
+        sizes = [
+            2.0 * float(self.model.geom_aabb[geom, 3:].min())
+            for geom in range(self.model.ngeom)
+            if int(self.model.geom_bodyid[geom]) in bodies and int(self.model.geom_type[geom]) not in PLANES
+        ]
+        return min(sizes, default=math.inf)
+
+    def read_targets(self) -> dict[JointKey, MotorTarget]:
+        """See `StateReader`; of actuators whose input is a position."""
+        targets = {}
+        for number, motor in enumerate(self.world.motors):
+            if motor.holds_position:
+                force = math.inf
+                if self.model.actuator_forcelimited[number]:
+                    force = float(np.abs(self.model.actuator_forcerange[number]).max()) * abs(motor.gear)
+                value = float(self.data.ctrl[number]) / motor.gear
+                targets[motor.body, motor.joint.index] = MotorTarget(value, force, f"actuator {motor.name}")
+        return targets
+
+    def read_command(self) -> WrittenCommand | None:
+        """See `StateReader`."""
+        if self._before is None or self._first is None or not len(self._joints):
+            return None
+        positions, speeds = self.model.jnt_qposadr[self._joints], self.model.jnt_dofadr[self._joints]
+        (qpos, qvel), (first_qpos, first_qvel) = self._before, self._first
+        first = first_qpos[positions], first_qvel[speeds]
+        return WrittenCommand(self.data.ctrl.copy(), qpos[positions], qvel[speeds], *first)
+
+    def read_weights(self) -> dict[JointKey, float]:
+        """See `StateReader`; empty for robots that stand on something, or are bound by an equality."""
+        mujoco, model, still = library(), self.model, self._other
+        mujoco.mj_copyData(still, model, self._now)
+        still.qvel[:] = 0
+        refresh(model, still)
+        forces = np.abs(still.qfrc_bias - still.qfrc_passive)
+        touching = {link[0] for pair in self.read_contacts() for link in pair}
+        return {
+            (body.id, joint.index): float(forces[model.jnt_dofadr[joint.index]])
+            for body in self.world.bodies
+            if not body.is_free and body.id not in touching and not model.neq
+            for joint in body.joints
+        }
+
+    def read_physics(self) -> tuple[list[float], float]:
+        """See `StateReader`."""
+        return self.model.opt.gravity.tolist(), float(self.model.opt.timestep)
+
+    def read_failure(self) -> str:
+        """See `StateReader`: MuJoCo found the simulation unstable and set it back to the model's first position."""
+        mujoco, warnings = library(), self.data.warning
+        for name in UNSTABLE:
+            if warnings[int(getattr(mujoco.mjtWarning, name))].number:
+                return f"MuJoCo reports {name}: the simulation is unstable, and mj_step has reset it"
+        return ""
+
+    def weight_matters(self) -> bool:
+        """See `StateReader`; gravity is only zero in MuJoCo where the model says so."""
+        return False
+
+    def find_jumps(self, seed: int) -> list[Jump]:
+        """See `StateReader`; the environment's data are not changed."""
+        mujoco, model, alone = library(), self.model, self._other
+        mujoco.mj_copyData(alone, model, self.data)
+        gravity, dt = float(np.linalg.norm(model.opt.gravity)), float(model.opt.timestep)
+        free = {b.name: int(model.jnt_dofadr[model.body_jntadr[b.id]]) for b in self.world.bodies if b.is_free}
+        speeds = [_free_speeds(alone, free)]
+        for _ in range(min(MOST_STEPS, max(1, round(LONGEST_S / dt)))):
+            mujoco.mj_step(model, alone)
+            speeds.append(_free_speeds(alone, free))
+        jumps = []
+        for name, before in speeds[0].items():
+            step = max(range(len(speeds)), key=lambda i: speeds[i][name])
+            jumps.append(Jump(name, speeds[step][name], before + gravity * step * dt, step * dt, seed))
+        return jumps
+
+
+def _free_speeds(data: Any, free: dict[str, int]) -> dict[str, float]:
+    speeds = {name: float(np.linalg.norm(data.qvel[first : first + 3])) for name, first in free.items()}
+    return {name: min(speed, 1e6) if math.isfinite(speed) else 1e6 for name, speed in speeds.items()}

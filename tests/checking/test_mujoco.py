@@ -1,0 +1,76 @@
+"""RL116 and RL8 in MuJoCo: each mistake is found, in two robots where it can be made in both, and none in the twins."""
+
+import pytest
+
+from tests.checking.judging import case, check_case, findings
+
+pytest.importorskip("mujoco")
+
+
+def broken(name, rule, severity="warning", twin=None):
+    base = "mujoco_robots.py:MujocoArm" if name.startswith("Arm") else "mujoco_robots.py:MujocoHopper"
+    return case(f"broken_mujoco.py:{name}", (rule, severity), twin=f"broken_mujoco.py:{twin}" if twin else base)
+
+
+CASES = [
+    broken("HopperQuaternion", "RL116", "error"),
+    broken("HopperVelocity", "RL116", "error", "HopperRightVelocity"),
+    broken("HopperHeading", "RL116", "error", "HopperRightHeading"),
+    broken("ArmQuaternion", "RL116", "error", "ArmRightQuaternion"),
+    broken("ArmBeyondLimits", "RL804"),
+    broken("HopperExplodes", "RL805"),
+    broken("HopperInTheGround", "RL807"),
+    broken("ArmLongSteps", "RL813"),
+    broken("ArmWeakMotors", "RL814"),
+    broken("ArmDegrees", "RL810", "error"),
+    broken("ArmRangeInDegrees", "RL810", "error", "ArmRange"),
+    broken("ArmRangeOfActuatorInDegrees", "RL810"),
+    broken("ArmObservesRadiansOfRadians", "RL810", "error"),
+    broken("HopperStartsInDegrees", "RL810", "error"),
+    broken("ArmOrder", "RL811", "error"),
+    broken("ArmOrderOfRanges", "RL811", "error", "ArmRange"),
+    broken("HopperOrder", "RL811", "error"),
+    broken("HopperOtherSoles", "RL812", twin="HopperThighs"),
+    broken("ArmTouchesWithPalm", "RL812", twin="ArmTouchesWithFinger"),
+    broken("ArmOldTip", "RL815"),
+    broken("ArmOldSensor", "RL815", twin="ArmRightSensor"),
+    broken("ArmResetsWithoutForward", "RL815"),
+    broken("ArmForwardTooEarly", "RL815"),
+    broken("HopperStateInTheLoop", "RL815"),
+    broken("ArmBeyondRange", "RL816"),
+    broken("HopperTorqueBeyondRange", "RL816", twin="HopperTorque"),
+    broken("ArmGrowsHeavy", "RL817", "error", "ArmNominalMass"),
+    broken("HopperSlips", "RL817", "error", "HopperFriction"),
+    broken("ArmKeepsActivation", "RL302", "error", "ArmResets"),
+    broken("HopperKeepsTime", "RL301", "error", "HopperResets"),
+    broken("HopperForces", "RL818", twin="HopperRightForces"),
+    broken("ArmInverse", "RL818", twin="ArmActuator"),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "rule", "words"),
+    [
+        ("HopperQuaternion", "RL116", ("of body", "(w, x, y, z) read as x, y, z, w")),
+        ("ArmOrder", "RL811", ("another order", "shoulder")),
+        ("HopperOrder", "RL811", ("right_knee", "left_knee", "not of its own joint")),
+        ("ArmRangeInDegrees", "RL810", ("were taken for degrees", "shoulder")),
+        ("HopperOtherSoles", "RL812", ("geom left_thigh",)),
+        ("ArmOldTip", "RL815", ("site_xpos of tip", "one substep old")),
+        ("ArmResetsWithoutForward", "RL815", ("of reset", "before mj_forward")),
+        ("HopperStateInTheLoop", "RL815", ("observation[0] (position of body)",)),
+        ("ArmBeyondRange", "RL816", ("only", "of the action's range")),
+        ("ArmGrowsHeavy", "RL817", ("body_mass[1] (upper)",)),
+        ("ArmKeepsActivation", "RL302", ("reset keeps state (data.act",)),
+        ("HopperForces", "RL818", ("data.cfrc_ext", "mj_rnePostConstraint")),
+    ],
+)
+def test_finding_names_what_is_wrong(name, rule, words):
+    messages = " ".join(finding.message for finding in findings(f"broken_mujoco.py:{name}", rule))
+    assert [word for word in words if word not in messages] == []
