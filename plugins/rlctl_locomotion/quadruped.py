@@ -135,4 +135,6 @@ class Quadruped(Legged):
 
     def describe_joints(self) -> Joints:
         """The legs', leg by leg."""
-        return self.body.describe_joints(JOINTS, default_positions=STANCE.tolist(), action_scale=ANGLES.tolist())
+        return self.body.describe_joints(
+            JOINTS, default_positions=STANCE.tolist(), action_scale=ANGLES.tolist(), clips_target=True
+        )
