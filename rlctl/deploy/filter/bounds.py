@@ -92,6 +92,34 @@ class Bounds:
             x = _clip(x, -room[1], room[0], self.position_name, on_limit)
         return x
 
+    def list_constants(self) -> dict[str, Array | None]:
+        """Return the arrays that the methods compute with, by the names that they have in exported C."""
+        return {
+            "command_factor": self.factor,
+            "command_offset": self.offset,
+            "command_low": self.low,
+            "command_high": self.high,
+            "position_low": self.position[0],
+            "position_high": self.position[1],
+            "speed": self.speed,
+            "change": self.change,
+            "least": self._least,
+            "most": self._most,
+            "per_square": self._per_square,
+            "per_step": self._per_step,
+            "quick_low": self._quick_low,
+            "quick_high": self._quick_high,
+            "middle_low": self._middle_low,
+            "middle_high": self._middle_high,
+            "slack": self._slack,
+            "slack_speed": self._slack_speed,
+            "slack_change": self._slack_change,
+            "slack_position_low": self._slack_position[0],
+            "slack_position_high": self._slack_position[1],
+            "slack_low": self._slack_low,
+            "slack_high": self._slack_high,
+        }
+
     def keeps_ends(self, value: Array) -> bool:
         """Return whether a value is within its bounds."""
         # Comparing bytes takes a tenth of the time of `(a != b).any()`.
