@@ -25,8 +25,8 @@ Clips = Literal["", "exact", "towards"]
 _KEYWORDS = set(
     re.findall(
         r"\w+",
-        "auto break case char const continue default do double else enum extern float for goto if inline int long register "
-        "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while "
+        "auto break case char const continue default do double else enum extern float for goto if inline int long "
+        "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while "
         "bool catch class delete explicit export false friend mutable namespace new operator private protected public "
         "template this throw true try typename using virtual and or not xor",
     )

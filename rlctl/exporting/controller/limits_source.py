@@ -74,6 +74,11 @@ class LimitsSource:
         return self.speed or self.change or (self.bounds_position and not self.is_value)
 
     @property
+    def precision(self) -> str:
+        """Relative precision of the last check."""
+        return repr(float(self.bounds.precision))
+
+    @property
     def alpha(self) -> str:
         """Weight of the newest command in the low-pass; empty without one."""
         return repr(self._command.alpha) if self._command.alpha < 1.0 else ""

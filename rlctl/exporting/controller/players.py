@@ -67,9 +67,7 @@ class CController(Controller):
         """Give an order: one of `ORDERS`."""
         self.library.rlctl_order(self.state, ctypes.c_int(ORDERS.index(order)))
 
-    def step(
-        self, inputs: Inputs | None, age_s: float = 0.0
-    ) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
+    def step(self, inputs: Inputs | None, age_s: float = 0.0) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
         """Return copies of action and targets."""
         pointer = None
         if inputs is not None:
@@ -81,9 +79,7 @@ class CController(Controller):
 
     def limit(self, values: NDArray[np.float64] | None, age_s: float, requested: NDArray[Any] | None) -> NDArray[Any]:
         """Return the action of the limits alone, for a policy's action."""
-        pointers = [
-            None if array is None else array.ctypes.data_as(ctypes.c_void_p) for array in (values, requested)
-        ]
+        pointers = [None if array is None else array.ctypes.data_as(ctypes.c_void_p) for array in (values, requested)]
         outputs = self._outputs[0], self._outputs[2]
         self.library.rlctl_limit(self.state, pointers[0], ctypes.c_double(age_s), pointers[1], *outputs)
         return self.action
@@ -96,7 +92,11 @@ class CController(Controller):
 
 def compile_controller(code: CSource, folder: Path, compiler: list[str]) -> Path:
     """Compile a controller in `folder` and return the library; raises `AnswerIsNo` if the compiler fails."""
-    for name, content in ((f"{code.name}.h", code.header), (f"{code.name}.c", code.source), ("harness.c", code.harness)):
+    for name, content in (
+        (f"{code.name}.h", code.header),
+        (f"{code.name}.c", code.source),
+        ("harness.c", code.harness),
+    ):
         (folder / name).write_text(content, encoding="utf-8")
     library = folder / f"{code.name}{LIBRARY_SUFFIX}"
     command = [*compiler, *FLAGS, "-fPIC", "-shared", "-o", str(library), "harness.c", "-lm"]
