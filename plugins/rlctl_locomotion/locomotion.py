@@ -170,7 +170,7 @@ class Locomotion(Task):
 
     def describe_joints(self) -> Joints:
         """Those with a motor; actions are torques."""
-        return self.body.describe_joints(list(self.motors), action_torque=self.top_torques.tolist())
+        return self.body.describe_joints(list(self.motors))
 
 
 def cut_off(value: float) -> float:

@@ -135,6 +135,4 @@ class Quadruped(Legged):
 
     def describe_joints(self) -> Joints:
         """The legs', leg by leg."""
-        return self.body.describe_joints(
-            JOINTS, default_positions=STANCE.tolist(), action_scale=ANGLES.tolist(), clips_target=True
-        )
+        return self.body.describe_joints(JOINTS, default_positions=STANCE.tolist(), action_scale=ANGLES.tolist())

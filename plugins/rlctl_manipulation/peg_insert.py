@@ -152,4 +152,4 @@ class PegInsert(Task):
 
     def describe_joints(self) -> Joints:
         """The arm's, which get speeds."""
-        return self.arm.describe_joints(JOINTS, action_speed=TOP_SPEED.tolist())
+        return self.arm.describe_joints(JOINTS)

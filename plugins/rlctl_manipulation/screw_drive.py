@@ -182,4 +182,4 @@ class ScrewDrive(Task):
 
     def describe_joints(self) -> Joints:
         """The gantry's, which get speeds."""
-        return self.gantry.describe_joints(JOINTS, action_speed=TOP_SPEED.tolist())
+        return self.gantry.describe_joints(JOINTS)

@@ -103,7 +103,12 @@ def compare(arm, options, count, seed, folder):
     source, controller = build_controller(make_policy(make_arm(**arm)), folder, limits)
     safety = SafetyFilter(source.layout.inputs_info, limits, clock=lambda: 0.0)
     space = source.layout.action_space
-    last, rng, seen, position = np.zeros(5), np.random.default_rng(seed), dict.fromkeys(("idle", "running", "holding", "stopped"), 0), None
+    last, rng, seen, position = (
+        np.zeros(5),
+        np.random.default_rng(seed),
+        dict.fromkeys(("idle", "running", "holding", "stopped"), 0),
+        None,
+    )
     for row, age, order in zip(*draw_steps(rng, count, space.dtype), strict=True):
         if order in ("stop", "hold", "resume", "reset") or (order == "home" and "home" in options):
             getattr(safety, order)()

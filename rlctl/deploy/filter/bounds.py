@@ -122,8 +122,7 @@ class Bounds:
 
     def keeps_ends(self, value: Array) -> bool:
         """Return whether a value is within its bounds."""
-        # Comparing bytes takes a tenth of the time of `(a != b).any()`.
-        return np.minimum(np.maximum(value, self.low), self.high).tobytes() == value.tobytes()
+        return _are_equal(np.minimum(np.maximum(value, self.low), self.high), value)
 
     def clip_ends(self, value: Array, on_limit: OnLimit) -> Array:
         """Return the value or motion within the bounds of the command."""
@@ -170,17 +169,17 @@ class Bounds:
         low, high = self._least, self._most
         if reach is not None:
             low, high = np.maximum(low, reach[0]), np.minimum(high, reach[1])
-        if np.minimum(np.maximum(x, low), high).tobytes() != x.tobytes():
+        if not _are_equal(np.minimum(np.maximum(x, low), high), x):
             return False
         return not self.bounds_position or reference is None or self._keeps_position(x, reference)
 
     def _keeps_position(self, x: Array, reference: Array) -> bool:
         """Return whether there is clearly room to brake after a motion that keeps the limit of speed."""
-        if np.minimum(np.maximum(reference, self._middle_low), self._middle_high).tobytes() == reference.tobytes():
+        if _are_equal(np.minimum(np.maximum(reference, self._middle_low), self._middle_high), reference):
             return True
         end = x if self.change is None else x * (np.abs(x) * self._per_square + self._per_step)
         end = end + reference
-        return bool(np.minimum(np.maximum(end, self._quick_low), self._quick_high).tobytes() == end.tobytes())
+        return _are_equal(np.minimum(np.maximum(end, self._quick_low), self._quick_high), end)
 
     def _find_room(self, reference: Array) -> Array:
         """Return how far a step may go up and down, shape (2, count).
@@ -201,6 +200,11 @@ class Bounds:
         room = distance / n + 0.5 * s * (n - 1.0)
         # No bound on the change, or none on the position.
         return np.where(np.isfinite(room), room, distance)
+
+
+def _are_equal(a: Array, b: Array) -> bool:
+    # Comparing bytes takes a tenth of the time of `(a == b).all()`, but -0.0 and 0.0 are equal.
+    return a.tobytes() == b.tobytes() or bool((a == b).all())
 
 
 def _clip(x: Array, low: Array, high: Array, name: str, on_limit: OnLimit) -> Array:

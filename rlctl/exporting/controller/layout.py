@@ -101,8 +101,8 @@ class ControllerLayout:
         self.info, env = info, info.env
         space, action_space = env.spaces()
         self.parts = split_space(space)
-        if not isinstance(action_space, spaces.Box) or action_space.dtype.kind != "f":
-            raise UsageError(f"export --controller: actions must be real numbers in a Box, not {action_space}")
+        if not isinstance(action_space, spaces.Box) or action_space.dtype.kind != "f" or len(action_space.shape) != 1:
+            raise UsageError(f"export --controller: actions must be a vector of real numbers, not {action_space}")
         if any(not isinstance(part, spaces.Box) or len(part.shape) != 1 for part in self.parts.values()):
             raise UsageError("export --controller: observations must be vectors; images and choices are not supported")
         self.action_space, self.dtype = action_space, observation_type(info)

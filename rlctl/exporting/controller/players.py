@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, short_repr
 from rlctl.exporting.c_source import FLAGS, CSource
+from rlctl.exporting.controller.graph import TARGET
 from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type
+from rlctl.policy.onnx_policy import ACTION, open_session
 
 Inputs = Mapping[str, NDArray[Any]]
 STATUS = ("idle", "running", "holding", "stopped")
@@ -88,6 +90,40 @@ class CController(Controller):
         """Repeat a step in a C loop, to measure its time."""
         self._values[:] = np.concatenate([np.ravel(inputs[part.name]) for part in self._layout.quantities])
         self.library.rlctl_repeat(self.state, self._values.ctypes.data_as(ctypes.c_void_p), ctypes.c_long(count))
+
+
+class OnnxController(Controller):
+    """A controller as an ONNX file."""
+
+    def __init__(self, content: bytes) -> None:
+        self.session = open_session(content)
+        self._outputs = [port.name for port in self.session.get_outputs()]
+        self._states = {
+            port.name: np.zeros([1 if isinstance(size, str) else size for size in port.shape], _DTYPES[port.type])
+            for port in self.session.get_inputs()
+            if f"{port.name}_out" in self._outputs
+        }
+        self._dtypes = {port.name: _DTYPES[port.type] for port in self.session.get_inputs()}
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin an episode: zeros in place of the state."""
+        self._state = dict(self._states)
+
+    def step(self, inputs: Inputs) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
+        """Return action and targets."""
+        feed = {name: np.asarray(value, self._dtypes[name]).reshape(1, -1) for name, value in inputs.items()}
+        results = dict(zip(self._outputs, self.session.run(self._outputs, feed | self._state), strict=True))
+        self._state = {name: results[f"{name}_out"] for name in self._states}
+        target = results.get(TARGET)
+        return results[ACTION][0], None if target is None else target[0]
+
+
+_DTYPES: dict[str, np.dtype[Any]] = {
+    "tensor(float)": np.dtype(np.float32),
+    "tensor(double)": np.dtype(np.float64),
+    "tensor(int64)": np.dtype(np.int64),
+}
 
 
 def compile_controller(code: CSource, folder: Path, compiler: list[str]) -> Path:
