@@ -11,7 +11,7 @@ from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.file import PolicyFile, PolicyInfo
 
 
-def make_policy(env, seed=0, **fields):
+def make_policy(env, seed=0, scale=1.0, **fields):
     """A PPO policy of 8 hidden units for an environment's description, with random weights."""
     observation, action = env.spaces()
     size, count = observation.shape[0], action.shape[0]
@@ -23,7 +23,9 @@ def make_policy(env, seed=0, **fields):
         "action_net.bias": (count,),
         "log_std": (count,),
     }
-    tensors = {f"policy/{name}": rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+    tensors = {
+        f"policy/{name}": rng.normal(scale=scale, size=shape).astype(np.float32) for name, shape in shapes.items()
+    }
     spec = fields.pop("spec", EnvSpec("reach"))
     info = PolicyInfo(algo="ppo", policy="MlpPolicy", policy_kwargs={"net_arch": [8]}, env=env, spec=spec, **fields)
     return PolicyFile(info, tensors)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, short_repr
 from rlctl.exporting.c_source import FLAGS, CSource
-from rlctl.exporting.controller.graph import TARGET
+from rlctl.exporting.controller.graph import LAST_ACTION, TARGET
 from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type
 from rlctl.policy.onnx_policy import ACTION, open_session
@@ -37,6 +37,10 @@ class Controller(abc.ABC):
     def step(self, inputs: Inputs) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
         """Return the action and, where the task says what it commands, the targets."""
 
+    @abc.abstractmethod
+    def set_last_action(self, action: NDArray[Any]) -> None:
+        """Replace the last action: a feedback may magnify its last bits, so recorded episodes are followed."""
+
 
 class CController(Controller):
     """A controller that `compile_controller` has compiled."""
@@ -52,6 +56,7 @@ class CController(Controller):
         self._target = np.zeros(layout.action_size)
         self._status = np.zeros(2, np.intc)
         self._outputs = [array.ctypes.data_as(ctypes.c_void_p) for array in (self.action, self._target, self._status)]
+        self.dtype = layout.dtype
         self._values = np.zeros(layout.input_size, layout.dtype)
         self.may_send = False
         self.library.rlctl_init(self.state)
@@ -79,6 +84,11 @@ class CController(Controller):
         action = self.action.reshape(self._layout.action_space.shape).copy()
         return action, self._target.copy() if self._has_target else None
 
+    def set_last_action(self, action: NDArray[Any]) -> None:
+        """Replace the last action."""
+        self.action[:] = action.ravel()
+        self.library.rlctl_set_last_action(self.state, self._outputs[0])
+
     def limit(self, values: NDArray[np.float64] | None, age_s: float, requested: NDArray[Any] | None) -> NDArray[Any]:
         """Return the action of the limits alone, for a policy's action."""
         pointers = [None if array is None else array.ctypes.data_as(ctypes.c_void_p) for array in (values, requested)]
@@ -86,10 +96,9 @@ class CController(Controller):
         self.library.rlctl_limit(self.state, pointers[0], ctypes.c_double(age_s), pointers[1], *outputs)
         return self.action
 
-    def repeat(self, inputs: Inputs, count: int) -> None:
-        """Repeat a step in a C loop, to measure its time."""
-        self._values[:] = np.concatenate([np.ravel(inputs[part.name]) for part in self._layout.quantities])
-        self.library.rlctl_repeat(self.state, self._values.ctypes.data_as(ctypes.c_void_p), ctypes.c_long(count))
+    def play(self, rows: NDArray[Any]) -> None:
+        """Take a step for each row of inputs in a C loop, to measure its time; rows have shape (steps, inputs)."""
+        self.library.rlctl_play(self.state, rows.ctypes.data_as(ctypes.c_void_p), ctypes.c_long(len(rows)))
 
 
 class OnnxController(Controller):
@@ -117,6 +126,11 @@ class OnnxController(Controller):
         self._state = {name: results[f"{name}_out"] for name in self._states}
         target = results.get(TARGET)
         return results[ACTION][0], None if target is None else target[0]
+
+    def set_last_action(self, action: NDArray[Any]) -> None:
+        """Replace the last action, if it is part of the state."""
+        if LAST_ACTION in self._state:
+            self._state[LAST_ACTION] = action.reshape(1, -1).astype(self._dtypes[LAST_ACTION])
 
 
 _DTYPES: dict[str, np.dtype[Any]] = {
