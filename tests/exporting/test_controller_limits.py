@@ -1,10 +1,13 @@
 """The limits in C are those in Python: the same actions and states, bit for bit, for any inputs and orders."""
 
+import collections
+
 import numpy as np
 import pytest
 
 from rlctl.deploy import Limits, SafetyFilter
 from rlctl.exporting.c_source import find_compiler
+from rlctl.exporting.controller.players import STATUS
 from tests.exporting.controllers import build_controller, make_arm, make_policy
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler (cc, or $CC) on this machine")
@@ -89,26 +92,25 @@ def draw_steps(rng, count, dtype):
     odd = np.array([0.0, -0.0, 1.5, -1.5, 2.0, 10.0, -10.0, np.inf, np.nan, 1e-40, 3.4e38, 1.0, -1.0])
     kind = rng.random((count, 7))
     rows = np.where(kind < 0.97, moderate, np.where(kind < 0.985, anything, rng.choice(odd, (count, 7))))
-    ages = np.where(rng.random(count) < 0.97, 0.0, rng.choice([0.1, 0.19, 0.31, -0.2, 5.0, np.inf, np.nan], count))
+    ages = np.where(
+        rng.random(count) < 0.97, 0.0, rng.choice([0.1, 0.19, 0.31, -0.2, 5.0, -5.0, np.inf, np.nan], count)
+    )
     orders = rng.choice(["", "stop", "hold", "home", "resume", "reset", "missing", "none", "frozen"], count, p=ORDERS)
     return rows, ages, orders
 
 
+STEPS = 1_000_000  # of all cases together
 ORDERS = [0.88, 0.005, 0.005, 0.01, 0.03, 0.02, 0.01, 0.01, 0.03]
 
 
 def compare(arm, options, count, seed, folder):
-    """Run both filters; return how many steps gave the same bits, per state."""
+    """Run both filters, which must give the same bits; return how often each state and reason came."""
     limits = Limits.model_validate({"joints": JOINTS, **options})
     source, controller = build_controller(make_policy(make_arm(**arm)), folder, limits)
     safety = SafetyFilter(source.layout.inputs_info, limits, clock=lambda: 0.0)
     space = source.layout.action_space
-    last, rng, seen, position = (
-        np.zeros(5),
-        np.random.default_rng(seed),
-        dict.fromkeys(("idle", "running", "holding", "stopped"), 0),
-        None,
-    )
+    rng, seen, position = np.random.default_rng(seed), collections.Counter[str](), None
+    last, is_frozen = np.zeros(5), False
     for row, age, order in zip(*draw_steps(rng, count, space.dtype), strict=True):
         if order in ("stop", "hold", "resume", "reset") or (order == "home" and "home" in options):
             getattr(safety, order)()
@@ -117,7 +119,8 @@ def compare(arm, options, count, seed, folder):
             values = row[:5].astype(np.float32).astype(np.float64)
             if position is not None and rng.random() < 0.9:  # the joints are about where they were sent
                 values[:2] = (position + 0.01 * row[:2]).astype(np.float32)
-            values = np.array(last) if order == "frozen" else values
+            is_frozen = order == "frozen" or (is_frozen and rng.random() < 0.7)
+            values = np.array(last) if is_frozen else values
             requested = row[5:].astype(space.dtype)
         last = values
         observed = None if order == "missing" else values
@@ -129,7 +132,7 @@ def compare(arm, options, count, seed, folder):
         assert (got == expected).all(), (got, expected, safety.state)
         assert controller.status[0] == safety.state
         assert is_same_reason(controller.status[1], safety.reason), (controller.status, safety.reason)
-        seen[safety.state] += 1
+        seen.update(controller.status)
         position = find_position(safety, expected)
     return seen
 
@@ -153,6 +156,9 @@ def is_same_reason(reason, text):
 def test_limits_in_c_are_those_in_python(case, tmp_path):
     seen = compare(*CASES[case], 6_700, 1, tmp_path)
     assert min(seen[state] for state in ("running", "holding", "stopped")) > 100
+    faults = {"missing", "not finite", "too old", "invalid action", "no action"}
+    faults |= {"out of range", "frozen"} if "sensors" in CASES[case][1] else set()
+    assert min(seen[reason] for reason in faults) >= 5
 
 
 @pytest.mark.slow
@@ -160,5 +166,5 @@ def test_limits_in_c_are_those_in_python(case, tmp_path):
 @pytest.mark.parametrize("case", [*CASES, *MORE_CASES])
 def test_a_million_steps(case, tmp_path):
     arm, options = (CASES | MORE_CASES)[case]
-    seen = compare(arm, options, 1_000_000 // len(CASES | MORE_CASES) + 1, 2, tmp_path)
-    assert sum(seen.values()) >= 76_923
+    seen = compare(arm, options, STEPS // len(CASES | MORE_CASES) + 1, 2, tmp_path)
+    assert sum(seen[state] for state in STATUS) == STEPS // len(CASES | MORE_CASES) + 1

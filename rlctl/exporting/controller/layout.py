@@ -86,6 +86,11 @@ class Target:
         return _UNITS[self.kind]
 
     @property
+    def interface(self) -> str:
+        """What it commands, as ros2_control calls it."""
+        return {"speed": "velocity", "torque": "effort"}.get(self.kind, "position")
+
+    @property
     def formula(self) -> str:
         """How it follows from the action, for people."""
         base = {"position": "default_positions + ", "step": "measured position + "}.get(self.kind, "")

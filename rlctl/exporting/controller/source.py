@@ -29,6 +29,7 @@ class _TargetCode:
     """The target as the templates read it."""
 
     kind: str
+    interface: str
     formula: str
     unit: str
     base: str
@@ -122,7 +123,14 @@ class ControllerSource:
         base = _BASES.get(target.kind, "").format(name=self.name)
         is_position = target.kind == "position"
         return _TargetCode(
-            target.kind, target.formula, target.unit, base, target.clips, target.measured, default=is_position
+            target.kind,
+            target.interface,
+            target.formula,
+            target.unit,
+            base,
+            target.clips,
+            target.measured,
+            default=is_position,
         )
 
     def _list_arrays(self, described: Layout) -> list[tuple[str, str, str, list[str]]]:
