@@ -42,8 +42,8 @@ class OnnxController : public Controller {
       output_names_.push_back(session_.GetOutputNameAllocated(i, allocator_).get());
       if (output_names_.back() == "target") command_ = i;
     }
-    const auto type = session_.GetOutputTypeInfo(command_).GetTensorTypeAndShapeInfo();
-    description_.command_size = static_cast<int>(type.GetShape().back());
+    const auto info = session_.GetOutputTypeInfo(command_);  // what it returns is a part of it
+    description_.command_size = static_cast<int>(info.GetTensorTypeAndShapeInfo().GetShape().back());
   }
 
   const Description& description() const override { return description_; }

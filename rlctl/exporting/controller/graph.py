@@ -139,12 +139,11 @@ class _Writer:
     def _emit_target(self, action: str, target: Target) -> None:
         graph = self._graph
         value = graph.add("Mul", self._read(action), graph.constant("target/factor", target.factor))
-        base = graph.constant("target/default", target.default)
-        if target.kind == "step":
-            joints = self._policy.info.env.joints
-            assert joints is not None
-            base = self._read(self._inputs[joints.measured])
-        value = graph.add("Add", base, value)
+        joints = self._policy.info.env.joints
+        if target.kind == "position":
+            value = graph.add("Add", graph.constant("target/default", target.default), value)
+        elif target.kind == "step" and joints is not None:
+            value = graph.add("Add", self._read(self._inputs[joints.measured]), value)
         if target.clips:
             value = graph.add("Max", value, graph.constant("target/low", target.low))
             value = graph.add("Min", value, graph.constant("target/high", target.high))
