@@ -144,6 +144,7 @@ def make_metadata(info: PolicyInfo) -> dict[str, str]:
         "observation_names": ",".join(env.observation_sizes),
         "observation_sizes": ",".join(str(size) for size in env.observation_sizes.values()),
         "observation_units": ",".join(env.observation_units.get(name, "") for name in env.observation_sizes),
+        "observation_history": ",".join(f"{name}:{count}" for name, count in env.observation_history.items()),
         "frame_stack": str(info.spec.frame_stack),
         "action_meaning": env.action_meaning,
         "action_space": "" if isinstance(action_space, spaces.Box) else str(action_space),

@@ -85,6 +85,8 @@ class Layout:
         lines, first = [], 0
         for part in self.observed:
             unit = f" [{part.unit}]" if part.unit else ""
+            if (count := self.info.env.observation_history.get(part.name, 1)) > 1:
+                unit += f", the last {count}, oldest first"
             index = f"[{first}]" if part.size == 1 else f"[{first}..{first + part.size - 1}]"
             lines.append(f"  {index:<10} {part.name}{unit}")
             first += part.size

@@ -7,9 +7,11 @@ import pytest
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
-from rlctl.exporting.c_source import find_compiler
+from rlctl.exporting.actor import build
+from rlctl.exporting.c_source import find_compiler, write_c
 from rlctl.exporting.controller.export import export_controller
 from rlctl.exporting.request import ExportRequest
+from rlctl.policy.file import PolicyFile
 from tests.exporting import controlled
 from tests.exporting.controllers import make_policy
 
@@ -75,3 +77,24 @@ def test_a_wrong_declaration_is_not_written(name, policy_of, tmp_path):
 def test_limits_need_a_controller():
     with pytest.raises(UsageError, match="only a controller has limits; add --controller"):
         ExportRequest("run", limits="limits.yaml")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "count"), [("reach", 2400), ("walk", 10_000)])
+def test_bundled_tasks_have_controllers(task, count, rlctl, tmp_path):
+    done = rlctl("export", task, "--pretrained", "--controller", "--json", "-", "-o", "controller.c", timeout=600)
+    assert done.returncode == 0, done.stderr
+    reports = json.loads(done.stdout)
+    for report in (reports["onnx"], reports["c"]):
+        assert report["verified"]
+        assert report["observations"] == count
+        assert report["max_difference"] < 1e-5
+        assert report["closed_loop"]["same_success"] == 20
+    assert (tmp_path / "controller.h").exists()
+
+
+def test_the_c_and_onnx_of_a_policy_name_its_histories(policy_of):
+    policy = PolicyFile.read(policy_of())
+    assert "[0..5]     places [m], the last 3, oldest first" in write_c(policy, "cart").header
+    metadata = {entry.key: entry.value for entry in build(policy).metadata_props}
+    assert metadata["observation_history"] == "places:3"
