@@ -39,7 +39,7 @@ class Reach(Task):
         "hand_to_goal": "m",
         "goal": "m",
     }
-    observation_terms = {"hand_to_goal": terms.Difference("goal", "hand")}
+    observation_terms = {"hand_to_goal": terms.Displacement("goal", "hand")}
     reward_weights = {"distance": -1.0, "reached": 1.0, "action": -0.05, "smoothness": -0.05}
     events = {  # what a real arm may differ by; acts with `randomize: true`
         "mass": Event("reset", events.scale_mass, body="arm", factor=(0.8, 1.2)),

@@ -18,13 +18,13 @@ from rlctl.errors import ArtifactError, OldGymError, TaskError, UsageError, shor
 from rlctl.storage import validation
 from rlctl.task.history import Start
 from rlctl.task.joints import Joints
-from rlctl.task.terms import Difference, Distance, Gravity, LastAction, PhaseClock, Scaled, Term
+from rlctl.task.terms import Displacement, Distance, Gravity, LastAction, PhaseClock, Scaled, Term
 
 if TYPE_CHECKING:
     import mujoco
 
 AnyTerm = Annotated[
-    Scaled | Gravity | Difference | Distance | LastAction | PhaseClock, pydantic.Field(discriminator="kind")
+    Scaled | Gravity | Displacement | Distance | LastAction | PhaseClock, pydantic.Field(discriminator="kind")
 ]
 _SHOWN_JOINTS = 8
 _ONE_HOT = 10  # each value of a discrete space counts as this many elements of a Box

@@ -15,7 +15,7 @@ from rlctl.errors import RecipeError, TaskError, UsageError, check_name, short_r
 from rlctl.task.batch import BatchTask, OneWorld, as_single
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
-from rlctl.task.history import History
+from rlctl.task.history import TermHistory
 from rlctl.task.joints import Joints
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.observation import Observation, ObservationFormat, compute_terms
@@ -92,7 +92,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             self.sim.close()
             raise
         self._format = ObservationFormat(task, first)
-        self._history = History(task.observation_history, task.history_start)
+        self._history = TermHistory(task.observation_history, task.history_start)
         self.observation_sizes, self.observation_space = self._format.sizes, self._format.space
 
     def set_level(self, level: float) -> None:

@@ -106,12 +106,12 @@ class Gravity(Term):
 
 
 @dataclasses.dataclass(frozen=True)
-class Difference(Term):
+class Displacement(Term):
     """The vector from one position to another, such as from a hand to its goal, in the frame of both."""
 
     to: str
     start: str
-    kind: Literal["difference"] = "difference"
+    kind: Literal["displacement"] = "displacement"
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -127,7 +127,7 @@ class Difference(Term):
 
 
 @dataclasses.dataclass(frozen=True)
-class Distance(Difference):
+class Distance(Displacement):
     """The distance between two positions, shape (1,)."""
 
     kind: Literal["distance"] = "distance"  # type: ignore[assignment]

@@ -16,7 +16,7 @@ class Cart(Task):
     control_dt, substeps, episode_s = 0.1, 1, 12.0
     action_space = Box(-1.0, 1.0, (2,), np.float32)
     observation_units = {"places": "m", "goal": "m"}
-    observation_terms = {"to_goal": terms.Difference("goal", "places"), "last_action": terms.LastAction()}
+    observation_terms = {"to_goal": terms.Displacement("goal", "places"), "last_action": terms.LastAction()}
     observation_history = {"places": 3}
     reward_weights = {"distance": -1.0}
     events = {"noise": Event("observation", events.noise, of="to_goal", std=(0.1, 0.2))}

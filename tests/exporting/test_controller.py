@@ -19,7 +19,7 @@ from rlctl.policy.numpy_policy import NumpyPolicy
 from rlctl.policy.onnx_policy import OnnxPolicy, encode
 from rlctl.policy.torch_policy import TorchPolicy
 from rlctl.task import Joints, terms
-from rlctl.task.history import History
+from rlctl.task.history import TermHistory
 from rlctl.task.rotations import normalize
 from tests.exporting.controllers import build_controller, make_arm, make_policy
 
@@ -27,7 +27,7 @@ needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compil
 TERMS = {
     "gravity": terms.Gravity("orientation"),
     "angles": terms.Scaled("angles", offset=(0.1, -0.2), scale=(2.0,)),
-    "to_goal": terms.Difference("goal", "hand"),
+    "to_goal": terms.Displacement("goal", "hand"),
     "far": terms.Distance("goal", "hand"),
     "last": terms.LastAction(),
     "clock": terms.PhaseClock(0.35),
@@ -65,7 +65,7 @@ def draw_inputs(rng):
 def play(policy, controllers, env):
     """Compare controllers with terms, history and policy in Python, in two episodes; return the largest difference."""
     rng, worst = np.random.default_rng(3), 0.0
-    history = History(env.observation_history, env.history_start)
+    history = TermHistory(env.observation_history, env.history_start)
     for _ in range(2):
         history.begin()
         policy.reset()

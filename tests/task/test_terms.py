@@ -50,7 +50,7 @@ def test_gravity_has_the_bits_of_a_rotation():
 
 def test_terms_by_hand():
     assert terms.Distance("goal", "hand")((np.array([3.0, 4.0, 1.0]), np.array([0.0, 0.0, 1.0]))).tolist() == [5.0]
-    assert terms.Difference("goal", "hand")((np.array([3.0]), np.array([1.0]))).tolist() == [2.0]
+    assert terms.Displacement("goal", "hand")((np.array([3.0]), np.array([1.0]))).tolist() == [2.0]
     assert terms.Scaled("q", offset=[1.0, 2.0], scale=2.0)(np.array([2.0, 4.0])).tolist() == [2.0, 4.0]
     # A quarter of a turn, and one turn more.
     assert terms.PhaseClock(4.0)(1.0) == pytest.approx([1.0, 0.0], abs=1e-12)
@@ -140,7 +140,7 @@ def test_joints_say_what_an_action_commands():
 class StoolWithHistory(Stool):
     """The stool, with noise on what it remembers, and its goal as a quantity."""
 
-    observation_terms = {"height": terms.Difference("seat", "goal"), "last": terms.LastAction()}
+    observation_terms = {"height": terms.Displacement("seat", "goal"), "last": terms.LastAction()}
     observation_history = {"hips": 3, "speeds": 2}
 
     def observe(self):

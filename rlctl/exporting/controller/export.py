@@ -18,7 +18,7 @@ from rlctl.errors import AnswerIsNo, TaskError, UsageError
 from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
 from rlctl.exporting.controller.graph import build_graph
-from rlctl.exporting.controller.layout import ControllerLayout, Target
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
 from rlctl.exporting.controller.players import CController, Controller, OnnxController, compile_controller
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.exporting.export import (
@@ -31,9 +31,11 @@ from rlctl.exporting.export import (
     format_closed_loop,
 )
 from rlctl.exporting.request import ExportRequest
-from rlctl.exporting.verify import Latency, measure_sb3
+from rlctl.exporting.verify import Latency, change_last_bits, measure_sb3
 from rlctl.policy.file import PolicyFile
+from rlctl.policy.numpy_policy import NumpyPolicy
 from rlctl.policy.onnx_policy import encode
+from rlctl.policy.policy import Policy
 from rlctl.policy.torch_policy import TorchPolicy, pin_threads
 from rlctl.storage import files
 
@@ -76,7 +78,7 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
         check_environment(source.file, torch_policy.info, built)
         # Policies that were trained before their task declared its terms do not contain them.
         policy = torch_policy.file.with_info(env=built)
-        player = verify.Player(ControllerLayout(policy.info), env, spec.task)
+        player = verify.TaskPlayer(ControllerLayout(policy.info), env, spec.task)
         export = _Export(torch_policy, policy, player, limits)
         write = {"onnx": export.write_onnx, "c": export.write_c}
         return [write[form](target.with_suffix(f".{form}")) for form in request.formats]
@@ -95,7 +97,7 @@ class _Export:
 
     torch_policy: TorchPolicy
     policy: PolicyFile
-    player: verify.Player
+    player: verify.TaskPlayer
     limits: Limits | None
 
     def write_onnx(self, path: Path) -> ControllerReport:
@@ -143,19 +145,22 @@ class _Export:
         details = {"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0], "limits": limits}
         return self._report(path, size, details, source.target, median, fields)
 
+    def _make_reference(self, policy: Policy, is_limited: bool) -> verify.Reference:
+        return verify.Reference(ControllerLayout(self.policy.info), policy, self.limits if is_limited else None)
+
     @functools.lru_cache(maxsize=2)  # noqa: B019 (for one export)
     def _record(self, is_limited: bool) -> list[verify.Recorded]:
-        layout = ControllerLayout(self.policy.info)
-        reference = verify.Reference(layout, self.torch_policy, self.limits if is_limited else None)
-        return verify.record(self.player, reference)
+        return verify.record(self.player, self._make_reference(self.torch_policy, is_limited))
 
     @functools.lru_cache(maxsize=2)  # noqa: B019
     def _check_conclusive(self, is_limited: bool) -> tuple[bool, bool]:
-        layout, limits = ControllerLayout(self.policy.info), self.limits if is_limited else None
-        return verify.check_conclusive(self.player, layout, self.policy, limits, self._record(is_limited))
+        changed = dataclasses.replace(self.policy, tensors=change_last_bits(self.policy.tensors))
+        policies: tuple[Policy, Policy] = self.torch_policy, NumpyPolicy(changed)
+        references = [self._make_reference(policy, is_limited) for policy in policies]
+        return verify.check_conclusive(self.player, (references[0], references[1]), self._record(is_limited))
 
     def _verify(
-        self, path: Path, controller: Controller, target: Target | None, *, is_limited: bool
+        self, path: Path, controller: Controller, target: JointTarget | None, *, is_limited: bool
     ) -> tuple[dict[str, Any], list[verify.Recorded]]:
         """Return how a controller was verified, as fields of its report; raises `AnswerIsNo` if it acts differently."""
         recorded = self._record(is_limited)
@@ -178,7 +183,7 @@ class _Export:
         path: Path,
         size: int,
         details: dict[str, Any],
-        target: Target | None,
+        target: JointTarget | None,
         median: float | None,
         fields: dict[str, Any],
     ) -> ControllerReport:

@@ -7,7 +7,7 @@ import onnx
 
 from rlctl.errors import UsageError
 from rlctl.exporting.actor import emit_actor, make_metadata
-from rlctl.exporting.controller.layout import ControllerLayout, Observed, Stack, Target
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Stack
 from rlctl.exporting.controller.symbols import GraphSymbol
 from rlctl.exporting.layers import BATCH, Graph, concatenate
 from rlctl.policy import onnx_policy
@@ -136,7 +136,7 @@ class _Writer:
                 parts[key] = self._graph.cast(value, space.dtype), space.dtype
         return parts
 
-    def _emit_target(self, action: str, target: Target) -> None:
+    def _emit_target(self, action: str, target: JointTarget) -> None:
         graph = self._graph
         value = graph.add("Mul", self._read(action), graph.constant("target/factor", target.factor))
         joints = self._policy.info.env.joints

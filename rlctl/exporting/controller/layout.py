@@ -68,7 +68,7 @@ class Stack:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Target:
+class JointTarget:
     """What an action commands: `base + factor * action`."""
 
     kind: Command
@@ -183,7 +183,7 @@ class ControllerLayout:
                 return quantity
         raise UsageError(f"export --controller: no input has the joints' positions: {name!r} is computed inside")
 
-    def find_target(self, limits: Limits | None, bounds: Bounds | None) -> Target | None:
+    def find_target(self, limits: Limits | None, bounds: Bounds | None) -> JointTarget | None:
         """Return what an action commands, if the task describes it; `bounds` are those of the limits.
 
         Raises `RecipeError` for limits with other units than the task has.
@@ -203,7 +203,7 @@ class ControllerLayout:
         measured = self.find_quantity(joints.measured).start if kind == "step" else 0
         clips: Clips = "" if not joints.clips_target else "towards" if limits and kind == "step" else "exact"
         low, high = (np.array(ends or [0.0] * count) for ends in (joints.low, joints.high))
-        return Target(kind, factor, default, measured, clips, low, high)
+        return JointTarget(kind, factor, default, measured, clips, low, high)
 
     def describe_inputs(self) -> list[str]:
         """Return a line per input: its name, size and unit."""

@@ -11,7 +11,7 @@ from rlctl.deploy.filter.limits import Limits
 from rlctl.exporting import c_source
 from rlctl.exporting.c_layers import CWriter, write_number
 from rlctl.exporting.c_source import CSource, Layout
-from rlctl.exporting.controller.layout import ControllerLayout, Observed, Target
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed
 from rlctl.exporting.controller.limits_source import LimitsSource
 from rlctl.exporting.controller.symbols import CSymbol
 from rlctl.policy.file import PolicyFile
@@ -119,7 +119,7 @@ class ControllerSource:
     def _read_quantity(self, start: int, size: int) -> CSymbol:
         return CSymbol([f"values[{start + index}]" for index in range(size)])
 
-    def _describe_target(self, target: Target) -> _TargetCode:
+    def _describe_target(self, target: JointTarget) -> _TargetCode:
         base = _BASES.get(target.kind, "").format(name=self.name)
         is_position = target.kind == "position"
         return _TargetCode(

@@ -14,11 +14,9 @@ from rlctl.deploy.filter.safety_filter import SafetyFilter
 from rlctl.environments.dict_spaces import SINGLE, split
 from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError
-from rlctl.exporting.controller.layout import ControllerLayout, Target
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
 from rlctl.exporting.controller.players import CController, Controller, Inputs
-from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, change_last_bits, compare_episodes
-from rlctl.policy.file import PolicyFile
-from rlctl.policy.numpy_policy import NumpyPolicy
+from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, compare_episodes
 from rlctl.policy.policy import Policy
 from rlctl.rollout.collect import MOST_STEPS, Episode
 from rlctl.rollout.messages import EpisodeResult
@@ -60,7 +58,7 @@ class Recorded:
     episode: Episode
 
 
-class Player:
+class TaskPlayer:
     """Plays episodes of the task in this process."""
 
     def __init__(self, layout: ControllerLayout, env: gymnasium.Env[Any, Any], task: str) -> None:
@@ -106,7 +104,7 @@ class Player:
 
 
 @dataclasses.dataclass(frozen=True)
-class Verification:
+class ControllerAgreement:
     """How a controller compares with the policy."""
 
     agreement: Agreement
@@ -114,7 +112,7 @@ class Verification:
     max_target_difference: float | None  # in the unit of the targets; None without targets
 
 
-def record(player: Player, reference: Reference) -> list[Recorded]:
+def record(player: TaskPlayer, reference: Reference) -> list[Recorded]:
     """Play `EPISODES` episodes, and more until `_MIN_OBSERVATIONS` are recorded."""
     recorded: list[Recorded] = []
     while len(recorded) < EPISODES or sum(len(episode.actions) for episode in recorded) < _MIN_OBSERVATIONS:
@@ -125,8 +123,8 @@ def record(player: Player, reference: Reference) -> list[Recorded]:
 
 
 def verify_controller(
-    player: Player, recorded: Sequence[Recorded], controller: Controller, target: Target | None
-) -> Verification:
+    player: TaskPlayer, recorded: Sequence[Recorded], controller: Controller, target: JointTarget | None
+) -> ControllerAgreement:
     """Compare a controller with recorded episodes, step by step; then let it act in the first of them."""
     agreement, worst = Agreement(), 0.0
     for episode in recorded:
@@ -147,26 +145,28 @@ def verify_controller(
         controller.begin()
         actual.append(player.play(episode.episode.result.seed, act).episode)
     loop = compare_episodes([episode.episode for episode in recorded[:EPISODES]], actual)
-    return Verification(agreement, loop, None if target is None else worst)
+    return ControllerAgreement(agreement, loop, None if target is None else worst)
 
 
 def check_conclusive(
-    player: Player, layout: ControllerLayout, policy: PolicyFile, limits: Limits | None, recorded: Sequence[Recorded]
+    player: TaskPlayer, references: tuple[Reference, Reference], recorded: Sequence[Recorded]
 ) -> tuple[bool, bool]:
-    """Return whether the policy repeats its episodes, and whether these change with the last bits of its weights."""
-    answers = []
-    for file in (policy, dataclasses.replace(policy, tensors=change_last_bits(policy.tensors))):
-        reference = Reference(layout, NumpyPolicy(file), limits)
+    """Return whether a policy repeats its recorded episodes, and whether they change with the last bits of its weights.
+
+    The references are the policy and one with other last bits.
+    """
+    loops = []
+    for reference in references:
         again = []
         for episode in recorded[:EPISODES]:
             reference.begin()
             again.append(player.play(episode.episode.result.seed, reference.act).episode)
-        answers.append(compare_episodes([episode.episode for episode in recorded[:EPISODES]], again))
-    # NumPy's network has other last bits than torch's: it need not repeat the return exactly.
-    return answers[0].agrees or not answers[1].agrees, not answers[1].agrees
+        loops.append(compare_episodes([episode.episode for episode in recorded[:EPISODES]], again))
+    repeats = loops[0].agrees and loops[0].max_return_difference == 0.0
+    return repeats, repeats and not loops[1].agrees
 
 
-def find_targets(target: Target, inputs: Inputs, action: NDArray[Any]) -> NDArray[np.float64]:
+def find_targets(target: JointTarget, inputs: Inputs, action: NDArray[Any]) -> NDArray[np.float64]:
     """Return the joints' targets for an action, from their definition."""
     base = target.default
     if target.kind == "step":
