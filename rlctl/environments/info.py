@@ -18,7 +18,7 @@ from rlctl.errors import ArtifactError, OldGymError, TaskError, UsageError, shor
 from rlctl.storage import validation
 from rlctl.task.history import Start
 from rlctl.task.joints import Joints
-from rlctl.task.terms import Displacement, Distance, Gravity, LastAction, PhaseClock, Scaled, Term
+from rlctl.task.terms import Displacement, Distance, Gravity, LastAction, PhaseClock, Scaled, find_quantity_sizes
 
 if TYPE_CHECKING:
     import mujoco
@@ -76,17 +76,6 @@ class EnvInfo(pydantic.BaseModel):
         counts = {name: count for name, count in self.observation_history.items() if count > 1}
         listed = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
         return f"a history of {listed} that begins with {self.history_start}" if counts else "no history"
-
-
-def find_quantity_sizes(terms: Mapping[str, Term], measured: Mapping[str, Any]) -> dict[str, int]:
-    """Return the sizes of the quantities from which terms were computed; raises `TaskError` for one of two sizes."""
-    sizes: dict[str, int] = {}
-    for name, term in terms.items():
-        values = measured[name] if isinstance(measured[name], tuple) else (measured[name],)
-        for quantity, value in zip(term.inputs, values, strict=False):
-            if sizes.setdefault(quantity, int(np.size(value))) != np.size(value):
-                raise TaskError(f"the quantity {quantity!r} of term {name!r} has two sizes")
-    return sizes
 
 
 def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:

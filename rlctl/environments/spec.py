@@ -77,7 +77,6 @@ class EnvSpec:
 
                 env = TimeFeature(env)
             if self.frame_stack > 1:
-                _check_no_history(env)
                 from rlctl.environments.wrappers import stack_frames
 
                 env = stack_frames(env, self.frame_stack)
@@ -234,12 +233,6 @@ def make(
         name, entry_point = f"rlctl/{make_slug(task)}-v0", "rlctl.environments.spec:make"
         env.unwrapped.spec = GymnasiumSpec(name, entry_point, kwargs=kwargs, disable_env_checker=True)
     return env
-
-
-def _check_no_history(env: gymnasium.Env[Any, Any]) -> None:
-    """Raise `RecipeError` for a stack of whole observations, some of which are histories already."""
-    if history := getattr(getattr(env.unwrapped, "task", None), "observation_history", None):
-        raise RecipeError(f"frame_stack: the task declares a history of {', '.join(history)}; set frame_stack: 1")
 
 
 def _name_by(kind: str) -> Callable[[EnvSpec], EnvSpec]:

@@ -3,9 +3,11 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
-from rlctl.errors import TaskError
+from gymnasium import spaces
+
+from rlctl.errors import TaskError, check_name, short_repr
 
 Command = Literal["", "position", "step", "speed", "torque"]
 _KINDS: dict[Command, str] = {"position": "scale", "step": "step", "speed": "speed", "torque": "torque"}
@@ -64,3 +66,19 @@ class Joints:
             if per_action := getattr(self, f"action_{kind}"):
                 return command, per_action
         return "", ()
+
+
+def check_joints(task: str, joints: Any, action_space: spaces.Space[Any], observed: Sequence[str]) -> None:
+    """Raise `TaskError` for what `describe_joints` returned, unless it has a joint per element of the action.
+
+    `observed` are the names of observations and of the quantities of terms.
+    """
+    count = math.prod(action_space.shape or ())
+    if joints is not None and (not isinstance(joints, Joints) or len(joints.names) != count):
+        given = list(joints.names) if isinstance(joints, Joints) else joints
+        raise TaskError(
+            f"{task}: describe_joints() returned {short_repr(given)}; "
+            f"return body.describe_joints(names) with {count} names, one per element of the action"
+        )
+    if joints is not None and joints.measured:
+        check_name(joints.measured, observed, f"{task}: joints: no observation", TaskError)

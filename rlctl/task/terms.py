@@ -10,7 +10,7 @@ ONNX, with the quantities as inputs of the file.
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -172,6 +172,17 @@ class PhaseClock(Term):
         turns = time / self.period_s
         angle = (turns - np.floor(turns)) * (2.0 * math.pi)
         return [np.sin(angle), np.cos(angle)]
+
+
+def find_quantity_sizes(terms: Mapping[str, Term], measured: Mapping[str, Any]) -> dict[str, int]:
+    """Return the sizes of the quantities from which terms were computed; raises `TaskError` for one of two sizes."""
+    sizes: dict[str, int] = {}
+    for name, term in terms.items():
+        values = measured[name] if isinstance(measured[name], tuple) else (measured[name],)
+        for quantity, value in zip(term.inputs, values, strict=False):
+            if sizes.setdefault(quantity, int(np.size(value))) != np.size(value):
+                raise TaskError(f"the quantity {quantity!r} of term {name!r} has two sizes")
+    return sizes
 
 
 def _read_numbers(values: float | Sequence[float], where: str) -> Numbers:
