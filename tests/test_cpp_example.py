@@ -1,4 +1,4 @@
-"""The C++ example builds, and its loop acts as the policy does and holds without observations."""
+"""The C++ example builds, and its loop commands what the policy does and holds without measurements."""
 
 import os
 import shutil
@@ -9,14 +9,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import sb3_contrib
 
 import rlctl
+from rlctl.environments.info import describe
+from rlctl.environments.spec import EnvSpec
+from rlctl.exporting.controller.graph import build_graph
+from rlctl.exporting.controller.source import ControllerSource
+from rlctl.policy.onnx_policy import encode
+from rlctl.training.snapshot import pack
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "cpp"
 # A plugin for Unity: of the packages of Python and Node the one with ONNX Runtime's C++ headers, and Linux's library.
 NPM_PACKAGE = "com.github.asus4.onnxruntime@0.4.9"  # 150 MB; of ONNX Runtime 1.30
 HEADERS, LIBRARY = "/ios-arm64/onnxruntime.framework/Headers/", "/Linux/x64/libonnxruntime.so"
 pytestmark = [
+    pytest.mark.pybullet,
     pytest.mark.slow,
     pytest.mark.skipif(shutil.which("cmake") is None or shutil.which("c++") is None, reason="no cmake or no compiler"),
 ]
@@ -31,13 +39,12 @@ def build(folder, *options):
 
 
 def play(program, *arguments):
-    """Send observations in time, then one that is not finite, then nothing; compare the actions and the holding."""
-    policy = rlctl.load_policy("reach")
-    observation = np.random.default_rng(0).uniform(-0.5, 0.5, 20).astype(np.float32)
+    """Send measurements in time, then one that is not finite, then none; return the lines and what was said."""
+    numbers = np.random.default_rng(0).uniform(-0.5, 0.5, 20).astype(np.float32)
     process = subprocess.Popen(
         [program, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    line = " ".join(map(str, observation.tolist()))
+    line = " ".join(map(str, numbers.tolist()))
     for _ in range(20):
         process.stdin.write(f"{line}\n")
         process.stdin.flush()
@@ -45,23 +52,64 @@ def play(program, *arguments):
     process.stdin.write(f"{line.rpartition(' ')[0]} nan\n")
     printed, said = process.communicate(timeout=30)
     assert process.returncode == 0, said
-    lines = printed.splitlines()
-    actions = [np.array(each.split(), np.float32) for each in lines if each != "hold"]
-    assert len(actions) >= 3
-    for action in actions:
-        assert action == pytest.approx(policy.predict(observation), abs=1e-5)
-    assert lines[-1] == "hold"
-    assert "observation: 20 elements" in said
-    return said
+    for text in (
+        "inputs: 20 numbers: joint_positions (7) [rad], joint_velocities (7) [rad/s], hand (3) [m], goal (3) [m]",
+        "of lbr_iiwa_joint_1, lbr_iiwa_joint_2",
+        "period: 0.0166667 s",
+    ):
+        assert text in said
+    return numbers, printed.splitlines()
 
 
-def test_loop_with_the_c_function(rlctl, tmp_path):
-    done = rlctl("export", "reach", "--pretrained", "--c", "-o", "policy.c", timeout=300)
+def check_commands(policy, numbers, lines):
+    """Every command is the target of the policy's next action; the last one is held."""
+    joints, hand, goal = numbers[:7], numbers[14:17], numbers[17:]
+    observation = np.concatenate([numbers[:17], goal.astype(float) - hand]).astype(np.float32)
+    steps = policy.info.env.joints.action_step
+    commands = [np.array(line.split()[1:], float) for line in lines if line.startswith("running")]
+    assert len(commands) >= 3
+    for command in commands:
+        action = policy.predict(observation)
+        assert command == pytest.approx(joints + np.array(steps) * action, abs=1e-6)
+    assert lines[-1].startswith("holding")
+
+
+def describe_reach():
+    env = rlctl.make("reach")
+    info = describe(env)
+    env.close()
+    return info
+
+
+def make_recurrent(folder):
+    """An untrained policy with an LSTM for reach, as a file and as a policy."""
+    spec = EnvSpec("reach")
+    env = spec.make()
+    model = sb3_contrib.RecurrentPPO("MlpLstmPolicy", env, seed=0, policy_kwargs={"lstm_hidden_size": 16})
+    file = pack(model, "recurrent_ppo", spec, describe(env))
+    file.write(folder / "recurrent.safetensors")
+    env.close()
+    return file, rlctl.load_policy(str(folder / "recurrent.safetensors"))
+
+
+def load_reach():
+    policy = rlctl.load_policy("reach")
+    policy.info = policy.info.model_copy(update={"env": describe_reach()})  # the shipped file is older than its steps
+    return policy
+
+
+def test_loop_with_c(rlctl, tmp_path):
+    done = rlctl("export", "reach", "--pretrained", "--controller", "--c", "-o", "controller.c", timeout=300)
     assert done.returncode == 0, done.stderr
-    said = play(build(tmp_path, f"-DPOLICY_C={tmp_path / 'policy.c'}"))
-    assert "period: 0.0166667 s" in said
-    assert "joint_positions (7) [rad], joint_velocities (7) [rad/s]" in said
-    assert "action: 7 elements: lbr_iiwa_joint_1 (-1 to 1), " in said
+    check_commands(load_reach(), *play(build(tmp_path, f"-DCONTROLLER_C={tmp_path / 'controller.c'}")))
+
+
+def test_loop_with_a_recurrent_policy_in_c(tmp_path):
+    file, policy = make_recurrent(tmp_path)
+    code = ControllerSource(file, "controller", None).write()
+    (tmp_path / "controller.c").write_text(code.source)
+    (tmp_path / "controller.h").write_text(code.header)
+    check_commands(policy, *play(build(tmp_path, f"-DCONTROLLER_C={tmp_path / 'controller.c'}")))
 
 
 @pytest.fixture
@@ -96,8 +144,10 @@ def unpack(package, folder):
 
 
 def test_loop_with_onnx_runtime(rlctl, tmp_path, onnxruntime):
-    done = rlctl("export", "reach", "--pretrained", "--onnx", "-o", "policy.onnx", timeout=300)
+    done = rlctl("export", "reach", "--pretrained", "--controller", "--onnx", "-o", "controller.onnx", timeout=300)
     assert done.returncode == 0, done.stderr
     program = build(tmp_path, f"-DONNXRUNTIME_DIR={onnxruntime}")
-    said = play(program, tmp_path / "policy.onnx")
-    assert "joint_positions (7) [rad], joint_velocities (7) [rad/s]" in said
+    check_commands(load_reach(), *play(program, tmp_path / "controller.onnx"))
+    file, policy = make_recurrent(tmp_path)
+    (tmp_path / "recurrent.onnx").write_bytes(encode(build_graph(file)))
+    check_commands(policy, *play(program, tmp_path / "recurrent.onnx"))

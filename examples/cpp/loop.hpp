@@ -1,33 +1,35 @@
-// A loop of a fixed rate around a policy: the newest observation in, a bounded action out, and a watchdog.
+// A loop of a fixed rate around a controller: the newest numbers in, a command out.
 #pragma once
 
+#include <chrono>
 #include <functional>
 #include <mutex>
 #include <vector>
 
-#include "policy.hpp"
+#include "controller.hpp"
 
-// The newest observation, written by one thread and read by another.
+using Clock = std::chrono::steady_clock;
+
+// The newest numbers, written by one thread and read by another.
 class Newest {
  public:
   void put(std::vector<float> values);
   void close();  // nothing more will come
-  // Returns how often something was put so far; copies the newest.
-  long get(std::vector<float>& values, bool& closed);
+  // Copies the newest numbers and returns when they were put; nothing has come before that.
+  Clock::time_point get(std::vector<float>& values, bool& closed);
 
  private:
   std::mutex mutex_;
   std::vector<float> values_;
-  long count_ = 0;
+  Clock::time_point time_ = Clock::time_point::min();
   bool closed_ = false;
 };
 
 struct Counts {
-  long steps = 0;     // actions of the policy
-  long held = 0;      // periods without an observation that is new enough: the robot is to hold its position
-  long clamped = 0;   // actions with an element outside its bounds
-  long late = 0;      // periods that the loop began more than a tenth of a period late
+  long running = 0;  // commands of the policy
+  long held = 0;     // periods in which the controller held the robot, or had no command
+  long late = 0;     // periods that the loop began more than a tenth of a period late
 };
 
-// Runs until the observations end. `send` gets an action, or nothing where the robot is to hold.
-Counts run_loop(Policy& policy, Newest& newest, const std::function<void(const std::vector<float>*)>& send);
+// Runs until no more numbers come. `send` gets the outputs of each period.
+Counts run_loop(Controller& controller, Newest& newest, const std::function<void(const Output&)>& send);

@@ -1,6 +1,7 @@
-// policy_loop [policy.onnx]: a line of numbers per observation on stdin, a line per action, or `hold`, on stdout.
+// policy_loop [controller.onnx]: a line of numbers per measurement on stdin, a line per command on stdout, with the
+// controller's status before it.
 //
-// In a robot's program stdin and stdout are its drivers: read sensors where `read_observations` is, in the order and the
+// In a robot's program stdin and stdout are its drivers: read sensors where `read_numbers` is, in the order and the
 // units that the description names, and send commands where `print` is.
 #include <cstdio>
 #include <exception>
@@ -13,39 +14,33 @@
 
 namespace {
 
-void read_observations(Newest& newest) {
+void read_numbers(Newest& newest) {
   for (std::string line; std::getline(std::cin, line);) {
     std::stringstream stream(line);
     std::vector<float> values;
-    for (float value; stream >> value;) values.push_back(value);
+    for (std::string word; stream >> word;) values.push_back(std::strtof(word.c_str(), nullptr));  // also nan
     newest.put(std::move(values));
   }
   newest.close();
 }
 
-void print(const std::vector<float>* action) {
-  if (action == nullptr) {
-    std::puts("hold");
-  } else {
-    for (float value : *action) std::printf("%.9g ", static_cast<double>(value));
-    std::puts("");
+void print(const Output& output) {
+  std::fputs(output.status.c_str(), stdout);
+  if (output.may_send) {
+    for (double value : output.command) std::printf(" %.9g", value);
   }
+  std::puts("");
   std::fflush(stdout);
 }
 
 void describe(const Description& about) {
-  std::cerr << "observation: " << about.observation_size << " elements";
-  for (std::size_t i = 0; i < about.observation_names.size() && i < about.observation_sizes.size(); ++i) {
-    std::cerr << (i == 0 ? ": " : ", ") << about.observation_names[i] << " (" << about.observation_sizes[i] << ")";
-    if (i < about.observation_units.size() && !about.observation_units[i].empty()) {
-      std::cerr << " [" << about.observation_units[i] << "]";
-    }
+  std::cerr << "inputs: " << about.input_size << " numbers";
+  for (std::size_t i = 0; i < about.input_names.size() && i < about.input_sizes.size(); ++i) {
+    std::cerr << (i == 0 ? ": " : ", ") << about.input_names[i] << " (" << about.input_sizes[i] << ")";
+    if (i < about.input_units.size() && !about.input_units[i].empty()) std::cerr << " [" << about.input_units[i] << "]";
   }
-  std::cerr << "\naction: " << about.action_size << " elements";
-  for (std::size_t i = 0; i < about.action_names.size(); ++i) {
-    std::cerr << (i == 0 ? ": " : ", ") << about.action_names[i];
-    if (i < about.low.size() && i < about.high.size()) std::cerr << " (" << about.low[i] << " to " << about.high[i] << ")";
-  }
+  std::cerr << "\ncommand: " << about.command;
+  for (std::size_t i = 0; i < about.joint_names.size(); ++i) std::cerr << (i == 0 ? " of " : ", ") << about.joint_names[i];
   std::cerr << "\nperiod: " << about.control_dt << " s\n";
 }
 
@@ -53,14 +48,13 @@ void describe(const Description& about) {
 
 int main(int count, char** arguments) {
   try {
-    const auto policy = load_policy(count > 1 ? arguments[1] : "policy.onnx");
-    describe(policy->description());
+    const auto controller = load_controller(count > 1 ? arguments[1] : "controller.onnx");
+    describe(controller->description());
     Newest newest;
-    std::thread reader(read_observations, std::ref(newest));
-    const Counts counts = run_loop(*policy, newest, print);
+    std::thread reader(read_numbers, std::ref(newest));
+    const Counts counts = run_loop(*controller, newest, print);
     reader.join();
-    std::cerr << counts.steps << " actions, " << counts.held << " held, " << counts.clamped << " clamped, " << counts.late
-              << " periods late\n";
+    std::cerr << counts.running << " commands, " << counts.held << " held, " << counts.late << " periods late\n";
   } catch (const std::exception& error) {
     std::cerr << "error: " << error.what() << "\n";
     return 1;

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rlctl.task import BatchTask, Box, CommandTerm, Event, Joints, Sim, WorldRngs, events, rewards
+from rlctl.task import BatchTask, Box, CommandTerm, Event, Joints, Sim, WorldRngs, events, rewards, terms
 from rlctl.task.rotations import rotate_inverse
 from rlctl_locomotion.quadruped import JOINTS
 
@@ -38,7 +38,18 @@ class Walk(BatchTask):
     control_dt, substeps, solver_iterations = 0.02, 4, 3  # [s], -, -
     action_space = Box(-4.0, 4.0, (12,), np.float32)
     action_meaning = "joint angles from the stance; 1 is 0.25 rad"
-    observation_units = {"gyroscope": "rad/s", "joint_positions": "rad", "joint_velocities": "rad/s"}
+    observation_units = {
+        "gyroscope": "rad/s",
+        "orientation": "quaternion x, y, z, w",
+        "command": "m/s, m/s, rad/s",
+        "joint_positions": "rad",
+        "joint_velocities": "rad/s",
+    }
+    observation_terms = {
+        "gravity": terms.Gravity("orientation"),
+        "joint_positions": terms.Scaled("joint_positions", offset=tuple(STANCE)),
+        "last_action": terms.LastAction(),
+    }
     reward_weights = {
         "tracking": 0.1,
         "turning": 0.05,
@@ -107,13 +118,13 @@ class Walk(BatchTask):
         self.error_sum += self.error
 
     def observe(self) -> dict[str, np.ndarray]:
-        """Return what the robot's own sensors measure, the command and the last action."""
+        """Return what the robot's own sensors measure, the command and the last action; see `observation_terms`."""
         orientation = self.body.base_orientation
         return {
             "gyroscope": rotate_inverse(orientation, self.body.base_angular_velocity),
-            "gravity": rotate_inverse(orientation, DOWN),
+            "gravity": orientation,
             "command": self.command,
-            "joint_positions": self.body.joint_positions - STANCE,
+            "joint_positions": self.body.joint_positions,
             "joint_velocities": self.body.joint_velocities,
             "last_action": self.last_action,
         }
@@ -148,4 +159,6 @@ class Walk(BatchTask):
 
     def describe_joints(self) -> Joints:
         """The legs', leg by leg."""
-        return self.body.describe_joints(JOINTS, default_positions=STANCE.tolist(), action_scale=[REACH] * 12)
+        return self.body.describe_joints(
+            JOINTS, default_positions=STANCE.tolist(), action_scale=[REACH] * 12, measured="joint_positions"
+        )

@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from rlctl.task import Box, CommandTerm, Event, Joints, Sim, Task, TaskError, events, rewards
+from rlctl.task import Box, CommandTerm, Event, Joints, Sim, Task, TaskError, events, rewards, terms
 
 HOME = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])  # [rad], elbow bent
 SPEED_LIMIT = np.radians([85, 85, 100, 75, 130, 135, 135])  # [rad/s], LBR iiwa 14 R820 data sheet
@@ -32,7 +33,14 @@ class Reach(Task):
     solver_iterations = 10  # after 2 s without feedback the hand is 6 mm (median) from where 500 would bring it
     action_space = Box(-1.0, 1.0, (7,), np.float32)
     action_meaning = "joint steps; 1 moves a joint at its top speed"
-    observation_units = {"joint_positions": "rad", "joint_velocities": "rad/s", "hand": "m", "hand_to_goal": "m"}
+    observation_units = {
+        "joint_positions": "rad",
+        "joint_velocities": "rad/s",
+        "hand": "m",
+        "hand_to_goal": "m",
+        "goal": "m",
+    }
+    observation_terms = {"hand_to_goal": terms.Displacement("goal", "hand")}
     reward_weights = {"distance": -1.0, "reached": 1.0, "action": -0.05, "smoothness": -0.05}
     events = {  # what a real arm may differ by; acts with `randomize: true`
         "mass": Event("reset", events.scale_mass, body="arm", factor=(0.8, 1.2)),
@@ -70,14 +78,14 @@ class Reach(Task):
         self.arm.drive_to(target, max_speed=self.max_speed, max_force=self.max_torque, gain=GAIN)
         self.action_change, self.last_action = action - self.last_action, action
 
-    def observe(self) -> dict[str, np.ndarray]:
+    def observe(self) -> dict[str, Any]:
         """Return the arm's state and where the goal is, seen from the hand."""
         hand = self.arm.link_position(HAND)
         return {
             "joint_positions": self.arm.joint_positions,
             "joint_velocities": self.arm.joint_velocities,
             "hand": hand,
-            "hand_to_goal": self.goal - hand,
+            "hand_to_goal": (self.goal, hand),
         }
 
     def rewards(self, action: np.ndarray) -> dict[str, float]:
@@ -114,7 +122,13 @@ class Reach(Task):
 
     def describe_joints(self) -> Joints:
         """The arm's. Actions are steps from where a joint is, so they have no scale about the home position."""
-        return self.arm.describe_joints(self.arm.joint_names, default_positions=HOME.tolist())
+        return self.arm.describe_joints(
+            self.arm.joint_names,
+            default_positions=HOME.tolist(),
+            action_step=JOINT_STEP.tolist(),
+            measured="joint_positions",
+            clips_target=True,
+        )
 
 
 def check_goals(low: np.ndarray, high: np.ndarray) -> None:

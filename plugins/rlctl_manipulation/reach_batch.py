@@ -1,10 +1,12 @@
 """Reach in many worlds at once: the task of reach.py as a `BatchTask`, for MuJoCo."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from rlctl.task import BatchTask, Joints, Sim, WorldRngs, rewards
+from rlctl.task import BatchTask, CommandTerm, Joints, Sim, WorldRngs, rewards
 from rlctl_manipulation.reach import (
     GAIN,
     GOAL_HIGH,
@@ -37,7 +39,8 @@ class ReachBatch(BatchTask):
     control_dt, substeps, episode_s = Reach.control_dt, Reach.substeps, Reach.episode_s
     solver_iterations = Reach.solver_iterations
     action_space, action_meaning = Reach.action_space, Reach.action_meaning
-    observation_units, reward_weights, events = Reach.observation_units, Reach.reward_weights, Reach.events
+    observation_units, observation_terms = Reach.observation_units, Reach.observation_terms
+    reward_weights, events = Reach.reward_weights, Reach.events
     per_world = {"goal": (3,), "last_action": (7,), "action_change": (7,)}
 
     def build(self, sim: Sim) -> None:
@@ -61,14 +64,14 @@ class ReachBatch(BatchTask):
         self.action_change = action - self.last_action
         self.last_action = action.astype(float)
 
-    def observe(self) -> dict[str, np.ndarray]:
+    def observe(self) -> dict[str, Any]:
         """Return the arm's state and where the goal is, seen from the hand."""
         hand = self.arm.link_position(HAND)
         return {
             "joint_positions": self.arm.joint_positions,
             "joint_velocities": self.arm.joint_velocities,
             "hand": hand,
-            "hand_to_goal": self.goal - hand,
+            "hand_to_goal": (self.goal, hand),
         }
 
     def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
@@ -93,6 +96,22 @@ class ReachBatch(BatchTask):
         """The goal."""
         return {"goal": self.goal}
 
+    def commands(self) -> dict[str, CommandTerm]:
+        """Return the positions of the goals."""
+        rows = zip("xyz", self.goal.T, self.goal_low, self.goal_high, strict=True)
+        return {f"goal_{axis}": CommandTerm(values, low, high, "m") for axis, values, low, high in rows}
+
+    def set_commands(self, values: Mapping[str, np.ndarray]) -> None:
+        """Move the goals."""
+        for name, value in values.items():
+            self.goal[:, "xyz".index(name[-1])] = value
+
     def describe_joints(self) -> Joints:
         """The arm's. Actions are steps from where a joint is, so they have no scale about the home position."""
-        return self.arm.describe_joints(self.arm.joint_names, default_positions=HOME.tolist())
+        return self.arm.describe_joints(
+            self.arm.joint_names,
+            default_positions=HOME.tolist(),
+            action_step=JOINT_STEP.tolist(),
+            measured="joint_positions",
+            clips_target=True,
+        )

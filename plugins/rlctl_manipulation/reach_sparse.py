@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.task import Event, events
-from rlctl_manipulation.reach import HAND, Reach
+from rlctl.task import Event, Joints, events
+from rlctl_manipulation.reach import HAND, HOME, Reach
 
 STRICT = 0.02  # [m]
 
@@ -17,6 +17,7 @@ class ReachSparse(Reach):
 
     observation_layout = "dict"
     observation_units = {"achieved_goal": "m", "desired_goal": "m"}
+    observation_terms = {}
     reward_weights = {"away": -1.0, "within_2_cm": 0.0, "distance": 0.0}
     events = {
         name: event for name, event in Reach.events.items() if not name.endswith("noise") or name == "action_noise"
@@ -33,6 +34,10 @@ class ReachSparse(Reach):
             "achieved_goal": self.arm.link_position(HAND),
             "desired_goal": self.goal,
         }
+
+    def describe_joints(self) -> Joints:
+        """The arm's, without the steps that actions command: no observation has the joints' positions alone."""
+        return self.arm.describe_joints(self.arm.joint_names, default_positions=HOME.tolist())
 
     def rewards(self, action: np.ndarray) -> dict[str, float]:
         """Return 1 for every step away from the goal; how far away, and within 2 cm or not, is not rewarded."""

@@ -14,6 +14,16 @@ def export(
     run: RunName = None,
     onnx: Annotated[bool, Option("Write an ONNX file (the default without --c).", ("--onnx",))] = False,
     c: Annotated[bool, Option("Write a C99 header and source file without dependencies.", ("--c",))] = False,
+    controller: Annotated[
+        bool,
+        Option(
+            "Write the controller, from what a robot measures to joint targets within limits; ONNX and C99.",
+            ("--controller",),
+        ),
+    ] = False,
+    limits: Annotated[
+        Path | None, Option("Limits of the controller's commands, in its C file (limits.yaml).", metavar="FILE")
+    ] = None,
     policy: Annotated[
         Path | None,
         Option(
@@ -34,15 +44,16 @@ def export(
     ] = None,
     json: Json = None,
 ) -> None:
-    """Write a policy as a self-contained ONNX file or C source, and verify that it acts the same."""
+    """Write a policy, or its controller, as a self-contained ONNX file or C source; verify that it acts the same."""
     checkpoint = choose_checkpoint(checkpoint, pretrained)
-    if policy is not None and (output is not None or onnx or c):
-        raise UsageError("--policy FILE writes only that file: leave out --output, --onnx and --c")
-    formats: tuple[Format, ...] = ("onnx", "c") if onnx and c else ("c",) if c else ("onnx",)
-    request = ExportRequest(run, formats, checkpoint, output, policy, episodes, dataset, sim)
+    if policy is not None and (output is not None or onnx or c or controller):
+        raise UsageError("--policy FILE writes only that file: leave out --output, --onnx, --c and --controller")
+    both = onnx == c if controller else onnx and c
+    formats: tuple[Format, ...] = ("onnx", "c") if both else ("c",) if c else ("onnx",)
+    request = ExportRequest(run, formats, checkpoint, output, policy, episodes, dataset, controller, limits, sim)
     if dataset is not None:
-        if onnx or c or policy is not None:
-            raise UsageError("--dataset writes only a dataset: leave out --onnx, --c and --policy")
+        if onnx or c or controller or policy is not None:
+            raise UsageError("--dataset writes only a dataset: leave out --onnx, --c, --controller and --policy")
         from rlctl.exporting import dataset as dataset_module
 
         dataset_module.show(dataset_module.export_dataset(request), json)
@@ -54,7 +65,12 @@ def export(
         return
     from rlctl.exporting.export import export_policy, show
 
-    reports = export_policy(request)
+    if controller:
+        from rlctl.exporting.controller.export import export_controller
+
+        reports = export_controller(request)
+    else:
+        reports = export_policy(request)
     show(reports, json)
     for report in reports:
         report.check()

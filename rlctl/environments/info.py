@@ -6,7 +6,7 @@ import itertools
 import math
 import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium
 import numpy as np
@@ -16,11 +16,16 @@ from gymnasium import spaces
 from rlctl.environments.dict_spaces import LARGEST_SPACE, format_space
 from rlctl.errors import ArtifactError, OldGymError, TaskError, UsageError, short_repr
 from rlctl.storage import validation
+from rlctl.task.history import Start
 from rlctl.task.joints import Joints
+from rlctl.task.terms import Displacement, Distance, Gravity, LastAction, PhaseClock, Scaled, find_quantity_sizes
 
 if TYPE_CHECKING:
     import mujoco
 
+AnyTerm = Annotated[
+    Scaled | Gravity | Displacement | Distance | LastAction | PhaseClock, pydantic.Field(discriminator="kind")
+]
 _SHOWN_JOINTS = 8
 _ONE_HOT = 10  # each value of a discrete space counts as this many elements of a Box
 
@@ -33,6 +38,12 @@ class EnvInfo(pydantic.BaseModel):
     observation_sizes: dict[str, int] = {}
     """Size per observation name, in the order of the flat observation; empty if the names are unknown."""
     observation_units: dict[str, str] = {}
+    observation_history: dict[str, int] = {}
+    """Number of last values, oldest first, of the observations that are histories; their sizes include all."""
+    history_start: Start = "first"  # what fills histories when an episode begins
+    observation_terms: dict[str, AnyTerm] = {}  # observations that are computed from measured quantities
+    quantity_sizes: dict[str, int] = {}
+    """Size per measured quantity of the terms, in the order of the terms and of their inputs."""
     action_meaning: str = ""
     control_dt: float | None = None  # time between two actions [s]
     reward_weights: dict[str, float] = {}
@@ -57,7 +68,14 @@ class EnvInfo(pydantic.BaseModel):
         own, foreign = (", ".join(info.observation_sizes) for info in (self, other))
         if own != foreign and sorted(self.observation_sizes) == sorted(other.observation_sizes):
             return f"its observations are in the order {own}, {whose} in the order {foreign}"
+        if (ours := self._describe_history()) != (theirs := other._describe_history()):
+            return f"its observations have {ours}, {whose} have {theirs}"
         return None
+
+    def _describe_history(self) -> str:
+        counts = {name: count for name, count in self.observation_history.items() if count > 1}
+        listed = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
+        return f"a history of {listed} that begins with {self.history_start}" if counts else "no history"
 
 
 def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
@@ -78,6 +96,10 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
             **common,
             "observation_sizes": sizes if time is None else time.extend_sizes(sizes),
             "observation_units": dict(task.observation_units),
+            "observation_history": dict(task.observation_history),
+            "history_start": task.history_start,
+            "observation_terms": dict(task.observation_terms),
+            "quantity_sizes": find_quantity_sizes(task.observation_terms, inner.measured),
             "action_meaning": task.action_meaning,
             "control_dt": task.control_dt,
             "reward_weights": inner.reward_weights,

@@ -96,6 +96,8 @@ def find_time_limit(env: Any) -> int | None:
 def stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any, Any]:
     """Observe the last `frames` observations, oldest first, along the last axis."""
     space = env.observation_space
+    if history := getattr(getattr(env.unwrapped, "task", None), "observation_history", None):
+        raise RecipeError(f"frame_stack: the task declares a history of {', '.join(history)}; set frame_stack: 1")
     if not isinstance(space, spaces.Box) or len(space.shape) not in (1, 3):
         raise RecipeError(f"frame_stack: only flat and image observations can be stacked, this task has {space}")
     if (count := math.prod(space.shape) * frames) > LARGEST_SPACE:

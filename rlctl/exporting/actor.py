@@ -26,15 +26,28 @@ def build(policy: PolicyFile) -> onnx.ModelProto:
 
     Raises `UsageError` for a part that cannot be written as ONNX.
     """
-    info = policy.info
-    graph, network = Graph(), Network(policy)
-    observation_space, action_space = info.env.spaces()
-    inputs = {key: _add_input(graph, info, key, part) for key, part in split_space(observation_space).items()}
+    info, graph = policy.info, Graph()
+    parts = split_space(info.env.spaces()[0])
+    inputs = {key: _add_input(graph, info, key, part) for key, part in parts.items()}
+    emit_actor(graph, policy, inputs)
+    description = (
+        f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps: raw observations in, "
+        "deterministic action out; normalisation and the action's bounds are inside"
+    )
+    return graph.model(make_metadata(info), description)
+
+
+def emit_actor(graph: Graph, policy: PolicyFile, inputs: Mapping[str, tuple[str, Any]]) -> None:
+    """Add a policy, from the parts of a raw observation, each a value and its dtype, to the output `action`.
+
+    The state of an LSTM becomes inputs and outputs of the graph.
+    """
+    network, action_space = Network(policy), policy.info.env.spaces()[1]
+    state: tuple[str, ...] = ()
     if network.own is None:
         value = concatenate(graph, [_emit_part(graph, inputs[key], network, key) for key in network.parts])
     else:
         value = _emit_own(graph, inputs, network.own)
-    state: tuple[str, ...] = ()
     if (lstm := network.lstm) is not None:
         names, shape = onnx_policy.STATE_INPUTS, (len(lstm.layers), BATCH, lstm.state.shape[2])
         hidden, cell = (graph.input(name, np.float32, shape, _STATE_MEANING) for name in names)
@@ -46,15 +59,10 @@ def build(policy: PolicyFile) -> onnx.ModelProto:
         value, dtype = _emit_continuous(graph, value, action_space, network.is_squashed)
     else:
         value, dtype = _emit_discrete(graph, value, action_space), np.dtype(np.int64)
-    meaning = info.env.action_meaning or "action of the environment"
+    meaning = policy.info.env.action_meaning or "action of the environment"
     graph.output(value, onnx_policy.ACTION, dtype, (BATCH, *(action_space.shape or ())), meaning)
     for name, part in zip(onnx_policy.STATE_OUTPUTS, state, strict=False):
         graph.output(part, name, np.float32, shape, "LSTM state for the next step")
-    description = (
-        f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps: raw observations in, "
-        "deterministic action out; normalisation and the action's bounds are inside"
-    )
-    return graph.model(make_metadata(info), description)
 
 
 def _add_input(graph: Graph, info: PolicyInfo, key: str, space: spaces.Space[Any]) -> tuple[str, Any]:
@@ -136,6 +144,7 @@ def make_metadata(info: PolicyInfo) -> dict[str, str]:
         "observation_names": ",".join(env.observation_sizes),
         "observation_sizes": ",".join(str(size) for size in env.observation_sizes.values()),
         "observation_units": ",".join(env.observation_units.get(name, "") for name in env.observation_sizes),
+        "observation_history": ",".join(f"{name}:{count}" for name, count in env.observation_history.items()),
         "frame_stack": str(info.spec.frame_stack),
         "action_meaning": env.action_meaning,
         "action_space": "" if isinstance(action_space, spaces.Box) else str(action_space),

@@ -85,6 +85,8 @@ class Layout:
         lines, first = [], 0
         for part in self.observed:
             unit = f" [{part.unit}]" if part.unit else ""
+            if (count := self.info.env.observation_history.get(part.name, 1)) > 1:
+                unit += f", the last {count}, oldest first"
             index = f"[{first}]" if part.size == 1 else f"[{first}..{first + part.size - 1}]"
             lines.append(f"  {index:<10} {part.name}{unit}")
             first += part.size
@@ -109,12 +111,12 @@ class Layout:
         low, high = _write_bounds(self.parts.values(), self.size, self.type)
         action_low, action_high = _write_bounds([self.action_space], self.action_size, self.action_type)
         return [
-            ("char *const", "observation_names", "OBSERVATION_PARTS", [_quote(part.name) for part in self.observed]),
-            ("char *const", "observation_units", "OBSERVATION_PARTS", [_quote(part.unit) for part in self.observed]),
+            ("char *const", "observation_names", "OBSERVATION_PARTS", [quote(part.name) for part in self.observed]),
+            ("char *const", "observation_units", "OBSERVATION_PARTS", [quote(part.unit) for part in self.observed]),
             ("int", "observation_sizes", "OBSERVATION_PARTS", [str(part.size) for part in self.observed]),
             (self.type, "observation_low", "OBSERVATION_SIZE", low),
             (self.type, "observation_high", "OBSERVATION_SIZE", high),
-            ("char *const", "action_names", "ACTION_SIZE", [_quote(element.name) for element in self.actions]),
+            ("char *const", "action_names", "ACTION_SIZE", [quote(element.name) for element in self.actions]),
             (self.action_type, "action_low", "ACTION_SIZE", action_low),
             (self.action_type, "action_high", "ACTION_SIZE", action_high),
         ]
@@ -135,7 +137,7 @@ def _find_part_bounds(space: spaces.Space[Any]) -> tuple[NDArray[Any], NDArray[A
     return np.zeros_like(highest), highest
 
 
-def _quote(text: str) -> str:
+def quote(text: str) -> str:
     """Return a text in UTF-8 as a C string literal."""
     plain = {*range(32, 127)} - set(b'"\\?')  # two question marks start a trigraph
     return '"' + "".join(chr(byte) if byte in plain else f"\\{byte:03o}" for byte in text.encode()) + '"'
@@ -146,12 +148,8 @@ def write_c(policy: PolicyFile, file_name: str) -> CSource:
 
     Raises `UsageError` for images, a user's own network, and networks of more than `LARGEST` weights.
     """
-    if (weights := sum(tensor.size for tensor in policy.actor_only().tensors.values())) > LARGEST:
-        raise UsageError(f"export --c: {weights:,} weights are too many, the limit is {LARGEST:,}; use export --onnx")
-    for key in own_modules.KEYS:
-        if isinstance(own := policy.info.policy_kwargs.get(key), dict):
-            raise UsageError(f"export --c: the {key} {own['class']} cannot be written as C; use export --onnx")
-    name, network = _make_identifier(file_name), Network(policy)
+    check_can_be_written(policy)
+    name, network = make_identifier(file_name), Network(policy)
     layout = Layout(name, policy.info)
     has_images = any(isinstance(layer, ScaleImage) for part in network.parts.values() for layer in part)
     if has_images or (layout.frames > 1 and [len(part.shape or ()) for part in layout.parts.values()] != [1]):
@@ -180,19 +178,34 @@ def write_c(policy: PolicyFile, file_name: str) -> CSource:
         "functions": writer.find_functions(),
         "statements": writer.statements,
     }
-    header, source, harness = (_render(file, values) for file in ("policy.h", "policy.c", "harness.c"))
+    header, source, harness = (render(file, values) for file in ("policy.h", "policy.c", "harness.c"))
     return CSource(name, header, source, values["prototype"], harness)
 
 
-def _render(file: str, values: dict[str, Any]) -> str:
+def check_can_be_written(policy: PolicyFile) -> None:
+    """Raise `UsageError` for a user's own network, and for one of more than `LARGEST` weights."""
+    if (weights := sum(tensor.size for tensor in policy.actor_only().tensors.values())) > LARGEST:
+        raise UsageError(f"export --c: {weights:,} weights are too many, the limit is {LARGEST:,}; use export --onnx")
+    for key in own_modules.KEYS:
+        if isinstance(own := policy.info.policy_kwargs.get(key), dict):
+            raise UsageError(f"export --c: the {key} {own['class']} cannot be written as C; use export --onnx")
+
+
+def render(file: str, values: dict[str, Any]) -> str:
+    """Return the content of a file from its template."""
     import jinja2
 
     environment = jinja2.Environment(
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+        loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates"), encoding="utf-8"),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
     )
     environment.filters["comment"] = _write_comment
+    environment.filters["one_line"] = lambda text: " ".join(_write_comment(text).split()).replace("/* *", "/*")
     environment.globals["write_array"] = write_array
-    return environment.from_string(Path(__file__).with_name(f"{file}.jinja").read_text(encoding="utf-8")).render(values)
+    return environment.get_template(f"{file}.jinja").render(values)
 
 
 def _write_comment(text: str) -> str:
@@ -202,7 +215,8 @@ def _write_comment(text: str) -> str:
     return "/* " + "\n".join(f" * {line}".rstrip() for line in safe)[3:] + "\n */"
 
 
-def _make_identifier(text: str) -> str:
+def make_identifier(text: str) -> str:
+    """Return a name in C for the name of a file."""
     plain = re.sub(r"\W", "_", text, flags=re.ASCII)
     return plain if re.match(r"[A-Za-z]", plain) else f"policy_{plain}"
 

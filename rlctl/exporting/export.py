@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl import output
+from rlctl.environments.info import EnvInfo
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.exporting.request import ExportRequest
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, Latency, measure_latency, verify
@@ -143,7 +144,13 @@ def export_policy(request: ExportRequest) -> list[ExportReport]:
     The files of several formats differ in their suffix. Raises `UsageError` if a format cannot represent the policy.
     Raises `AnswerIsNo` with the numbers if a file does not act as the policy does; that file is not written.
     """
-    source, formats, target = lookup.find_policy(request.run, request.checkpoint), request.formats, request.output
+    source, target = find_source(request, "policy")
+    return _export(source, [target.with_suffix(f".{name}") for name in request.formats], request.sim)
+
+
+def find_source(request: ExportRequest, name: str) -> tuple[FoundPolicy, Path]:
+    """Return the policy to export, and the path of the files without their suffixes, which end in `name` by default."""
+    source, target = lookup.find_policy(request.run, request.checkpoint), request.output
     output.print_notes(source.notes)
     if source.file.suffix == ".onnx":
         raise UsageError(f"{source.file} is an ONNX file already; export the run or its .safetensors file")
@@ -151,8 +158,9 @@ def export_policy(request: ExportRequest) -> list[ExportReport]:
         if source.run is not None:
             refuse_links_out(source.run.path)
         folder = Path() if request.checkpoint == PRETRAINED else source.file.parent
-        target = source.run.onnx_file if source.run else folder / source.file.name
-    return _export(source, [target.with_suffix(f".{name}") for name in formats], request.sim)
+        stem = source.file.name if name == "policy" else f"{source.file.stem}-{name}.c"
+        target = source.run.onnx_file.with_stem(name) if source.run else folder / stem
+    return source, target
 
 
 def _export(source: FoundPolicy, targets: list[Path], sim: str | None) -> list[ExportReport]:
@@ -187,8 +195,18 @@ def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) ->
     try:
         built = workers.info
     except (UsageError, TaskError) as error:
-        message = f"{policy_file}: the export cannot be verified, because its environment does not build: {error}"
-        raise type(error)(message, details=error.details) from None
+        raise explain_unverifiable(policy_file, error) from None
+    check_environment(policy_file, info, built)
+
+
+def explain_unverifiable(policy_file: Path, error: UsageError | TaskError) -> UsageError | TaskError:
+    """Return the error for an environment that does not build."""
+    message = f"{policy_file}: the export cannot be verified, because its environment does not build: {error}"
+    return type(error)(message, details=error.details)
+
+
+def check_environment(policy_file: Path, info: PolicyInfo, built: EnvInfo) -> None:
+    """Raise `ArtifactError` if a policy's environment has changed since its training."""
     if difference := info.env.find_difference(built):
         raise ArtifactError(
             f"{policy_file}: the export cannot be verified, because its environment has changed: {difference}; "
@@ -213,7 +231,7 @@ def _export_onnx(policy: TorchPolicy, workers: Workers, target: Path, model: onn
         fields.update(_verify(policy, workers, target, exported, part))
 
     files.write_with(target, write)
-    return ExportReport(**_describe(policy, target), **fields, size=len(content))
+    return ExportReport(**describe_policy(policy, target), **fields, size=len(content))
 
 
 def _export_c(policy: TorchPolicy, workers: Workers, target: Path, code: CSource) -> ExportReport:
@@ -233,10 +251,11 @@ def _export_c(policy: TorchPolicy, workers: Workers, target: Path, code: CSource
     files.write_text(target, code.source)
     size = len(code.source.encode()) + len(code.header.encode())
     details = {"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0]}
-    return ExportReport(**_describe(policy, target), **fields, size=size, details=details)
+    return ExportReport(**describe_policy(policy, target), **fields, size=size, details=details)
 
 
-def _describe(policy: TorchPolicy, target: Path) -> dict[str, Any]:
+def describe_policy(policy: TorchPolicy, target: Path) -> dict[str, Any]:
+    """Return the fields of a report that describe the policy and the file."""
     info = policy.info
     about = {"task": info.spec.task, "algo": info.algo, "training_steps": info.training_steps}
     return {"path": target, "policy": policy.file.path, **about}

@@ -39,6 +39,10 @@ class Graph:
         self._constants[name] = numpy_helper.from_array(np.array(value, order="C"), name)
         return name
 
+    def count_constants(self) -> int:
+        """Return the number of constants, for the name of the next one."""
+        return len(self._constants)
+
     def add(self, operator: str, *inputs: str, **attributes: Any) -> str:
         """Add a node with one output and return the output's name."""
         return self.add_with_outputs(operator, inputs, 1, **attributes)[0]

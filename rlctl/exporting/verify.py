@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import map_parts, stack, take_row
 from rlctl.policy.c_policy import CPolicy
-from rlctl.policy.file import PolicyFile
+from rlctl.policy.file import PolicyFile, Tensors
 from rlctl.policy.onnx_policy import OnnxPolicy
 from rlctl.policy.policy import Policy
 from rlctl.rollout.collect import Episode, play_episodes
@@ -206,8 +206,7 @@ def _magnifies_rounding(policy: PolicyFile, workers: Workers, expected: Sequence
 
     Contacts cause this within some hundred steps; such episodes cannot show whether two policies are the same.
     """
-    changed = {name: _change_last_bits(values) for name, values in policy.tensors.items()}
-    return not _play_again(PolicyFile(policy.info, changed), workers, expected).agrees
+    return not _play_again(PolicyFile(policy.info, change_last_bits(policy.tensors)), workers, expected).agrees
 
 
 def _play_again(policy: PolicyFile, workers: Workers, expected: Sequence[Episode]) -> ClosedLoop:
@@ -215,8 +214,12 @@ def _play_again(policy: PolicyFile, workers: Workers, expected: Sequence[Episode
     return compare_episodes(expected, play_episodes(workers, [episode.result.seed for episode in expected]))
 
 
-def _change_last_bits(values: NDArray[Any]) -> NDArray[Any]:
-    return (values * (1.0 + _LAST_BITS)).astype(values.dtype) if values.dtype.kind == "f" else values
+def change_last_bits(tensors: Tensors) -> dict[str, NDArray[Any]]:
+    """Return a policy's tensors with other last bits."""
+    return {
+        name: (values * (1.0 + _LAST_BITS)).astype(values.dtype) if values.dtype.kind == "f" else values
+        for name, values in tensors.items()
+    }
 
 
 def compare_episodes(expected: Sequence[Episode], actual: Sequence[Episode]) -> ClosedLoop:
@@ -243,14 +246,20 @@ def measure_latency(torch_policy: TorchPolicy, exported: Policy) -> Latency:
     space = torch_policy.observation_space
     space.seed(0)
     observation = space.sample()
-    normalized: Any = torch_policy.normalize(observation)
     exported.reset()
     if isinstance(exported, CPolicy):
         exported_us = _measure_median_us(lambda: exported.repeat(observation, _CALLS)) / _CALLS
     else:
         exported_us = _measure_median_us(lambda: exported.predict(observation))
-    sb3_us = _measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True))
-    return Latency(exported_us, sb3_us)
+    return Latency(exported_us, measure_sb3(torch_policy))
+
+
+def measure_sb3(torch_policy: TorchPolicy) -> float:
+    """Return the time that SB3 takes for one normalised observation [us]."""
+    space = torch_policy.observation_space
+    space.seed(0)
+    normalized: Any = torch_policy.normalize(space.sample())
+    return _measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True))
 
 
 def _measure_median_us(call: Callable[[], Any]) -> float:

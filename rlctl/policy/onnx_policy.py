@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import onnx
 
 METADATA_KEY = "rlctl"  # metadata key of the policy's description
+CONTROLLER_KEY = "rlctl_controller"  # metadata key of a controller, which is not a policy for the environment
 DIGEST_KEY = "sha256"  # metadata key of the sha256 of the file's bytes, computed with zeros in place of the digest
 SINGLE_INPUT = "obs"
 """Name of the input for an observation that is not a dictionary; a dictionary has one input per key."""
@@ -76,7 +77,7 @@ def check(content: bytes) -> None:
             raise ValueError("its content does not match its sha256")
 
 
-def _open_session(content: bytes) -> onnxruntime.InferenceSession:
+def open_session(content: bytes) -> onnxruntime.InferenceSession:
     """Check a graph and load it into onnxruntime; raises `ValueError` if one of them refuses it."""
     check(content)
     options = onnxruntime.SessionOptions()
@@ -108,10 +109,15 @@ class OnnxPolicy(Policy):
     def load(cls, path: Path) -> OnnxPolicy:
         """Read an exported file; raises `ArtifactError` if it is missing, damaged, foreign or of a newer format."""
         try:
-            session = _open_session(untrusted.read_bytes(path))
-            text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+            session = open_session(untrusted.read_bytes(path))
+            metadata = session.get_modelmeta().custom_metadata_map
+            text = metadata.get(METADATA_KEY)
         except ValueError as error:  # for damaged metadata a UnicodeDecodeError
             raise ArtifactError(f"{path}: damaged, or not an ONNX file of rlctl: {error}") from None
+        if CONTROLLER_KEY in metadata:
+            raise ArtifactError(
+                f"{path}: a controller takes what a robot measures; give the policy that it was made of"
+            )
         if text is None:
             raise ArtifactError(
                 f"{path}: not an ONNX file of rlctl: its metadata has no {METADATA_KEY!r} entry; "
@@ -168,7 +174,7 @@ class OwnGraph:
     def __init__(self, tensors: Tensors, normalize: Mapping[str, Normalize]) -> None:
         self.content = np.asarray(tensors[GRAPH], np.uint8).tobytes()
         self.normalize = normalize  # by key of the part of an observation
-        self._session = _open_session(self.content)
+        self._session = open_session(self.content)
         inputs = [port.name for port in (*self._session.get_inputs(), *self._session.get_overridable_initializers())]
         self.weights = {name: tensors[name] for name in inputs if not name.startswith(OWN_INPUT)}
         self._keys = [name.removeprefix(OWN_INPUT) for name in inputs if name.startswith(OWN_INPUT)]

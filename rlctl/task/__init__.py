@@ -8,6 +8,7 @@ from gymnasium.spaces import MultiDiscrete as MultiDiscrete
 from rlctl.errors import TaskError as TaskError
 from rlctl.task import events as events
 from rlctl.task import rewards as rewards
+from rlctl.task import terms as terms
 from rlctl.task.attachments import Attachment as Attachment
 from rlctl.task.batch import BatchTask as BatchTask
 from rlctl.task.batch import WorldRngs as WorldRngs

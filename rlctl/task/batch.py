@@ -53,7 +53,7 @@ class BatchTask(TaskDefinition):
         """Set motor targets from actions of shape (worlds, ...) inside `action_space`."""
         raise NotImplementedError
 
-    def observe(self) -> dict[str, NDArray[np.float64]]:
+    def observe(self) -> dict[str, Any]:
         """Return what the policy sees, by name, each of shape (worlds, size)."""
         raise NotImplementedError
 
@@ -114,7 +114,7 @@ class OneWorld(Task):
     def act(self, action: NDArray[Any]) -> None:
         self.batch.act(np.asarray(action)[None])
 
-    def observe(self) -> dict[str, NDArray[np.float64]]:
+    def observe(self) -> dict[str, Any]:
         return self._read("observe", self.batch.observe(), 2)
 
     def rewards(self, action: NDArray[Any]) -> dict[str, float]:
@@ -141,10 +141,13 @@ class OneWorld(Task):
         """Return the row of each array; what is not a dict is left to `TaskEnv`."""
         if not isinstance(values, dict):
             return values
-        return {
-            name: read_rows(self._name, f"{method}()[{name!r}]", value, (1, None)[:axes], np.float64)[0]
-            for name, value in values.items()
-        }
+
+        def read(name: str, value: Any) -> Any:
+            if isinstance(value, tuple):  # the quantities of a term
+                return tuple(read(name, quantity) for quantity in value)
+            return read_rows(self._name, f"{method}()[{name!r}]", value, (1, None)[:axes], np.float64)[0]
+
+        return {name: read(name, value) for name, value in values.items()}
 
     def describe_joints(self) -> Joints | None:
         return self.batch.describe_joints()

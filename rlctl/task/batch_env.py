@@ -14,7 +14,9 @@ from rlctl.task.batch import BatchTask, WorldRngs, read_rows
 from rlctl.task.env import TaskEnv
 from rlctl.task.events.acting import ActingEvents, Streams, seed_streams
 from rlctl.task.events.batch_signals import BatchSignals
+from rlctl.task.history import HistoryRows
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
+from rlctl.task.observation import compute_terms
 
 Array = NDArray[np.float64]
 Worlds = NDArray[np.int64]
@@ -60,9 +62,10 @@ class BatchEnv:
         task.prepare(self.sim, worlds)
         self.sim.save()
         self.set_events(single)
-        names = single._format.sizes
-        self._sizes, self._names = [names[name] for name in names], list(names)
-        self._ends = np.cumsum(self._sizes)
+        sizes, frames = single._format.frame_sizes, task.observation_history
+        self._sizes, self._names = list(sizes.values()), list(sizes)
+        self._ends = np.cumsum([*single._format.sizes.values()])
+        self._history = HistoryRows(worlds, sizes, frames, task.history_start) if frames else None
         low, high = single.observation_space.low, single.observation_space.high  # type: ignore[attr-defined]
         self._bounds = (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
 
@@ -93,6 +96,8 @@ class BatchEnv:
             self._act("start", world)
             if self._signals is not None:
                 self._signals.begin(world, self._streams[world], level)
+        if self._history is not None:
+            self._history.begin(worlds)
         with self._leave_others(worlds):
             observation = self._observe(worlds)
             self._check_kept("reset")
@@ -207,12 +212,15 @@ class BatchEnv:
         parts = self.task.observe()
         if not isinstance(parts, dict) or list(parts) != self._names:
             raise TaskError(f"{self.name}: observe() returned {short_repr(list(parts))}, at first {self._names}")
+        if self.task.observation_terms:
+            parts = compute_terms(self.name, self.task.observation_terms, parts)
         columns = [
             read_rows(self.name, f"observe()[{name!r}]", parts[name], (self.worlds, size), np.float64)
             for name, size in zip(self._names, self._sizes, strict=True)
         ]
         exact = np.concatenate(columns, axis=1)[rows]
-        values = (exact if self._signals is None else self._signals.observe(exact, rows)).astype(np.float32)
+        seen = exact if self._signals is None else self._signals.observe(exact, rows)
+        values = (seen if self._history is None else self._history.add(seen, rows)).astype(np.float32)
         bad = ~np.isfinite(values.sum(axis=1))
         if bad.any():
             row = int(bad.argmax())

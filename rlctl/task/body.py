@@ -338,10 +338,11 @@ class Body:
         self._refuse("set_color")
 
     def describe_joints(
-        self, joints: Sequence[str], *, default_positions: Sequence[float] = (), action_scale: Sequence[float] = ()
+        self, joints: Sequence[str], *, default_positions: Sequence[float] = (), **commanded: Any
     ) -> Joints:
         """Return joints with the limits of the model file, for `Task.describe_joints`.
 
+        `commanded` are the fields of `Joints` that describe the action: `action_scale=[0.25] * 12`, for example.
         If a limit is missing, 0 or infinite for one of the joints, it is left out for all of them.
         """
         chosen = self.find_joints(joints)
@@ -354,13 +355,13 @@ class Body:
         return Joints(
             names=[self.joint_names[joint] for joint in chosen],
             default_positions=default_positions,
-            action_scale=action_scale,
             stiffness=() if self.drives is None else self.drives.stiffness[chosen].tolist(),
             damping=() if self.drives is None else self.drives.damping[chosen].tolist(),
             low=low.tolist() if bounded else (),
             high=high.tolist() if bounded else (),
             max_speed=speed,
             max_torque=torque,
+            **commanded,
         )
 
     def _find_force_limits(self, joints: list[int], max_force: Limit) -> Array:

@@ -15,9 +15,10 @@ from rlctl.errors import RecipeError, TaskError, UsageError, check_name, short_r
 from rlctl.task.batch import BatchTask, OneWorld, as_single
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
-from rlctl.task.joints import Joints
+from rlctl.task.history import TermHistory
+from rlctl.task.joints import check_joints
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
-from rlctl.task.observation import Observation, ObservationFormat
+from rlctl.task.observation import Observation, ObservationFormat, compute_terms
 from rlctl.task.pybullet.library import is_installed
 from rlctl.task.pybullet.sim import PybulletSim
 from rlctl.task.sim import Sim
@@ -62,6 +63,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.action_space = copy.deepcopy(task.action_space)
         self._acting = ActingEvents(self.events, task.control_dt)
         self.level = self._episode_level = 1.0
+        self.measured: dict[str, Any] = {}
+        """What the last observation's terms were computed from, by the name of the term."""
         self.sim = _make_world(task, sim, render_mode)
         self._step = 0
         self._running = self._closed = False
@@ -72,12 +75,14 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             self._acting.try_once(["reset"], self.sim)
             task.reset(np.random.default_rng(0))
             self._acting.try_once(["start", "interval"], self.sim)
-            self._first = first = task.observe()
-            if not isinstance(first, dict) or not first:
-                raise _not_by_name(self.name, "observe", first)
+            observed = task.observe()
+            if not isinstance(observed, dict) or not observed:
+                raise _not_by_name(self.name, "observe", observed)
+            self._first = first = self._compute_terms(observed)
             self._signals = Signals(self.events, first, self.action_space, task.observation_bounds)
             self._signals.try_once()
-            _check_joints(task)
+            quantities = [name for term in task.observation_terms.values() for name in term.inputs]
+            check_joints(self.name, task.describe_joints(), self.action_space, [*first, *quantities])
             # A task knows its markers after a reset; they are added to the world as it was built.
             markers = list(task.markers()) if render_mode is not None else []
             if self.events or render_mode is not None:
@@ -88,6 +93,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             self.sim.close()
             raise
         self._format = ObservationFormat(task, first)
+        self._history = TermHistory(task.observation_history, task.history_start)
         self.observation_sizes, self.observation_space = self._format.sizes, self._format.space
 
     def set_level(self, level: float) -> None:
@@ -150,6 +156,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.task.reset(self.np_random)
         drawn |= self._acting.run("start", self.sim, self._streams, self.level)
         self._signals.begin(self._streams, self.level)
+        self._history.begin()
         self._step = 0
         self._running = True
         observation = self._observe()
@@ -221,7 +228,15 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         return action
 
     def _observe(self) -> Observation:
-        return self._format.assemble(self._signals.observe(self.task.observe()), self._step)
+        parts = self._signals.observe(self._compute_terms(self.task.observe()))
+        return self._format.assemble(self._history.add(parts), self._step)
+
+    def _compute_terms(self, observed: Any) -> Any:
+        terms = self.task.observation_terms
+        if not terms or not isinstance(observed, dict):
+            return observed
+        self.measured = {name: observed[name] for name in terms if name in observed}
+        return compute_terms(self.name, terms, observed)
 
     def move_markers(self) -> None:
         """Move the drawn markers to their current positions in the task."""
@@ -268,16 +283,6 @@ def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]
         check_name(name, weights, f"reward_weights: {type(task).__name__} has no term", RecipeError)
         weights[name] = float(weight)
     return weights
-
-
-def _check_joints(task: Task) -> None:
-    joints, count = task.describe_joints(), math.prod(task.action_space.shape or ())
-    if joints is not None and (not isinstance(joints, Joints) or len(joints.names) != count):
-        given = list(joints.names) if isinstance(joints, Joints) else joints
-        raise TaskError(
-            f"{type(task).__name__}: describe_joints() returned {short_repr(given)}; "
-            f"return body.describe_joints(names) with {count} names, one per element of the action"
-        )
 
 
 def _not_by_name(task: str, method: str, value: Any) -> TaskError:

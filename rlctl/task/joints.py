@@ -3,8 +3,14 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any, Literal
 
-from rlctl.errors import TaskError
+from gymnasium import spaces
+
+from rlctl.errors import TaskError, check_name, short_repr
+
+Command = Literal["", "position", "step", "speed", "torque"]
+_KINDS: dict[Command, str] = {"position": "scale", "step": "step", "speed": "speed", "torque": "torque"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,9 +29,16 @@ class Joints:
     high: Sequence[float] = ()
     max_speed: Sequence[float] = ()  # [rad/s or m/s]
     max_torque: Sequence[float] = ()
+    action_step: Sequence[float] = ()  # only if the target is the joint's measured position plus `action_step * action`
+    action_speed: Sequence[float] = ()  # only if the target is a speed, `action_speed * action` [rad/s or m/s]
+    action_torque: Sequence[float] = ()  # only if the target is a torque or force, `action_torque * action`
+    measured: str = ""  # the observation, or quantity of a term, that has the positions of these joints in this order
+    clips_target: bool = False  # whether a position that an action commands is clipped to `low` and `high`
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self)[1:]:
+            if field.default != ():
+                continue
             values = [float(value) for value in getattr(self, field.name)]
             if values and (len(values) != len(self.names) or not all(map(math.isfinite, values))):
                 raise TaskError(
@@ -36,3 +49,36 @@ class Joints:
         if odd := [name for name in self.names if not isinstance(name, str)]:
             raise TaskError(f"joints: names must be text, not {odd[0]!r}")
         object.__setattr__(self, "names", tuple(self.names))
+        given = [f"action_{kind}" for kind in _KINDS.values() if getattr(self, f"action_{kind}")]
+        if len(given) > 1:
+            raise TaskError(f"joints: {' and '.join(given)} exclude each other: an action commands one thing")
+        if self.action_step and not self.measured:
+            raise TaskError(
+                "joints: action_step needs measured: the name of the observation with the joints' positions"
+            )
+        if self.clips_target and not (self.low and self.high):
+            raise TaskError("joints: clips_target needs low and high")
+
+    @property
+    def command(self) -> tuple[Command, Sequence[float]]:
+        """What an action commands, and how much per 1 of the action and joint; ("", ()) if that is not known."""
+        for command, kind in _KINDS.items():
+            if per_action := getattr(self, f"action_{kind}"):
+                return command, per_action
+        return "", ()
+
+
+def check_joints(task: str, joints: Any, action_space: spaces.Space[Any], observed: Sequence[str]) -> None:
+    """Raise `TaskError` for what `describe_joints` returned, unless it has a joint per element of the action.
+
+    `observed` are the names of observations and of the quantities of terms.
+    """
+    count = math.prod(action_space.shape or ())
+    if joints is not None and (not isinstance(joints, Joints) or len(joints.names) != count):
+        given = list(joints.names) if isinstance(joints, Joints) else joints
+        raise TaskError(
+            f"{task}: describe_joints() returned {short_repr(given)}; "
+            f"return body.describe_joints(names) with {count} names, one per element of the action"
+        )
+    if joints is not None and joints.measured:
+        check_name(joints.measured, observed, f"{task}: joints: no observation", TaskError)

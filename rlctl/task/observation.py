@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, did_you_mean
 from rlctl.task.task import Task
+from rlctl.task.terms import Term
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
@@ -24,24 +25,43 @@ class ObservationFormat:
         self._task = task
         self._name = type(task).__name__
         self._bounds = task.observation_bounds
-        self._shapes = {name: np.shape(value) for name, value in first.items()}
+        self.frame_sizes = {name: int(np.size(value)) for name, value in first.items()}
+        """Elements per name of one step, without histories."""
+        self._check_history(first)
+        frames = task.observation_history
+        self._shapes = {
+            name: (frames[name] * int(np.size(value)),) if name in frames else np.shape(value)
+            for name, value in first.items()
+        }
         # Camera pictures stay bytes, as libraries expect images.
         self._dtypes: dict[str, Any] = {
             name: np.uint8 if np.asarray(value).dtype == np.uint8 else np.float32 for name, value in first.items()
         }
-        self.sizes = {name: int(np.size(value)) for name, value in first.items()}
+        self.sizes = {name: math.prod(shape) for name, shape in self._shapes.items()}
         """Elements per name, in the order of the flat observation."""
         if empty := [name for name, size in self.sizes.items() if size == 0]:
             raise TaskError(f"{self._name}: observation {empty[0]!r} is empty: check the slice in observe")
         self.space = self._make_space()
         self._zeros = np.zeros(self.space.shape or (), np.float32)
 
-    def _make_space(self) -> Any:
-        for name in [*self._bounds, *self._task.observation_units]:
-            if name not in self._shapes:
+    def _check_history(self, first: Mapping[str, Any]) -> None:
+        for name in self._task.observation_history:
+            if len(shape := np.shape(first.get(name, ()))) > 1:
                 raise TaskError(
-                    f"{self._name}: bounds or units for {name!r}, which is not observed."
-                    f"{did_you_mean(name, self._shapes)}"
+                    f"{self._name}: observation_history of {name!r}, of shape {shape}: only vectors have one"
+                )
+
+    def _make_space(self) -> Any:
+        quantities = [name for term in self._task.observation_terms.values() for name in term.inputs]
+        for what, names, known in (
+            ("bounds or units", self._bounds, self._shapes),
+            ("a term", self._task.observation_terms, self._shapes),
+            ("a history", self._task.observation_history, self._shapes),
+            ("bounds or units", self._task.observation_units, [*self._shapes, *quantities]),
+        ):
+            if unknown := [name for name in names if name not in known]:
+                raise TaskError(
+                    f"{self._name}: {what} for {unknown[0]!r}, which is not observed.{did_you_mean(unknown[0], known)}"
                 )
         parts: dict[str, Any] = {}
         for name, shape in self._shapes.items():
@@ -108,3 +128,15 @@ class ObservationFormat:
                     f"outside its bounds [{low:g}, {high:g}]"
                 )
         return TaskError(f"{self._name}: observation outside its bounds at step {step}")
+
+
+def compute_terms(name: str, terms: Mapping[str, Term], observed: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a task observes, with its terms computed; raises `TaskError` where quantities do not fit a term."""
+    parts = dict(observed)
+    for key, term in terms.items():
+        if key in parts:  # a missing one is an error of the observation's shape
+            try:
+                parts[key] = term(parts[key])
+            except (ValueError, TypeError) as error:
+                raise TaskError(f"{name}: observation {key!r} does not fit its term {term}: {error}") from None
+    return parts

@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError
 from rlctl.task.commands import CommandTerm
 from rlctl.task.events import Event
+from rlctl.task.history import Start
 from rlctl.task.joints import Joints
 from rlctl.task.sim import Sim
+from rlctl.task.terms import Term
+
+LONGEST_HISTORY = 1000  # [steps]
 
 
 class TaskDefinition:
@@ -36,7 +40,14 @@ class TaskDefinition:
     action_meaning: ClassVar[str] = ""
     observation_layout: ClassVar[Literal["flat", "dict"]] = "flat"
     """One flat Box in the order of `observe`, or a Dict space with one entry per name."""
+    observation_terms: ClassVar[Mapping[str, Term]] = {}
+    """Observations that are computed from measured quantities, by name; see `rlctl.task.terms`."""
+    observation_history: ClassVar[Mapping[str, int]] = {}
+    """Number of last values that an observation consists of, oldest first, by name; other observations have one."""
+    history_start: ClassVar[Start] = "first"
+    """What fills histories when an episode begins: `first`, the first observation, or `zeros`."""
     observation_units: ClassVar[Mapping[str, str]] = {}
+    """Unit by name, also of the quantities of `observation_terms`."""
     observation_bounds: ClassVar[Mapping[str, tuple[float, float]]] = {}
     """Range per observation name, in its unit; other observations are unbounded."""
     reward_weights: ClassVar[Mapping[str, float]] = {}
@@ -97,7 +108,7 @@ class Task(TaskDefinition):
         """Set motor targets from an action that is inside `action_space`."""
         raise NotImplementedError
 
-    def observe(self) -> dict[str, NDArray[np.float64]]:
+    def observe(self) -> dict[str, Any]:
         """Return what the policy sees, by name; the observation has the same order."""
         raise NotImplementedError
 
@@ -175,6 +186,17 @@ def check_definition(task: Task) -> None:
             raise TaskError(
                 f"{name}: observation_bounds of {key!r} are {bounds}; they must be two numbers, (low, high)"
             )
+    for key, term in task.observation_terms.items():
+        if not isinstance(term, Term):
+            raise TaskError(f"{name}: observation_terms of {key!r} is {term!r}; it must be one of rlctl.task.terms")
+    for key, count in task.observation_history.items():
+        if not isinstance(count, int) or not 1 <= count <= LONGEST_HISTORY:
+            raise TaskError(
+                f"{name}: observation_history of {key!r} is {count!r}; it must be a number of steps, "
+                f"from 1 to {LONGEST_HISTORY}"
+            )
+    if task.history_start not in ("first", "zeros"):
+        raise TaskError(f"{name}: history_start is {task.history_start!r}; it must be 'first' or 'zeros'")
     for key, event in task.events.items():
         if not isinstance(event, Event):
             raise TaskError(f"{name}: events.{key} is not an Event: Event('reset', scale_mass, body=...), for example")

@@ -119,4 +119,4 @@ def test_the_command(rlctl, run):
     assert done.stdout == "wrote data: lerobot, 2 episodes, 2 succeeded, 20 steps\n"
     refused = rlctl("export", run.path, "--dataset", "lerobot", "--c")
     assert refused.returncode == 2
-    assert "--dataset writes only a dataset: leave out --onnx, --c and --policy" in refused.stderr
+    assert "--dataset writes only a dataset: leave out --onnx, --c, --controller and --policy" in refused.stderr

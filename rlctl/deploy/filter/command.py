@@ -36,10 +36,10 @@ class Command:
         self._space = fitted.space
         self._safe, self._home = fitted.safe, fitted.home
         self._is_position = limits.command == "position"
-        self._blend_steps = round(min(limits.blend_in_s / bounds.dt, _MAX_STEPS))
+        self.blend_steps = round(min(limits.blend_in_s / bounds.dt, _MAX_STEPS))
         cutoff = limits.lowpass_hz
-        self._alpha = 1.0 if cutoff is None else 1.0 - math.exp(-2.0 * math.pi * cutoff * bounds.dt)
-        self._is_action = bool((bounds.factor == 1.0).all() and not bounds.offset.any())
+        self.alpha = 1.0 if cutoff is None else 1.0 - math.exp(-2.0 * math.pi * cutoff * bounds.dt)
+        self.is_action = bool((bounds.factor == 1.0).all() and not bounds.offset.any())
         """Whether a command is the action itself."""
         self._zeros = np.zeros(len(self._safe))
         self._none = bytes(len(self._safe))
@@ -57,7 +57,7 @@ class Command:
 
     def begin_blend(self) -> None:
         """Blend gradually from the present command into the next ones."""
-        self._blend_left = self._blend_steps
+        self._blend_left = self.blend_steps
         self._blend_from: Array | None = None
 
     def begin_from_measured(self) -> None:
@@ -88,18 +88,18 @@ class Command:
     def follow(self, action: Array) -> NDArray[Any]:
         """Return the allowed action closest to the policy's. Raises `UnsafeCommand`."""
         start = self._present(action)
-        target = action if self._is_action else self._bounds.offset + action * self._bounds.factor
-        if self._alpha < 1.0 or self._blend_left:
+        target = action if self.is_action else self._bounds.offset + action * self._bounds.factor
+        if self.alpha < 1.0 or self._blend_left:
             target = self._apply_smoothing(self._bounds.clip_ends(target, self._note), start)
         return self._move(target)
 
     def _apply_smoothing(self, target: Array, start: Array) -> Array:
         """Apply low-pass and blend to a command within its bounds, so that neither overflows nor winds up."""
-        if self._alpha < 1.0:
+        if self.alpha < 1.0:
             before = start if self._smooth is None else self._smooth
-            self._smooth = target = before + self._alpha * (target - before)
+            self._smooth = target = before + self.alpha * (target - before)
         if self._blend_left:
-            part = self._blend_left / (self._blend_steps + 1)
+            part = self._blend_left / (self.blend_steps + 1)
             self._blend_left -= 1
             if self._blend_from is None:
                 self._blend_from = start
@@ -175,17 +175,17 @@ class Command:
 
     def _read_command(self, action: NDArray[Any]) -> Array:
         sent = action.ravel().astype(np.float64)
-        return sent if self._is_action else self._bounds.offset + sent * self._bounds.factor
+        return sent if self.is_action else self._bounds.offset + sent * self._bounds.factor
 
     def _as_action(self, command: Array, direction: NDArray[np.int64] | None = None) -> NDArray[Any]:
         """Return the action of a command; whole numbers are rounded, or per joint: -1 down, 1 up."""
-        action = command if self._is_action else (command - self._bounds.offset) / self._bounds.factor
+        action = command if self.is_action else (command - self._bounds.offset) / self._bounds.factor
         if self._space.dtype.kind != "f":
             action = (
                 np.rint(action) if direction is None else np.where(direction < 0, np.floor(action), np.ceil(action))
             )
         action = action.astype(self._space.dtype).reshape(self._space.shape)
-        if self._is_action:
+        if self.is_action:
             return action
         return np.minimum(np.maximum(action, self._space.low), self._space.high)  # rounding
 

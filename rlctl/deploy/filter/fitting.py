@@ -205,8 +205,9 @@ def _check_can_be_limited(limits: Limits, joint: JointLimits, name: str) -> None
 def _choose_units(limits: Limits, space: spaces.Box, known: Joints | None, names: list[str]) -> tuple[Array, Array]:
     scale: Any = 1.0
     offset: Any = 0.0
-    if known is not None and known.action_scale and limits.command == "position":
-        scale, offset = known.action_scale, known.default_positions or 0.0
+    if known is not None and known.command[0] == limits.command:
+        scale = known.command[1]
+        offset = (known.default_positions or 0.0) if limits.command == "position" else 0.0
     elif limits.scale is None and limits.command != "action" and (space.low == -1).all() and (space.high == 1).all():
         raise RecipeError(
             f"limits: scale: required when actions range from -1 to 1; write scale: NUMBER, the {limits.command} of "

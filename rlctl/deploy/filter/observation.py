@@ -142,27 +142,27 @@ class SensorChecks:
         for name in limits.sensors:
             check_name(name, layout.slices, "limits: sensors: no observation", RecipeError, listed="Known")
         self._layout = layout
-        self._oldest = math.inf if control_dt is None else limits.max_age_periods * control_dt
-        self._low, self._high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
-        self._frozen: list[tuple[str, slice, int]] = []
+        self.oldest = math.inf if control_dt is None else limits.max_age_periods * control_dt
+        self.low, self.high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
+        self.frozen: list[tuple[str, slice, int]] = []
         for name, sensor in limits.sensors.items():
             part = layout.slices[name]
             if sensor.range is not None:
-                self._low[part], self._high[part] = sensor.range
+                self.low[part], self.high[part] = sensor.range
             if sensor.frozen_s is not None:
                 if control_dt is None:
                     raise RecipeError(
                         f"limits: sensors.{name}.frozen_s: this policy has no control_dt; write control_dt: SECONDS"
                     )
-                self._frozen.append((name, part, max(2, round(min(sensor.frozen_s / control_dt, 1e9)))))
+                self.frozen.append((name, part, max(2, round(min(sensor.frozen_s / control_dt, 1e9)))))
         self._all_finite = b"\x01" * layout.size
-        self._has_range = bool(np.isfinite(self._low).any())
+        self.has_range = bool(np.isfinite(self.low).any())
         self.reset()
 
     def reset(self) -> None:
         """Begin an episode."""
         self._last: Array | None = None
-        self._same = [0] * len(self._frozen)
+        self._same = [0] * len(self.frozen)
 
     def check(self, values: Array, age_s: float) -> Fault | None:
         """Return a fault of an observation's numbers; None if there is none. `age_s` is its age [s]."""
@@ -171,24 +171,24 @@ class SensorChecks:
         if np.isfinite(values).tobytes() != self._all_finite:
             index = int(np.argmin(np.isfinite(values)))
             fault = (f"{self._name(index)} not finite", float(values[index]), math.inf)
-        elif self._has_range and (outside := self._find_outside(values)) is not None:
-            value, low, high = (float(array[outside]) for array in (values, self._low, self._high))
+        elif self.has_range and (outside := self._find_outside(values)) is not None:
+            value, low, high = (float(array[outside]) for array in (values, self.low, self.high))
             fault = (f"{self._name(outside)} out of range", value, low if value < low else high)
-        elif not abs(age_s) <= self._oldest:  # from the future: the clocks differ, so its age is unknown
-            fault = ("observation too old", age_s, self._oldest)
-        if self._frozen:
+        elif not abs(age_s) <= self.oldest:  # from the future: the clocks differ, so its age is unknown
+            fault = ("observation too old", age_s, self.oldest)
+        if self.frozen:
             fault = self._check_frozen(values) or fault
         return fault
 
     def _find_outside(self, values: Array) -> int | None:
-        if np.minimum(np.maximum(values, self._low), self._high).tobytes() == values.tobytes():
+        if np.minimum(np.maximum(values, self.low), self.high).tobytes() == values.tobytes():
             return None
-        outside = (values < self._low) | (values > self._high)
+        outside = (values < self.low) | (values > self.high)
         return int(outside.argmax()) if outside.any() else None  # zeros may differ by their sign
 
     def _check_frozen(self, values: Array) -> Fault | None:
         fault: Fault | None = None
-        for number, (name, part, steps) in enumerate(self._frozen):
+        for number, (name, part, steps) in enumerate(self.frozen):
             same = self._last is not None and bool((values[part] == self._last[part]).all())
             self._same[number] = self._same[number] + 1 if same else 0
             if self._same[number] >= steps:

@@ -1,0 +1,194 @@
+"""`rlctl export --controller`: writes a controller as C and ONNX; keeps a file only if it acts as the policy does."""
+
+import dataclasses
+import functools
+import os
+import platform
+import tempfile
+import timeit
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlctl.deploy.filter.limits import Limits, read_limits
+from rlctl.environments.info import describe
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import AnswerIsNo, TaskError, UsageError
+from rlctl.exporting.c_source import FLAGS, find_compiler
+from rlctl.exporting.controller import verify
+from rlctl.exporting.controller.graph import build_graph
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
+from rlctl.exporting.controller.players import CController, Controller, OnnxController, compile_controller
+from rlctl.exporting.controller.source import ControllerSource
+from rlctl.exporting.export import (
+    ExportReport,
+    check_environment,
+    describe_policy,
+    explain_unverifiable,
+    find_source,
+    format_agreement,
+    format_closed_loop,
+)
+from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.verify import Latency, change_last_bits, measure_sb3
+from rlctl.policy.file import PolicyFile
+from rlctl.policy.numpy_policy import NumpyPolicy
+from rlctl.policy.onnx_policy import encode
+from rlctl.policy.policy import Policy
+from rlctl.policy.torch_policy import TorchPolicy, pin_threads
+from rlctl.storage import files
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ControllerReport(ExportReport):
+    """A controller that was exported, and how it was verified."""
+
+    max_target_difference: float | None = None
+
+    def list_rows(self) -> list[tuple[str, str]]:
+        """Return the lines of the report: pairs of a word and a text."""
+        details, rows = self.details, super().list_rows()
+        target = [("target", text)] if (text := details["target"]) else []
+        if "opset" in details:  # for a robot's program, not for `rlctl eval`
+            rows = rows[:-1]
+        else:
+            sizes = ", ".join(f"{name}[{size}]" for name, size in details["input_sizes"].items())
+            rows = [*rows[:2], ("inputs", sizes), *rows[2:]]
+        return [*rows[:3], *target, ("limits", details["limits"]), *rows[3:]]
+
+
+def export_controller(request: ExportRequest) -> list[ExportReport]:
+    """Export a policy's controller in one or more formats, and verify each in the policy's own environment.
+
+    Raises `UsageError` if a policy cannot have a controller, `RecipeError` for limits that do not fit it. Raises
+    `AnswerIsNo` with the numbers if a file does not act as the policy does; that file is not written.
+    """
+    source, target = find_source(request, "controller")
+    limits = None if request.limits is None else read_limits(request.limits)
+    pin_threads()
+    torch_policy = TorchPolicy.load(source.file)
+    spec = _choose_spec(source.locate(torch_policy.info.spec), request.sim)
+    try:
+        env = spec.make()
+        built = describe(env)
+    except (UsageError, TaskError) as error:
+        raise explain_unverifiable(source.file, error) from None
+    try:
+        check_environment(source.file, torch_policy.info, built)
+        # Policies that were trained before their task declared its terms do not contain them.
+        policy = torch_policy.file.with_info(env=built)
+        player = verify.TaskPlayer(ControllerLayout(policy.info), env, spec.task)
+        export = _Export(torch_policy, policy, player, limits)
+        write = {"onnx": export.write_onnx, "c": export.write_c}
+        return [write[form](target.with_suffix(f".{form}")) for form in request.formats]
+    finally:
+        env.close()
+
+
+def _choose_spec(spec: EnvSpec, sim: str | None) -> EnvSpec:
+    """Return the environment of the verification: without events, because noise acts on computed terms."""
+    return dataclasses.replace(spec, randomize=False, events={}, sim=spec.sim if sim is None else sim)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Export:
+    """A policy, and what its files are compared with. `policy` has the present description of its environment."""
+
+    torch_policy: TorchPolicy
+    policy: PolicyFile
+    player: verify.TaskPlayer
+    limits: Limits | None
+
+    def write_onnx(self, path: Path) -> ControllerReport:
+        """Write and verify the ONNX file, which has no limits."""
+        model = build_graph(self.policy)
+        content = encode(model)
+        controller = OnnxController(content)
+        target = ControllerLayout(self.policy.info).find_target(None, None)
+        fields, recorded = self._verify(path, controller, target, is_limited=False)
+        inputs = recorded[0].inputs[0]
+        median = float(np.median(timeit.repeat(lambda: controller.step(inputs), number=1, repeat=330)[30:])) * 1e6
+        files.write_bytes(path, content)
+        ports = {
+            kind: [{"name": port.name, "dtype": port.type[len("tensor(") : -1], "shape": port.shape} for port in some]
+            for kind, some in (
+                ("inputs", controller.session.get_inputs()),
+                ("outputs", controller.session.get_outputs()),
+            )
+        }
+        details = {"opset": model.opset_import[0].version, **ports, "limits": "none: the limits are in the C file"}
+        return self._report(path, len(content), details, target, median, fields)
+
+    def write_c(self, path: Path) -> ControllerReport:
+        """Write and verify the C file and its header, with the limits."""
+        source = ControllerSource(self.policy, path.stem, self.limits)
+        compiler, median = find_compiler(), None
+        command = os.environ.get("CC") or "cc"
+        fields: dict[str, Any] = {"not_verified": f"there is no C compiler {command!r}; set CC to one"}
+        code = source.write()
+        if compiler is not None:
+            with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
+                library = compile_controller(code, Path(folder), compiler)
+                controller = CController(source.layout, library, has_target=source.target is not None)
+                fields, recorded = self._verify(path, controller, source.target, is_limited=self.limits is not None)
+                median, longest = verify.measure_step(controller, recorded)
+            code = source.write(
+                f"A step took {median:.1f} us (median; {longest:.1f} us were enough for 99 % of the steps) "
+                f"on {platform.machine()} with {Path(compiler[0]).name} {FLAGS[1]}."
+            )
+        header = path.with_name(f"{code.name}.h")
+        files.write_text(header, code.header)
+        files.write_text(path, code.source)
+        size = len(code.source.encode()) + len(code.header.encode())
+        limits = "the bounds of the action; --limits FILE adds others" if self.limits is None else str(self.limits.file)
+        details = {"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0], "limits": limits}
+        return self._report(path, size, details, source.target, median, fields)
+
+    def _make_reference(self, policy: Policy, is_limited: bool) -> verify.Reference:
+        return verify.Reference(ControllerLayout(self.policy.info), policy, self.limits if is_limited else None)
+
+    @functools.lru_cache(maxsize=2)  # noqa: B019 (for one export)
+    def _record(self, is_limited: bool) -> list[verify.Recorded]:
+        return verify.record(self.player, self._make_reference(self.torch_policy, is_limited))
+
+    @functools.lru_cache(maxsize=2)  # noqa: B019
+    def _check_conclusive(self, is_limited: bool) -> tuple[bool, bool]:
+        changed = dataclasses.replace(self.policy, tensors=change_last_bits(self.policy.tensors))
+        policies: tuple[Policy, Policy] = self.torch_policy, NumpyPolicy(changed)
+        references = [self._make_reference(policy, is_limited) for policy in policies]
+        return verify.check_conclusive(self.player, (references[0], references[1]), self._record(is_limited))
+
+    def _verify(
+        self, path: Path, controller: Controller, target: JointTarget | None, *, is_limited: bool
+    ) -> tuple[dict[str, Any], list[verify.Recorded]]:
+        """Return how a controller was verified, as fields of its report; raises `AnswerIsNo` if it acts differently."""
+        recorded = self._record(is_limited)
+        result = verify.verify_controller(self.player, recorded, controller, target)
+        agreement, loop = result.agreement, result.closed_loop
+        if agreement.agrees and not loop.agrees:
+            repeats, magnified = self._check_conclusive(is_limited)
+            loop = dataclasses.replace(loop, repeats=repeats, magnified=magnified)
+        if not agreement.agrees or (loop.is_conclusive and not loop.agrees):
+            why = f"it does not act as {self.torch_policy.file.path} does"
+            if agreement.agrees:
+                why = "all actions agree, but the episodes differ"
+            numbers = f"{format_agreement(agreement)}\n{format_closed_loop(loop)}"
+            raise AnswerIsNo(f"{path}: not verified, not written: {why}\n{numbers}")
+        fields = {"agreement": agreement, "closed_loop": loop, "max_target_difference": result.max_target_difference}
+        return fields, recorded
+
+    def _report(
+        self,
+        path: Path,
+        size: int,
+        details: dict[str, Any],
+        target: JointTarget | None,
+        median: float | None,
+        fields: dict[str, Any],
+    ) -> ControllerReport:
+        sizes = {part.name: part.size for part in ControllerLayout(self.policy.info).quantities}
+        details = {**details, "input_sizes": sizes, "target": "" if target is None else target.formula}
+        if median is not None:
+            fields["latency"] = Latency(median, measure_sb3(self.torch_policy))
+        return ControllerReport(**describe_policy(self.torch_policy, path), **fields, size=size, details=details)

@@ -1,0 +1,154 @@
+"""Writes a controller as one ONNX graph: a named input per quantity; action, targets and the next state out."""
+
+from typing import Any
+
+import numpy as np
+import onnx
+
+from rlctl.errors import UsageError
+from rlctl.exporting.actor import emit_actor, make_metadata
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Stack
+from rlctl.exporting.controller.symbols import GraphSymbol
+from rlctl.exporting.layers import BATCH, Graph, concatenate
+from rlctl.policy import onnx_policy
+from rlctl.policy.file import PolicyFile
+
+TARGET = "target"
+OBSERVATION, LAST_ACTION, STEPS = "state_observation", "state_action", "state_steps"
+"""Names of the state's inputs: the last observation, the last action, the number of steps of the episode."""
+_TAKEN = {onnx_policy.ACTION, TARGET, *onnx_policy.STATE_INPUTS, OBSERVATION, LAST_ACTION, STEPS}
+_ZEROS = "zeros when an episode begins, then the output of the step before"
+
+
+def build_graph(policy: PolicyFile) -> onnx.ModelProto:
+    """Write a policy's controller, without limits, as ONNX. Raises `UsageError` for one that cannot be written."""
+    return _Writer(policy).write()
+
+
+class _Writer:
+    def __init__(self, policy: PolicyFile) -> None:
+        self._policy, self._layout, self._graph = policy, ControllerLayout(policy.info), Graph()
+        self._target = self._layout.find_target(None, None)
+        self._inputs = {part.name: self._add_input(part.name, part.size, part.unit) for part in self._layout.quantities}
+        self._states: list[str] = []
+        self._steps = ""
+        layout = self._layout
+        if "time" in layout.internal or (layout.stacks and layout.repeats_first):
+            self._steps = self._graph.input(STEPS, np.int64, (BATCH, 1), f"steps of the episode; {_ZEROS}")
+
+    def _add_input(self, name: str, size: int, unit: str) -> str:
+        if name.startswith("/") or name in _TAKEN or name.endswith("_out"):
+            raise UsageError(f"export --controller: an input named {name!r} cannot be written as ONNX; rename it")
+        return self._graph.input(name, self._layout.dtype, (BATCH, size), f"[{unit}]" if unit else "")
+
+    def write(self) -> onnx.ModelProto:
+        graph, layout, info = self._graph, self._layout, self._policy.info
+        action_type = np.result_type(np.float32, layout.action_space.dtype)
+        if "last_action" in layout.internal:
+            shape = (BATCH, layout.action_size)
+            self._last_action = graph.input(LAST_ACTION, action_type, shape, f"last action; {_ZEROS}")
+        newest = [self._compute(part) for part in layout.observed]
+        observation = self._stack(newest) if layout.stacks else concatenate(graph, newest)
+        emit_actor(graph, self._policy, self._split(observation))
+        action = onnx_policy.ACTION
+        if self._target is not None:
+            self._emit_target(action, self._target)
+        if "last_action" in layout.internal:
+            self._add_state(graph.add("Identity", action), LAST_ACTION, action_type, (BATCH, layout.action_size))
+        if self._steps:
+            after = graph.add("Add", self._steps, graph.constant("controller/one", np.array([1], np.int64)))
+            self._add_state(after, STEPS, np.int64, (BATCH, 1))
+        description = f"controller of {info.spec.task}: measured quantities in, action and joint targets out; no limits"
+        return graph.model(self._describe(), description)
+
+    def _describe(self) -> dict[str, str]:
+        """Return the policy's metadata, with the inputs; what the file is not, a policy of `rlctl`, is left out."""
+        metadata, quantities = make_metadata(self._policy.info), self._layout.quantities
+        del metadata[onnx_policy.METADATA_KEY]
+        metadata.pop("state", None)
+        states = ", ".join(self._states)
+        target = self._target
+        return metadata | {
+            onnx_policy.CONTROLLER_KEY: "1",
+            "input_names": ",".join(part.name for part in quantities),
+            "input_sizes": ",".join(str(part.size) for part in quantities),
+            "input_units": ",".join(part.unit.replace(",", ";") for part in quantities),
+            **({"target": target.formula} if target is not None else {}),
+            **({"state": f"{states}: {_ZEROS}, NAME_out"} if states else {}),
+        }
+
+    def _compute(self, part: Observed) -> str:
+        """Add the newest values of a part of the observation."""
+        graph, term = self._graph, part.term
+        if term is None:
+            return self._inputs[part.name]
+        sizes = {quantity.name: quantity.size for quantity in self._layout.quantities}
+        symbols = [GraphSymbol(graph, self._read(self._inputs[name]), sizes[name]) for name in term.inputs]
+        if term.internal == "last_action":
+            symbols = [GraphSymbol(graph, self._read(self._last_action), part.size)]
+        elif term.internal == "time":
+            dt = graph.constant("controller/control_dt", np.float64(self._layout.info.env.control_dt))
+            symbols = [GraphSymbol(graph, graph.add("Mul", self._read(self._steps), dt), 1)]
+        parts: list[GraphSymbol] = term.compute(*symbols)
+        joined = concatenate(graph, [symbol.value for symbol in parts])
+        return graph.cast(joined, self._layout.dtype)
+
+    def _read(self, value: str) -> str:
+        return self._graph.cast(value, np.float64)
+
+    def _stack(self, newest: list[str]) -> str:
+        """Add the histories: the last values of the state, and the newest."""
+        graph, layout = self._graph, self._layout
+        shape = (BATCH, layout.size)
+        before = graph.input(OBSERVATION, layout.dtype, shape, f"last observation; {_ZEROS}")
+        if layout.frames > 1:
+            newest = [concatenate(graph, newest)]
+        if layout.repeats_first:
+            zero = graph.constant("controller/zero", np.array([0], np.int64))
+            self._is_first = graph.add("Equal", self._steps, zero)
+        parts = [self._append(stack, before, value) for stack, value in zip(layout.stacks, newest, strict=True)]
+        observation = concatenate(graph, parts)
+        self._add_state(graph.add("Identity", observation), OBSERVATION, layout.dtype, shape)
+        return observation
+
+    def _append(self, stack: Stack, before: str, newest: str) -> str:
+        if stack.frames == 1:
+            return newest
+        graph = self._graph
+        places = np.arange(stack.start + stack.size, stack.start + stack.size * stack.frames)
+        older = graph.add("Gather", before, graph.constant(f"controller/older_{stack.start}", places), axis=1)
+        value = graph.add("Concat", older, newest, axis=1)
+        if not self._layout.repeats_first:
+            return value
+        return graph.add("Where", self._is_first, graph.add("Concat", *[newest] * stack.frames, axis=1), value)
+
+    def _split(self, observation: str) -> dict[str, tuple[str, Any]]:
+        """Return the parts of the policy's observation by key."""
+        layout, parts = self._layout, dict[str, tuple[str, Any]]()
+        for key, space in layout.parts.items():
+            value = observation
+            if len(layout.parts) > 1:
+                starts = [part.start for part in layout.observed if part.key == key]
+                places = self._graph.constant(f"controller/{key}", np.arange(space.shape[0]) + starts[0])  # type: ignore[index]
+                value = self._graph.add("Gather", observation, places, axis=1)
+            parts[key] = value, space.dtype
+            if space.dtype != layout.dtype:
+                parts[key] = self._graph.cast(value, space.dtype), space.dtype
+        return parts
+
+    def _emit_target(self, action: str, target: JointTarget) -> None:
+        graph = self._graph
+        value = graph.add("Mul", self._read(action), graph.constant("target/factor", target.factor))
+        joints = self._policy.info.env.joints
+        if target.kind == "position":
+            value = graph.add("Add", graph.constant("target/default", target.default), value)
+        elif target.kind == "step" and joints is not None:
+            value = graph.add("Add", self._read(self._inputs[joints.measured]), value)
+        if target.clips:
+            value = graph.add("Max", value, graph.constant("target/low", target.low))
+            value = graph.add("Min", value, graph.constant("target/high", target.high))
+        graph.output(value, TARGET, np.float64, (BATCH, self._layout.action_size), target.formula)
+
+    def _add_state(self, value: str, name: str, dtype: Any, shape: tuple[int | str, ...]) -> None:
+        self._states.append(name)
+        self._graph.output(value, f"{name}_out", dtype, shape, "state for the next step")

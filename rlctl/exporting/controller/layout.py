@@ -1,0 +1,230 @@
+"""What a controller takes, computes and returns: quantities, terms, histories and joint targets of one policy."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterable
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.deploy.filter.bounds import Bounds
+from rlctl.deploy.filter.limits import Limits
+from rlctl.environments.dict_spaces import SINGLE, split_space
+from rlctl.environments.info import AnyTerm, EnvInfo, space_to_json
+from rlctl.errors import RecipeError, UsageError
+from rlctl.policy.c_policy import observation_type
+from rlctl.policy.file import PolicyInfo
+from rlctl.task.joints import Command
+from rlctl.task.terms import Internal
+
+_UNITS = {"position": "rad or m", "step": "rad or m", "speed": "rad/s or m/s", "torque": "N m or N"}
+Clips = Literal["", "exact", "towards"]
+_KEYWORDS = set(
+    re.findall(
+        r"\w+",
+        "auto break case char const continue default do double else enum extern float for goto if inline int long "
+        "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while "
+        "bool catch class delete explicit export false friend mutable namespace new operator private protected public "
+        "template this throw true try typename using virtual and or not xor",
+    )
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+    """A named input: what the robot measures."""
+
+    name: str
+    size: int
+    start: int  # of all inputs, one after the other
+    unit: str  # empty if unknown
+    identifier: str  # its name in C
+
+
+@dataclasses.dataclass(frozen=True)
+class Observed:
+    """A named part of the policy's observation."""
+
+    name: str
+    key: str  # of the part of a Dict space
+    size: int  # elements of one step
+    frames: int
+    newest: int  # place among the newest values of all
+    start: int  # place in the observation
+    term: AnyTerm | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Stack:
+    """Newest values that are appended to the last ones."""
+
+    newest: int
+    size: int
+    start: int
+    frames: int
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class JointTarget:
+    """What an action commands: `base + factor * action`."""
+
+    kind: Command
+    factor: NDArray[np.float64]
+    default: NDArray[np.float64]  # of positions; zeros for the other kinds
+    measured: int  # where the inputs have the joints' positions, for steps
+    clips: Clips
+    """Whether a position is clipped to the joints' range; `towards`: a joint outside it is not sent back at once."""
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    @property
+    def unit(self) -> str:
+        """Unit, for people."""
+        return _UNITS[self.kind]
+
+    @property
+    def interface(self) -> str:
+        """What it commands, as ros2_control calls it."""
+        return {"speed": "velocity", "torque": "effort"}.get(self.kind, "position")
+
+    @property
+    def formula(self) -> str:
+        """How it follows from the action, for people."""
+        base = {"position": "default_positions + ", "step": "measured position + "}.get(self.kind, "")
+        clipped = "" if not self.clips else ", within target_low and target_high"
+        kind = "position" if self.kind == "step" else self.kind
+        return f"joint {kind} [{self.unit}] = {base}target_factor * action{clipped}"
+
+
+class ControllerLayout:
+    """The interface of a policy's controller. Raises `UsageError` for a policy that cannot have one."""
+
+    def __init__(self, info: PolicyInfo) -> None:
+        self.info, env = info, info.env
+        space, action_space = env.spaces()
+        self.parts = split_space(space)
+        if not isinstance(action_space, spaces.Box) or action_space.dtype.kind != "f" or len(action_space.shape) != 1:
+            raise UsageError(f"export --controller: actions must be a vector of real numbers, not {action_space}")
+        if any(not isinstance(part, spaces.Box) or len(part.shape) != 1 for part in self.parts.values()):
+            raise UsageError("export --controller: observations must be vectors; images and choices are not supported")
+        self.action_space, self.dtype = action_space, observation_type(info)
+        self.action_size = math.prod(action_space.shape)
+        self.repeats_first = env.history_start == "first"
+        self.frames = info.spec.frame_stack
+        self.observed = self._list_observed()
+        self.newest_size = sum(part.size for part in self.observed)
+        self.size = sum(part.size * part.frames for part in self.observed) * self.frames
+        self.quantities = self._list_quantities()
+        self.input_size = sum(quantity.size for quantity in self.quantities)
+        if not self.quantities:
+            raise UsageError("export --controller: this policy observes nothing that a robot measures")
+
+    def _list_observed(self) -> list[Observed]:
+        env, sizes = self.info.env, self.info.env.observation_sizes
+        if SINGLE not in self.parts:
+            sizes = {key: math.prod(part.shape or ()) for key, part in self.parts.items()}
+        total = sum(math.prod(part.shape or ()) for part in self.parts.values()) // self.frames
+        if sum(sizes.values()) != total:
+            sizes = {"observation": total}
+        observed, newest, start = [], 0, 0
+        for name, size in sizes.items():
+            frames, term = env.observation_history.get(name, 1), env.observation_terms.get(name)
+            key = name if name in self.parts else SINGLE
+            observed.append(Observed(name, key, size // frames, frames, newest, start, term))
+            newest, start = newest + size // frames, start + size
+        return observed
+
+    def _list_quantities(self) -> list[Quantity]:
+        env, sizes = self.info.env, dict[str, int]()
+        for part in self.observed:
+            term = part.term
+            names = [part.name] if term is None else [] if term.internal else term.inputs
+            for name in names:
+                size = part.size if term is None else env.quantity_sizes[name]
+                if sizes.setdefault(name, size) != size:
+                    raise UsageError(f"export --controller: two quantities are named {name!r}, of different sizes")
+        quantities: list[Quantity] = []
+        for name, size in sizes.items():
+            identifier = _make_identifier(name, {quantity.identifier for quantity in quantities})
+            start = sum(quantity.size for quantity in quantities)
+            quantities.append(Quantity(name, size, start, env.observation_units.get(name, ""), identifier))
+        return quantities
+
+    @property
+    def stacks(self) -> list[Stack]:
+        """The histories and the other parts of the observation, in its order; empty if it has no history."""
+        if self.frames > 1:
+            return [Stack(0, self.newest_size, 0, self.frames)]
+        if all(part.frames == 1 for part in self.observed):
+            return []
+        return [Stack(part.newest, part.size, part.start, part.frames) for part in self.observed]
+
+    @property
+    def internal(self) -> set[Internal]:
+        """What terms need of the controller's own state."""
+        return {part.term.internal for part in self.observed if part.term is not None} - {""}
+
+    @property
+    def inputs_info(self) -> EnvInfo:
+        """The environment as limits see it: its observation are the quantities."""
+        box = spaces.Box(-np.inf, np.inf, (self.input_size,), self.dtype.type)
+        sizes = {quantity.name: quantity.size for quantity in self.quantities}
+        no_terms: dict[str, Any] = {"observation_history": {}, "observation_terms": {}, "quantity_sizes": {}}
+        changes = {"observation_space": space_to_json(box), "observation_sizes": sizes, **no_terms}
+        return self.info.env.model_copy(update=changes)
+
+    def find_quantity(self, name: str) -> Quantity:
+        """Return an input by its name; raises `UsageError` if there is none."""
+        for quantity in self.quantities:
+            if quantity.name == name:
+                return quantity
+        raise UsageError(f"export --controller: no input has the joints' positions: {name!r} is computed inside")
+
+    def find_target(self, limits: Limits | None, bounds: Bounds | None) -> JointTarget | None:
+        """Return what an action commands, if the task describes it; `bounds` are those of the limits.
+
+        Raises `RecipeError` for limits with other units than the task has.
+        """
+        joints = self.info.env.joints
+        if joints is None or not joints.command[0]:
+            return None
+        kind, per_action = joints.command
+        count, factor = len(per_action), np.array(per_action)
+        default = np.array(
+            joints.default_positions if kind == "position" and joints.default_positions else [0.0] * count
+        )
+        if limits is not None and bounds is not None and limits.command == kind:
+            scale = bounds.factor / (bounds.dt if kind == "speed" else 1.0)
+            if not (np.allclose(scale, factor) and np.allclose(bounds.offset, default)):
+                raise RecipeError(f"limits: scale and offset differ from the task's {factor.tolist()}; leave them out")
+        measured = self.find_quantity(joints.measured).start if kind == "step" else 0
+        clips: Clips = "" if not joints.clips_target else "towards" if limits and kind == "step" else "exact"
+        low, high = (np.array(ends or [0.0] * count) for ends in (joints.low, joints.high))
+        return JointTarget(kind, factor, default, measured, clips, low, high)
+
+    def describe_inputs(self) -> list[str]:
+        """Return a line per input: its name, size and unit."""
+        return [
+            f"  {quantity.identifier}[{quantity.size}]{f' [{quantity.unit}]' if quantity.unit else ''}"
+            + ("" if quantity.name == quantity.identifier else f": {quantity.name}")
+            for quantity in self.quantities
+        ]
+
+    def describe_internal(self) -> list[str]:
+        """Return what the controller computes from the inputs, for people."""
+        computed = [f"{part.name} ({part.term.kind.replace('_', ' ')})" for part in self.observed if part.term]
+        histories = [f"the last {part.frames} of {part.name}" for part in self.observed if part.frames > 1]
+        stacked = [f"a stack of {self.frames} observations"] if self.frames > 1 else []
+        return [*computed, *histories, *stacked]
+
+
+def _make_identifier(name: str, taken: Iterable[str]) -> str:
+    plain = re.sub(r"\W", "_", name, flags=re.ASCII)
+    if not re.match(r"[A-Za-z]", plain) or plain in _KEYWORDS:
+        plain = f"input_{plain}"
+    while plain in taken:
+        plain += "_"
+    return plain

@@ -1,0 +1,159 @@
+"""Exported controllers that act in this process: compiled C through ctypes, ONNX with onnxruntime."""
+
+import abc
+import ctypes
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import AnswerIsNo, short_repr
+from rlctl.exporting.c_source import FLAGS, CSource
+from rlctl.exporting.controller.graph import LAST_ACTION, TARGET
+from rlctl.exporting.controller.layout import ControllerLayout
+from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type
+from rlctl.policy.onnx_policy import ACTION, open_session
+
+Inputs = Mapping[str, NDArray[Any]]
+STATUS = ("idle", "running", "holding", "stopped")
+REASONS = (
+    *("", "missing", "not finite", "out of range", "too old", "frozen"),
+    *("invalid action", "no action", "no position", "unsafe", "ordered"),
+)
+ORDERS = ("reset", "stop", "hold", "home", "resume")
+
+
+class Controller(abc.ABC):
+    """A controller: quantities in, an action and the joints' targets out."""
+
+    @abc.abstractmethod
+    def begin(self) -> None:
+        """Begin an episode."""
+
+    @abc.abstractmethod
+    def step(self, inputs: Inputs) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
+        """Return the action and, where the task says what it commands, the targets."""
+
+    @abc.abstractmethod
+    def set_last_action(self, action: NDArray[Any]) -> None:
+        """Replace the last action: a feedback may magnify its last bits, so recorded episodes are followed."""
+
+
+class CController(Controller):
+    """A controller that `compile_controller` has compiled."""
+
+    def __init__(self, layout: ControllerLayout, library: Path, *, has_target: bool) -> None:
+        self.library = ctypes.CDLL(str(library))
+        self.library.rlctl_state_size.restype = ctypes.c_size_t
+        # In units of a double, so that the memory is aligned.
+        self._memory = np.zeros(-(-self.library.rlctl_state_size() // 8), np.float64)
+        self.state = self._memory.ctypes.data_as(ctypes.c_void_p)
+        self._layout, self._has_target = layout, has_target
+        self.action = np.zeros(layout.action_size, action_type(layout.info))
+        self._target = np.zeros(layout.action_size)
+        self._status = np.zeros(2, np.intc)
+        self._outputs = [array.ctypes.data_as(ctypes.c_void_p) for array in (self.action, self._target, self._status)]
+        self.dtype = layout.dtype
+        self._values = np.zeros(layout.input_size, layout.dtype)
+        self.may_send = False
+        self.library.rlctl_init(self.state)
+
+    @property
+    def status(self) -> tuple[str, str]:
+        """State and reason of the limits."""
+        return STATUS[self._status[0]], REASONS[self._status[1]]
+
+    def begin(self) -> None:
+        """Begin an episode, and end what the limits hold."""
+        self.library.rlctl_begin(self.state)
+
+    def order(self, order: str) -> None:
+        """Give an order: one of `ORDERS`."""
+        self.library.rlctl_order(self.state, ctypes.c_int(ORDERS.index(order)))
+
+    def step(self, inputs: Inputs | None, age_s: float = 0.0) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
+        """Return copies of action and targets."""
+        pointer = None
+        if inputs is not None:
+            self._values[:] = np.concatenate([np.ravel(inputs[part.name]) for part in self._layout.quantities])
+            pointer = self._values.ctypes.data_as(ctypes.c_void_p)
+        self.may_send = bool(self.library.rlctl_step(self.state, pointer, ctypes.c_double(age_s), *self._outputs))
+        action = self.action.reshape(self._layout.action_space.shape).copy()
+        return action, self._target.copy() if self._has_target else None
+
+    def set_last_action(self, action: NDArray[Any]) -> None:
+        """Replace the last action."""
+        self.action[:] = action.ravel()
+        self.library.rlctl_set_last_action(self.state, self._outputs[0])
+
+    def limit(self, values: NDArray[np.float64] | None, age_s: float, requested: NDArray[Any] | None) -> NDArray[Any]:
+        """Return the action of the limits alone, for a policy's action."""
+        pointers = [None if array is None else array.ctypes.data_as(ctypes.c_void_p) for array in (values, requested)]
+        outputs = self._outputs[0], self._outputs[2]
+        self.library.rlctl_limit(self.state, pointers[0], ctypes.c_double(age_s), pointers[1], *outputs)
+        return self.action
+
+    def play(self, rows: NDArray[Any]) -> None:
+        """Take a step for each row of inputs in a C loop, to measure its time; rows have shape (steps, inputs)."""
+        self.library.rlctl_play(self.state, rows.ctypes.data_as(ctypes.c_void_p), ctypes.c_long(len(rows)))
+
+
+class OnnxController(Controller):
+    """A controller as an ONNX file."""
+
+    def __init__(self, content: bytes) -> None:
+        self.session = open_session(content)
+        self._outputs = [port.name for port in self.session.get_outputs()]
+        self._states = {
+            port.name: np.zeros([1 if isinstance(size, str) else size for size in port.shape], _DTYPES[port.type])
+            for port in self.session.get_inputs()
+            if f"{port.name}_out" in self._outputs
+        }
+        self._dtypes = {port.name: _DTYPES[port.type] for port in self.session.get_inputs()}
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin an episode: zeros in place of the state."""
+        self._state = dict(self._states)
+
+    def step(self, inputs: Inputs) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
+        """Return action and targets."""
+        feed = {name: np.asarray(value, self._dtypes[name]).reshape(1, -1) for name, value in inputs.items()}
+        results = dict(zip(self._outputs, self.session.run(self._outputs, feed | self._state), strict=True))
+        self._state = {name: results[f"{name}_out"] for name in self._states}
+        target = results.get(TARGET)
+        return results[ACTION][0], None if target is None else target[0]
+
+    def set_last_action(self, action: NDArray[Any]) -> None:
+        """Replace the last action, if it is part of the state."""
+        if LAST_ACTION in self._state:
+            self._state[LAST_ACTION] = action.reshape(1, -1).astype(self._dtypes[LAST_ACTION])
+
+
+_DTYPES: dict[str, np.dtype[Any]] = {
+    "tensor(float)": np.dtype(np.float32),
+    "tensor(double)": np.dtype(np.float64),
+    "tensor(int64)": np.dtype(np.int64),
+}
+
+
+def compile_controller(code: CSource, folder: Path, compiler: list[str]) -> Path:
+    """Compile a controller in `folder` and return the library; raises `AnswerIsNo` if the compiler fails."""
+    for name, content in (
+        (f"{code.name}.h", code.header),
+        (f"{code.name}.c", code.source),
+        ("harness.c", code.harness),
+    ):
+        (folder / name).write_text(content, encoding="utf-8")
+    library = folder / f"{code.name}{LIBRARY_SUFFIX}"
+    command = [*compiler, *FLAGS, "-fPIC", "-shared", "-o", str(library), "harness.c", "-lm"]
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise AnswerIsNo(f"{compiler[0]} cannot be started: {error.strerror or error}") from None
+    if done.returncode != 0:
+        raise AnswerIsNo(f"{compiler[0]} cannot compile the controller: {short_repr(done.stderr, 300)}")
+    return library

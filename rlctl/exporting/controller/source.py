@@ -1,0 +1,167 @@
+"""Writes a controller as C99: a header and a source file without dependencies."""
+
+import dataclasses
+import re
+from typing import Any
+
+import numpy as np
+
+from rlctl.deploy.filter.fitting import fit_limits
+from rlctl.deploy.filter.limits import Limits
+from rlctl.exporting import c_source
+from rlctl.exporting.c_layers import CWriter, write_number
+from rlctl.exporting.c_source import CSource, Layout
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed
+from rlctl.exporting.controller.limits_source import LimitsSource
+from rlctl.exporting.controller.symbols import CSymbol
+from rlctl.policy.file import PolicyFile
+from rlctl.policy.network import Network
+from rlctl.version import __version__
+
+_BASES = {
+    "position": "{name}_default_positions[i] + ",
+    "step": "position + ",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class _TargetCode:
+    """The target as the templates read it."""
+
+    kind: str
+    interface: str
+    formula: str
+    unit: str
+    base: str
+    clips: str
+    measured: int
+    default: bool
+
+
+class ControllerSource:
+    """The C code of a policy's controller; names of functions begin with the name of the file.
+
+    Raises `UsageError` for a policy that cannot be written as C, `RecipeError` for limits that do not fit it.
+    """
+
+    def __init__(self, policy: PolicyFile, file_name: str, limits: Limits | None) -> None:
+        c_source.check_can_be_written(policy)
+        self.layout = layout = ControllerLayout(policy.info)
+        self.limits = limits or Limits()
+        fitted = fit_limits(self.limits, layout.inputs_info)
+        assert fitted.bounds is not None  # the actions are in a Box
+        self._limits_source = LimitsSource(self.limits, fitted, fitted.bounds)
+        self.target = layout.find_target(limits, fitted.bounds)
+        self.name = c_source.make_identifier(file_name)
+        self._values = self._describe(policy)
+
+    def write(self, timing: str = "") -> CSource:
+        """Return the code, with how long a step takes in the header's comment."""
+        values = {**self._values, "timing": timing}
+        header, source, harness = (
+            c_source.render(file, values) for file in ("controller.h", "controller.c", "controller_harness.c")
+        )
+        prototype = (
+            f"int {self.name}_step({self.name}_state *, const {self.name}_inputs *, double, {self.name}_outputs *)"
+        )
+        return CSource(self.name, header, source, prototype, harness)
+
+    def _describe(self, policy: PolicyFile) -> dict[str, Any]:
+        layout, network, writer = self.layout, Network(policy), CWriter()
+        described = Layout(self.name, policy.info)
+        sizes = {key: part.shape[0] for key, part in layout.parts.items()}  # type: ignore[index]  # vectors
+        value, size = writer.write(network, sizes, "state->observation")
+        writer.write_action(network, value, size, layout.action_space, described.action_type)
+        hidden = 0 if network.lstm is None else network.lstm.state[0].size
+        values: dict[str, Any] = {
+            "name": self.name,
+            "upper": self.name.upper(),
+            "version": __version__,
+            "info": policy.info,
+            "layout": _WithActions(layout, described),
+            "limits": self._limits_source,
+            "kind": described.type,
+            "type": described.action_type,
+            "stacks": layout.stacks,
+            "lstm_size": hidden,
+            "arrays": self._list_arrays(described),
+            "target": None if self.target is None else self._describe_target(self.target),
+            "term_lines": [line for part in layout.observed for line in self._write_term(part, described.type)],
+            "constants": writer.constants,
+            "functions": writer.find_functions(),
+            "statements": writer.statements,
+        }
+        return {**values, "limits_code": self._write_limits(values)}
+
+    def _write_limits(self, values: dict[str, Any]) -> str:
+        """Return the code of the limits, with the constants that it uses."""
+        code = c_source.render("limits.c", {**values, "constants_of_limits": []})
+        used = set(re.findall(r"\w+", code))
+        arrays = [text for name, text in self._limits_source.list_arrays().items() if name in used]
+        return c_source.render("limits.c", {**values, "constants_of_limits": arrays})
+
+    def _write_term(self, part: Observed, kind: str) -> list[str]:
+        """Return statements that compute the newest values of a part of the observation."""
+        quantities = {quantity.name: quantity for quantity in self.layout.quantities}
+        if part.term is None:
+            start = quantities[part.name].start
+            loop = f"for (int i = 0; i < {part.size}; ++i) {{"
+            return [loop, f"    newest[{part.newest} + i] = ({kind})values[{start} + i];", "}"]
+        symbols = [self._read_quantity(quantities[name].start, quantities[name].size) for name in part.term.inputs]
+        if part.term.internal == "last_action":
+            symbols = [CSymbol([f"(double)state->last_action[{index}]" for index in range(part.size)])]
+        elif part.term.internal == "time":
+            symbols = [CSymbol([f"((double)state->steps * {self.layout.info.env.control_dt!r})"])]
+        parts: list[CSymbol] = part.term.compute(*symbols)
+        expressions = [element for symbol in parts for element in symbol.elements]
+        return [f"newest[{part.newest + i}] = ({kind}){text};" for i, text in enumerate(expressions)]
+
+    def _read_quantity(self, start: int, size: int) -> CSymbol:
+        return CSymbol([f"values[{start + index}]" for index in range(size)])
+
+    def _describe_target(self, target: JointTarget) -> _TargetCode:
+        base = _BASES.get(target.kind, "").format(name=self.name)
+        is_position = target.kind == "position"
+        return _TargetCode(
+            target.kind,
+            target.interface,
+            target.formula,
+            target.unit,
+            base,
+            target.clips,
+            target.measured,
+            default=is_position,
+        )
+
+    def _list_arrays(self, described: Layout) -> list[tuple[str, str, str, list[str]]]:
+        """Return the header's constant arrays: type, name, the macro of the length, and the values as C."""
+        quote, target, env = c_source.quote, self.target, self.layout.info.env
+        quantities = self.layout.quantities
+        arrays: list[tuple[str, str, str, list[str]]] = [
+            ("char *const", "input_names", "INPUTS", [quote(quantity.name) for quantity in quantities]),
+            ("char *const", "input_units", "INPUTS", [quote(quantity.unit) for quantity in quantities]),
+            ("int", "input_sizes", "INPUTS", [str(quantity.size) for quantity in quantities]),
+            *(array for array in described.list_arrays() if array[2] == "ACTION_SIZE"),
+        ]
+        numbers: dict[str, Any] = {}
+        if target is not None:
+            numbers["target_factor"] = target.factor
+            if target.kind == "position":
+                numbers["default_positions"] = target.default
+            if target.clips:
+                numbers |= {"target_low": target.low, "target_high": target.high}
+        if env.joints is not None and env.joints.default_positions:
+            numbers.setdefault("default_positions", np.array(env.joints.default_positions))
+        for name, array in numbers.items():
+            arrays.append(("double", name, "ACTION_SIZE", [write_number(value, "double") for value in array]))
+        return arrays
+
+
+class _WithActions:
+    """The layout as the templates read it: of the controller and, for the action, of the policy."""
+
+    def __init__(self, layout: ControllerLayout, described: Layout) -> None:
+        self._layout, self.describe_action = layout, described.describe_action
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._layout, name)

@@ -1,0 +1,94 @@
+"""Values in code that is being written. A term computes with them as with arrays, so its formula is written once."""
+
+import abc
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from rlctl.exporting.layers import Graph
+
+_C = {
+    "add": "({} + {})",
+    "subtract": "({} - {})",
+    "multiply": "({} * {})",
+    "divide": "({} / {})",
+    "sqrt": "sqrt({})",
+    "sin": "sin({})",
+    "cos": "cos({})",
+    "floor": "floor({})",
+}
+_ONNX = {"subtract": "Sub", "multiply": "Mul", "divide": "Div"}
+
+
+class Symbol(np.lib.mixins.NDArrayOperatorsMixin, abc.ABC):
+    """A value of shape (..., size). Operators and functions of NumPy call `apply` with the function's name."""
+
+    size: int
+
+    @property
+    def shape(self) -> tuple[int]:
+        """The length of the last axis, as the shape of an array ends with it."""
+        return (self.size,)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *operands: Any, **options: Any) -> Any:
+        if method != "__call__" or options:
+            return NotImplemented
+        return self.apply(ufunc.__name__, operands)
+
+    def __getitem__(self, key: tuple[Any, slice]) -> Self:
+        return self.take(range(*key[1].indices(self.size)))
+
+    @abc.abstractmethod
+    def apply(self, function: str, operands: Sequence[Any]) -> Self:
+        """Return the result of a function of symbols and numbers, element by element."""
+
+    @abc.abstractmethod
+    def take(self, elements: range) -> Self:
+        """Return some elements."""
+
+
+class CSymbol(Symbol):
+    """Expressions in C, of type double."""
+
+    def __init__(self, elements: Sequence[str]) -> None:
+        self.elements, self.size = elements, len(elements)
+
+    def apply(self, function: str, operands: Sequence[Any]) -> "CSymbol":
+        """Return an expression per element."""
+        columns = [
+            operand.elements if isinstance(operand, CSymbol) else [repr(float(x)) for x in np.atleast_1d(operand)]
+            for operand in operands
+        ]
+        size = max(map(len, columns))
+        form = _C[function]
+        return CSymbol([form.format(*(column[i % len(column)] for column in columns)) for i in range(size)])
+
+    def take(self, elements: range) -> "CSymbol":
+        """Return some expressions."""
+        return CSymbol([self.elements[index] for index in elements])
+
+
+class GraphSymbol(Symbol):
+    """A value of shape (batch, size) in an ONNX graph, in float64."""
+
+    def __init__(self, graph: Graph, value: str, size: int) -> None:
+        self.graph, self.value, self.size = graph, value, size
+
+    def apply(self, function: str, operands: Sequence[Any]) -> "GraphSymbol":
+        """Add a node."""
+        graph, names, sizes = self.graph, [], [1]
+        for operand in operands:
+            if isinstance(operand, GraphSymbol):
+                names.append(operand.value)
+                sizes.append(operand.size)
+            else:
+                numbers = np.atleast_1d(np.asarray(operand, np.float64))
+                names.append(graph.constant(f"term/{graph.count_constants()}", numbers))
+                sizes.append(len(numbers))
+        return GraphSymbol(graph, graph.add(_ONNX.get(function, function.capitalize()), *names), max(sizes))
+
+    def take(self, elements: range) -> "GraphSymbol":
+        """Add a node that selects elements."""
+        indices = self.graph.constant(f"term/{self.graph.count_constants()}", np.array(elements, np.int64))
+        return GraphSymbol(self.graph, self.graph.add("Gather", self.value, indices, axis=1), len(elements))

@@ -1,0 +1,207 @@
+"""Verifies a controller: on recorded quantities, and in closed loop against the task."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.deploy.filter.limits import Limits
+from rlctl.deploy.filter.safety_filter import SafetyFilter
+from rlctl.environments.dict_spaces import SINGLE, split
+from rlctl.environments.registry import call_plugin
+from rlctl.errors import TaskError
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
+from rlctl.exporting.controller.players import CController, Controller, Inputs
+from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, compare_episodes
+from rlctl.policy.policy import Policy
+from rlctl.rollout.collect import MOST_STEPS, Episode
+from rlctl.rollout.messages import EpisodeResult
+from rlctl.rollout.seeds import Stream, episode_seeds
+
+_MIN_OBSERVATIONS = 2000
+_TIMED_STEPS, _MEAN_OF = 3000, 10
+
+
+class Reference:
+    """The policy in Python, within the limits: what a controller is compared with."""
+
+    def __init__(self, layout: ControllerLayout, policy: Policy, limits: Limits | None) -> None:
+        self._layout, self._policy = layout, policy
+        self._safety = None if limits is None else SafetyFilter(layout.inputs_info, limits)
+
+    def begin(self) -> None:
+        """Begin an episode, and end what the limits hold."""
+        self._policy.reset()
+        if self._safety is not None:
+            self._safety.resume()
+            self._safety.reset()
+
+    def act(self, observation: Any, inputs: Inputs) -> NDArray[Any]:
+        """Return the action for what the policy observes and what the robot measures."""
+        if self._safety is None:
+            return self._policy.predict(observation)
+        values = np.concatenate([np.ravel(value) for value in inputs.values()]).astype(self._layout.dtype)
+        is_sound = self._safety.observe(values)
+        return np.asarray(self._safety.limit(self._policy.predict(observation) if is_sound else None))
+
+
+@dataclasses.dataclass(frozen=True)
+class Recorded:
+    """An episode: what was measured and done in each step."""
+
+    inputs: list[Inputs]
+    actions: list[NDArray[Any]]
+    episode: Episode
+
+
+class TaskPlayer:
+    """Plays episodes of the task in this process."""
+
+    def __init__(self, layout: ControllerLayout, env: gymnasium.Env[Any, Any], task: str) -> None:
+        self._layout, self._env, self._task = layout, env, task
+
+    def play(self, seed: int, act: Callable[[Any, Inputs], NDArray[Any]]) -> Recorded:
+        """Play an episode; raises `TaskError` if the environment fails or the episode does not end."""
+        observation, info = call_plugin(self._task, lambda: self._env.reset(seed=seed))
+        measured: list[Inputs] = []
+        actions: list[NDArray[Any]] = []
+        total, ended = 0.0, False
+        while not ended:
+            if len(actions) == MOST_STEPS:
+                raise TaskError(f"{self._task}: the episode of seed {seed} has not ended after {MOST_STEPS:,} steps")
+            inputs = self._measure(observation)
+            action = np.array(act(observation, inputs))
+            measured.append(inputs)
+            actions.append(action)
+            step = call_plugin(self._task, lambda action=action: self._env.step(action))  # type: ignore[misc]
+            observation, reward, terminated, truncated, info = step
+            total, ended = total + float(reward), bool(terminated or truncated)
+        success = info.get("is_success")
+        result = EpisodeResult(0, seed, total, len(actions), None if success is None else bool(success), {}, None)
+        return Recorded(measured, actions, Episode(result))
+
+    def _measure(self, observation: Any) -> Inputs:
+        """Return the quantities of the last observation, in the order of the inputs."""
+        flat = split(observation)
+        values: dict[str, NDArray[Any]] = {}
+        for part in self._layout.observed:
+            if part.term is None:
+                source = np.ravel(flat[part.key])
+                start = part.start if part.key == SINGLE else 0
+                if self._layout.frames > 1:
+                    start = len(source) - self._layout.newest_size + part.newest
+                newest = start + part.size * (part.frames - 1)
+                values[part.name] = source[newest : newest + part.size]
+                continue
+            measured = self._env.unwrapped.measured[part.name]  # type: ignore[attr-defined]  # only tasks have terms
+            quantities = measured if isinstance(measured, tuple) else (measured,)
+            values |= {name: np.ravel(value) for name, value in zip(part.term.inputs, quantities, strict=False)}
+        return {quantity.name: np.array(values[quantity.name]) for quantity in self._layout.quantities}
+
+
+@dataclasses.dataclass(frozen=True)
+class ControllerAgreement:
+    """How a controller compares with the policy."""
+
+    agreement: Agreement
+    closed_loop: ClosedLoop
+    max_target_difference: float | None  # in the unit of the targets; None without targets
+
+
+def record(player: TaskPlayer, reference: Reference) -> list[Recorded]:
+    """Play `EPISODES` episodes, and more until `_MIN_OBSERVATIONS` are recorded."""
+    recorded: list[Recorded] = []
+    while len(recorded) < EPISODES or sum(len(episode.actions) for episode in recorded) < _MIN_OBSERVATIONS:
+        seed = episode_seeds(0, Stream.VERIFY, len(recorded) + 1)[-1]
+        reference.begin()
+        recorded.append(player.play(seed, reference.act))
+    return recorded
+
+
+def verify_controller(
+    player: TaskPlayer, recorded: Sequence[Recorded], controller: Controller, target: JointTarget | None
+) -> ControllerAgreement:
+    """Compare a controller with recorded episodes, step by step; then let it act in the first of them."""
+    agreement, worst = Agreement(), 0.0
+    for episode in recorded:
+        controller.begin()
+        for inputs, expected in zip(episode.inputs, episode.actions, strict=True):
+            action, targets = controller.step(inputs)
+            _compare(agreement, expected, action)
+            controller.set_last_action(expected)
+            if target is not None and targets is not None:
+                worst = max(worst, _compare(agreement, find_targets(target, inputs, expected), targets))
+    agreement.observations = sum(len(episode.actions) for episode in recorded)
+
+    def act(observation: Any, inputs: Inputs) -> NDArray[Any]:
+        return controller.step(inputs)[0]
+
+    actual = []
+    for episode in recorded[:EPISODES]:
+        controller.begin()
+        actual.append(player.play(episode.episode.result.seed, act).episode)
+    loop = compare_episodes([episode.episode for episode in recorded[:EPISODES]], actual)
+    return ControllerAgreement(agreement, loop, None if target is None else worst)
+
+
+def check_conclusive(
+    player: TaskPlayer, references: tuple[Reference, Reference], recorded: Sequence[Recorded]
+) -> tuple[bool, bool]:
+    """Return whether a policy repeats its recorded episodes, and whether they change with the last bits of its weights.
+
+    The references are the policy and one with other last bits.
+    """
+    loops = []
+    for reference in references:
+        again = []
+        for episode in recorded[:EPISODES]:
+            reference.begin()
+            again.append(player.play(episode.episode.result.seed, reference.act).episode)
+        loops.append(compare_episodes([episode.episode for episode in recorded[:EPISODES]], again))
+    repeats = loops[0].agrees and loops[0].max_return_difference == 0.0
+    return repeats, repeats and not loops[1].agrees
+
+
+def find_targets(target: JointTarget, inputs: Inputs, action: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the joints' targets for an action, from their definition."""
+    base = target.default
+    if target.kind == "step":
+        values = np.concatenate([np.ravel(value) for value in inputs.values()])
+        base = values[target.measured : target.measured + len(target.factor)]
+    targets = np.asarray(base + target.factor * action.ravel(), np.float64)
+    if not target.clips:
+        return targets
+    low, high = target.low, target.high
+    if target.clips == "towards":
+        low, high = np.minimum(low, base), np.maximum(high, base)
+    return np.clip(targets, low, high)
+
+
+def _compare(agreement: Agreement, expected: NDArray[Any], actual: NDArray[Any]) -> float:
+    difference = np.abs(np.asarray(expected, np.float64) - actual)
+    # With this comparison NaN is beyond the limit.
+    agreement.beyond_limit += int(not (difference <= MAX_DIFFERENCE * np.maximum(1.0, np.abs(expected))).all())
+    largest = float(difference.max())
+    agreement.max_difference = max(agreement.max_difference, largest)
+    return largest
+
+
+def measure_step(controller: CController, recorded: Sequence[Recorded]) -> tuple[float, float]:
+    """Return the median time of a step of recorded episodes, and the time that 99 % of the steps keep [us]."""
+    inputs = [inputs for episode in recorded for inputs in episode.inputs]
+    rows = np.array([np.concatenate([np.ravel(value) for value in each.values()]) for each in inputs], controller.dtype)
+    measured = []
+    for count in (_MEAN_OF, 1):
+        controller.begin()
+        durations = []
+        for first in range(0, min(_TIMED_STEPS, len(rows)) - count + 1, count):
+            part = rows[first : first + count]
+            start = time.perf_counter_ns()
+            controller.play(part)
+            durations.append((time.perf_counter_ns() - start) / count / 1000.0)
+        measured.append(durations)
+    return float(np.median(measured[0])), float(np.quantile(measured[1], 0.99))

@@ -1,0 +1,192 @@
+"""Observations that are computed from measured quantities, by formulas that simulation and exported controllers share.
+
+    observation_terms = {"gravity": terms.Gravity("orientation"), "last_action": terms.LastAction()}
+
+For these names `Task.observe` returns the measured quantities, an array or, for several, a tuple of arrays in the order
+of `inputs`; the environment computes the observation. `rlctl export --controller` writes the same formulas as C and
+ONNX, with the quantities as inputs of the file.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import TaskError
+
+Numbers = tuple[float, ...]
+Internal = Literal["", "last_action", "time"]
+"""What a controller knows itself: nothing, its last action, or the time since the start of the episode [s]."""
+
+
+class Term:
+    """A function of measured quantities. `compute` uses operators and functions of NumPy that act on elements only,
+    so that it also takes the symbols from which the export writes code."""
+
+    internal: ClassVar[Internal] = ""
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the quantities that a robot measures; none for what a controller knows itself."""
+        return ()
+
+    def compute(self, *quantities: Any) -> list[Any]:
+        """Return the parts of the observation, joined along the last axis later; quantities have shape (..., size)."""
+        raise NotImplementedError
+
+    def __call__(self, observed: Any) -> NDArray[np.float64]:
+        """Return the observation for what `Task.observe` returned; raises `ValueError` where they do not fit."""
+        given = observed if isinstance(observed, tuple) else (observed,)
+        if len(given) != (count := len(self.inputs) or 1):
+            raise ValueError(f"{len(given)} quantities, expected {count}")
+        parts = self.compute(*(np.atleast_1d(np.asarray(value, np.float64)) for value in given))
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scaled(Term):
+    """`(quantity - offset) * scale`: joint positions from the default pose, for example."""
+
+    quantity: str
+    offset: Numbers = ()  # one number per element, or one for all, in the quantity's unit; none: 0
+    scale: Numbers = ()  # none: 1
+    kind: Literal["scaled"] = "scaled"
+
+    def __post_init__(self) -> None:
+        for key in ("offset", "scale"):
+            object.__setattr__(self, key, _read_numbers(getattr(self, key), f"Scaled({self.quantity!r}).{key}"))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The quantity."""
+        return (self.quantity,)
+
+    @functools.cached_property
+    def _arrays(self) -> list[NDArray[np.float64]]:
+        return [np.array(numbers) for numbers in (self.offset, self.scale)]
+
+    def compute(self, *quantities: Any) -> list[Any]:
+        """Return the shifted and scaled quantity."""
+        (value,), (offset, scale) = quantities, self._arrays
+        for numbers in (offset, scale):
+            if len(numbers) not in (0, 1, value.shape[-1]):
+                raise ValueError(f"{len(numbers)} numbers for {value.shape[-1]} elements")
+        value = value - offset if len(offset) else value
+        return [value * scale if len(scale) else value]
+
+
+@dataclasses.dataclass(frozen=True)
+class Gravity(Term):
+    """Direction of gravity in a body's frame, shape (3,), from its orientation as a unit quaternion (x, y, z, w)."""
+
+    orientation: str = "orientation"
+    kind: Literal["gravity"] = "gravity"
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The orientation."""
+        return (self.orientation,)
+
+    def compute(self, *quantities: Any) -> list[Any]:
+        """Return the third row of the rotation matrix, times -1."""
+        (orientation,) = quantities
+        if orientation.shape[-1] != 4:
+            raise ValueError(f"a quaternion of {orientation.shape[-1]} elements")
+        x, y, z, w = (orientation[..., index : index + 1] for index in range(4))
+        # In the order of `rotate_inverse(orientation, (0, 0, -1))`, whose bits it has: 0.0 removes the sign of zeros.
+        return [
+            0.0 + w * (2.0 * y) - z * (2.0 * x),
+            0.0 - w * (2.0 * x) - z * (2.0 * y),
+            x * (2.0 * x) + y * (2.0 * y) - 1.0,
+        ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Displacement(Term):
+    """The vector from one position to another, such as from a hand to its goal, in the frame of both."""
+
+    to: str
+    start: str
+    kind: Literal["displacement"] = "displacement"
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The end and the start of the vector."""
+        return (self.to, self.start)
+
+    def compute(self, *quantities: Any) -> list[Any]:
+        """Return the vector."""
+        to, start = quantities
+        if to.shape[-1] != start.shape[-1]:
+            raise ValueError(f"positions of {to.shape[-1]} and of {start.shape[-1]} elements")
+        return [to - start]
+
+
+@dataclasses.dataclass(frozen=True)
+class Distance(Displacement):
+    """The distance between two positions, shape (1,)."""
+
+    kind: Literal["distance"] = "distance"  # type: ignore[assignment]
+
+    def compute(self, *quantities: Any) -> list[Any]:
+        """Return the length of the difference."""
+        (difference,) = super().compute(*quantities)
+        squares = [difference[..., index : index + 1] for index in range(difference.shape[-1])]
+        return [np.sqrt(sum((part * part for part in squares[1:]), squares[0] * squares[0]))]
+
+
+@dataclasses.dataclass(frozen=True)
+class LastAction(Term):
+    """The action of the step before, within its bounds; zeros at the start. `observe` returns it."""
+
+    kind: Literal["last_action"] = "last_action"
+    internal: ClassVar[Internal] = "last_action"
+
+    def compute(self, *quantities: Any) -> list[Any]:
+        """Return the action unchanged."""
+        return [*quantities]
+
+
+@dataclasses.dataclass(frozen=True)
+class PhaseClock(Term):
+    """Sine and cosine of a phase that runs through a circle in `period_s`; `observe` returns the time of the episode,
+    shape (1,) [s]: 0 at the first observation, one `control_dt` more in each step."""
+
+    period_s: float
+    kind: Literal["phase_clock"] = "phase_clock"
+    internal: ClassVar[Internal] = "time"
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.period_s < math.inf:
+            raise TaskError(f"PhaseClock: period_s is {self.period_s}; it must be a time above 0 [s]")
+
+    def compute(self, *quantities: Any) -> list[Any]:
+        """Return sine and cosine."""
+        (time,) = quantities
+        if time.shape[-1] != 1:
+            raise ValueError(f"a time of {time.shape[-1]} elements")
+        turns = time / self.period_s
+        angle = (turns - np.floor(turns)) * (2.0 * math.pi)
+        return [np.sin(angle), np.cos(angle)]
+
+
+def find_quantity_sizes(terms: Mapping[str, Term], measured: Mapping[str, Any]) -> dict[str, int]:
+    """Return the sizes of the quantities from which terms were computed; raises `TaskError` for one of two sizes."""
+    sizes: dict[str, int] = {}
+    for name, term in terms.items():
+        values = measured[name] if isinstance(measured[name], tuple) else (measured[name],)
+        for quantity, value in zip(term.inputs, values, strict=False):
+            if sizes.setdefault(quantity, int(np.size(value))) != np.size(value):
+                raise TaskError(f"the quantity {quantity!r} of term {name!r} has two sizes")
+    return sizes
+
+
+def _read_numbers(values: float | Sequence[float], where: str) -> Numbers:
+    numbers = tuple(np.atleast_1d(np.asarray(values, np.float64)).tolist())
+    if not all(map(math.isfinite, numbers)):
+        raise TaskError(f"{where} must be finite, but is {list(numbers)}")
+    return numbers

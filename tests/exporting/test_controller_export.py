@@ -1,0 +1,100 @@
+"""`rlctl export --controller` keeps only files that act as the policy does in the task."""
+
+import json
+
+import pytest
+
+from rlctl.environments.info import describe
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import AnswerIsNo, UsageError
+from rlctl.exporting.actor import build
+from rlctl.exporting.c_source import find_compiler, write_c
+from rlctl.exporting.controller.export import export_controller
+from rlctl.exporting.request import ExportRequest
+from rlctl.policy.file import PolicyFile
+from tests.exporting import controlled
+from tests.exporting.controllers import make_policy
+
+pytestmark = [
+    pytest.mark.pybullet,
+    pytest.mark.skipif(find_compiler() is None, reason="no C compiler (cc, or $CC) on this machine"),
+]
+LIMITS = """
+command: step
+measured: {position: places}
+limits: {all: {speed: 0.2, acceleration: 1.0}}
+lowpass_hz: 2
+sensors: {goal: {range: [-3, 3]}}
+"""
+
+
+@pytest.fixture
+def policy_of(tmp_path):
+    """Write a policy of the cart with random weights; return its path."""
+
+    def write(**parameters):
+        spec = EnvSpec(f"{controlled.__file__}:Cart", parameters, randomize=True)
+        env = spec.make()
+        path = tmp_path / "cart.safetensors"
+        make_policy(describe(env), scale=0.5, spec=spec.__dict__).write(path)
+        env.close()
+        return path
+
+    return write
+
+
+def test_both_files_are_verified_within_limits(policy_of, tmp_path):
+    limits = tmp_path / "limits.yaml"
+    limits.write_text(LIMITS)
+    request = ExportRequest(str(policy_of()), ("onnx", "c"), controller=True, limits=limits, output=tmp_path / "cart.c")
+    onnx, in_c = export_controller(request)
+    for report in (onnx, in_c):
+        assert report.agreement.observations == 2400
+        assert report.agreement.max_difference < 1e-6
+        assert report.max_target_difference < 1e-6
+        assert report.closed_loop.agrees
+        json.dumps(report.as_json(), default=str)
+        assert report.details["input_sizes"] == {"places": 2, "goal": 2}
+    # The limits brake the carts, and the C file agrees with the limits in Python about it.
+    assert abs(in_c.closed_loop.mean_return - onnx.closed_loop.mean_return) > 1.0
+    header = (tmp_path / "cart.h").read_text()
+    assert "A step took " in header
+    assert " *   limits: {all: {speed: 0.2, acceleration: 1}}\n" in header
+    words = [word for word, _ in in_c.list_rows()]
+    assert words == ["exported", "policy", "inputs", "target", "limits", "function", *words[6:]]
+    assert (tmp_path / "cart.onnx").exists()
+
+
+@pytest.mark.parametrize("name", ["onnx", pytest.param("c", marks=pytest.mark.slow)])
+def test_a_wrong_declaration_is_not_written(name, policy_of, tmp_path):
+    path = policy_of(fault="last action")
+    request = ExportRequest(str(path), (name,), controller=True, output=tmp_path / f"wrong.{name}")
+    with pytest.raises(AnswerIsNo, match="not verified, not written: it does not act as"):
+        export_controller(request)
+    assert not list(tmp_path.glob("wrong*"))
+
+
+def test_limits_need_a_controller():
+    with pytest.raises(UsageError, match="only a controller has limits; add --controller"):
+        ExportRequest("run", limits="limits.yaml")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "count"), [("reach", 2400), ("walk", 10_000)])
+def test_bundled_tasks_have_controllers(task, count, rlctl, tmp_path):
+    done = rlctl("export", task, "--pretrained", "--controller", "--json", "-", "-o", "controller.c", timeout=600)
+    assert done.returncode == 0, done.stderr
+    reports = json.loads(done.stdout)
+    for report in (reports["onnx"], reports["c"]):
+        assert report["verified"]
+        assert report["observations"] == count
+        assert report["max_difference"] < 1e-5
+        assert report["closed_loop"]["same_success"] == 20
+    assert (tmp_path / "controller.h").exists()
+
+
+def test_the_c_and_onnx_of_a_policy_name_its_histories(policy_of):
+    policy = PolicyFile.read(policy_of())
+    assert "[0..5]     places [m], the last 3, oldest first" in write_c(policy, "cart").header
+    metadata = {entry.key: entry.value for entry in build(policy).metadata_props}
+    assert metadata["observation_history"] == "places:3"

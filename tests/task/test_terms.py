@@ -1,0 +1,195 @@
+"""Observations computed from measured quantities, and histories: by hand, and alike in one world and in many."""
+
+import numpy as np
+import pytest
+
+from rlctl.environments.info import EnvInfo, describe
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import RecipeError, TaskError
+from rlctl.task import Joints, terms
+from rlctl.task.batch_env import BatchEnv
+from rlctl.task.env import TaskEnv
+from rlctl.task.events import EventSettings
+from rlctl.task.rotations import normalize, rotate_inverse
+from tests.task.batches import Stool
+from tests.task.tasks import Slider
+
+pytestmark = pytest.mark.pybullet
+
+
+class Clock(Slider):
+    """A slider that observes its place from 2 m, three times, and a clock of 1 s."""
+
+    observation_terms = {"place": terms.Scaled("rail", offset=2.0, scale=[0.5]), "clock": terms.PhaseClock(1.0)}
+    observation_history = {"place": 3}
+    observation_units = {"rail": "m"}
+
+    def reset(self, rng):
+        super().reset(rng)
+        self.time = 0.0
+
+    def act(self, action):
+        super().act(action)
+        self.time += self.control_dt
+
+    def observe(self):
+        return {"place": np.array([self.place]), "clock": self.time}
+
+
+class Zeros(Clock):
+    history_start = "zeros"
+
+
+def test_gravity_has_the_bits_of_a_rotation():
+    quaternions = normalize(np.random.default_rng(0).normal(size=(1000, 4)))
+    quaternions[:2] = (0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)
+    expected = rotate_inverse(quaternions, (0.0, 0.0, -1.0))
+    assert terms.Gravity()(quaternions).tobytes() == expected.tobytes()
+    assert terms.Gravity()(quaternions[7]).tobytes() == expected[7].tobytes()
+
+
+def test_terms_by_hand():
+    assert terms.Distance("goal", "hand")((np.array([3.0, 4.0, 1.0]), np.array([0.0, 0.0, 1.0]))).tolist() == [5.0]
+    assert terms.Displacement("goal", "hand")((np.array([3.0]), np.array([1.0]))).tolist() == [2.0]
+    assert terms.Scaled("q", offset=[1.0, 2.0], scale=2.0)(np.array([2.0, 4.0])).tolist() == [2.0, 4.0]
+    # A quarter of a turn, and one turn more.
+    assert terms.PhaseClock(4.0)(1.0) == pytest.approx([1.0, 0.0], abs=1e-12)
+    assert terms.PhaseClock(4.0)(np.array([[5.0], [2.0]])) == pytest.approx(np.array([[1.0, 0.0], [0.0, -1.0]]))
+
+
+def test_a_history_begins_with_the_first_value():
+    env = TaskEnv(Clock(start=1.0))
+    observation, _ = env.reset(seed=0)
+    # (1.0 - 2.0) * 0.5 = -0.5, three times; the clock is at its start.
+    assert observation.tolist() == [-0.5, -0.5, -0.5, 0.0, 1.0]
+    observation = env.step(np.array([0.5, 0.0]))[0]
+    assert observation[:3].tolist() == [-0.5, -0.5, -0.25]
+    observation = env.step(np.array([0.5, 0.0]))[0]
+    assert observation[:3].tolist() == [-0.5, -0.25, 0.0]
+    assert env.measured == {"place": np.array([2.0]), "clock": pytest.approx(2 * Clock.control_dt)}
+    assert env.reset(seed=0)[0][:3].tolist() == [-0.5, -0.5, -0.5]
+    env.close()
+
+
+def test_a_history_may_begin_with_zeros():
+    env = TaskEnv(Zeros(start=1.0))
+    assert env.reset(seed=0)[0][:3].tolist() == [0.0, 0.0, -0.5]
+    assert env.step(np.array([0.5, 0.0]))[0][:3].tolist() == [0.0, -0.5, -0.25]
+    env.close()
+
+
+def test_a_history_excludes_a_stack_of_frames():
+    with pytest.raises(RecipeError, match="frame_stack: the task declares a history of place; set frame_stack: 1"):
+        EnvSpec(f"{__file__}:Clock", frame_stack=2).make()
+
+
+def test_the_description_has_terms_and_history():
+    env = TaskEnv(Clock())
+    info = describe(env)
+    assert EnvInfo.model_validate_json(info.model_dump_json()) == info
+    assert info.observation_sizes == {"place": 3, "clock": 2}
+    assert info.observation_history == {"place": 3}
+    assert info.quantity_sizes == {"rail": 1}
+    assert info.observation_terms["place"] == terms.Scaled("rail", offset=(2.0,), scale=(0.5,))
+    other = TaskEnv(Zeros())
+    assert info.find_difference(describe(other)) == (
+        "its observations have a history of place (3) that begins with first, the environment's have "
+        "a history of place (3) that begins with zeros"
+    )
+    env.close()
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observation_terms": {"plase": terms.LastAction()}}, "a term for 'plase', which is not observed"),
+        ({"observation_terms": {"place": "gravity"}}, "it must be one of rlctl.task.terms"),
+        ({"observation_terms": {"place": terms.Gravity()}}, "does not fit its term .*: a quaternion of 1 elements"),
+        ({"observation_terms": {"place": terms.Distance("a", "b")}}, "1 quantities, expected 2"),
+        ({"observation_terms": {"place": terms.Scaled("rail", offset=[1.0, 2.0])}}, "2 numbers for 1 elements"),
+        ({"observation_history": {"plase": 2}}, "a history for 'plase', which is not observed. Did you mean 'place'"),
+        ({"observation_history": {"place": 0}}, "observation_history of 'place' is 0; .* from 1 to 1000"),
+        ({"history_start": "last"}, "history_start is 'last'; it must be 'first' or 'zeros'"),
+    ],
+)
+def test_a_wrong_declaration_is_an_error(changes, message):
+    wrong = type("Wrong", (Clock,), changes)
+    with pytest.raises(TaskError, match=message):
+        TaskEnv(wrong())
+
+
+def test_a_clock_needs_a_period_and_numbers_are_finite():
+    with pytest.raises(TaskError, match=r"period_s is 0\.0"):
+        terms.PhaseClock(0.0)
+    with pytest.raises(TaskError, match=r"Scaled\('q'\).scale must be finite"):
+        terms.Scaled("q", scale=np.inf)
+
+
+def test_joints_say_what_an_action_commands():
+    assert Joints(["hip"], action_step=[0.1], measured="joints").command == ("step", (0.1,))
+    assert Joints(["hip"]).command == ("", ())
+    with pytest.raises(TaskError, match="action_scale and action_torque exclude each other"):
+        Joints(["hip"], action_scale=[1.0], action_torque=[1.0])
+    with pytest.raises(TaskError, match="action_step needs measured"):
+        Joints(["hip"], action_step=[1.0])
+    with pytest.raises(TaskError, match="clips_target needs low and high"):
+        Joints(["hip"], action_scale=[1.0], clips_target=True)
+
+
+class StoolWithHistory(Stool):
+    """The stool, with noise on what it remembers, and its goal as a quantity."""
+
+    observation_terms = {"height": terms.Displacement("seat", "goal"), "last": terms.LastAction()}
+    observation_history = {"hips": 3, "speeds": 2}
+
+    def observe(self):
+        return {**super().observe(), "height": (self.body.base_position[:, 2:], self.goal[:, None])}
+
+
+@pytest.mark.parametrize("start", ["first", "zeros"])
+def test_many_worlds_have_the_histories_of_one(start):
+    kind = type("Remembering", (StoolWithHistory,), {"history_start": start, "__doc__": "A stool."})
+    events = EventSettings(True, {})
+    single = TaskEnv(kind(), events=events, sim="mujoco")
+    batch = BatchEnv(kind(), 3, TaskEnv(kind(), events=events, sim="mujoco"), "mujoco")
+    actions = np.random.default_rng(0).uniform(-1, 1, (6, 2)).astype(np.float32)
+    rows = [batch.reset(np.arange(3), [5, 6, 7])[1]]
+    for step, action in enumerate(actions):
+        if step == 3:  # another world begins an episode; this one goes on
+            batch.reset(np.array([2]), [9])
+        rows.append(batch.step(np.tile(action, (3, 1))).observation[1])
+    expected = [single.reset(seed=6)[0], *(single.step(action)[0] for action in actions)]
+    assert np.array(rows).tobytes() == np.array(expected).tobytes()
+    hips = slice(*np.cumsum([0, *describe(single).observation_sizes.values()])[[2, 3]])
+    assert single.observation_sizes["hips"] == 6
+    assert expected[3][hips][:4].tolist() == expected[2][hips][2:].tolist()
+    single.close()
+    batch.close()
+
+
+def test_reach_and_walk_declare_their_terms():
+    from rlctl_locomotion.walk import Walk
+    from rlctl_manipulation.reach import Reach
+
+    env = TaskEnv(Reach())
+    env.reset(seed=0)
+    goal, hand = env.measured["hand_to_goal"]
+    assert (goal == env.task.goal).all()
+    assert describe(env).quantity_sizes == {"goal": 3, "hand": 3}
+    assert hand.shape == (3,)
+    env.close()
+    env = TaskEnv(Walk())
+    observation, _ = env.reset(seed=0)
+    assert describe(env).quantity_sizes == {"orientation": 4, "joint_positions": 12}
+    assert observation[3:6].tolist() == pytest.approx([0.0, 0.0, -1.0])
+    env.close()
+
+
+def test_the_measured_joints_are_observed():
+    class Moving(Slider):
+        def describe_joints(self):
+            return Joints(["x", "y"], action_step=[1.0, 1.0], measured="plase")
+
+    with pytest.raises(TaskError, match=r"joints: no observation 'plase'\. Did you mean 'place'"):
+        TaskEnv(Moving())
