@@ -22,7 +22,7 @@ LAYERS = [
     {"runs"},
     {"exporting", "replaying", "tasks", "importing"},
     {"checking", "evaluation"},
-    {"deploy.identify"},
+    {"deploy.identify", "deploy.diagnose"},
     {"rollout"},
     {"deploy.server"},
     {"deploy"},
