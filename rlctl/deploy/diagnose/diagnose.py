@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from rlctl.deploy.diagnose.actor import Actor
-from rlctl.deploy.diagnose.candidates import list_candidates
+from rlctl.deploy.diagnose.actor import RIGHT, Actor
+from rlctl.deploy.diagnose.candidates import list_candidates, make_normalised
 from rlctl.deploy.diagnose.correction import Correction, correct
 from rlctl.deploy.diagnose.evidence import Likelihood, Scorer
 from rlctl.deploy.diagnose.frozen import Frozen, find_frozen
@@ -83,11 +83,19 @@ class Doctor:
     Raises `UsageError` for a policy whose observations or actions are not vectors of numbers.
     """
 
-    def __init__(self, policy: PolicyFile, spec: EnvSpec, seed: int = 0, others: Sequence[PolicyFile] = ()) -> None:
+    def __init__(
+        self,
+        policy: PolicyFile,
+        spec: EnvSpec,
+        seed: int = 0,
+        others: Sequence[PolicyFile] = (),
+        steps: int | None = None,
+    ) -> None:
+        """`steps` of rollouts in simulation in total; by default as many as the observation needs."""
         self.policy, self.spec, self._others = policy, spec, others
         self.actor = Actor(policy)
         width = int(np.prod(policy.info.env.spaces()[0].shape or ()))
-        steps = int(np.clip(_STEPS_PER_ELEMENT * width, _FEWEST_STEPS, _MOST_STEPS))
+        steps = steps or int(np.clip(_STEPS_PER_ELEMENT * width, _FEWEST_STEPS, _MOST_STEPS))
         self.likelihood = Likelihood(record_reference(spec, self.actor, steps, seed))
         statistics = self.likelihood.reference.statistics
         self.candidates = list_candidates(policy.info.env, statistics, self.actor.normalize)
@@ -99,7 +107,7 @@ class Doctor:
             longest, needed = max(signals.lengths), 2 * self.likelihood.margin + 1
             raise ArtifactError(f"the longest part without gaps has {longest} rows; diagnose needs {needed}")
         frozen = find_frozen(signals, self.likelihood.reference.sound)
-        match = self._match(signals)
+        match = self._match(signals, pairs=not frozen)
         findings = [*self._describe_frozen(frozen, signals), *self._describe_match(match, signals, bool(frozen))]
         corrected = correct(signals, match.corrections)
         stuck = [(one.term, element) for one in frozen for element in one.elements]
@@ -124,12 +132,31 @@ class Doctor:
         answers = self._answer(signals, corrected, of_robot, match, stuck)
         return findings[:MOST], answers, build_mapping(match.corrections, of_robot, dict(signals.sizes))
 
-    def _match(self, signals: LoggedSignals) -> PolicyMatch:
+    def _match(self, signals: LoggedSignals, *, pairs: bool) -> PolicyMatch:
         std = self.likelihood.reference.statistics[ACTIONS].std
         if self.actor.in_rows:
-            return Matcher(self.actor, signals, std, self.candidates).match()
+            return self._decide_normalisation(
+                Matcher(self.actor, signals, std, self.candidates).match(pairs=pairs), signals
+            )
         difference = np.minimum(np.abs(signals.actions - self.actor.act_all(signals)) / std, 1.0)
         return PolicyMatch(float(difference.mean()), float(difference.mean()))
+
+    def _decide_normalisation(self, match: PolicyMatch, signals: LoggedSignals) -> PolicyMatch:
+        """Tell logged values that are normalised already from a network that got none: the actions are the same."""
+        if self.actor.normalize is None or not match.is_explained:
+            return match
+        normalised = make_normalised(self.actor.normalize)
+        is_variant = match.variant.normalizes == 0
+        if not is_variant and normalised not in match.corrections:
+            return match
+        rows = signals.inner_rows(self.likelihood.margin)
+        scorer = Scorer(self.likelihood, signals, rows[:: max(1, len(rows) // 400)])
+        others = [one for one in match.corrections if one != normalised]
+        scorer.rebase(others)
+        if scorer.gain(normalised) > 0:
+            return dataclasses.replace(match, corrections=(normalised, *others), variant=RIGHT, also=())
+        variant = next(one for one in self.actor.variants() if one.normalizes == 0)
+        return dataclasses.replace(match, corrections=tuple(others), variant=variant, also=())
 
     def _describe_frozen(self, frozen: Sequence[Frozen], signals: LoggedSignals) -> list[MappingFinding]:
         return [

@@ -14,7 +14,7 @@ _MOST_SAMPLES = 30.0
 """Independent rows that a relation counts for at most: a real robot differs a little, however long the log is."""
 
 _CHANCE_LOGS, _CHANCE_ROWS = 6, 1500  # logs of a sound robot in simulation, and for how many rows each counts
-_CHANCE_FACTOR = 2.0
+_CHANCE_FACTOR = 1.5
 
 
 class Likelihood:
@@ -24,7 +24,7 @@ class Likelihood:
         self.reference = reference
         self.windows = Windows(reference)
         self.relations, self.echoes = fit_relations(reference, self.windows)
-        matrix = self.relations.matrix
+        matrix = self.relations.matrix[:, : self.windows.total]
         self.affected = {
             name: np.flatnonzero(np.abs(matrix[:, columns]).max(axis=1) > 0)
             for name, columns in self.windows.columns.items()
@@ -54,12 +54,17 @@ class Likelihood:
             scorer = Scorer(self, part, inner, (), _CHANCE_ROWS)
             for one in candidates:
                 gain = scorer.gain(one)
-                for key in (one, (one.term, one.kind)):
+                for key in (one, _group(one)):
                     self._chances[key] = max(self._chances.get(key, 0.0), gain)
 
     def chance(self, one: Correction) -> float:
         """Return the evidence to take off a correction: more than it had in simulation without any mistake [nats]."""
-        return _CHANCE_FACTOR * self._chances.get(one, self._chances.get((one.term, one.kind), 0.0))
+        return _CHANCE_FACTOR * self._chances.get(one, self._chances.get(_group(one), 0.0))
+
+
+def _group(one: Correction) -> tuple[str, str]:
+    """Return which corrections one with a fitted number is like."""
+    return one.term, "scale" if one.kind == "unit" else one.kind
 
 
 class Scorer:
@@ -99,7 +104,10 @@ class Scorer:
     def _begin(self) -> None:
         windows, relations = self._likelihood.windows, self._likelihood.relations
         self._window = windows.make(self._signals, self._rows, self.base) * self._keep
-        self._errors = self._window @ relations.matrix.T + relations.constant
+        extended = windows.extend(self._window)
+        self._features = extended[:, windows.total :]
+        self._before = self._window @ windows.projection + windows.bias
+        self._errors = extended @ relations.matrix.T + relations.constant
         self._losses = compute_losses(self._errors).mean(axis=0)
 
     def _cost(self, one: Correction) -> float:
@@ -127,12 +135,16 @@ class Scorer:
         corrections = [*self.base, one]
         if one.term == EVERYTHING and EVERYTHING not in windows.sizes:
             window = windows.make(self._signals, self._rows, corrections) * self._keep
-            everything: Array = compute_losses(window @ relations.matrix.T + relations.constant).mean(axis=0)
+            everything: Array = compute_losses(windows.extend(window) @ relations.matrix.T + relations.constant).mean(
+                axis=0
+            )
             return everything
         columns, affected = windows.columns[one.term], self._likelihood.affected[one.term]
         block = windows.block(one.term, self._signals, self._rows, corrections) * self._keep[columns]
         change = block - self._window[:, columns]
         errors = self._errors[:, affected] + change @ relations.matrix[np.ix_(affected, columns)].T
+        features = np.tanh(self._before + change @ windows.projection[columns]) - self._features
+        errors += features @ relations.matrix[affected, windows.total :].T
         losses = self._losses.copy()
         losses[affected] = compute_losses(errors).mean(axis=0)
         return losses

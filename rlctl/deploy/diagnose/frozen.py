@@ -44,6 +44,8 @@ def find_frozen(signals: LoggedSignals, sound: LoggedSignals) -> list[Frozen]:
         ]
         if stuck:
             rows, first = runs[stuck[0]]
+            # Those that often keep a value, such as a joint at its top speed, but here with the others.
+            stuck = [index for index, run in enumerate(runs) if index in stuck or run == (rows, first)]
             value = float(signals.term(name)[first, stuck[0]])
             found.append(Frozen(name, tuple(stuck), value, first, rows))
     return found

@@ -13,8 +13,9 @@ from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSigna
 SAME = 0.02
 """Mean difference, in standard deviations of the action, below which actions are the same."""
 _BETTER = 0.25  # of the difference before, below which a correction that explains only a part must bring it
-_ROWS = 160
-_STARTS = 8
+_CLEARLY_BETTER = 0.5  # of the difference with one correction, which a pair must bring it to
+_ROWS = 100
+_STARTS = 6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ class Matcher:
         residuals: Array = (corrected.actions[self._middle] - computed) / self._std
         return residuals
 
-    def match(self) -> PolicyMatch:
+    def match(self, *, pairs: bool = True) -> PolicyMatch:
         """Search single corrections, then pairs."""
         begin = self.compare()
         if begin < SAME:
@@ -85,9 +86,12 @@ class Matcher:
         if best.difference < SAME:
             also = tuple(one.corrections for one in singles[1:4] if one.difference < SAME and one.corrections)
             return PolicyMatch(begin, best.difference, best.corrections, best.variant, also)
-        pairs = sorted(self._list_pairs(singles[:_STARTS]), key=lambda guess: guess.difference)
-        if pairs and (pairs[0].difference < SAME or pairs[0].difference < 0.5 * best.difference):
-            best = pairs[0]
+        for first in singles[:_STARTS] if pairs else ():
+            pair = min(self._list_pairs([first]), key=lambda guess: guess.difference)
+            if pair.difference < _CLEARLY_BETTER * best.difference:
+                best = pair
+            if best.difference < SAME:
+                break
         return PolicyMatch(begin, best.difference, best.corrections, best.variant)
 
     def _list_singles(self) -> list[_Guess]:

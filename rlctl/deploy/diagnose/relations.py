@@ -1,8 +1,9 @@
-"""Linear relations between the signals of nearby rows, learned from rollouts in simulation.
+"""Relations between the signals of nearby rows, learned from rollouts in simulation.
 
 Each relation predicts one element of an observation: from the other observations (`across`), its change from the other
 observations (`moves`), from the rows before and the actions (`ahead`), or from nothing, its usual value (`alone`). A
 `window` holds the standardised observations of five rows, two actions that the robot executed, and a logged action.
+All are linear, except that `ahead` also uses random tanh features of the row: gravity and inertia change with the pose.
 """
 
 import dataclasses
@@ -17,6 +18,7 @@ from rlctl.deploy.diagnose.signals import ACTIONS, Array, LoggedSignals
 _RIDGE = 1e-4
 _SMALLEST_ERROR = 0.01  # of an element's standard deviation: sensors are no better
 _WIDER = 1.5  # errors are counted in units of so many usual errors
+_FEATURES = 100
 STRIDE = 8  # rows to the first and the last row of a window: changes in so long a time are larger than noise
 STEPS = (-STRIDE, -1, 0, 1, STRIDE)  # the rows of a window
 _ECHO = 1e-4  # median difference to the action before, of an observation that repeats it
@@ -37,6 +39,22 @@ class Windows:
         self.columns[ACTIONS] = np.arange(base, base + 2 * self.actions)  # executed: before, and at the row
         self.logged_action = np.arange(base + 2 * self.actions, base + 3 * self.actions)  # before
         self.total = base + 3 * self.actions
+        self.features = _FEATURES
+        self._draw_features()
+
+    def _draw_features(self) -> None:
+        """Draw features of the observations and of the executed action of the middle row."""
+        rng = np.random.default_rng(0)
+        middle = STEPS.index(0)
+        used = [self.columns[name][middle * n : (middle + 1) * n] for name, n in self.sizes.items()]
+        inputs = np.concatenate([*used, self.columns[ACTIONS][self.actions :]])
+        self.projection = np.zeros((self.total, self.features))
+        self.projection[inputs] = rng.standard_normal((len(inputs), self.features)) / np.sqrt(len(inputs))
+        self.bias = rng.uniform(-1.0, 1.0, self.features)
+
+    def extend(self, window: Array) -> Array:
+        """Return windows with their features, shape (rows, total + features)."""
+        return np.concatenate([window, np.tanh(window @ self.projection + self.bias)], axis=1)
 
     def make(self, signals: LoggedSignals, rows: Array, corrections: Sequence[Correction] = ()) -> Array:
         """Return the windows of rows, shape (rows, total)."""
@@ -78,9 +96,9 @@ class Windows:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Relations:
-    """errors = window @ matrix.T + constant, in units of the usual error; a row per relation."""
+    """errors = extended window @ matrix.T + constant, in units of the usual error; a row per relation."""
 
-    matrix: Array  # shape (relations, window)
+    matrix: Array  # shape (relations, total + features)
     constant: Array
     element: Array  # the element of the observation that is predicted
     samples: Array  # how many independent rows a row counts for, in (0, 1]
@@ -96,11 +114,11 @@ def compute_losses(errors: Array) -> Array:
 
 def fit_relations(reference: Reference, windows: Windows) -> tuple[Relations, list[str]]:
     """Return the relations, and the observations that repeat the action before."""
-    train = np.concatenate(
-        [windows.make(signals, signals.inner_rows(STRIDE)) for signals in (reference.sound, reference.varied)]
+    train, held = (
+        np.concatenate([windows.extend(windows.make(signals, signals.inner_rows(STRIDE))) for signals in some])
+        for some in ((reference.sound, reference.varied), (reference.held_out,))
     )
     held_out = reference.held_out
-    held = windows.make(held_out, held_out.inner_rows(STRIDE))
     echoes = [name for name in windows.sizes if _repeats_action(reference.sound, windows, name)]
     rows, constants, kinds, elements = [], [], [], []
     for kind, name, targets, weights, bias in _list_fits(train, windows, echoes):
@@ -144,7 +162,8 @@ def _repeats_action(signals: LoggedSignals, windows: Windows, name: str) -> bool
 
 def _list_fits(train: Array, windows: Windows, echoes: Sequence[str]) -> Iterator[tuple[str, str, Array, Array, Array]]:
     """Yield kind, observation, targets and weights as rows of a matrix over windows, and the biases."""
-    sizes, columns, total = windows.sizes, windows.columns, windows.total
+    sizes, columns, total = windows.sizes, windows.columns, windows.total + windows.features
+    features = np.arange(windows.total, total)
     gram = _Gram(train)
     plain = [name for name in sizes if name not in echoes]
     nothing = np.zeros(0, np.int64)
@@ -153,6 +172,7 @@ def _list_fits(train: Array, windows: Windows, echoes: Sequence[str]) -> Iterato
         first, _, now, after, last = (own[step * size : (step + 1) * size] for step in range(len(STEPS)))
         others = np.concatenate([*(columns[other] for other in plain if other != name), columns[ACTIONS]])
         past = np.concatenate([*(columns[other][sizes[other] : 3 * sizes[other]] for other in plain), columns[ACTIONS]])
+        past = np.concatenate([past, features])
         eye = np.eye(total)
         for kind, targets, inputs in (
             ("across", eye[now], others),

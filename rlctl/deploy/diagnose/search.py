@@ -11,8 +11,8 @@ from rlctl.deploy.diagnose.evidence import Likelihood, Scorer
 from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
 
 _ROWS = 300  # of a log, in each half
-_STARTS = 4  # best single corrections that are tried as parts of pairs
-EVIDENCE = 9.0
+_STARTS = 3  # best single corrections that are tried as parts of pairs
+EVIDENCE = 12.0
 """Evidence in nats that a finding needs in the rows it was searched in, and half of it in the others."""
 LEAST_SHARE = 0.3
 """Part of the errors that it changes which a finding must explain."""
@@ -129,7 +129,7 @@ class Search:
                 scale = make_scale(one.term, len(one.factor), elements, float(np.exp(log_factor)))
                 return -self._search.gain(scale)
 
-            best = minimize_scalar(cost, bounds=(begin - 1.2, begin + 1.2), method="bounded", options={"maxiter": 14})
+            best = minimize_scalar(cost, bounds=(begin - 0.8, begin + 0.8), method="bounded", options={"maxiter": 14})
             if -best.fun > gain:
                 scale = make_scale(one.term, len(one.factor), elements, float(np.exp(best.x)))
                 fitted.append((-float(best.fun) - 0.01, scale))
