@@ -40,7 +40,7 @@ class PolicyMatch:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Guess:
+class _ExplainedActions:
     difference: float
     corrections: tuple[Correction, ...]
     variant: Variant = RIGHT
@@ -94,32 +94,32 @@ class Matcher:
                 break
         return PolicyMatch(begin, best.difference, best.corrections, best.variant)
 
-    def _list_singles(self) -> list[_Guess]:
-        guesses = [_Guess(self.compare([one]), (one,)) for one in self._candidates]
-        guesses += [_Guess(self.compare([], variant), (), variant) for variant in self._actor.variants()]
+    def _list_singles(self) -> list[_ExplainedActions]:
+        guesses = [_ExplainedActions(self.compare([one]), (one,)) for one in self._candidates]
+        guesses += [_ExplainedActions(self.compare([], variant), (), variant) for variant in self._actor.variants()]
         guesses += self._fit([])
         return sorted(guesses, key=lambda guess: guess.difference)
 
-    def _list_pairs(self, singles: Sequence[_Guess]) -> list[_Guess]:
+    def _list_pairs(self, singles: Sequence[_ExplainedActions]) -> list[_ExplainedActions]:
         pairs = []
         for first in singles:
             for one in self._candidates:
                 if one not in first.corrections:
                     both = (*first.corrections, one)
-                    pairs.append(_Guess(self.compare(both, first.variant), both, first.variant))
+                    pairs.append(_ExplainedActions(self.compare(both, first.variant), both, first.variant))
             for variant in self._actor.variants() if first.variant is RIGHT else ():
-                pairs.append(_Guess(self.compare(first.corrections, variant), first.corrections, variant))
+                pairs.append(_ExplainedActions(self.compare(first.corrections, variant), first.corrections, variant))
             pairs += self._fit(first.corrections, first.variant)
         return pairs
 
-    def _fit(self, before: Sequence[Correction], variant: Variant = RIGHT) -> list[_Guess]:
+    def _fit(self, before: Sequence[Correction], variant: Variant = RIGHT) -> list[_ExplainedActions]:
         """Return corrections with fitted numbers: a factor of a term, an offset or a factor of one of its elements."""
         guesses = [*self._fit_actions(before, variant)]
         for name in self.signals.sizes:
             guesses += self._fit_term(name, before, variant)
         return guesses
 
-    def _fit_actions(self, before: Sequence[Correction], variant: Variant) -> list[_Guess]:
+    def _fit_actions(self, before: Sequence[Correction], variant: Variant) -> list[_ExplainedActions]:
         corrected = correct(self._windows, before)
         computed = self._actor.act(corrected.observations[self._middle], variant)
         logged = corrected.actions[self._middle]
@@ -152,17 +152,17 @@ class Matcher:
                     offset=tuple(offsets.tolist()),
                 )
             )
-        return [_Guess(self.compare([*before, one], variant), (*before, one), variant) for one in fitted]
+        return [_ExplainedActions(self.compare([*before, one], variant), (*before, one), variant) for one in fitted]
 
-    def _fit_term(self, name: str, before: Sequence[Correction], variant: Variant) -> list[_Guess]:
+    def _fit_term(self, name: str, before: Sequence[Correction], variant: Variant) -> list[_ExplainedActions]:
         """Return the best factor of a whole term near the best of a coarse grid."""
         from scipy.optimize import minimize_scalar
 
         size = self.signals.sizes[name]
 
-        def guess(factor: float) -> _Guess:
+        def guess(factor: float) -> _ExplainedActions:
             both = (*before, make_scale(name, size, range(size), factor))
-            return _Guess(self.compare(both, variant), both, variant)
+            return _ExplainedActions(self.compare(both, variant), both, variant)
 
         grid = [guess(factor) for factor in np.geomspace(0.15, 6.0, 9)]
         best = min(grid, key=lambda one: one.difference)
