@@ -102,6 +102,7 @@ def _note(what: str, right: bool, wrongs: Sequence[Wrong], found: Sequence[Mappi
         print(
             f"{what} {'named' if right else 'MISSED'}: {mistakes} -> {texts or 'nothing'}", file=sys.stderr, flush=True
         )
+    return right
 
 
 def _row(task: str, repeat: int) -> Row:

@@ -36,7 +36,9 @@ class PolicyMatch:
     @property
     def is_explained(self) -> bool:
         """Whether it does so with the corrections."""
-        return self.corrected < SAME or (self.corrected < _BETTER * self.difference and bool(self.corrections))
+        return self.corrected < SAME or (
+            self.corrected < _BETTER * self.difference and bool(self.corrections or self.variant.text)
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -92,7 +94,8 @@ class Matcher:
                 best = pair
             if best.difference < SAME:
                 break
-        return PolicyMatch(begin, best.difference, best.corrections, best.variant)
+        found = PolicyMatch(begin, best.difference, best.corrections, best.variant)
+        return found if found.is_explained else PolicyMatch(begin, best.difference)
 
     def _list_singles(self) -> list[_ExplainedActions]:
         guesses = [_ExplainedActions(self.compare([one]), (one,)) for one in self._candidates]
