@@ -33,15 +33,6 @@ class Correction:
         """Return a line such as `joint_velocities: elements 3 and 4 are swapped`."""
         return f"{self.term}: {self.text}"
 
-    @property
-    def log_volume(self) -> float:
-        """Sum of log|factor|: how much the correction stretches the values."""
-        return float(np.log(np.abs(self.factor)).sum()) if self.factor else 0.0
-
-    def element_volumes(self, size: int) -> Array:
-        """Return log|factor| of each element, shape (size,)."""
-        return np.log(np.abs(self.factor)) if self.factor else np.zeros(size)
-
     def change(self, values: Array) -> Array:
         """Return factor * values[order] + offset for values of shape (..., elements)."""
         if self.order:

@@ -106,7 +106,8 @@ class Doctor:
         if not len(signals.inner_rows(self.likelihood.margin)):
             longest, needed = max(signals.lengths), 2 * self.likelihood.margin + 1
             raise ArtifactError(f"the longest part without gaps has {longest} rows; diagnose needs {needed}")
-        frozen = find_frozen(signals, self.likelihood.reference.sound)
+        reference = self.likelihood.reference
+        frozen = find_frozen(signals, (reference.sound, reference.varied))
         match = self._match(signals, pairs=not frozen)
         findings = [*self._describe_frozen(frozen, signals), *self._describe_match(match, signals, bool(frozen))]
         corrected = correct(signals, match.corrections)

@@ -1,12 +1,14 @@
 """Sensors that do not change although they do in simulation."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from rlctl.deploy.diagnose.signals import Array, LoggedSignals
 
 _LONGER = 3.0  # than the longest time without a change in simulation
+_LONGER_AT_END = 10.0  # the same at an end of the range, where contacts and saturated actions stay
 _LEAST_ROWS = 20
 
 
@@ -30,17 +32,17 @@ class Frozen:
         return f"{self.term}: {which} {verb} frozen{at} from row {self.first_row} on, for {self.rows} rows"
 
 
-def find_frozen(signals: LoggedSignals, sound: LoggedSignals) -> list[Frozen]:
-    """Return the frozen elements of each observation, those of a term together."""
+def find_frozen(signals: LoggedSignals, references: Sequence[LoggedSignals]) -> list[Frozen]:
+    """Return the elements of each observation that are frozen to the end of a segment, those of a term together."""
     found = []
+    ends = np.cumsum(signals.lengths).tolist()
     for name in signals.sizes:
-        usual = [_longest_run(column, sound.lengths)[0] for column in sound.term(name).T]
         runs = [_longest_run(column, signals.lengths) for column in signals.term(name).T]
-        longest = max(sound.lengths)
         stuck = [
             index
-            for index, ((rows, _), often) in enumerate(zip(runs, usual, strict=True))
-            if often < longest / 2 and rows >= max(_LONGER * often, _LEAST_ROWS)
+            for index, (rows, first) in enumerate(runs)
+            if first + rows in ends
+            and rows >= max(_LEAST_ROWS, _count_least(references, name, index, signals.term(name)[first, index]))
         ]
         if stuck:
             rows, first = runs[stuck[0]]
@@ -49,6 +51,17 @@ def find_frozen(signals: LoggedSignals, sound: LoggedSignals) -> list[Frozen]:
             value = float(signals.term(name)[first, stuck[0]])
             found.append(Frozen(name, tuple(stuck), value, first, rows))
     return found
+
+
+def _count_least(references: Sequence[LoggedSignals], name: str, index: int, value: float) -> float:
+    """Return for how many rows an element must keep a value: never, if it often does in simulation."""
+    columns = [signals.term(name)[:, index] for signals in references]
+    usual = max(_longest_run(column, one.lengths)[0] for column, one in zip(columns, references, strict=True))
+    if usual >= max(max(one.lengths) for one in references) / 2:
+        return np.inf
+    low, high = min(column.min() for column in columns), max(column.max() for column in columns)
+    is_inside = low + 1e-6 < value < high - 1e-6
+    return (_LONGER if is_inside else _LONGER_AT_END) * usual
 
 
 def _longest_run(values: Array, lengths: tuple[int, ...]) -> tuple[int, int]:

@@ -57,7 +57,7 @@ class Search:
         self._search, self._confirm = (
             Scorer(likelihood, signals, _thin(part), frozen, len(part)) for part in (rows[~is_second], rows[is_second])
         )
-        self._likelihood, self._frozen = likelihood, frozen
+        self._likelihood = likelihood
         allowed = likelihood.reference.allowed_delay
         self._candidates = [one for one in candidates if one.term != ACTIONS or one.kind in ("order", "sign", "scale")]
         self._late = [make_delay(steps) for steps in range(allowed + 1, allowed + MAX_DELAY + 1)]
@@ -130,9 +130,9 @@ class Search:
                 return -self._search.gain(scale)
 
             best = minimize_scalar(cost, bounds=(begin - 0.8, begin + 0.8), method="bounded", options={"maxiter": 14})
-            if -best.fun > gain:
-                scale = make_scale(one.term, len(one.factor), elements, float(np.exp(best.x)))
-                fitted.append((-float(best.fun) - 0.01, scale))
+            scale = make_scale(one.term, len(one.factor), elements, float(np.exp(best.x)))
+            if (better := -float(best.fun) - self._likelihood.chance(scale)) > gain:
+                fitted.append((better, scale))
         return fitted
 
     def _fit_offsets(self) -> list[tuple[float, Correction]]:

@@ -46,13 +46,6 @@ class LoggedSignals:
         ]
         return np.concatenate(parts) if parts else np.zeros(0, np.int64)
 
-    def cut(self, starts: list[int], length: int) -> "LoggedSignals":
-        """Return windows of `length` rows as segments."""
-        rows = np.concatenate([np.arange(start, start + length) for start in starts])
-        return dataclasses.replace(
-            self, observations=self.observations[rows], actions=self.actions[rows], lengths=(length,) * len(starts)
-        )
-
 
 def shift(values: Array, steps: int, lengths: tuple[int, ...]) -> Array:
     """Return values from `steps` rows later in the same segment; at its ends the nearest row of the segment."""
