@@ -10,6 +10,7 @@ from rlctl.deploy.diagnose.signals import Array, LoggedSignals
 _LONGER = 3.0  # than the longest time without a change in simulation
 _LONGER_AT_END = 10.0  # the same at an end of the range, where contacts and saturated actions stay
 _LEAST_ROWS = 20
+_LEAST_MOTION = 0.05  # of the standard deviations in simulation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +43,7 @@ def find_frozen(signals: LoggedSignals, references: Sequence[LoggedSignals]) -> 
             index
             for index, (rows, first) in enumerate(runs)
             if first + rows in ends
+            and _moves(signals, references[0], name, slice(first, first + rows))
             and rows >= max(_LEAST_ROWS, _count_least(references, name, index, signals.term(name)[first, index]))
         ]
         if stuck:
@@ -51,6 +53,15 @@ def find_frozen(signals: LoggedSignals, references: Sequence[LoggedSignals]) -> 
             value = float(signals.term(name)[first, stuck[0]])
             found.append(Frozen(name, tuple(stuck), value, first, rows))
     return found
+
+
+def _moves(signals: LoggedSignals, sound: LoggedSignals, name: str, rows: slice) -> bool:
+    """Return whether the other observations change in these rows: a robot that lies still has no frozen sensors."""
+    others = [other for other in signals.sizes if other != name]
+    ratios = [
+        signals.term(other)[rows].std(axis=0) / np.maximum(sound.term(other).std(axis=0), 1e-9) for other in others
+    ]
+    return not ratios or bool(np.median(np.concatenate(ratios)) > _LEAST_MOTION)
 
 
 def _count_least(references: Sequence[LoggedSignals], name: str, index: int, value: float) -> float:

@@ -30,3 +30,15 @@ def test_a_pause_and_a_long_contact_are_not_frozen():
     assert find_frozen(fallen, [contact]) == []
     never = make_signals(np.zeros(400), (200, 200))
     assert find_frozen(make_signals(np.zeros(100), (100,)), [never]) == []
+
+
+def test_a_robot_that_lies_still_has_no_frozen_sensor():
+    sound = np.sin(np.arange(400.0))
+    fallen = np.where(np.arange(100) < 40, np.sin(np.arange(100.0)), 0.25)
+
+    def make_pair(first, second, lengths):
+        return LoggedSignals(np.column_stack([first, second]), np.zeros((len(first), 1)), lengths, {"q": 1, "v": 1})
+
+    reference = make_pair(sound, sound, (200, 200))
+    assert find_frozen(make_pair(fallen, fallen, (100,)), [reference]) == []
+    assert len(find_frozen(make_pair(fallen, np.sin(np.arange(100.0)), (100,)), [reference])) == 1
