@@ -44,6 +44,7 @@ def find_frozen(signals: LoggedSignals, references: Sequence[LoggedSignals]) -> 
             for index, (rows, first) in enumerate(runs)
             if first + rows in ends
             and _moves(signals, references[0], name, slice(first, first + rows))
+            and not _repeats_constant_action(signals, name, index, slice(first, first + rows - 1))
             and rows >= max(_LEAST_ROWS, _count_least(references, name, index, signals.term(name)[first, index]))
         ]
         if stuck:
@@ -62,6 +63,14 @@ def _moves(signals: LoggedSignals, sound: LoggedSignals, name: str, rows: slice)
         signals.term(other)[rows].std(axis=0) / np.maximum(sound.term(other).std(axis=0), 1e-9) for other in others
     ]
     return not ratios or bool(np.median(np.concatenate(ratios)) > _LEAST_MOTION)
+
+
+def _repeats_constant_action(signals: LoggedSignals, name: str, index: int, rows: slice) -> bool:
+    """Return whether an element is that of the last action, and the action itself does not change."""
+    if signals.sizes[name] != signals.actions.shape[1]:
+        return False
+    actions = signals.actions[rows, index]
+    return bool(np.ptp(actions) == 0 and signals.term(name)[rows.stop, index] == actions[-1])
 
 
 def _count_least(references: Sequence[LoggedSignals], name: str, index: int, value: float) -> float:
