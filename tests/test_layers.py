@@ -23,7 +23,7 @@ LAYERS = [
     {"playing"},
     {"exporting", "replaying", "tasks", "importing", "deploy.robot"},
     {"checking", "evaluation"},
-    {"deploy.identify"},
+    {"deploy.identify", "deploy.diagnose"},
     {"rollout"},
     {"deploy.server"},
     {"deploy"},

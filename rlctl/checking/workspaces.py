@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.bullet_worlds import ClientCalls, WorldBody, find_clients, read_world
+from rlctl.checking.bullet_worlds import ClientCalls, find_clients, read_world
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rules import NotJudged
+from rlctl.checking.worlds import WorldBody
 
 FEWEST_JOINTS, MOST_JOINTS = 2, 12
 SAMPLES, SWEEPS, VALUES = 200, 3, 9  # random joint positions; then each joint in turn at so many positions

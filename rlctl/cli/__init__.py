@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli import demo, deploy, eval, export, runs, tasks, train
+from rlctl.cli import demo, deploy, diagnose, eval, export, runs, tasks, train
 from rlctl.errors import UsageError
 from rlctl.processes import error_boundary
 from rlctl.version import __version__
@@ -41,6 +41,7 @@ COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "robot": deploy.robot,
     "play": deploy.play,
     "identify": deploy.identify,
+    "diagnose": diagnose.diagnose,
     "tasks": tasks.app,
     "recipe": tasks.recipe,
     "runs": runs.app,

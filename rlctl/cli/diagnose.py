@@ -1,0 +1,46 @@
+"""`rlctl diagnose`."""
+
+from pathlib import Path
+from typing import Annotated
+
+from rlctl.cli.arguments import choose_checkpoint, command
+from rlctl.deploy.diagnose.request import DiagnoseRequest
+from rlctl.options import Argument, Json, Sim
+
+
+@command
+def diagnose(
+    log: Annotated[
+        Path,
+        Argument(
+            "Recording of observations and actions (.csv, .npz): a row per action; columns NAME_0, .., action_0, ..",
+            metavar="LOG",
+        ),
+    ],
+    request: DiagnoseRequest,
+    sim: Sim = None,
+    json: Json = None,
+) -> None:
+    """Find what is wrong between a robot and a policy: order, sign, unit, offset, delay, frozen sensors."""
+    from rlctl import output
+    from rlctl.cli.arguments import parse_changes
+    from rlctl.deploy.diagnose.diagnose import diagnose_log
+    from rlctl.deploy.diagnose.report import show
+    from rlctl.deploy.diagnose.source import find_source
+
+    source = find_source(
+        request.policy, choose_checkpoint(request.checkpoint, request.pretrained), parse_changes([], sim)
+    )
+    output.print_notes(source.notes)
+    result = diagnose_log(
+        log,
+        source.policy,
+        source.spec,
+        columns=request.columns,
+        seed=request.seed,
+        others=source.others,
+        report=lambda line: output.err().print(f"diagnose: {line}"),
+    )
+    output.print_notes(result.notes)
+    show(result, json)
+    result.check()

@@ -1,0 +1,191 @@
+"""How much more plausible corrections make a log for the robot in simulation, in nats."""
+
+import dataclasses
+from collections.abc import Collection, Iterable, Sequence
+
+import numpy as np
+
+from rlctl.deploy.diagnose.correction import EVERYTHING, Correction
+from rlctl.deploy.diagnose.reference import Reference
+from rlctl.deploy.diagnose.relations import STEPS, STRIDE, Windows, compute_losses, fit_relations
+from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
+
+_MOST_SAMPLES = 30.0
+"""Independent rows that a relation counts for at most: a real robot differs a little, however long the log is."""
+
+_CHANCE_LOGS, _CHANCE_ROWS = 6, 1500  # logs of a sound robot in simulation, and for how many rows each counts
+_CHANCE_FACTOR = 1.5
+
+
+class Likelihood:
+    """The relations of a task, and what they count for."""
+
+    def __init__(self, reference: Reference) -> None:
+        self.reference = reference
+        self.windows = Windows(reference)
+        self.relations, self.echoes = fit_relations(reference, self.windows)
+        matrix = self.relations.matrix[:, : self.windows.total]
+        self.affected = {
+            name: np.flatnonzero(np.abs(matrix[:, columns]).max(axis=1) > 0)
+            for name, columns in self.windows.columns.items()
+        }
+        self.margin = MAX_DELAY + reference.allowed_delay + STRIDE
+        """Rows that are left out at both ends of a segment."""
+        self._chances: dict[tuple[str, str] | Correction, float] = {}
+
+    def learn_chances(self, candidates: Sequence[Correction]) -> None:
+        """Learn which evidence wrong corrections have in simulation, where nothing is wrong.
+
+        It is not zero where a linear relation does not hold, such as for a finger that has reached its end stop.
+        """
+        held_out = self.reference.held_out
+        starts, groups = held_out.starts, min(_CHANCE_LOGS, len(held_out.lengths))
+        for group in np.array_split(np.arange(len(starts)), groups):
+            first, last = int(group[0]), int(group[-1])
+            rows = np.arange(starts[first], starts[last] + held_out.lengths[last])
+            part = dataclasses.replace(
+                held_out,
+                observations=held_out.observations[rows],
+                actions=held_out.actions[rows],
+                lengths=held_out.lengths[first : last + 1],
+            )
+            if not len(inner := part.inner_rows(self.margin)):
+                continue
+            scorer = Scorer(self, part, inner, (), _CHANCE_ROWS)
+            for one in candidates:
+                gain = scorer.gain(one)
+                for key in (one, _group(one)):
+                    self._chances[key] = max(self._chances.get(key, 0.0), gain)
+
+    def chance(self, one: Correction) -> float:
+        """Return the evidence to take off a correction: more than it had in simulation without any mistake [nats]."""
+        return _CHANCE_FACTOR * self._chances.get(one, self._chances.get(_group(one), 0.0))
+
+
+def _group(one: Correction) -> tuple[str, str]:
+    """Return which corrections one with a fitted number is like."""
+    return one.term, "scale" if one.kind == "unit" else one.kind
+
+
+class Scorer:
+    """Scores corrections on some rows of a log; lower is more plausible, a difference is evidence in nats."""
+
+    def __init__(
+        self,
+        likelihood: Likelihood,
+        signals: LoggedSignals,
+        rows: Array,
+        frozen: Collection[tuple[str, int]] = (),
+        stands_for: int | None = None,
+    ) -> None:
+        """`rows` are a sample of `stands_for` rows."""
+        self._likelihood, self._signals, self._rows = likelihood, signals, rows
+        relations, windows = likelihood.relations, likelihood.windows
+        weights = np.minimum(relations.samples * (stands_for or len(rows)), _MOST_SAMPLES)
+        self._keep = np.ones(windows.total)  # 0 for columns of frozen elements: their usual value is used
+        for name, element in frozen:
+            weights[relations.element == windows.slices[name].start + element] = 0.0
+            self._keep[windows.columns[name][element :: windows.sizes[name]]] = 0.0
+        self._weights = weights
+        self.rebase([])
+
+    def rebase(self, corrections: Sequence[Correction]) -> float:
+        """Begin from these corrections; return their score."""
+        cost = 0.0
+        self.base: list[Correction] = []
+        self._begin()
+        for one in corrections:
+            cost += self._cost(one)
+            self.base = [*self.base, one]
+            self._begin()
+        self.score = float(self._losses @ self._weights) + cost
+        return self.score
+
+    def _begin(self) -> None:
+        windows, relations = self._likelihood.windows, self._likelihood.relations
+        self._window = windows.make(self._signals, self._rows, self.base) * self._keep
+        extended = windows.extend(self._window)
+        self._features = extended[:, windows.total :]
+        self._before = self._window @ windows.projection + windows.bias
+        self._errors = extended @ relations.matrix.T + relations.constant
+        self._losses = compute_losses(self._errors).mean(axis=0)
+
+    def _cost(self, one: Correction) -> float:
+        """Return what a correction that makes values smaller gains where they are noise; it is no evidence."""
+        windows, relations = self._likelihood.windows, self._likelihood.relations
+        if one.term == ACTIONS or not one.factor:
+            return 0.0
+        shrinks = np.ones(windows.width)
+        columns = slice(None) if one.term == EVERYTHING else windows.slices[one.term]
+        shrinks[columns] = np.minimum(np.abs(one.factor), 1.0)
+        factors = shrinks[relations.element]
+        some = np.flatnonzero(factors < 1.0)
+        if not len(some):
+            return 0.0
+        gains = self._losses[some] - compute_losses(self._errors[:, some] * factors[some]).mean(axis=0)
+        return float(gains @ self._weights[some])
+
+    def gain(self, one: Correction) -> float:
+        """Return the evidence for one more correction [nats]."""
+        return float((self._losses - self._try(one)) @ self._weights) - self._cost(one)
+
+    def _try(self, one: Correction) -> Array:
+        """Return the mean losses with one more correction, shape (relations,)."""
+        windows, relations = self._likelihood.windows, self._likelihood.relations
+        corrections = [*self.base, one]
+        if one.term == EVERYTHING and EVERYTHING not in windows.sizes:
+            window = windows.make(self._signals, self._rows, corrections) * self._keep
+            everything: Array = compute_losses(windows.extend(window) @ relations.matrix.T + relations.constant).mean(
+                axis=0
+            )
+            return everything
+        columns, affected = windows.columns[one.term], self._likelihood.affected[one.term]
+        block = windows.block(one.term, self._signals, self._rows, corrections) * self._keep[columns]
+        change = block - self._window[:, columns]
+        errors = self._errors[:, affected] + change @ relations.matrix[np.ix_(affected, columns)].T
+        features = np.tanh(self._before + change @ windows.projection[columns]) - self._features
+        errors += features @ relations.matrix[affected, windows.total :].T
+        losses = self._losses.copy()
+        losses[affected] = compute_losses(errors).mean(axis=0)
+        return losses
+
+    def share(self, one: Correction) -> float:
+        """Return which part of the errors that it changes a correction explains, in [0, 1]."""
+        typical = self._likelihood.relations.typical
+        before, after = self._losses, self._try(one)
+        better = self._weights * (before > after + 0.05)
+        removable = float(np.maximum(before - np.minimum(typical, before), before - after) @ better)
+        return float((before - after) @ better) / max(removable, 1e-9)
+
+    def rank(self, candidates: Iterable[Correction]) -> list[tuple[float, Correction]]:
+        """Return candidates with their evidence, the best first."""
+        return sorted(((self.gain(one), one) for one in candidates), key=lambda pair: -pair[0])
+
+    def times_usual(self, name: str | None) -> float:
+        """Return how many times larger than in simulation errors of an observation are; None: of the next row's."""
+        relations, windows = self._likelihood.relations, self._likelihood.windows
+        used = np.array([kind == "ahead" for kind in relations.kind])
+        if name is not None:
+            part = windows.slices[name]
+            used = (relations.element >= part.start) & (relations.element < part.stop)
+        used &= self._weights > 0
+        if not used.any():
+            return 1.0
+        return float(np.exp((self._losses - relations.typical)[used].mean()))
+
+    def fit_offset(self, name: str) -> Array:
+        """Return the offset of each element alone that suits the log best, by reweighted least squares."""
+        windows, relations = self._likelihood.windows, self._likelihood.relations
+        columns, size = windows.columns[name], windows.sizes[name]
+        affected = self._likelihood.affected[name]
+        matrix = relations.matrix[np.ix_(affected, columns)]
+        effect = matrix.reshape(len(affected), len(STEPS), size).sum(axis=1)
+        errors, offset = self._errors[:, affected], np.zeros(size)
+        for index in range(size):
+            for _ in range(6):
+                now = errors + effect[:, index] * offset[index]
+                weights = self._weights[affected] / (1.0 + np.square(now))
+                slope = float((weights * effect[:, index] ** 2).mean(axis=0).sum())
+                offset[index] -= float((weights * now * effect[:, index]).mean(axis=0).sum()) / max(slope, 1e-9)
+        found: Array = offset * windows.statistics[name].std
+        return found

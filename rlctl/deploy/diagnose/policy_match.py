@@ -1,0 +1,186 @@
+"""Question 1: does the policy, given the logged observations, produce the logged actions? If not, what is wrong?"""
+
+import dataclasses
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from rlctl.deploy.diagnose.actor import RIGHT, Actor, Variant
+from rlctl.deploy.diagnose.candidates import make_offset, make_scale
+from rlctl.deploy.diagnose.correction import Correction, correct
+from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
+
+SAME = 0.02
+"""Mean difference, in standard deviations of the action, below which actions are the same."""
+_BETTER = 0.25  # of the difference before, below which a correction that explains only a part must bring it
+_CLEARLY_BETTER = 0.5  # of the difference with one correction, which a pair must bring it to
+_ROWS = 100
+_STARTS = 6
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PolicyMatch:
+    """How well the policy produces the logged actions, and the corrections of the log with which it does."""
+
+    difference: float  # mean |logged - computed| in standard deviations of the action, each at most 1
+    corrected: float  # with the corrections
+    corrections: tuple[Correction, ...] = ()
+    variant: Variant = RIGHT
+    also: tuple[tuple[Correction, ...], ...] = ()  # other corrections with the same result
+
+    @property
+    def is_same(self) -> bool:
+        """Whether the policy produces the logged actions as they are."""
+        return self.difference < SAME
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether it does so with the corrections."""
+        return self.corrected < SAME or (
+            self.corrected < _BETTER * self.difference and bool(self.corrections or self.variant.text)
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _ExplainedActions:
+    difference: float
+    corrections: tuple[Correction, ...]
+    variant: Variant = RIGHT
+
+
+class Matcher:
+    """Compares logged actions with those of the policy under corrections of the log."""
+
+    def __init__(self, actor: Actor, signals: LoggedSignals, std: Array, candidates: Sequence[Correction]) -> None:
+        self._actor, self._std = actor, np.maximum(std, 1e-6)
+        self.signals = signals
+        self._candidates = candidates
+        rows = signals.inner_rows(MAX_DELAY + 1)
+        self._rows = rows if len(rows) <= _ROWS else rows[np.linspace(0, len(rows) - 1, _ROWS).astype(int)]
+        # Only the windows around these rows are corrected.
+        around = np.arange(-MAX_DELAY, MAX_DELAY + 1)
+        picked = (self._rows[:, None] + around).ravel()
+        self._windows = dataclasses.replace(
+            signals,
+            observations=signals.observations[picked],
+            actions=signals.actions[picked],
+            lengths=(len(around),) * len(self._rows),
+        )
+        self._middle = np.arange(len(self._rows)) * len(around) + MAX_DELAY
+
+    def compare(self, corrections: Sequence[Correction] = (), variant: Variant = RIGHT) -> float:
+        """Return the mean difference with corrections."""
+        return float(np.minimum(np.abs(self._residuals(corrections, variant)), 1.0).mean())
+
+    def _residuals(self, corrections: Sequence[Correction], variant: Variant = RIGHT) -> Array:
+        corrected = correct(self._windows, corrections)
+        computed = self._actor.act(corrected.observations[self._middle], variant)
+        residuals: Array = (corrected.actions[self._middle] - computed) / self._std
+        return residuals
+
+    def match(self, *, pairs: bool = True) -> PolicyMatch:
+        """Search single corrections, then pairs."""
+        begin = self.compare()
+        if begin < SAME:
+            return PolicyMatch(begin, begin)
+        singles = self._list_singles()
+        best = singles[0]
+        if best.difference < SAME:
+            also = tuple(one.corrections for one in singles[1:4] if one.difference < SAME and one.corrections)
+            return PolicyMatch(begin, best.difference, best.corrections, best.variant, also)
+        for first in singles[:_STARTS] if pairs else ():
+            pair = min(self._list_pairs([first]), key=lambda guess: guess.difference)
+            if pair.difference < _CLEARLY_BETTER * best.difference:
+                best = pair
+            if best.difference < SAME:
+                break
+        found = PolicyMatch(begin, best.difference, best.corrections, best.variant)
+        return found if found.is_explained else PolicyMatch(begin, best.difference)
+
+    def _list_singles(self) -> list[_ExplainedActions]:
+        guesses = [_ExplainedActions(self.compare([one]), (one,)) for one in self._candidates]
+        guesses += [_ExplainedActions(self.compare([], variant), (), variant) for variant in self._actor.variants()]
+        guesses += self._fit([])
+        return sorted(guesses, key=lambda guess: guess.difference)
+
+    def _list_pairs(self, singles: Sequence[_ExplainedActions]) -> list[_ExplainedActions]:
+        pairs = []
+        for first in singles:
+            for one in self._candidates:
+                if one not in first.corrections:
+                    both = (*first.corrections, one)
+                    pairs.append(_ExplainedActions(self.compare(both, first.variant), both, first.variant))
+            for variant in self._actor.variants() if first.variant is RIGHT else ():
+                pairs.append(_ExplainedActions(self.compare(first.corrections, variant), first.corrections, variant))
+            pairs += self._fit(first.corrections, first.variant)
+        return pairs
+
+    def _fit(self, before: Sequence[Correction], variant: Variant = RIGHT) -> list[_ExplainedActions]:
+        """Return corrections with fitted numbers: a factor of a term, an offset or a factor of one of its elements."""
+        guesses = [*self._fit_actions(before, variant)]
+        for name in self.signals.sizes:
+            guesses += self._fit_term(name, before, variant)
+        return guesses
+
+    def _fit_actions(self, before: Sequence[Correction], variant: Variant) -> list[_ExplainedActions]:
+        corrected = correct(self._windows, before)
+        computed = self._actor.act(corrected.observations[self._middle], variant)
+        logged = corrected.actions[self._middle]
+        size = logged.shape[1]
+        centred = logged - logged.mean(axis=0)
+        slopes = (centred * (computed - computed.mean(axis=0))).sum(axis=0) / np.maximum(
+            (centred**2).sum(axis=0), 1e-12
+        )
+        offsets = computed.mean(axis=0) - slopes * logged.mean(axis=0)
+        ones = np.ones(size)
+        fitted = []
+        usual = float(np.median(slopes))
+        if abs(usual) > 1e-6:
+            fitted.append(make_log_scale(size, range(size), usual))
+        worst = int(np.abs(self._residuals(before, variant)).mean(axis=0).argmax())
+        factor = ones.copy()
+        if abs(slopes[worst]) > 1e-6:
+            factor[worst] = slopes[worst]
+            fitted.append(make_log_scale(size, [worst], float(slopes[worst])))
+        shift = np.zeros(size)
+        shift[worst] = float(np.median(computed[:, worst] - logged[:, worst]))
+        fitted.append(make_offset(ACTIONS, [worst], shift))
+        if (np.abs(slopes) > 1e-6).all():
+            fitted.append(
+                Correction(
+                    ACTIONS,
+                    "scale",
+                    "the logged actions are scaled and shifted: they may be commands of the joints",
+                    factor=tuple(slopes.tolist()),
+                    offset=tuple(offsets.tolist()),
+                )
+            )
+        return [_ExplainedActions(self.compare([*before, one], variant), (*before, one), variant) for one in fitted]
+
+    def _fit_term(self, name: str, before: Sequence[Correction], variant: Variant) -> list[_ExplainedActions]:
+        """Return the best factor of a whole term near the best of a coarse grid."""
+        from scipy.optimize import minimize_scalar
+
+        size = self.signals.sizes[name]
+
+        def guess(factor: float) -> _ExplainedActions:
+            both = (*before, make_scale(name, size, range(size), factor))
+            return _ExplainedActions(self.compare(both, variant), both, variant)
+
+        grid = [guess(factor) for factor in np.geomspace(0.15, 6.0, 9)]
+        best = min(grid, key=lambda one: one.difference)
+        begin = float(np.log(best.corrections[-1].factor[0]))
+        found = minimize_scalar(
+            lambda log_factor: guess(float(np.exp(log_factor))).difference,
+            bounds=(begin - 0.5, begin + 0.5),
+            method="bounded",
+            options={"maxiter": 25, "xatol": 1e-4},
+        )
+        return [guess(float(np.exp(found.x)))]
+
+
+def make_log_scale(size: int, elements: Collection[int], factor: float) -> Correction:
+    """Return the correction of logged actions that differ from the policy's by a factor."""
+    one = make_scale(ACTIONS, size, list(elements), factor)
+    some = "all elements are" if len(elements) == size else f"element {next(iter(elements))} is"
+    return dataclasses.replace(one, text=f"{some} {1 / factor:.4g} times as large in the log as the policy's")
