@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from rlctl.checking.families.units import find_rates
 from rlctl.checking.rules import NotJudged
+from rlctl.checking.transitions import Transitions
 from rlctl.checking.values import read_attributes
 from rlctl.checking.workspaces import find_reach
 from tests.checking.judging import case, check_case, findings
@@ -53,6 +55,16 @@ def test_units_are_told_apart_by_the_time_of_a_step():
     # 0.1 m in a step at 1 m/s are 100 mm; the heading changes by 0.1 times the turning rate.
     assert finding.evidence["value"] == pytest.approx(100.0, rel=1e-3)
     assert "millimetres" in finding.message
+
+
+@pytest.mark.parametrize(("rows", "columns", "last"), [(9, 0, False), (9, 3, True)], ids=["constant", "one step"])
+def test_where_nothing_changes_nothing_has_a_rate(rows, columns, last):
+    table, flags, numbers = np.zeros((rows, columns)), np.full(rows, last), np.zeros(rows)
+    counts = np.arange(rows)
+    steps = Transitions(
+        table, table, numbers[:, None], numbers[:, None], numbers, flags, flags, flags, counts, counts, ["x"] * columns
+    )
+    assert list(find_rates(steps)) == []
 
 
 def test_jump_of_an_angle_is_measured():

@@ -61,6 +61,8 @@ def find_rates(steps: Transitions) -> Iterator[Rate]:
     """Yield what is the rate of what, and for how long: elements, angles, and lengths of consecutive elements."""
     steps = steps.select(~steps.is_last)
     before, after = steps.before, steps.after
+    if not before.size:  # every episode has one step, or nothing changes
+        return
     pairs = find_unit_pairs(before)
     turns = [np.arctan2(after[:, j], after[:, i]) - np.arctan2(before[:, j], before[:, i]) for i, j in pairs]
     turns = [(turn + np.pi) % (2 * np.pi) - np.pi for turn in turns]

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Sequence
 import numpy as np
 
 from rlctl.deploy.diagnose.correction import EVERYTHING, Correction
-from rlctl.deploy.diagnose.reference import Reference
+from rlctl.deploy.diagnose.reference import Recordings
 from rlctl.deploy.diagnose.relations import STEPS, STRIDE, Windows, compute_losses, fit_relations
 from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
 
@@ -20,7 +20,7 @@ _CHANCE_FACTOR = 1.5
 class Likelihood:
     """The relations of a task, and what they count for."""
 
-    def __init__(self, reference: Reference) -> None:
+    def __init__(self, reference: Recordings) -> None:
         self.reference = reference
         self.windows = Windows(reference)
         self.relations, self.echoes = fit_relations(reference, self.windows)

@@ -26,7 +26,7 @@ _NOISE = (0.0, 0.05, 0.2, 0.4)  # of half the range of an action
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Reference:
+class Recordings:
     """Recordings in simulation: what the sensors of the task measured, and what the robot executed."""
 
     sound: LoggedSignals  # of the policy, of the nominal and of changed robots
@@ -36,7 +36,7 @@ class Reference:
     allowed_delay: int  # [control steps]: how late actions can be by the task's own events
 
 
-def record_reference(spec: EnvSpec, actor: Actor, steps: int, seed: int = 0) -> Reference:
+def record_reference(spec: EnvSpec, actor: Actor, steps: int, seed: int = 0) -> Recordings:
     """Play the policy in its task for so many control steps in total.
 
     Raises `UsageError` for a task whose observations or actions are not flat vectors of numbers.
@@ -51,7 +51,7 @@ def record_reference(spec: EnvSpec, actor: Actor, steps: int, seed: int = 0) -> 
         statistics = measure_statistics(sound)
         candidates = list_candidates(actor.info.env, statistics)
         varied = player.play(int((1 - _SOUND_SHARE - _HELD_OUT_SHARE) * steps), candidates, statistics)
-        return Reference(sound, held_out, varied, statistics, player.allowed_delay)
+        return Recordings(sound, held_out, varied, statistics, player.allowed_delay)
 
 
 def measure_statistics(signals: LoggedSignals) -> dict[str, TermStatistics]:

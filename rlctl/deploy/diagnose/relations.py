@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.deploy.diagnose.correction import EVERYTHING, Correction, turn
-from rlctl.deploy.diagnose.reference import Reference
+from rlctl.deploy.diagnose.reference import Recordings
 from rlctl.deploy.diagnose.signals import ACTIONS, Array, LoggedSignals
 
 _RIDGE = 1e-4
@@ -27,7 +27,7 @@ _ECHO = 1e-4  # median difference to the action before, of an observation that r
 class Windows:
     """Lays out windows, and makes them from signals with corrections."""
 
-    def __init__(self, reference: Reference) -> None:
+    def __init__(self, reference: Recordings) -> None:
         self.sizes, self.slices = reference.sound.sizes, reference.sound.slices
         self.width = sum(self.sizes.values())
         self.statistics = reference.statistics
@@ -112,7 +112,7 @@ def compute_losses(errors: Array) -> Array:
     return losses
 
 
-def fit_relations(reference: Reference, windows: Windows) -> tuple[Relations, list[str]]:
+def fit_relations(reference: Recordings, windows: Windows) -> tuple[Relations, list[str]]:
     """Return the relations, and the observations that repeat the action before."""
     train, held = (
         np.concatenate([windows.extend(windows.make(signals, signals.inner_rows(STRIDE))) for signals in some])

@@ -38,7 +38,7 @@ class Arrival(NamedTuple):
     problem: str = ""
 
 
-class Controller(abc.ABC):
+class ControlProgram(abc.ABC):
     """A connected program."""
 
     resends = False
@@ -80,7 +80,7 @@ class Controller(abc.ABC):
         self._wake()
 
 
-class WebSocketController(Controller):
+class WebSocketController(ControlProgram):
     """A program that has connected by WebSocket. An answer without a `sequence` is for the next observation in turn."""
 
     def __init__(self, name: str, loop: asyncio.AbstractEventLoop, socket: web.WebSocketResponse) -> None:
@@ -126,7 +126,7 @@ class WebSocketController(Controller):
         await self._socket.close(message=b"the test is over")
 
 
-class UdpController(Controller, asyncio.DatagramProtocol):
+class UdpController(ControlProgram, asyncio.DatagramProtocol):
     """The first program that says hello at the robot's UDP port, with the key if one is needed."""
 
     resends = True

@@ -7,7 +7,7 @@ from typing import Any
 
 from aiohttp import web
 
-from rlctl.deploy.robot.controller import Controller, UdpController, WebSocketController
+from rlctl.deploy.robot.controller import ControlProgram, UdpController, WebSocketController
 from rlctl.deploy.robot.request import RobotRequest
 from rlctl.deploy.server import messages
 from rlctl.deploy.server.access import find_problem, is_websocket
@@ -52,7 +52,7 @@ async def wait_for_controller(
     metadata: dict[str, Any],
     udp_sizes: tuple[int, int] | None,
     on_start: Callable[[list[str]], None],
-) -> AsyncIterator[Controller]:
+) -> AsyncIterator[ControlProgram]:
     """Listen, call `on_start` with the addresses, and yield the first program that connects.
 
     `udp_sizes` are the numbers of values of an observation and of an action; None: no UDP. Raises `UsageError` for a
@@ -75,7 +75,7 @@ async def wait_for_controller(
         await server.shutdown(1.0)
 
 
-async def _wait(door: _Door, udp: UdpController | None, timeout_s: float) -> Controller:
+async def _wait(door: _Door, udp: UdpController | None, timeout_s: float) -> ControlProgram:
     waiting: set[asyncio.Future[Any]] = {door.connected, *([udp.connected] if udp else [])}
     done, _ = await asyncio.wait(waiting, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
     if not done:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rlctl.deploy.filter.observation import ObservationLayout
 from rlctl.deploy.robot.commands import CommandCounts, CommandQueue, read_action
 from rlctl.deploy.robot.comparison import CommandComparison
-from rlctl.deploy.robot.controller import Arrival, Controller, SentObservation
+from rlctl.deploy.robot.controller import Arrival, ControlProgram, SentObservation
 from rlctl.deploy.robot.faults import EpisodeFaults, Faults
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import AnswerIsNo
@@ -33,7 +33,7 @@ class RobotPlayer:
         self,
         env: Any,
         info: EnvInfo,
-        controller: Controller,
+        controller: ControlProgram,
         *,
         task: str,
         timeout_s: float,

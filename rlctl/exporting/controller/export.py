@@ -145,8 +145,8 @@ class _Export:
         details = {"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0], "limits": limits}
         return self._report(path, size, details, source.target, median, fields)
 
-    def _make_reference(self, policy: Policy, is_limited: bool) -> verify.Reference:
-        return verify.Reference(ControllerLayout(self.policy.info), policy, self.limits if is_limited else None)
+    def _make_reference(self, policy: Policy, is_limited: bool) -> verify.LimitedPolicy:
+        return verify.LimitedPolicy(ControllerLayout(self.policy.info), policy, self.limits if is_limited else None)
 
     @functools.lru_cache(maxsize=2)  # noqa: B019 (for one export)
     def _record(self, is_limited: bool) -> list[verify.Recorded]:

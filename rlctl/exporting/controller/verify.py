@@ -26,7 +26,7 @@ _MIN_OBSERVATIONS = 2000
 _TIMED_STEPS, _MEAN_OF = 3000, 10
 
 
-class Reference:
+class LimitedPolicy:
     """The policy in Python, within the limits: what a controller is compared with."""
 
     def __init__(self, layout: ControllerLayout, policy: Policy, limits: Limits | None) -> None:
@@ -112,7 +112,7 @@ class ControllerAgreement:
     max_target_difference: float | None  # in the unit of the targets; None without targets
 
 
-def record(player: TaskPlayer, reference: Reference) -> list[Recorded]:
+def record(player: TaskPlayer, reference: LimitedPolicy) -> list[Recorded]:
     """Play `EPISODES` episodes, and more until `_MIN_OBSERVATIONS` are recorded."""
     recorded: list[Recorded] = []
     while len(recorded) < EPISODES or sum(len(episode.actions) for episode in recorded) < _MIN_OBSERVATIONS:
@@ -149,7 +149,7 @@ def verify_controller(
 
 
 def check_conclusive(
-    player: TaskPlayer, references: tuple[Reference, Reference], recorded: Sequence[Recorded]
+    player: TaskPlayer, references: tuple[LimitedPolicy, LimitedPolicy], recorded: Sequence[Recorded]
 ) -> tuple[bool, bool]:
     """Return whether a policy repeats its recorded episodes, and whether they change with the last bits of its weights.
 
