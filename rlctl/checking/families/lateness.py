@@ -93,6 +93,8 @@ def _find_late_success(records: Records) -> Iterator[RuleFinding]:
     steps = collect_transitions(records)
     ends = steps.terminated & ~steps.success
     for what, is_event, most in (("is_success", steps.success, 1), ("terminated", ends, MOST_LIMITS)):
+        if is_event.all() or not steps.names:  # no other step to compare with, or nothing that changes
+            continue
         if len(np.unique(steps.seeds[is_event])) >= FEWEST_SEEDS and (late := _find_late_limits(steps, is_event, most)):
             count = f"in all {int(is_event.sum())} steps where it is true, and in no other step"
             where = f"{count}, the observation before the step has {late}"
