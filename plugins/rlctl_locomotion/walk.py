@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rlctl.task import BatchTask, Box, Event, Joints, Sim, WorldRngs, events, rewards
+from rlctl.task import BatchTask, Body, Box, Event, Joints, Sim, WorldRngs, events, rewards
 from rlctl.task.rotations import rotate_inverse
 from rlctl_locomotion.quadruped import JOINTS
 
@@ -66,13 +66,17 @@ class Walk(BatchTask):
 
     def build(self, sim: Sim) -> None:
         """Load the ground and the robot."""
-        self.ground = sim.load("ground", "plane.urdf", fixed=True)
+        self.ground = self.load_ground(sim)
         self.ground.set_friction(0.8)
         self.body = sim.load("robot", "a1.urdf", position=(0.0, 0.0, START_HEIGHT))
         self.body.set_friction(1.0)  # times the ground's
         self.body.set_drives(STIFFNESS, DAMPING, armature=ARMATURE)
         self.body.set_joint_damping(0.3)  # [N m s/rad], of the gears
         self.joints = self.body.find_joints(JOINTS)
+
+    def load_ground(self, sim: Sim) -> Body:
+        """Load the body `ground`."""
+        return sim.load("ground", "plane.urdf", fixed=True)
 
     def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
         """Stand, with a commanded velocity."""
@@ -99,10 +103,14 @@ class Walk(BatchTask):
         self.velocity = rotate_inverse(orientation, self.body.base_velocity)  # [m/s], of the trunk, in its frame
         self.turning = rotate_inverse(orientation, self.body.base_angular_velocity)  # [rad/s], in its frame
         self.gravity = rotate_inverse(orientation, DOWN)
-        self.height = self.body.base_position[:, 2]
+        self.height = self.measure_height()
         self.fallen = (self.gravity[:, 2] > -0.5) | (self.height < FALLEN)
         self.error = np.linalg.norm(self.command[:, :2] - self.velocity[:, :2], axis=1)  # [m/s]
         self.error_sum += self.error
+
+    def measure_height(self) -> np.ndarray:
+        """Return the height of the trunk above the ground [m]."""
+        return self.body.base_position[:, 2]
 
     def observe(self) -> dict[str, np.ndarray]:
         """Return what the robot's own sensors measure, the command and the last action."""

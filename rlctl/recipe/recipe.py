@@ -23,6 +23,9 @@ ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
 """Algorithms with hindsight replay: those with a replay buffer, except crossq, which has no network for Dict spaces."""
 
+WITH_PRIVILEGED: tuple[Algorithm, ...] = ("ppo", "a2c", "sac", "tqc")
+"""Algorithms whose critic may see more than the actor."""
+
 SCHEMA_FILE = Path(__file__).with_name("recipe.schema.json")
 """The JSON schema of recipes for editors; `docs/generate.py` writes it."""
 
@@ -70,6 +73,15 @@ class Hindsight(Section):
     """Which of the goals that the episode reached later replace the desired goal."""
 
 
+class PrivilegedSettings(Section):
+    """What the critic sees besides the actor's observation, in training only."""
+
+    task: Switch = True
+    """Whether it sees what the task names in `privileged()`."""
+    events: Switch = True
+    """Whether it sees the values that the acting events drew, such as a mass or a push."""
+
+
 class CheckpointSettings(Section):
     """Which checkpoints are kept."""
 
@@ -98,6 +110,8 @@ class Recipe(Section):
     """Parameters of the networks; see the algorithm's own table."""
     her: Hindsight | None = None
     """Hindsight experience replay, for tasks with goals; null: off."""
+    privileged: PrivilegedSettings | None = None
+    """A critic that sees more than the actor, for tasks with flat observations; null: it sees the same."""
     normalize: NormalizeSettings | None = Field(
         None, json_schema_extra=decide_by("both for ppo, a2c, recurrent_ppo; else neither")
     )
@@ -164,6 +178,16 @@ class Recipe(Section):
         algo = others.data.get("algo")
         if value is not None and algo is not None and algo not in IN_HINDSIGHT:
             raise ValueError(f"{algo} does not support hindsight replay; {', '.join(IN_HINDSIGHT)} do")
+        return value
+
+    @pydantic.field_validator("privileged")
+    @classmethod
+    def _check_critic(
+        cls, value: PrivilegedSettings | None, others: pydantic.ValidationInfo
+    ) -> PrivilegedSettings | None:
+        algo = others.data.get("algo")
+        if value is not None and algo is not None and algo not in WITH_PRIVILEGED:
+            raise ValueError(f"{algo} has no critic that may see more than its actor; {', '.join(WITH_PRIVILEGED)} have")
         return value
 
     def env_specs(self, task: str, named_by: str = "") -> list[EnvSpec]:

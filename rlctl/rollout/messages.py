@@ -2,7 +2,7 @@
 
 import dataclasses
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,7 @@ class Build:
     """Close the environments, if there are any, and build those of a spec."""
 
     spec: EnvSpec
+    privileged: Mapping[str, bool] | None = None  # what only the critic sees; the arguments of `TaskEnv.show_critic`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,6 +146,8 @@ class Answer:
     info: EnvInfo | None = None  # description of the environments, if it has changed
     lockstep: bool = False  # whether they are the worlds of a `BatchTask`, which play together
     shared_world: SharedWorld | None = None  # of environments that were built
+    privileged: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """Size of each observation that only the critic sees, by name."""
     rewards: NDArray[np.float64] | None = None  # those of `ComputeRewards`, shape (n,)
 
 

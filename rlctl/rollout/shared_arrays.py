@@ -17,6 +17,8 @@ from rlctl.rollout.messages import EpisodeResult
 
 Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]  # shape and dtype per name
 
+CRITIC = "critic"
+"""Key of what only the critic sees, beside the keys of the observation."""
 _ALIGNMENT = 64  # [bytes], a cache line: two workers never write one
 _ROWS = ("stored", "action", "reward", "terminated", "truncated", "terms")
 """The arrays of a segment that have a row for each step."""
@@ -55,9 +57,12 @@ class SharedArrays:
     The file has no name, so nothing is left behind if the processes are killed. Unused pages take no memory.
     """
 
-    def __init__(self, descriptor: int, info: EnvInfo, n_envs: int, steps: int) -> None:
+    def __init__(self, descriptor: int, info: EnvInfo, n_envs: int, steps: int, privileged: int = 0) -> None:
+        """Map the arrays; `privileged` is the number of values that only the critic sees, under the key `CRITIC`."""
         observation_space, action_space = info.spaces()
-        observation, action = observation_fields(observation_space), _leaf(action_space)
+        observation, action = dict(observation_fields(observation_space)), _leaf(action_space)
+        if privileged:
+            observation[CRITIC] = (privileged,), np.dtype(np.float32)
         stored = np.dtype(np.float32 if isinstance(action_space, spaces.Box) else np.int64)
         of_segment: Layout = {
             "stored": ((max(1, int(np.prod(action[0]))),), stored),

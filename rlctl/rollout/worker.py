@@ -6,7 +6,7 @@ policy's parameters are in shared memory.
 
 import contextlib
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
 from time import perf_counter
 from typing import Any
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rlctl.environments.dict_spaces import SINGLE
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import describe_exception
+from rlctl.errors import RecipeError, describe_exception
 from rlctl.library_output import print_whole_lines
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_policy import PolicyPlayer
@@ -32,7 +32,7 @@ from rlctl.rollout.batch_episodes import BatchEpisodes, Players
 from rlctl.rollout.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
 from rlctl.rollout.running_episode import ObservationWriter, RunningEpisode, compute_rewards
 from rlctl.rollout.seeds import list_training_seeds
-from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
+from rlctl.rollout.shared_arrays import CRITIC, SharedArrays, map_arrays
 from rlctl.rollout.shared_world import make_watched
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import Event, EventSettings, push
@@ -51,6 +51,7 @@ class Worker:
         self._make_player: Callable[[], Player]
         self._states: NDArray[np.float32] | None = None
         self._info: EnvInfo
+        self._privileged: dict[str, int] = {}  # sizes of what only the critic sees
         self._arrays: SharedArrays
         self._writer: ObservationWriter
 
@@ -64,18 +65,19 @@ class Worker:
             case messages.ComputeRewards():
                 return Answer(rewards=compute_rewards(self._episodes[0].env, message.achieved, message.desired))
             case messages.Build():
-                return self._build(message.spec)
+                return self._build(message.spec, message.privileged)
             case messages.SetEvents():
                 return Answer(info=self._set_events(message))
             case messages.Attach():
-                self._arrays = SharedArrays(self._job.memory, self._info, self._job.total, message.steps)
+                size = sum(self._privileged.values())
+                self._arrays = SharedArrays(self._job.memory, self._info, self._job.total, message.steps, size)
             case messages.LoadPolicy():
                 self._load_policy(message)
             case messages.LimitActions():
                 self._limit_actions(message)
         return Answer()
 
-    def _build(self, spec: EnvSpec) -> Answer:
+    def _build(self, spec: EnvSpec, privileged: Mapping[str, bool] | None) -> Answer:
         if self._episodes:
             self.close()
             gc.unfreeze()
@@ -86,10 +88,13 @@ class Worker:
         else:
             first = spec.make()
         envs = [first]
+        self._privileged = {} if privileged is None else show_critic(spec, first, privileged)
         if (batch := spec.make_batch(first, self._job.count)) is not None:
             self._batch = BatchEpisodes(batch, self._job.first)
         elif shared_world is None:
             envs += [spec.make() for _ in range(self._job.count - 1)]
+            for env in envs[1:] if privileged is not None else ():
+                show_critic(spec, env, privileged or {})
         self._info = describe(envs[0])
         metrics = [name for name, weight in self._info.reward_weights.items() if weight == 0]
         self._episodes = [RunningEpisode(env, self._job.first + index, metrics) for index, env in enumerate(envs)]
@@ -98,7 +103,8 @@ class Worker:
         checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
         self._writer = ObservationWriter(space, checked=checked)
         gc.freeze()  # present objects live long: later collections skip them
-        return Answer(info=self._info, lockstep=self._batch is not None, shared_world=shared_world)
+        lockstep, sizes = self._batch is not None, self._privileged
+        return Answer(info=self._info, lockstep=lockstep, shared_world=shared_world, privileged=sizes)
 
     def _set_events(self, message: messages.SetEvents) -> EnvInfo:
         spec, added = message.spec, {}
@@ -169,7 +175,19 @@ class Worker:
 
     def _begin(self, episode: RunningEpisode, seed: int) -> None:
         self._arrays.inside[episode.index] = seed, 0, -1
-        self._writer.write(self._arrays.observation, episode.index, episode.start(seed))
+        self._writer_of(episode)(self._arrays.observation, episode.index, episode.start(seed))
+
+    def _writer_of(self, episode: RunningEpisode) -> Callable[[Mapping[str, NDArray[Any]], int, Any], None]:
+        """Return what writes an environment's observation into a row of arrays, and what only the critic sees."""
+        if not self._privileged:
+            return self._writer.write
+        env = episode.env.unwrapped
+
+        def write(target: Mapping[str, NDArray[Any]], index: int, observation: Any) -> None:
+            self._writer.write(target, index, observation)
+            target[CRITIC][index] = env.observe_privileged()
+
+        return write
 
     def _replay(self, episode: RunningEpisode, actions: NDArray[np.generic]) -> bool:
         """Take steps with recorded actions; return whether the episode ended."""
@@ -177,7 +195,7 @@ class Worker:
             episode.step += 1
             self._arrays.inside[episode.index, 1] = episode.step
             observation, _, terminated, truncated, _ = episode.take_step(action)
-            self._writer.write(self._arrays.observation, episode.index, observation)
+            self._writer_of(episode)(self._arrays.observation, episode.index, observation)
             if terminated or truncated:
                 return True
         return False
@@ -206,7 +224,7 @@ class Worker:
         self, episode: RunningEpisode, asked: messages.Play, next_seeds: Iterator[int] | None
     ) -> list[EpisodeResult]:
         """Play a segment of one environment; without `next_seeds` it stops when an episode ends."""
-        arrays, index, player, write = self._arrays, episode.index, self._loaded_player, self._writer.write
+        arrays, index, player, write = self._arrays, episode.index, self._loaded_player, self._writer_of(episode)
         segment, inside = arrays.segment.of(index), arrays.inside[index]
         now = segment.observation
         single = now.get(SINGLE)
@@ -281,6 +299,18 @@ class Worker:
         if self._batch is not None:
             self._batch.close()
         self._batch = None
+
+
+def show_critic(spec: EnvSpec, env: Any, privileged: Mapping[str, bool]) -> dict[str, int]:
+    """Let an environment observe what only the critic sees; return its sizes by name, or raise `RecipeError`."""
+    inner, space = env.unwrapped, env.observation_space
+    if not isinstance(inner, TaskEnv):
+        raise RecipeError(f"privileged: {spec.task} is a plain Gymnasium environment; only tasks have it")
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise RecipeError(f"privileged: {spec.task} observes {space}; a critic sees more only beside a flat observation")
+    inner.show_critic(**privileged)
+    assert inner.privileged is not None
+    return inner.privileged.sizes
 
 
 def make_player_of(name: str, env: Any) -> Player:

@@ -51,8 +51,10 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         n_workers: int | None = None,
         timeout_s: float = DEFAULT_TIMEOUT_S,
         printed: PrintedLines | None = None,
+        privileged: Mapping[str, bool] | None = None,
     ) -> None:
         self.n_envs = n_envs
+        self._privileged = privileged  # what the critic of a training sees; see `TaskEnv.show_critic`
         self.timeout_s = timeout_s
         self.spec = spec  # spec of the environments
         self.shared_world: messages.SharedWorld | None = None  # why each environment has a process of its own
@@ -89,6 +91,12 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         return self._info
 
     @property
+    def privileged_sizes(self) -> Mapping[str, int]:
+        """Size of each observation that only the critic sees, by name; waits until the environments are built."""
+        self._wait_until_built()
+        return self._privileged_sizes
+
+    @property
     def arrays(self) -> SharedArrays:
         """The shared arrays, a row per environment; waits until the environments are built."""
         self._wait_until_built()
@@ -122,7 +130,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
     def _begin_to_build(self) -> None:
         for worker in range(len(self._ranges)):
-            self._send(worker, messages.Build(self.spec))
+            self._send(worker, messages.Build(self.spec, self._privileged))
 
     def _wait_until_built(self) -> None:
         if self._ready:
@@ -132,6 +140,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
             self._give_each_a_process(shared[0])
             return
         self._info, self._lockstep = _info_of(answers), answers[0].lockstep
+        self._privileged_sizes = answers[0].privileged
         self._numbers.forget()
         self._ready = True
         self._attach(self._steps)
@@ -148,7 +157,8 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
     def _attach(self, steps: int) -> None:
         self._steps = steps
-        self._arrays = SharedArrays(self._memories[0], self._info, self.n_envs, steps)
+        size = sum(self._privileged_sizes.values())
+        self._arrays = SharedArrays(self._memories[0], self._info, self.n_envs, steps, size)
         self._arrays.inside[:] = -1
         self._ask_all(messages.Attach(steps), "attaching")
 

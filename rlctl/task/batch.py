@@ -60,6 +60,10 @@ class BatchTask(TaskDefinition):
         """Return the raw reward terms, each of shape (worlds,), by the names of `reward_weights`."""
         raise NotImplementedError
 
+    def privileged(self) -> dict[str, NDArray[np.float64]]:
+        """Return what only a critic sees, by name, each of shape (worlds, size); see `Task.privileged`. Optional."""
+        return {}
+
     def is_success(self) -> Any:
         """Return whether the goal is reached now, shape (worlds,). Optional."""
         return None
@@ -107,6 +111,9 @@ class OneWorld(Task):
 
     def observe(self) -> dict[str, NDArray[np.float64]]:
         return self._read("observe", self.batch.observe(), 2)
+
+    def privileged(self) -> dict[str, NDArray[np.float64]]:
+        return self._read("privileged", self.batch.privileged(), 2)
 
     def rewards(self, action: NDArray[Any]) -> dict[str, float]:
         terms = self._read("rewards", self.batch.rewards(np.asarray(action)[None]), 1)

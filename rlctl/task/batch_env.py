@@ -1,7 +1,7 @@
 """`BatchEnv`: n worlds of a `BatchTask`, stepped together; the same episodes as of one world at a time."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from rlctl.task.batch import BatchTask, WorldRngs, read_rows
 from rlctl.task.env import TaskEnv
 from rlctl.task.events.acting import ActingEvents, Streams, seed_streams
 from rlctl.task.events.batch_signals import BatchSignals
+from rlctl.task.events.event import Drawn
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 
 Array = NDArray[np.float64]
@@ -71,6 +72,8 @@ class BatchEnv:
         self._single = single
         self._events = single.events
         self._acting = ActingEvents(self._events, self.task.control_dt)
+        shown = single.privileged
+        self._privileged = None if shown is None else np.zeros((self.worlds, shown.size), np.float32)
         self._signals: BatchSignals | None = None
         if any(event.event.when in ("observation", "action") for event in self._events.values()):
             assert isinstance(self._space, spaces.Box)
@@ -84,6 +87,8 @@ class BatchEnv:
         generators = [np_random(int(seed))[0] for seed in seeds]
         level = self._single.level
         self._levels[worlds] = level
+        if self._privileged is not None:
+            self._privileged[worlds] = 0.0  # what is of an event that has not acted yet
         for world, seed in zip(worlds.tolist(), seeds, strict=True):
             self._streams[world] = seed_streams(self._events, int(seed))
             self._act("reset", world)
@@ -96,12 +101,39 @@ class BatchEnv:
         with self._leave_others(worlds):
             observation = self._observe(worlds)
             self._check_kept("reset")
+        if self._signals is not None:
+            for world in worlds.tolist():
+                self._note(world, self._signals.drawn[world])
         return observation
+
+    def observe_privileged(self, worlds: Worlds) -> NDArray[np.float32]:
+        """Return what only the critic sees now in some worlds, shape (k, size); call `show_critic` of the single."""
+        shown, rows = self._single.privileged, self._privileged
+        assert shown is not None
+        assert rows is not None
+        with self._leave_others(worlds):
+            parts = self.task.privileged() if self._single.shows_task else {}
+            for name, value in parts.items() if isinstance(parts, dict) else ():
+                read_rows(self.name, f"privileged()[{name!r}]", value, (self.worlds, None), np.float64)
+            shown.write_task(rows, parts)
+        chosen = rows[worlds]
+        bad = ~np.isfinite(chosen.sum(axis=1))
+        if bad.any():
+            row = int(bad.argmax())
+            self._fail(worlds[row], f"privileged {shown.find_fault(chosen[row])!r} is not finite")
+        return chosen
+
+    def _note(self, world: int, drawn: Mapping[str, Drawn]) -> None:
+        """Let the critic see what events drew."""
+        if self._privileged is not None and self._single.privileged is not None:
+            with in_world(world):
+                self._single.privileged.write_events(self._privileged[world], drawn)
 
     def _act(self, when: Literal["reset", "start"], world: int) -> None:
         if self._events:
             with in_world(world):
-                self._acting.run(when, self.sim.one(world), self._streams[world], float(self._levels[world]))
+                drawn = self._acting.run(when, self.sim.one(world), self._streams[world], float(self._levels[world]))
+            self._note(world, drawn)
 
     def step(self, action: NDArray[Any], worlds: Worlds | None = None) -> BatchStep:
         """Advance all worlds, or some, by a control step; `action` has a row for each of them, shape (k, ...)."""
@@ -201,7 +233,8 @@ class BatchEnv:
         for world in rows[due].tolist():
             step, level = int(self.step_of[world]), float(self._levels[world])
             with in_world(world):
-                self._acting.run_due(step, self.sim.one(world), self._streams[world], level)
+                drawn = self._acting.run_due(step, self.sim.one(world), self._streams[world], level)
+            self._note(world, drawn)
 
     def _observe(self, rows: Worlds) -> NDArray[np.float32]:
         parts = self.task.observe()

@@ -10,14 +10,17 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
+from numpy.typing import NDArray
 
 from rlctl.errors import RecipeError, TaskError, UsageError, check_name, short_repr
 from rlctl.task.batch import BatchTask, OneWorld, as_single
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
+from rlctl.task.events.event import Drawn
 from rlctl.task.joints import Joints
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.observation import Observation, ObservationFormat
+from rlctl.task.privileged import PrivilegedFormat
 from rlctl.task.pybullet.library import is_installed
 from rlctl.task.pybullet.sim import PybulletSim
 from rlctl.task.sim import Sim
@@ -67,16 +70,21 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self._running = self._closed = False
         self._streams: Streams = {}
         self._markers: dict[str, int] = {}
+        self._drawn: dict[str, Drawn] = {}
+        """Values that the events of this episode drew, the last ones of those at an interval."""
+        self.privileged: PrivilegedFormat | None = None  # what only a critic sees, after `show_critic`
+        self.shows_task = False
         try:
             self._build()
-            self._acting.try_once(["reset"], self.sim)
+            drawn = self._acting.try_once(["reset"], self.sim)
             task.reset(np.random.default_rng(0))
-            self._acting.try_once(["start", "interval"], self.sim)
+            drawn |= self._acting.try_once(["start", "interval"], self.sim)
             self._first = first = task.observe()
             if not isinstance(first, dict) or not first:
                 raise _not_by_name(self.name, "observe", first)
             self._signals = Signals(self.events, first, self.action_space, task.observation_bounds)
             self._signals.try_once()
+            self._examples = task.privileged(), drawn | self._signals.drawn
             _check_joints(task)
             # A task knows its markers after a reset; they are added to the world as it was built.
             markers = list(task.markers()) if render_mode is not None else []
@@ -93,6 +101,33 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def set_level(self, level: float) -> None:
         """Set the level of ranges written `{from: ..., to: ...}`, from 0 (`from`) to 1 (`to`), for the next resets."""
         self.level = float(level)
+
+    def show_critic(self, *, task: bool, events: bool) -> None:
+        """Let `observe_privileged` return what the task names, and the values of events, from the next reset on.
+
+        Raises `RecipeError` if there is neither.
+        """
+        of_task, drawn = self._examples
+        if not isinstance(of_task, dict):
+            raise _not_by_name(self.name, "privileged", of_task)
+        shown = PrivilegedFormat(self.name, of_task if task else {}, drawn if events else {})
+        if not shown.size:
+            raise RecipeError(
+                f"privileged: a critic of {self.name} would see no more than the actor: the task has no privileged(), "
+                "and no event acts; leave the key out, or enable events: randomize: true"
+            )
+        self.privileged, self.shows_task = shown, task
+
+    def observe_privileged(self) -> NDArray[np.float32]:
+        """Return what only the critic sees now, shape (size,); call `show_critic` once before."""
+        shown = self.privileged
+        assert shown is not None
+        row = np.zeros(shown.size, np.float32)
+        shown.write_task(row, self.task.privileged() if self.shows_task else {})
+        shown.write_events(row, self._drawn)
+        if fault := shown.find_fault(row):
+            raise TaskError(f"{self.name}: privileged {fault!r} is not finite at step {self._step}")
+        return row
 
     def set_events(self, events: EventSettings, added: Mapping[str, Event] | None = None) -> None:
         """Let only the events of `events` and the `added` ones act; call `reset` afterwards.
@@ -154,6 +189,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self._running = True
         observation = self._observe()
         drawn |= self._signals.drawn
+        self._drawn = dict(drawn)
         info: dict[str, Any] = {"events": drawn} if drawn else {}
         if self.render_mode == "human":
             self.move_markers()
@@ -188,6 +224,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         if self._acting.periods:
             drawn = self._acting.run_due(self._step, self.sim, self._streams, self._episode_level)
             info.update({"events": drawn} if drawn else {})
+            self._drawn.update(drawn)
         if self.has_success:
             info["is_success"] = self._read_flag("is_success")
         self._running = not (terminated or truncated)

@@ -112,6 +112,14 @@ class Task(TaskDefinition):
         """Return whether the episode ends, for example after a fall; the time limit is not part of it. Optional."""
         return False
 
+    def privileged(self) -> dict[str, NDArray[np.float64]]:
+        """Return what only a critic sees, by name, such as the true velocity or the friction of the ground. Optional.
+
+        Called after `observe` in a training whose recipe has the key `privileged`, and nowhere else: policies, players
+        and exported files never see it.
+        """
+        return {}
+
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> NDArray[Any]:
         """Return the rewards, shape (n,), of steps for other desired goals; goals have shape (n, size). Optional.
 

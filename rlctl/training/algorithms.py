@@ -21,6 +21,7 @@ from rlctl.storage.untrusted import measure_free_memory
 from rlctl.training.device import describe_device, find_fastest
 from rlctl.training.off_policy import replay_arguments
 from rlctl.training.own_networks import check_policy_class, write_graph
+from rlctl.training.privileged import POLICIES, has_privileged_critic
 from rlctl.training.rollouts import WorkerVecEnv
 from rlctl.training.snapshot import pack
 
@@ -66,6 +67,10 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     if isinstance(activation := policy_kwargs.get("activation_fn"), str):
         policy_kwargs["activation_fn"] = ACTIVATIONS[activation]
     own_policy = policy_kwargs.pop("policy_class", None)
+    if env.workers.privileged_sizes:
+        if own_policy is not None:
+            raise RecipeError("policy_kwargs.policy_class: a critic that sees more (privileged) has its own policy class")
+        own_policy, policy_kwargs["actor_size"] = POLICIES[recipe.algo], env.workers.info.spaces()[0].shape[0]
     base = next(iter(cls.policy_aliases.values()))
     if own_policy is not None and not issubclass(own_policy, base):
         raise RecipeError(f"policy_kwargs.policy_class: {own_policy.__name__} is not a subclass of {base.__name__}")
@@ -81,7 +86,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         if recipe.algo in _DELAYED_BY_US:
             model.policy_delay = recipe.algo_kwargs.get("policy_delay", 1)  # type: ignore[attr-defined]
         write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # reports faults of a user's network
-        if own_policy is not None:
+        if own_policy is not None and not has_privileged_critic(model.policy):
             use_sde = {"use_sde": True} if getattr(model, "use_sde", False) else {}
             model.policy.own_arguments = model.policy_kwargs | use_sde  # type: ignore[assignment]
             check_policy_class(model, recipe.algo, pack(model, recipe.algo, env.workers.spec, env.workers.info))

@@ -177,7 +177,7 @@ def find_differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
 def environment_tensors(env: WorkerVecEnv) -> Tensors:
     """Return the numbers, actions and last observations of the running episodes."""
     histories = [env.join_actions(index) for index in range(env.num_envs)]
-    last = split(env.last_observations())
+    last = env.last_observations()
     return {
         "environments/episodes_started": np.array(env.episodes_started, np.int64),
         "environments/steps": np.array([len(actions) for actions in histories], np.int64),

@@ -4,6 +4,7 @@ The normalisation statistics are constant while a segment is played, and are upd
 """
 
 import abc
+import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -23,7 +24,8 @@ from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
 from rlctl.training.own_networks import write_graph
-from rlctl.training.snapshot import observation_statistics, pack
+from rlctl.training.privileged import widen, widen_space
+from rlctl.training.snapshot import observation_statistics, pack, select_actor
 from rlctl.training.status import Progress
 from rlctl.training.updates.choice import choose_learner
 
@@ -60,7 +62,9 @@ class WorkerVecEnv(VecEnv):
         self.waited_s = 0.0  # time spent waiting for the environments to play [s], since it was set to 0
         self._steps = 0
         self._is_playing = False  # whether a segment has been started and not finished
-        super().__init__(workers.n_envs, *workers.info.spaces())
+        observation_space, action_space = workers.info.spaces()
+        privileged = sum(workers.privileged_sizes.values())
+        super().__init__(workers.n_envs, widen_space(observation_space, privileged), action_space)
 
     def _seed(self, env: int, episode: int) -> int:
         return episode_seed(self.run_seed, Stream.TRAIN, env, episode)
@@ -74,7 +78,11 @@ class WorkerVecEnv(VecEnv):
             raise
         self.episodes_started = [number + 1 for number in self.episodes_started]
         self._actions = [[actions] for actions in self.workers.arrays.segment.action[:, :0]]
-        return self.workers.observations()
+        return self.observations()
+
+    def observations(self) -> Observations:
+        """Return a copy of the current observations, with what only the critic sees, shape (n_envs, ...)."""
+        return join(widen({key: rows.copy() for key, rows in self.workers.arrays.observation.items()}))
 
     def join_actions(self, env: int) -> NDArray[Any]:
         """Return the actions of an environment's running episode so far, shape (steps, ...)."""
@@ -114,26 +122,28 @@ class WorkerVecEnv(VecEnv):
         for env, actions in enumerate(segment.action[:, :steps]):
             self._actions[env].append(actions[last_rows.get(env, -1) + 1 :].copy())
         self.ended += ended
-        seen = {key: rows[:, 1 : steps + 1] for key, rows in segment.observation.items()}
+        last = segment.first(steps, ended)
+        last = dataclasses.replace(last, observation=widen(last.observation), final=widen(last.final))
+        seen = {key: rows[:, 1:] for key, rows in last.observation.items()}
         count, message = _count_outside(self.observation_space, seen)
         self.outside, self.outside_message = self.outside + count, self.outside_message or message
-        self.last_segment = segment.first(steps, ended)
-        return self.last_segment
+        self.last_segment = last
+        return last
 
     @property
     def steps_in_segment(self) -> int:
         """How many steps of the segment that is being played were begun so far, by all environments."""
         return int((self.workers.arrays.inside[:, 2] + 1).sum()) if self._is_playing else 0
 
-    def last_observations(self) -> Observations:
-        """Return the last observations of all segments that were finished, shape (n_envs, ...) or a dict of such."""
+    def last_observations(self) -> dict[str, NDArray[Any]]:
+        """Return the last observations, by key, of all segments that were finished, shape (n_envs, ...)."""
         arrays = self.workers.arrays
         observations = {key: array.copy() for key, array in arrays.observation.items()}
         if self._is_playing:
             begun = arrays.inside[:, 2] >= 0  # row 0 was written before; those done have replaced the other
             for key, array in observations.items():
                 array[begun] = arrays.segment.observation[key][begun, 0]
-        return join(observations)
+        return observations
 
     def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any]:
         """Return the actions of a failed episode; the last is that of the failed step."""
@@ -242,7 +252,8 @@ class Rollouts(abc.ABC):
         if self._policy_info is None:
             self._policy_info = pack(model, self._algo, workers.spec, workers.info).info
         tensors = {f"policy/{name}": value.cpu().numpy() for name, value in model.policy.state_dict().items()}
-        for key, (mean, var) in statistics.items():
+        for key, moments in statistics.items():
+            mean, var = (select_actor(part, model.policy) for part in moments)
             tensors |= {f"normalize/{key}/mean": mean, f"normalize/{key}/var": var}
         tensors |= write_graph(model, self._algo, workers.info.spaces()[0])
         workers.set_policy(PolicyFile(self._policy_info, tensors))

@@ -59,7 +59,8 @@ def set_up(start: Start, display: Display, printed: PrintedLines) -> Iterator[Tr
         stack.callback(printed.report)
         # The workers build their environments, and the check runs, while this process imports torch.
         make_workers = functools.partial(Workers, timeout_s=request.env_timeout_s)
-        workers = stack.enter_context(make_workers(specs[start.stage - 1], recipe.n_envs))
+        privileged = None if recipe.privileged is None else recipe.privileged.model_dump()
+        workers = stack.enter_context(make_workers(specs[start.stage - 1], recipe.n_envs, privileged=privileged))
         checked = _begin_check(specs[-1], request.env_timeout_s) if request.check and start.run is None else None
         from rlctl.training.evaluator import EvaluationEpisodes, Evaluator
         from rlctl.training.loop import TrainingLoop

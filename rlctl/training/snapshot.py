@@ -18,6 +18,7 @@ from rlctl.errors import ArtifactError, DivergedError
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.torch_policy import describe_network, policy_name
 from rlctl.training.own_networks import write_graph
+from rlctl.training.privileged import has_privileged_critic
 from rlctl.version import collect_versions
 
 Tensors = dict[str, NDArray[Any]]
@@ -35,7 +36,11 @@ def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> Policy
     statistics = observation_statistics(normalizer)
     tensors = {f"policy/{key}": value.cpu().numpy().copy() for key, value in model.policy.state_dict().items()}
     for key, rms in statistics.items():
-        tensors |= {f"normalize/{key}/mean": rms.mean.copy(), f"normalize/{key}/var": rms.var.copy()}
+        for part, values in (("mean", rms.mean), ("var", rms.var)):
+            actor = select_actor(values, model.policy)
+            tensors[f"normalize/{key}/{part}"] = actor.copy()
+            if len(actor) < len(values):  # not needed to act
+                tensors[f"critic/{part}"] = values[len(actor) :].copy()
     info = PolicyInfo(
         algo=algo,
         policy=policy_name(algo, env.spaces()[0]),
@@ -48,6 +53,11 @@ def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> Policy
         versions=collect_versions(),
     )
     return PolicyFile(info, {**tensors, **write_graph(model, algo, env.spaces()[0])})
+
+
+def select_actor(values: NDArray[Any], policy: Any) -> NDArray[Any]:
+    """Return the part of the elements of an observation that the actor of a policy sees, which comes first."""
+    return values[: policy.actor_size] if has_privileged_critic(policy) else values
 
 
 def observation_statistics(normalizer: VecNormalize | None) -> dict[str, RunningMeanStd]:

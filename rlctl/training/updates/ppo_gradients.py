@@ -39,7 +39,7 @@ class PpoSettings:
         floats, numbers = np.dtype(np.float32), np.dtype(np.float64)
         return {
             "losses": ((MAX_BLOCKS, len(LOSSES)), numbers),  # sums of each block
-            "features": ((self.rows, self.actor[0]), floats),
+            "features": ((self.rows, self.critic[0]), floats),  # the actor sees the first of them
             "actions": ((self.rows, self.actor[-1]), floats),
             **dict.fromkeys(("values", "log_probs", "returns"), ((self.rows,), floats)),
             "order": ((self.rows,), np.dtype(np.int64)),  # of the rows in this epoch
@@ -74,7 +74,7 @@ class PpoGradients(BlockWork):
     def _evaluate_actor(self, rows: slice) -> None:
         """Write the log-probabilities of the rollout's actions."""
         for part in _split(rows):
-            actor = self._actor.run(self._arrays["features"][None, part], "actor")
+            actor = self._actor.run(self._arrays["features"][None, part, : self._settings.actor[0]], "actor")
             z = self._arrays["actions"][part] - actor[-1][0]
             std = self._compute_std(actor)
             z /= std
@@ -91,7 +91,7 @@ class PpoGradients(BlockWork):
     def _differentiate_actor(self, block: int, rows: slice, size: int) -> None:
         """Set a block's gradients of the minibatch's mean loss, and its sums of what is logged."""
         clip_range = float(self._arrays["clip_ranges"][0])
-        actor = self._actor.run(self._take("features", rows)[None], "actor")
+        actor = self._actor.run(self._take("features", rows)[None, :, : self._settings.actor[0]], "actor")
         std = self._compute_std(actor)
         z = self._take("actions", rows) - actor[-1][0]
         z /= std
