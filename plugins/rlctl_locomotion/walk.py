@@ -14,7 +14,6 @@ STIFFNESS, DAMPING, ARMATURE = 35.0, 0.7, 0.01  # [N m/rad], [N m s/rad], [kg m^
 START_HEIGHT, HEIGHT, FALLEN = 0.30, 0.28, 0.14  # [m], of the trunk
 LOWEST = np.array([-0.5, -0.4, -0.8])  # commanded velocities forwards and sideways [m/s], and of turning [rad/s]
 HIGHEST = np.array([1.0, 0.4, 0.8])
-SCALE = 0.5  # [m/s] and [rad/s]; so far from the command, tracking is worth 1/e
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -48,6 +47,7 @@ class Walk(BatchTask):
         "fall": -1.0,
         "velocity_error": 0.0,  # a metric [m/s]
     }
+    scale = 0.5  # [m/s] and [rad/s]; so far from the command, tracking is worth 1/e
     per_world = {"command": (3,), "last_action": (12,), "action_change": (12,), "error_sum": (), "steps": ()}
     events = {  # with `randomize: true`
         "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
@@ -127,8 +127,8 @@ class Walk(BatchTask):
     def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
         """Return how well the command is followed, and how calmly."""
         return {
-            "tracking": rewards.closeness(self.error, SCALE),
-            "turning": rewards.closeness(self.command[:, 2] - self.turning[:, 2], SCALE),
+            "tracking": rewards.closeness(self.error, self.scale),
+            "turning": rewards.closeness(self.command[:, 2] - self.turning[:, 2], self.scale),
             "bounce": self.velocity[:, 2] ** 2,
             "sway": np.sum(self.turning[:, :2] ** 2, axis=1),
             "smoothness": rewards.squared(self.action_change),

@@ -10,7 +10,7 @@ from rlctl_locomotion.quadruped import FEET
 from rlctl_locomotion.walk import HIGHEST, LOWEST, STANCE, START_HEIGHT, Walk
 
 HIGHEST_BUMPS = 0.1  # [m]; above, the legs are too short
-CELL = 0.15  # [m], between the points of the ground
+CELL = 0.2  # [m], between the points of the ground
 SIZE = (50.0, 80.0)  # [m], of the ground along x and y: in an episode at most 22 m are walked
 FLAT, FULL = -30.0, 0.0  # [m]: from y = FLAT to FULL the bumps grow from 0 to their height
 START = 2.0  # [m], half of the length of the square in which episodes begin
@@ -26,6 +26,8 @@ class WalkRough(Walk):
     rough: float = 0.05  # [m], height of the bumps
     terrain_seed: int = 0
     episode_s: float = 20.0
+
+    scale = 0.4
 
     events = {
         "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2), enabled=True),
@@ -50,7 +52,7 @@ class WalkRough(Walk):
 
     def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
         """Stand somewhere, with a commanded velocity."""
-        place = rng.uniform(-START, START, 2) + (0.0, HARDEST)
+        place = np.array([0.0, HARDEST]) + rng.uniform(-START, START, 2)
         around = self.find_heights(place[:, None] + SCANNED)
         self.body.set_base(np.column_stack([place, START_HEIGHT + around.max(axis=1)]), worlds=worlds)
         self.body.set_joints(STANCE + rng.uniform(-self.start_noise, self.start_noise, 12), worlds=worlds)

@@ -187,7 +187,9 @@ class Recipe(Section):
     ) -> PrivilegedSettings | None:
         algo = others.data.get("algo")
         if value is not None and algo is not None and algo not in WITH_PRIVILEGED:
-            raise ValueError(f"{algo} has no critic that may see more than its actor; {', '.join(WITH_PRIVILEGED)} have")
+            raise ValueError(
+                f"{algo} has no critic that may see more than its actor; {', '.join(WITH_PRIVILEGED)} have"
+            )
         return value
 
     def env_specs(self, task: str, named_by: str = "") -> list[EnvSpec]:

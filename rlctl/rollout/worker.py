@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rlctl.environments.dict_spaces import SINGLE
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import RecipeError, describe_exception
+from rlctl.errors import describe_exception
 from rlctl.library_output import print_whole_lines
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_policy import PolicyPlayer
@@ -30,9 +30,15 @@ from rlctl.processes.pool import answer_messages
 from rlctl.rollout import messages
 from rlctl.rollout.batch_episodes import BatchEpisodes, Players
 from rlctl.rollout.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
-from rlctl.rollout.running_episode import ObservationWriter, RunningEpisode, compute_rewards
+from rlctl.rollout.running_episode import (
+    CriticWriter,
+    ObservationWriter,
+    RunningEpisode,
+    compute_rewards,
+    show_critic,
+)
 from rlctl.rollout.seeds import list_training_seeds
-from rlctl.rollout.shared_arrays import CRITIC, SharedArrays, map_arrays
+from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
 from rlctl.rollout.shared_world import make_watched
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import Event, EventSettings, push
@@ -53,7 +59,6 @@ class Worker:
         self._info: EnvInfo
         self._privileged: dict[str, int] = {}  # sizes of what only the critic sees
         self._arrays: SharedArrays
-        self._writer: ObservationWriter
 
     def answer(self, message: Message) -> Answer:
         """Execute a message and return the answer."""
@@ -101,7 +106,9 @@ class Worker:
         space = envs[0].observation_space
         # A task's environment checks its observations itself.
         checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
-        self._writer = ObservationWriter(space, checked=checked)
+        writer = ObservationWriter(space, checked=checked)
+        for episode in self._episodes:
+            episode.write = CriticWriter(writer, episode.env).write if self._privileged else writer.write
         gc.freeze()  # present objects live long: later collections skip them
         lockstep, sizes = self._batch is not None, self._privileged
         return Answer(info=self._info, lockstep=lockstep, shared_world=shared_world, privileged=sizes)
@@ -175,19 +182,7 @@ class Worker:
 
     def _begin(self, episode: RunningEpisode, seed: int) -> None:
         self._arrays.inside[episode.index] = seed, 0, -1
-        self._writer_of(episode)(self._arrays.observation, episode.index, episode.start(seed))
-
-    def _writer_of(self, episode: RunningEpisode) -> Callable[[Mapping[str, NDArray[Any]], int, Any], None]:
-        """Return what writes an environment's observation into a row of arrays, and what only the critic sees."""
-        if not self._privileged:
-            return self._writer.write
-        env = episode.env.unwrapped
-
-        def write(target: Mapping[str, NDArray[Any]], index: int, observation: Any) -> None:
-            self._writer.write(target, index, observation)
-            target[CRITIC][index] = env.observe_privileged()
-
-        return write
+        episode.write(self._arrays.observation, episode.index, episode.start(seed))
 
     def _replay(self, episode: RunningEpisode, actions: NDArray[np.generic]) -> bool:
         """Take steps with recorded actions; return whether the episode ended."""
@@ -195,7 +190,7 @@ class Worker:
             episode.step += 1
             self._arrays.inside[episode.index, 1] = episode.step
             observation, _, terminated, truncated, _ = episode.take_step(action)
-            self._writer_of(episode)(self._arrays.observation, episode.index, observation)
+            episode.write(self._arrays.observation, episode.index, observation)
             if terminated or truncated:
                 return True
         return False
@@ -224,7 +219,7 @@ class Worker:
         self, episode: RunningEpisode, asked: messages.Play, next_seeds: Iterator[int] | None
     ) -> list[EpisodeResult]:
         """Play a segment of one environment; without `next_seeds` it stops when an episode ends."""
-        arrays, index, player, write = self._arrays, episode.index, self._loaded_player, self._writer_of(episode)
+        arrays, index, player, write = self._arrays, episode.index, self._loaded_player, episode.write
         segment, inside = arrays.segment.of(index), arrays.inside[index]
         now = segment.observation
         single = now.get(SINGLE)
@@ -299,18 +294,6 @@ class Worker:
         if self._batch is not None:
             self._batch.close()
         self._batch = None
-
-
-def show_critic(spec: EnvSpec, env: Any, privileged: Mapping[str, bool]) -> dict[str, int]:
-    """Let an environment observe what only the critic sees; return its sizes by name, or raise `RecipeError`."""
-    inner, space = env.unwrapped, env.observation_space
-    if not isinstance(inner, TaskEnv):
-        raise RecipeError(f"privileged: {spec.task} is a plain Gymnasium environment; only tasks have it")
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        raise RecipeError(f"privileged: {spec.task} observes {space}; a critic sees more only beside a flat observation")
-    inner.show_critic(**privileged)
-    assert inner.privileged is not None
-    return inner.privileged.sizes
 
 
 def make_player_of(name: str, env: Any) -> Player:

@@ -112,7 +112,7 @@ class BatchEnv:
         assert shown is not None
         assert rows is not None
         with self._leave_others(worlds):
-            parts = self.task.privileged() if self._single.shows_task else {}
+            parts = shown.read_task(self.task)
             for name, value in parts.items() if isinstance(parts, dict) else ():
                 read_rows(self.name, f"privileged()[{name!r}]", value, (self.worlds, None), np.float64)
             shown.write_task(rows, parts)

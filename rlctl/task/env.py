@@ -2,7 +2,6 @@
 
 import copy
 import math
-import numbers
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
@@ -23,6 +22,7 @@ from rlctl.task.observation import Observation, ObservationFormat
 from rlctl.task.privileged import PrivilegedFormat
 from rlctl.task.pybullet.library import is_installed
 from rlctl.task.pybullet.sim import PybulletSim
+from rlctl.task.returned import not_a_number, not_by_name, term_mismatch
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_definition, check_parameters
 
@@ -73,7 +73,6 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self._drawn: dict[str, Drawn] = {}
         """Values that the events of this episode drew, the last ones of those at an interval."""
         self.privileged: PrivilegedFormat | None = None  # what only a critic sees, after `show_critic`
-        self.shows_task = False
         try:
             self._build()
             drawn = self._acting.try_once(["reset"], self.sim)
@@ -81,7 +80,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             drawn |= self._acting.try_once(["start", "interval"], self.sim)
             self._first = first = task.observe()
             if not isinstance(first, dict) or not first:
-                raise _not_by_name(self.name, "observe", first)
+                raise not_by_name(self.name, "observe", first)
             self._signals = Signals(self.events, first, self.action_space, task.observation_bounds)
             self._signals.try_once()
             self._examples = task.privileged(), drawn | self._signals.drawn
@@ -107,27 +106,12 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 
         Raises `RecipeError` if there is neither.
         """
-        of_task, drawn = self._examples
-        if not isinstance(of_task, dict):
-            raise _not_by_name(self.name, "privileged", of_task)
-        shown = PrivilegedFormat(self.name, of_task if task else {}, drawn if events else {})
-        if not shown.size:
-            raise RecipeError(
-                f"privileged: a critic of {self.name} would see no more than the actor: the task has no privileged(), "
-                "and no event acts; leave the key out, or enable events: randomize: true"
-            )
-        self.privileged, self.shows_task = shown, task
+        self.privileged = PrivilegedFormat.of(self.name, *self._examples, task=task, events=events)
 
     def observe_privileged(self) -> NDArray[np.float32]:
         """Return what only the critic sees now, shape (size,); call `show_critic` once before."""
-        shown = self.privileged
-        assert shown is not None
-        row = np.zeros(shown.size, np.float32)
-        shown.write_task(row, self.task.privileged() if self.shows_task else {})
-        shown.write_events(row, self._drawn)
-        if fault := shown.find_fault(row):
-            raise TaskError(f"{self.name}: privileged {fault!r} is not finite at step {self._step}")
-        return row
+        assert self.privileged is not None
+        return self.privileged.observe(self.task, self._drawn, self._step)
 
     def set_events(self, events: EventSettings, added: Mapping[str, Event] | None = None) -> None:
         """Let only the events of `events` and the `added` ones act; call `reset` afterwards.
@@ -208,15 +192,15 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         truncated = not terminated and self._step >= self.max_steps
         raw = task.rewards(action)
         if not isinstance(raw, dict):
-            raise _not_by_name(self.name, "rewards", raw)
+            raise not_by_name(self.name, "rewards", raw)
         weights = self.reward_weights
         if raw.keys() != weights.keys():
-            raise _term_mismatch(self.name, raw, weights)
+            raise term_mismatch(self.name, raw, weights)
         try:
             terms = {name: weight * raw[name] for name, weight in weights.items()}
             reward = float(sum(terms.values()))
         except (TypeError, ValueError):
-            raise _not_a_number(self.name, raw, self._step) from None
+            raise not_a_number(self.name, raw, self._step) from None
         if not math.isfinite(reward):
             bad = next((name for name, term in terms.items() if not math.isfinite(term)), "sum")
             raise TaskError(f"{self.name}: reward term {bad!r} is {terms.get(bad, reward)} at step {self._step}")
@@ -315,18 +299,3 @@ def _check_joints(task: Task) -> None:
             f"{type(task).__name__}: describe_joints() returned {short_repr(given)}; "
             f"return body.describe_joints(names) with {count} names, one per element of the action"
         )
-
-
-def _not_by_name(task: str, method: str, value: Any) -> TaskError:
-    return TaskError(f"{task}: {method}() returned {short_repr(value)}, not a dict of values by name: {{'speed': ...}}")
-
-
-def _not_a_number(task: str, raw: Mapping[str, Any], step: int) -> TaskError:
-    name = next((name for name, value in raw.items() if not isinstance(value, numbers.Real)), "sum")
-    return TaskError(f"{task}: reward term {name!r} is {short_repr(raw.get(name))} at step {step}, not a number")
-
-
-def _term_mismatch(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:
-    problems = [f"rewards() returns {name!r}, which has no weight" for name in raw if name not in weights]
-    problems += [f"reward_weights has {name!r}, which rewards() does not return" for name in weights if name not in raw]
-    return TaskError(f"{task}: {problems[0]}")

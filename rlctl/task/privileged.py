@@ -1,12 +1,13 @@
 """What only a critic sees in a training: what the task names, and the values that its events drew."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, short_repr
+from rlctl.errors import RecipeError, TaskError, short_repr
+from rlctl.task.returned import not_by_name
 
 Row = NDArray[np.float32]
 Drawn = Mapping[str, Mapping[str, float]]
@@ -29,8 +30,36 @@ class PrivilegedFormat:
         if empty := [name for name, size in self.sizes.items() if size == 0]:
             raise TaskError(f"{task}: privileged() returned {empty[0]!r} empty")
         ends = np.cumsum([*self.sizes.values()]).tolist()
-        self._columns = {name: slice(end - size, end) for (name, size), end in zip(self.sizes.items(), ends, strict=True)}
+        self._columns = {
+            name: slice(end - size, end) for (name, size), end in zip(self.sizes.items(), ends, strict=True)
+        }
         self.size = sum(self.sizes.values())
+
+    @classmethod
+    def of(cls, name: str, first: Any, drawn: Drawn, *, task: bool, events: bool) -> Self:
+        """Return the format of a task and of its events, or of one of them; raises `RecipeError` if it is empty."""
+        if not isinstance(first, dict):
+            raise not_by_name(name, "privileged", first)
+        result = cls(name, first if task else {}, drawn if events else {})
+        if not result.size:
+            raise RecipeError(
+                f"privileged: a critic of {name} would see no more than the actor: the task has no privileged(), and "
+                "no event acts; leave the key out, or enable events: randomize: true"
+            )
+        return result
+
+    def read_task(self, task: Any) -> dict[str, Any]:
+        """Return what the task names now."""
+        return task.privileged() if self._of_task else {}
+
+    def observe(self, task: Any, drawn: Drawn, step: int) -> Row:
+        """Return what the critic of one world sees, shape (size,); raises `TaskError` if it is not finite."""
+        row = np.zeros(self.size, np.float32)
+        self.write_task(row, self.read_task(task))
+        self.write_events(row, drawn)
+        if fault := self.find_fault(row):
+            raise TaskError(f"{self._task}: privileged {fault!r} is not finite at step {step}")
+        return row
 
     def write_task(self, rows: Row, parts: Mapping[str, Any]) -> None:
         """Write what the task names into `rows`, shape (..., size); raises `TaskError` if it does not fit."""

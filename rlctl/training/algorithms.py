@@ -69,8 +69,10 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     own_policy = policy_kwargs.pop("policy_class", None)
     if env.workers.privileged_sizes:
         if own_policy is not None:
-            raise RecipeError("policy_kwargs.policy_class: a critic that sees more (privileged) has its own policy class")
-        own_policy, policy_kwargs["actor_size"] = POLICIES[recipe.algo], env.workers.info.spaces()[0].shape[0]
+            raise RecipeError(
+                "policy_kwargs.policy_class: a critic that sees more (privileged) has its own policy class"
+            )
+        own_policy, policy_kwargs["privileged"] = POLICIES[recipe.algo], dict(env.workers.privileged_sizes)
     base = next(iter(cls.policy_aliases.values()))
     if own_policy is not None and not issubclass(own_policy, base):
         raise RecipeError(f"policy_kwargs.policy_class: {own_policy.__name__} is not a subclass of {base.__name__}")

@@ -136,7 +136,8 @@ class Learner:
 
 def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
     """Build an environment of every stage; raise an error if it differs from that of the first; return the last."""
-    first = info = workers.info
+    first, seen = workers.info, workers.privileged_sizes
+    info = first
     for number, spec in enumerate(specs[1:], start=2):
         where = f"stage {number} of {len(specs)}"
         try:
@@ -145,6 +146,12 @@ def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
             raise type(error)(f"{where}: {error}", details=error.details) from None
         if difference := info.find_difference(first, "stage 1's"):
             raise RecipeError(f"{where}: {difference}. One policy learns in all stages: leave out what changes it")
+        if workers.privileged_sizes != seen:
+            names = ", ".join(name for name, _ in set(workers.privileged_sizes.items()) ^ set(seen.items()))
+            raise RecipeError(
+                f"{where}: its critic does not see the same as stage 1's: {names}. Let the same events act in all "
+                "stages, or add --set privileged.events=false"
+            )
         if list(info.reward_weights) != list(first.reward_weights):
             raise RecipeError(
                 f"{where}: its reward terms are {', '.join(info.reward_weights)}, "

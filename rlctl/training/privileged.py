@@ -6,6 +6,7 @@ An observation of the training has the actor's elements first and the critic's o
 Stable-Baselines3 get all of it; their features extractors select what each of them sees.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -65,8 +66,13 @@ class CriticColumns(BaseFeaturesExtractor):
 class Privileged:
     """Makes the features extractors of a policy of Stable-Baselines3, of whose observation the actor sees a part."""
 
-    actor_size: int  # number of elements that the actor sees
+    privileged: Mapping[str, int]  # sizes of what only the critic sees, by name
     observation_space: Any
+
+    @property
+    def actor_size(self) -> int:
+        """Number of elements that the actor sees."""
+        return int(self.observation_space.shape[0]) - sum(self.privileged.values())
 
     def make_inner(self) -> BaseFeaturesExtractor:
         """Return an extractor for the actor's part of an observation."""
@@ -87,10 +93,13 @@ class Privileged:
 class PrivilegedActorCriticPolicy(Privileged, ActorCriticPolicy):
     """PPO's and A2C's networks."""
 
-    def __init__(self, *args: Any, actor_size: int, share_features_extractor: bool = True, **kwargs: Any) -> None:
-        self.actor_size, self._shares = actor_size, share_features_extractor
+    def __init__(
+        self, *args: Any, privileged: Mapping[str, int], share_features_extractor: bool = True, **kwargs: Any
+    ) -> None:
+        self.privileged, self._shares = privileged, share_features_extractor
         # For SB3 they are two extractors, because they return different features.
-        super().__init__(*args, share_features_extractor=False, **kwargs)
+        kwargs["share_features_extractor"] = False
+        super().__init__(*args, **kwargs)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         """Return the actor's extractor; `_build_mlp_extractor` makes the critic's."""
@@ -108,10 +117,12 @@ class PrivilegedActorCriticPolicy(Privileged, ActorCriticPolicy):
 class PrivilegedSACPolicy(Privileged, SACPolicy):
     """SAC's networks."""
 
-    def __init__(self, *args: Any, actor_size: int, share_features_extractor: bool = False, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, privileged: Mapping[str, int], share_features_extractor: bool = False, **kwargs: Any
+    ) -> None:
         if share_features_extractor:
             raise ValueError("share_features_extractor: the critic sees more than the actor, so they share none")
-        self.actor_size = actor_size
+        self.privileged = privileged
         super().__init__(*args, **kwargs)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
@@ -126,10 +137,12 @@ class PrivilegedSACPolicy(Privileged, SACPolicy):
 class PrivilegedTQCPolicy(Privileged, TQCPolicy):
     """TQC's networks."""
 
-    def __init__(self, *args: Any, actor_size: int, share_features_extractor: bool = False, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, privileged: Mapping[str, int], share_features_extractor: bool = False, **kwargs: Any
+    ) -> None:
         if share_features_extractor:
             raise ValueError("share_features_extractor: the critic sees more than the actor, so they share none")
-        self.actor_size = actor_size
+        self.privileged = privileged
         super().__init__(*args, **kwargs)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
@@ -148,6 +161,11 @@ POLICIES: dict[str, Any] = {
     "tqc": PrivilegedTQCPolicy,
 }
 """The policy of each algorithm whose critic may see more than the actor."""
+
+
+def read_privileged(policy: Any) -> dict[str, int]:
+    """Return the sizes of what only the critic of a policy sees, by name; empty if it sees what the actor sees."""
+    return dict(policy.privileged) if has_privileged_critic(policy) else {}
 
 
 def has_privileged_critic(policy: Any) -> bool:

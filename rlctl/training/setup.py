@@ -136,7 +136,8 @@ def _build_learner(
     pin_threads()
     recipe, goal = start.recipe, workers.info
     if len(specs) > 1:  # check every stage now, not after hours of training
-        with make_workers(specs[0], 1) as probe:
+        privileged = None if recipe.privileged is None else recipe.privileged.model_dump()
+        with make_workers(specs[0], 1, privileged=privileged) as probe:
             goal = check_stages(specs, probe)
     # A plain Gymnasium environment shows only at the end of an episode whether it reports success.
     if workers.info.reward_weights and not workers.info.has_success:

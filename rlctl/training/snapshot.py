@@ -18,7 +18,7 @@ from rlctl.errors import ArtifactError, DivergedError
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.torch_policy import describe_network, policy_name
 from rlctl.training.own_networks import write_graph
-from rlctl.training.privileged import has_privileged_critic
+from rlctl.training.privileged import has_privileged_critic, read_privileged
 from rlctl.version import collect_versions
 
 Tensors = dict[str, NDArray[Any]]
@@ -47,6 +47,7 @@ def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> Policy
         policy_kwargs=describe_network(model.policy),
         clip_observation=normalizer.clip_obs if normalizer is not None and statistics else None,
         normalized_keys=list(statistics),
+        privileged=read_privileged(model.policy),
         env=env,
         spec=spec,
         training_steps=model.num_timesteps,
@@ -180,7 +181,8 @@ def _restore_normalizer(model: BaseAlgorithm, tensors: Tensors) -> None:
     normalizer.returns = tensors["normalize/returns"].copy()
     for key, rms in {**observation_statistics(normalizer), "return": normalizer.ret_rms}.items():
         rms.mean, rms.var = (tensors[f"normalize/{key}/{part}"].copy() for part in ("mean", "var"))
-        rms.count = float(tensors[f"normalize/{key}/count"])
+        count = tensors[f"normalize/{key}/count"]
+        rms.count = count.copy() if count.ndim else float(count)  # type: ignore[assignment]
 
 
 def _rollout_tensors(model: BaseAlgorithm) -> Tensors:

@@ -45,6 +45,13 @@ CASES = {
     "ppo, on reach": ("reach", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
     "ppo, on worlds in batches": (STOOL, settings("ppo", randomize=True)),
     "recurrent_ppo, on worlds in batches": (STOOL, settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
+    "ppo, privileged, on worlds in batches": (STOOL, settings("ppo", randomize=True, privileged={})),
+    "ppo, privileged, on reach": (
+        "reach",
+        settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"], randomize=True, privileged={}),
+    ),
+    "sac, privileged": (STOOL, settings("sac", randomize=True, privileged={}, **NORMALIZED)),
+    "tqc, privileged": (STOOL, settings("tqc", randomize=True, privileged={"task": False})),
     "ppo, on hopper": ("hopper", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
     "a2c": ("Line", settings("a2c")),
     "recurrent_ppo": ("Line", settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
@@ -71,7 +78,7 @@ CASES = {
 # trainings of plain ppo and sac are in tests/crash.
 QUICK = {
     *("ppo with gSDE", "ppo, curriculum", "recurrent_ppo", "sac, hindsight, normalised"),
-    "ppo, on worlds in batches",
+    "ppo, privileged, on worlds in batches",
 }
 
 
