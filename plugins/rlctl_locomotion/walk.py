@@ -14,6 +14,7 @@ STIFFNESS, DAMPING, ARMATURE = 35.0, 0.7, 0.01  # [N m/rad], [N m s/rad], [kg m^
 START_HEIGHT, HEIGHT, FALLEN = 0.30, 0.28, 0.14  # [m], of the trunk
 LOWEST = np.array([-0.5, -0.4, -0.8])  # commanded velocities forwards and sideways [m/s], and of turning [rad/s]
 HIGHEST = np.array([1.0, 0.4, 0.8])
+OTHER_SIDE = (-4, 5, 6, -1, 2, 3, -10, 11, 12, -7, 8, 9)  # joints of the mirror image: hips turn the other way
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -49,6 +50,12 @@ class Walk(BatchTask):
     }
     scale = 0.5  # [m/s] and [rad/s]; so far from the command, tracking is worth 1/e
     per_world = {"command": (3,), "last_action": (12,), "action_change": (12,), "error_sum": (), "steps": ()}
+    mirror = {
+        "gyroscope": (-1, 2, -3),
+        "gravity": (1, -2, 3),
+        "command": (1, -2, -3),
+        **dict.fromkeys(("joint_positions", "joint_velocities", "last_action", "action"), OTHER_SIDE),
+    }
     events = {  # with `randomize: true`
         "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
         "friction": Event("reset", events.set_friction, body="ground", friction=(0.4, 1.2)),

@@ -28,7 +28,17 @@ class WalkRough(Walk):
     episode_s: float = 20.0
 
     scale = 0.4
+    # With -0.012, as on flat ground, noise that explores cost more than tracking earned.
+    reward_weights = {**Walk.reward_weights, "smoothness": -0.005}
 
+    mirror = {
+        **Walk.mirror,
+        "velocity": (1, -2, 3),
+        "height": (1,),
+        "foot_heights": (2, 1, 4, 3),
+        "ground": (3, 2, 1, 6, 5, 4, 9, 8, 7, 12, 11, 10, 15, 14, 13),
+        "events/push": (1, -2),  # speed and direction
+    }
     events = {
         "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2), enabled=True),
         "friction": Event("reset", events.set_friction, body="ground", friction=(0.3, 1.3), enabled=True),

@@ -112,6 +112,8 @@ class Recipe(Section):
     """Hindsight experience replay, for tasks with goals; null: off."""
     privileged: PrivilegedSettings | None = None
     """A critic that sees more than the actor, for tasks with flat observations; null: it sees the same."""
+    mirror: Switch = False
+    """PPO: whether to learn from the mirror image of every step too, for tasks that declare their symmetry."""
     normalize: NormalizeSettings | None = Field(
         None, json_schema_extra=decide_by("both for ppo, a2c, recurrent_ppo; else neither")
     )

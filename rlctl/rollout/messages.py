@@ -148,6 +148,7 @@ class Answer:
     shared_world: SharedWorld | None = None  # of environments that were built
     privileged: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """Size of each observation that only the critic sees, by name."""
+    mirror: Mapping[str, Sequence[int]] = dataclasses.field(default_factory=dict)  # the task's declaration
     rewards: NDArray[np.float64] | None = None  # those of `ComputeRewards`, shape (n,)
 
 

@@ -111,7 +111,8 @@ class Worker:
             episode.write = CriticWriter(writer, episode.env).write if self._privileged else writer.write
         gc.freeze()  # present objects live long: later collections skip them
         lockstep, sizes = self._batch is not None, self._privileged
-        return Answer(info=self._info, lockstep=lockstep, shared_world=shared_world, privileged=sizes)
+        mirror = getattr(getattr(envs[0].unwrapped, "task", None), "mirror", {}) if checked else {}
+        return Answer((), (), self._info, lockstep, shared_world, privileged=sizes, mirror=mirror)
 
     def _set_events(self, message: messages.SetEvents) -> EnvInfo:
         spec, added = message.spec, {}

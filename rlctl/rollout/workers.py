@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import itertools
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -97,6 +97,12 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         return self._privileged_sizes
 
     @property
+    def mirror(self) -> Mapping[str, Sequence[int]]:
+        """The mirror symmetry that the task declares; empty without one. Waits until the environments are built."""
+        self._wait_until_built()
+        return self._mirror
+
+    @property
     def arrays(self) -> SharedArrays:
         """The shared arrays, a row per environment; waits until the environments are built."""
         self._wait_until_built()
@@ -140,7 +146,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
             self._give_each_a_process(shared[0])
             return
         self._info, self._lockstep = _info_of(answers), answers[0].lockstep
-        self._privileged_sizes = answers[0].privileged
+        self._privileged_sizes, self._mirror = answers[0].privileged, answers[0].mirror
         self._numbers.forget()
         self._ready = True
         self._attach(self._steps)

@@ -17,6 +17,7 @@ from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
 from rlctl.task.events.event import Drawn
 from rlctl.task.joints import Joints
+from rlctl.task.mirror import ACTION, check_declaration
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.observation import Observation, ObservationFormat
 from rlctl.task.privileged import PrivilegedFormat
@@ -96,6 +97,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             raise
         self._format = ObservationFormat(task, first)
         self.observation_sizes, self.observation_space = self._format.sizes, self._format.space
+        sizes = {**self.observation_sizes, ACTION: math.prod(self.action_space.shape or ())}
+        check_declaration(self.name, task.mirror, sizes, self._examples[0])
 
     def set_level(self, level: float) -> None:
         """Set the level of ranges written `{from: ..., to: ...}`, from 0 (`from`) to 1 (`to`), for the next resets."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError
 from rlctl.task.events import Event
 from rlctl.task.joints import Joints
+from rlctl.task.mirror import Declaration
 from rlctl.task.sim import Sim
 
 
@@ -40,6 +41,10 @@ class TaskDefinition:
     """Range per observation name, in its unit; other observations are unbounded."""
     reward_weights: ClassVar[Mapping[str, float]] = {}
     """Weight per reward term; a term with weight 0 is a metric."""
+    mirror: ClassVar[Declaration] = {}
+    """How the robot's mirror image, left and right exchanged, is observed and acts: per observation, and for `action`,
+    which element is each element of the mirrored array, counted from 1, with its sign: `{"gyroscope": (-1, 2, -3)}`.
+    The recipe's key `mirror` uses it. Names of `privileged`, and `events/NAME`, may have an entry too."""
     events: ClassVar[Mapping[str, Event]] = {}
     stages: ClassVar[Sequence[Mapping[str, Any]]] = ()
     """Stages of a curriculum, such as `{"task": {"tolerance": 0.2}, "promote": {"success": 0.8, "window": 100}}`; the

@@ -17,13 +17,16 @@ from rlctl.errors import RecipeError, RlctlError, UsageError, short_repr
 from rlctl.policy.own_modules import import_named
 from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
 from rlctl.recipe.recipe import ON_POLICY, NormalizeSettings, Recipe
+from rlctl.rollout.workers import Workers
 from rlctl.storage.untrusted import measure_free_memory
+from rlctl.task.mirror import ACTION, join_places
 from rlctl.training.device import describe_device, find_fastest
 from rlctl.training.off_policy import replay_arguments
 from rlctl.training.own_networks import check_policy_class, write_graph
 from rlctl.training.privileged import POLICIES, has_privileged_critic
 from rlctl.training.rollouts import WorkerVecEnv
 from rlctl.training.snapshot import pack
+from rlctl.training.updates.ppo import PpoUpdate
 
 # The system provides a replay buffer's memory only when it is written, so one that is too large fails hours later.
 _FLOAT32 = 4  # [bytes]
@@ -87,6 +90,8 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         )
         if recipe.algo in _DELAYED_BY_US:
             model.policy_delay = recipe.algo_kwargs.get("policy_delay", 1)  # type: ignore[attr-defined]
+        if recipe.mirror:
+            add_mirror(model, env.workers)
         write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # reports faults of a user's network
         if own_policy is not None and not has_privileged_critic(model.policy):
             use_sde = {"use_sde": True} if getattr(model, "use_sde", False) else {}
@@ -100,6 +105,20 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         if not own and not isinstance(error, AssertionError | ValueError | TypeError | RuntimeError):
             raise
         raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error) or error, 300)}") from error
+
+
+def add_mirror(model: Any, workers: Workers) -> None:
+    """Let a PPO model learn from mirror images too; raises `RecipeError` where it cannot."""
+    task, info = workers.spec.task, workers.info
+    if not workers.mirror:
+        raise RecipeError(f"mirror: {task} declares no mirror symmetry; leave the key out")
+    if workers.spec.frame_stack > 1 or workers.spec.time_feature:
+        raise RecipeError("mirror: observations with frame_stack or time_feature cannot be mirrored; leave them out")
+    if not PpoUpdate.supports(model):
+        raise RecipeError("mirror: supported only for PPO with multi-layer perceptrons with tanh or ReLU on the CPU")
+    sizes = {**info.observation_sizes, **workers.privileged_sizes}
+    action = {ACTION: len(workers.mirror[ACTION])}
+    model.mirror = join_places(workers.mirror, sizes), join_places(workers.mirror, action)
 
 
 def keep_compiler_out() -> None:

@@ -23,6 +23,7 @@ from rlctl.rollout.messages import EpisodeResult, Play
 from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
+from rlctl.task.mirror import Mirror
 from rlctl.training.own_networks import write_graph
 from rlctl.training.privileged import widen, widen_space
 from rlctl.training.snapshot import observation_statistics, pack, select_actor
@@ -205,6 +206,7 @@ class Rollouts(abc.ABC):
         self._progress = progress
         self._learner = choose_learner(model)
         self._policy_info: PolicyInfo | None = None
+        self._mirror = Mirror(model.mirror[0]) if hasattr(model, "mirror") else None  # of observations
         self.rehearse: Callable[[int], None] = lambda updates: None  # called after so many off-policy updates
 
     def begin(self, total_timesteps: int) -> None:
@@ -280,7 +282,9 @@ class Rollouts(abc.ABC):
         model = self.model
         for key, rms in observation_statistics(model.get_vec_normalize_env()).items():
             rows = segment.observation[key][:, 1:]
-            rms.update(rows.reshape(-1, *rows.shape[2:]))
+            rows = rows.reshape(-1, *rows.shape[2:])
+            # Symmetric statistics: normalised, the mirror image of an observation is the mirrored observation.
+            rms.update(rows if self._mirror is None else np.concatenate([rows, self._mirror(rows)]))
         model._last_episode_starts = segment.done[:, -1]
         model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
 

@@ -135,11 +135,20 @@ def test_a_policy_with_a_privileged_critic_starts_another_training(train, tmp_pa
         ({}, "Line", "is a plain Gymnasium environment; only tasks have it"),
         ({}, "reach", "a critic of Reach would see no more than the actor"),
         ({"privileged": {"event": True}}, STOOL, "no key 'privileged.event'. Did you mean 'events'?"),
+        ({"mirror": True}, STOOL, "mirror: tests.task.batches:Stool declares no mirror symmetry"),
+        (
+            {"mirror": True, "algo_kwargs": {"use_sde": True}, "policy_kwargs": {"full_std": False}},
+            "walk",
+            "mirror: supp",
+        ),
+        ({"mirror": True, "algo": "sac"}, "walk", "mirror: supported only for PPO"),
         ({"policy_kwargs": {"policy_class": "own_nets.py:Policy"}}, STOOL, "policy_kwargs.policy_class"),
     ],
 )
 def test_what_is_not_supported_is_refused(train, settings, task, message):
-    given = {"total_timesteps": 64, "n_envs": 2, "privileged": {}, **settings}
+    given = {"total_timesteps": 64, "n_envs": 2, "privileged": {}, "randomize": task in (STOOL, "walk"), **settings}
+    if settings.get("algo") == "sac":
+        given["algo_kwargs"] = {}
     with pytest.raises(RecipeError) as caught:
         train(task, given, **({"envs": ""} if task == STOOL else {}))
     assert message in str(caught.value)

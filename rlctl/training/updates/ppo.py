@@ -40,6 +40,7 @@ class PpoUpdate:
             sde_epsilon=float(self._policy.action_dist.epsilon) if self._policy.use_sde else None,
             ent_coef=model.ent_coef,
             vf_coef=model.vf_coef,
+            mirror=getattr(model, "mirror", None),
         )
         shapes = settings.list_shapes()
         self._weights = sum(math.prod(shape) for shape in shapes)
