@@ -46,7 +46,7 @@ CASES = {
     "ppo, on worlds in batches": (STOOL, settings("ppo", randomize=True)),
     "recurrent_ppo, on worlds in batches": (STOOL, settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
     "ppo, privileged, on worlds in batches": (STOOL, settings("ppo", randomize=True, privileged={})),
-    "ppo, mirrored": ("walk", settings("ppo", mirror=True, privileged={"task": False}, randomize=True, **SHORT)),
+    "ppo, mirrored": ("walk", settings("ppo", mirror=True, randomize=True, task={"episode_s": 0.4})),
     "ppo, privileged, on reach": (
         "reach",
         settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"], randomize=True, privileged={}),
