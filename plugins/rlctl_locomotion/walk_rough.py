@@ -15,6 +15,7 @@ SIZE = (50.0, 80.0)  # [m], of the ground along x and y: in an episode at most 2
 FLAT, FULL = -30.0, 0.0  # [m]: from y = FLAT to FULL the bumps grow from 0 to their height
 START = 2.0  # [m], half of the length of the square in which episodes begin
 EASIEST, HARDEST = FLAT, 15.0  # [m]: y of the middle of that square at level 0 and at level 1
+PUSH = {"from": (0.0, 0.3), "to": (0.0, 1.0)}  # [m/s], at level 0 and at level 1
 SCANNED = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.2, 0.2, 3), indexing="ij"), -1).reshape(-1, 2)
 """Points around the robot [m] whose heights the critic sees, in its own frame without roll and pitch."""
 
@@ -48,7 +49,7 @@ class WalkRough(Walk):
         "position_noise": Event("observation", events.noise, of="joint_positions", std=(0.0, 0.01), enabled=True),
         "velocity_noise": Event("observation", events.noise, of="joint_velocities", std=(0.0, 1.0), enabled=True),
         "action_delay": Event("action", events.delay, steps=(0, 1), enabled=True),  # of 20 ms
-        "push": Event("interval", events.kick, every_s=4.0, body="robot", speed=(0.0, 1.0), enabled=True),  # [m/s]
+        "push": Event("interval", events.kick, every_s=4.0, body="robot", speed=PUSH, enabled=True),
     }
 
     def load_ground(self, sim: Sim) -> Body:
@@ -62,7 +63,8 @@ class WalkRough(Walk):
 
     def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
         """Stand somewhere, with a commanded velocity."""
-        place = np.array([0.0, HARDEST]) + rng.uniform(-START, START, 2)
+        place = rng.uniform(-START, START, 2)
+        place[:, 1] += EASIEST + (HARDEST - EASIEST) * self.level[worlds]
         around = self.find_heights(place[:, None] + SCANNED)
         self.body.set_base(np.column_stack([place, START_HEIGHT + around.max(axis=1)]), worlds=worlds)
         self.body.set_joints(STANCE + rng.uniform(-self.start_noise, self.start_noise, 12), worlds=worlds)

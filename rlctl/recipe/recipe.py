@@ -14,7 +14,7 @@ from rlctl.errors import RecipeError, UsageError, short_repr
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS, decide_by
 from rlctl.recipe.hyperparameters import ON_POLICY as ON_POLICY
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
-from rlctl.recipe.stages import Stage, check_promotions
+from rlctl.recipe.stages import FollowingLevel, Stage, check_promotions
 from rlctl.storage import validation, yaml_text
 from rlctl.storage.validation import Number, Section, Switch, Whole
 
@@ -217,7 +217,7 @@ class Recipe(Section):
                 reward_weights={**self.reward_weights, **stage.reward_weights},
                 events=merge(self.events, stage.events),
                 stage=number,
-                level=stage.level,
+                level=1.0 if isinstance(stage.level, FollowingLevel) else stage.level,
             )
             for number, stage in enumerate(self.stages, start=1)
         ] or [base]

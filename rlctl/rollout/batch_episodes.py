@@ -45,7 +45,7 @@ class BatchEpisodes:
             [self.seeds[worlds], np.zeros(len(worlds), np.int64), np.full(len(worlds), -1)], axis=1
         )
         try:
-            first = self.env.reset(worlds, [int(seed) for seed in seeds])
+            first = self.env.reset(worlds, [int(seed) for seed in seeds], arrays.level[self._first + worlds])
         except BaseException as error:  # a plugin may raise anything, SystemExit too
             self._fail(error, int(worlds[0]))
         arrays.observation[SINGLE][self._first + worlds] = first
@@ -152,6 +152,10 @@ class BatchEpisodes:
                     rows[envs[done], row] = segment.observation[key][envs[done], row + 1]
                 if following:
                     fresh = [next(following[int(env)]) for env in envs[done]]
+                    if asked.levels is not None:
+                        for last in ended[-len(fresh) :]:
+                            level = float(arrays.level[last.env])
+                            arrays.level[last.env] = asked.levels.follow(level, last.success)
                     self.begin(arrays, worlds[done], fresh)
                     for key, rows in segment.observation.items():
                         rows[envs[done], row + 1] = arrays.observation[key][envs[done]]

@@ -84,6 +84,19 @@ class LimitActions:
 
 
 @dataclasses.dataclass(frozen=True)
+class LevelRule:
+    """How the level of an environment follows the success of its episodes."""
+
+    start: float
+    up: float
+    down: float
+
+    def follow(self, level: float, success: bool | None) -> float:
+        """Return the level of the episode after one at `level`; rounded, so that equal levels are equal numbers."""
+        return round(min(1.0, level + self.up) if success else max(0.0, level - self.down), 9)
+
+
+@dataclasses.dataclass(frozen=True)
 class Play:
     """Play a segment in some environments, one after the other."""
 
@@ -92,6 +105,7 @@ class Play:
     next_episodes: dict[int, int] = dataclasses.field(default_factory=dict)
     """Per environment the number of the training episode that follows when one ends; empty: none follows."""
     run_seed: int = 0
+    levels: LevelRule | None = None  # of the episodes that follow
     exploration: Exploration = dataclasses.field(default_factory=Exploration)
     record: bool = False  # whether to write reward terms
     contacts: Sequence[int] = ()  # the environments in which to measure after every step how far bodies overlap

@@ -30,6 +30,7 @@ class RunningEpisode:
         self.write: Callable[[Mapping[str, NDArray[Any]], int, Any], None]
         """Writes an observation into row `index` of each array."""
         self._metrics = metrics  # reward terms of weight 0
+        self._is_task = isinstance(env.unwrapped, TaskEnv)
         self._discrete = isinstance(env.action_space, spaces.Discrete)
         self._clear(-1)
 
@@ -43,9 +44,11 @@ class RunningEpisode:
         self._raw_sums = dict.fromkeys(self._metrics, 0.0)
         self._deepest_contact: float | None = None
 
-    def start(self, seed: int) -> Any:
-        """Begin the episode of a seed; return its first observation."""
+    def start(self, seed: int, level: float) -> Any:
+        """Begin the episode of a seed, of a task at this level; return its first observation."""
         self._clear(seed)
+        if self._is_task:
+            self.env.unwrapped.set_level(level)
         observation, info = _check_tuple(self.env.reset(seed=seed), _RESET, "reset")
         _check_info(info)
         return observation

@@ -76,7 +76,7 @@ class SharedArrays:
         # Segments come last, so that the other arrays do not move when segments get longer.
         arrays = map_arrays(
             descriptor,
-            {"inside": ((n_envs, 3), np.dtype(np.int64))}
+            {"inside": ((n_envs, 3), np.dtype(np.int64)), "level": ((n_envs,), np.dtype(np.float64))}
             | {f"observation/{key}": ((n_envs, *shape), dtype) for key, (shape, dtype) in observation.items()}
             | {f"segment/{name}": ((n_envs, steps, *shape), dtype) for name, (shape, dtype) in of_segment.items()}
             | {f"segment/observation/{k}": ((n_envs, steps + 1, *shape), d) for k, (shape, d) in observation.items()},
@@ -84,6 +84,8 @@ class SharedArrays:
         self.inside = arrays["inside"]
         """Episode seed, step and row of the segment during a call of each environment, shape (n_envs, 3); errors name
         them if a worker dies or hangs. Step 0 is the reset; the step is negative outside of calls."""
+        self.level = arrays["level"]
+        """How hard the episode of each environment is, or the next one that begins, from 0 to 1; shape (n_envs,)."""
         self.observation = {key: arrays[f"observation/{key}"] for key in observation}  # the current ones, by key
         self.segment = SegmentArrays(
             {key: arrays[f"segment/observation/{key}"] for key in observation},

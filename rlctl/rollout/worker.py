@@ -183,7 +183,8 @@ class Worker:
 
     def _begin(self, episode: RunningEpisode, seed: int) -> None:
         self._arrays.inside[episode.index] = seed, 0, -1
-        episode.write(self._arrays.observation, episode.index, episode.start(seed))
+        first = episode.start(seed, float(self._arrays.level[episode.index]))
+        episode.write(self._arrays.observation, episode.index, first)
 
     def _replay(self, episode: RunningEpisode, actions: NDArray[np.generic]) -> bool:
         """Take steps with recorded actions; return whether the episode ended."""
@@ -258,7 +259,9 @@ class Worker:
                     write(segment.final, row - 1, observation)
                     seed = next(next_seeds)
                     inside[:] = seed, 0, row
-                    observation = episode.start(seed)
+                    if asked.levels is not None:
+                        arrays.level[index] = asked.levels.follow(float(arrays.level[index]), ended[-1].success)
+                    observation = episode.start(seed, float(arrays.level[index]))
                     if player.state is not None:
                         player.state[:] = 0.0
             write(now, row, observation)

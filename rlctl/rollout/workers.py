@@ -150,6 +150,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         self._numbers.forget()
         self._ready = True
         self._attach(self._steps)
+        self._arrays.level[:] = self.spec.level
 
     def _give_each_a_process(self, shared_world: messages.SharedWorld) -> None:
         self._pool.close(grace_s=0.0)  # their close could end the world of another environment
@@ -176,6 +177,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         """
         self._wait_until_built()
         self.spec = spec
+        self._arrays.level[:] = spec.level
         self._info = _info_of(self._ask_all(messages.SetEvents(spec, dict(push) if push else None), "changing events"))
         return self._info
 

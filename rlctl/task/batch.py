@@ -78,7 +78,7 @@ class BatchTask(TaskDefinition):
 
     def prepare(self, sim: Sim, worlds: int) -> None:
         """Set the number of worlds and the attributes of `per_world`, and build the world. rlctl calls it."""
-        self.sim, self.worlds = sim, worlds
+        self.sim, self.worlds, self.level = sim, worlds, np.ones(worlds)
         for name, shape in self.per_world.items():
             setattr(self, name, np.zeros((worlds, *shape)))
         self.build(sim)
@@ -105,6 +105,14 @@ class OneWorld(Task):
     def reset(self, rng: np.random.Generator) -> None:
         self.batch.clear_kept(np.zeros(1, np.int64))
         self.batch.reset(WorldRngs([rng]), np.zeros(1, np.int64))
+
+    @property
+    def level(self) -> float:
+        return float(self.batch.level[0])
+
+    @level.setter
+    def level(self, value: float) -> None:
+        self.batch.level[:] = value
 
     def act(self, action: NDArray[Any]) -> None:
         self.batch.act(np.asarray(action)[None])
@@ -173,7 +181,9 @@ def as_single(task: Task | BatchTask) -> Task:
         raise TaskError(
             f"{type(task).__name__} does not define {', '.join(missing)}; a task needs {', '.join(required)}"
         )
-    values = {name: getattr(task, name) for name in TaskDefinition.__annotations__ if hasattr(task, name)}
+    values = {
+        name: getattr(task, name) for name in TaskDefinition.__annotations__ if name != "level" and hasattr(task, name)
+    }
     if type(task).is_success is not BatchTask.is_success:
         values["is_success"] = _is_success
     single: Task = type(type(task).__name__, (OneWorld,), values | {"__doc__": type(task).__doc__})()

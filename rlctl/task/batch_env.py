@@ -80,13 +80,15 @@ class BatchEnv:
             bounds = self.task.observation_bounds
             self._signals = BatchSignals(self.worlds, self._events, single._first, self._space, bounds)
 
-    def reset(self, worlds: Worlds, seeds: Sequence[int]) -> NDArray[np.float32]:
-        """Begin the episodes of `seeds` in `worlds`; return their first observations, shape (k, size)."""
+    def reset(self, worlds: Worlds, seeds: Sequence[int], levels: Array | None = None) -> NDArray[np.float32]:
+        """Begin the episodes of `seeds` in `worlds`; return their first observations, shape (k, size).
+
+        `levels`, shape (k,), is how hard they are; by default as the single environment's.
+        """
         self.sim.restore(worlds)
         self.step_of[worlds] = 0
         generators = [np_random(int(seed))[0] for seed in seeds]
-        level = self._single.level
-        self._levels[worlds] = level
+        self._levels[worlds] = self.task.level[worlds] = self._single.level if levels is None else levels
         if self._privileged is not None:
             self._privileged[worlds] = 0.0  # what is of an event that has not acted yet
         for world, seed in zip(worlds.tolist(), seeds, strict=True):
@@ -97,7 +99,7 @@ class BatchEnv:
         for world in worlds.tolist():
             self._act("start", world)
             if self._signals is not None:
-                self._signals.begin(world, self._streams[world], level)
+                self._signals.begin(world, self._streams[world], float(self._levels[world]))
         with self._leave_others(worlds):
             observation = self._observe(worlds)
             self._check_kept("reset")

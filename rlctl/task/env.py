@@ -101,7 +101,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         check_declaration(self.name, task.mirror, sizes, self._examples[0])
 
     def set_level(self, level: float) -> None:
-        """Set the level of ranges written `{from: ..., to: ...}`, from 0 (`from`) to 1 (`to`), for the next resets."""
+        """Set the level of the task, and of ranges written `{from: ..., to: ...}`, from 0 to 1, for the next resets."""
         self.level = float(level)
 
     def show_critic(self, *, task: bool, events: bool) -> None:
@@ -164,7 +164,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             self._build()
             if self._markers:
                 self._add_markers(list(self._markers))
-        self._episode_level = self.level
+        self._episode_level = self.task.level = self.level
         if self.events and (seed is not None or not self._streams):
             base = int(self.np_random.integers(2**63)) if seed is None else seed
             self._streams = seed_streams(self.events, base)

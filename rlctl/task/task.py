@@ -53,6 +53,9 @@ class TaskDefinition:
     """Reset by restoring the built world. False loads the world again at every reset, which is a hundred times slower:
     for worlds whose contacts do not repeat bit for bit after a restore."""
 
+    level: Any = 1.0
+    """How hard the episode is that `reset` begins, from 0 to 1: the `level` of the curriculum's stage, 1 without one.
+    For a `BatchTask` an array of shape (worlds,)."""
     sim: Sim
     """The simulation this task was built in; set before `build`."""
 

@@ -18,8 +18,8 @@ from rlctl.errors import RecipeError, RlctlError
 from rlctl.output import format_count
 from rlctl.policy.file import PolicyFile
 from rlctl.recipe.recipe import Recipe
-from rlctl.recipe.stages import Promotion, Stage, format_title
-from rlctl.rollout.messages import EpisodeResult
+from rlctl.recipe.stages import FollowingLevel, Promotion, Stage, format_title
+from rlctl.rollout.messages import EpisodeResult, LevelRule
 from rlctl.rollout.workers import Workers
 from rlctl.training.display import percent
 from rlctl.training.rollouts import Rollouts
@@ -43,6 +43,12 @@ class Curriculum:
     def _rule(self) -> Promotion | None:
         """Promotion rule of the current stage; None for the last."""
         return self.stages[self._progress.stage - 1].promote if self.stages else None
+
+    @property
+    def level_rule(self) -> LevelRule | None:
+        """How the levels of the environments follow success in the current stage; None where they do not."""
+        level = self.stages[self._progress.stage - 1].level if self.stages else 1.0
+        return LevelRule(**level.model_dump()) if isinstance(level, FollowingLevel) else None
 
     @property
     def title(self) -> str:
@@ -130,8 +136,10 @@ class Learner:
     def begin_next_stage(self) -> tuple[str, str]:
         """Cut the running episodes short and begin the next stage; return its title and the reason."""
         self.env.workers.rebuild(self.curriculum.specs[self.progress.stage])
+        begun = self.curriculum.enter_next_stage(self.steps)
+        self.env.follow_success(self.curriculum.level_rule)
         begin_next_episodes(self.model)
-        return self.curriculum.enter_next_stage(self.steps)
+        return begun
 
 
 def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:

@@ -19,7 +19,7 @@ from rlctl.errors import EpisodeFailed
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import Recipe
-from rlctl.rollout.messages import EpisodeResult, Play
+from rlctl.rollout.messages import EpisodeResult, LevelRule, Play
 from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
@@ -57,6 +57,8 @@ class WorkerVecEnv(VecEnv):
         self.run_seed = run_seed
         self.episodes_started = [0] * workers.n_envs  # per environment the number of episodes that have begun
         self._actions: list[list[NDArray[Any]]] = []  # of the running episodes: by environment, in parts
+        self._levels: NDArray[np.float64] = workers.arrays.level.copy()  # when the last segment had ended
+        self._level_rule: LevelRule | None = None
         self.outside, self.outside_message = 0, ""  # observations outside their space since it was set to 0
         self.ended: list[EpisodeResult] = []  # episodes that ended since the list was emptied
         self.last_segment: SegmentArrays | None = None  # of `finish`; the next segment overwrites its arrays
@@ -66,6 +68,21 @@ class WorkerVecEnv(VecEnv):
         observation_space, action_space = workers.info.spaces()
         privileged = sum(workers.privileged_sizes.values())
         super().__init__(workers.n_envs, widen_space(observation_space, privileged), action_space)
+
+    def follow_success(self, rule: LevelRule | None) -> None:
+        """Begin the next episode of each environment at the rule's first level; without a rule at that of the spec."""
+        self._level_rule = rule
+        self.levels = np.full(self.num_envs, self.workers.spec.level if rule is None else rule.start)
+
+    @property
+    def levels(self) -> NDArray[np.float64]:
+        """How hard the running episode of each environment is, from 0 to 1, shape (n_envs,)."""
+        return self._levels
+
+    @levels.setter
+    def levels(self, levels: NDArray[np.float64]) -> None:
+        self._levels = levels.copy()
+        self.workers.arrays.level[:] = levels
 
     def _seed(self, env: int, episode: int) -> int:
         return episode_seed(self.run_seed, Stream.TRAIN, env, episode)
@@ -103,7 +120,8 @@ class WorkerVecEnv(VecEnv):
         self._steps, self._is_playing = steps, True
         self.workers.arrays.inside[:, 2] = -1
         running, next_episodes = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
-        self.workers.start_playing(Play(steps, running, next_episodes, self.run_seed, exploration=exploration))
+        rule = self._level_rule
+        self.workers.start_playing(Play(steps, running, next_episodes, self.run_seed, rule, exploration))
 
     def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
         """Wait for the steps that `start` began; `check` is called several times a second."""
@@ -114,6 +132,7 @@ class WorkerVecEnv(VecEnv):
             error.actions = self._failed_actions(error)
             raise
         self._is_playing = False
+        self._levels = self.workers.arrays.level.copy()
         self.waited_s += time.monotonic() - began
         segment, steps = self.workers.arrays.segment, self._steps
         last_rows = {episode.env: episode.row for episode in ended}  # where the last episode of the segment ended

@@ -26,6 +26,7 @@ from rlctl.output import format_count
 from rlctl.printed_lines import PrintedLines
 from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import ON_POLICY, Recipe
+from rlctl.recipe.stages import FollowingLevel
 from rlctl.rollout.shared_world import explain_processes
 from rlctl.rollout.workers import Workers, available_cores
 from rlctl.run import directory
@@ -158,7 +159,9 @@ def _build_learner(
 
         display.phase("cloning demonstrations")
         clone(start, rollouts, goal, display.message)
-    return Learner(recipe, rollouts, Curriculum(recipe.stages, specs, goal, progress), progress)
+    curriculum = Curriculum(recipe.stages, specs, goal, progress)
+    env.follow_success(curriculum.level_rule)
+    return Learner(recipe, rollouts, curriculum, progress)
 
 
 def _refuse_success_rates(start: Start) -> None:
@@ -166,6 +169,8 @@ def _refuse_success_rates(start: Start) -> None:
     if recipe.stop_success is not None:
         raise RecipeError(f"stop_success: {problem}; leave it out")
     for number, stage in enumerate(recipe.stages, start=1):
+        if isinstance(stage.level, FollowingLevel):
+            raise RecipeError(f"stage {number} of {len(recipe.stages)}: level: {problem}, which it would follow")
         if stage.promote is not None and stage.promote.success is not None:
             raise RecipeError(
                 f"stage {number} of {len(recipe.stages)}: promote.success: {problem}; "
