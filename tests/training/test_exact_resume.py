@@ -28,6 +28,10 @@ NORMALIZED = {"normalize": {"observation": True, "reward": True}}
 STAGES = {
     "stages": [{"task": {"tolerance": 0.5}, "promote": {"success": 0.5, "window": 6}}, {"task": {"tolerance": 0.3}}]
 }
+LEVELS = {
+    "stages": [{"level": {"start": 0.1, "up": 0.3, "down": 0.2}}],
+    "events": {"mass": {"factor": {"from": [1.0, 1.0], "to": [0.5, 2.0]}}, "kick": {}},
+}
 WIDE = {"policy_kwargs": {"net_arch": [128, 128]}}
 STOOL = "tests.task.batches:Stool"
 CASES = {
@@ -47,6 +51,8 @@ CASES = {
     "recurrent_ppo, on worlds in batches": (STOOL, settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
     "ppo, privileged, on worlds in batches": (STOOL, settings("ppo", randomize=True, privileged={})),
     "ppo, mirrored": ("walk", settings("ppo", mirror=True, randomize=True, task={"episode_s": 0.4})),
+    "ppo, levels, on worlds in batches": (STOOL, settings("ppo", **LEVELS)),
+    "sac, levels": (STOOL, settings("sac", **LEVELS)),
     "ppo, privileged, on reach": (
         "reach",
         settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"], randomize=True, privileged={}),
