@@ -23,7 +23,7 @@ ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
 """Algorithms with hindsight replay: those with a replay buffer, except crossq, which has no network for Dict spaces."""
 
-WITH_PRIVILEGED: tuple[Algorithm, ...] = ("ppo", "a2c", "sac", "tqc")
+WITH_PRIVILEGED: tuple[Algorithm, ...] = ("ppo", "a2c", "recurrent_ppo", "sac", "tqc")
 """Algorithms whose critic may see more than the actor."""
 
 SCHEMA_FILE = Path(__file__).with_name("recipe.schema.json")

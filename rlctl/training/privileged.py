@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from sb3_contrib.tqc.policies import TQCPolicy
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
@@ -114,6 +115,36 @@ class PrivilegedActorCriticPolicy(Privileged, ActorCriticPolicy):
         self.mlp_extractor.value_net = critic.value_net
 
 
+class PrivilegedRecurrentPolicy(Privileged, RecurrentActorCriticPolicy):
+    """Recurrent PPO's networks; each has its own LSTM, or the critic has none."""
+
+    def __init__(
+        self, *args: Any, privileged: Mapping[str, int], share_features_extractor: bool = True, **kwargs: Any
+    ) -> None:
+        if kwargs.get("shared_lstm"):
+            raise ValueError("shared_lstm: the critic sees more than the actor, so they share no LSTM")
+        self.privileged, self._shares = privileged, share_features_extractor
+        kwargs["share_features_extractor"] = False
+        super().__init__(*args, **kwargs)
+        # SB3 has made the critic's for the actor's features.
+        size, hidden = self.vf_features_extractor.features_dim, self.lstm_output_dim
+        if self.lstm_critic is None:
+            self.critic = torch.nn.Linear(size, hidden)
+        else:
+            self.lstm_critic = torch.nn.LSTM(size, hidden, num_layers=self.lstm_actor.num_layers, **self.lstm_kwargs)
+        rate = self.optimizer.param_groups[0]["lr"]
+        self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        """Return the actor's extractor; `_build_mlp_extractor` makes the critic's."""
+        return self.make_actor_columns()
+
+    def _build_mlp_extractor(self) -> None:
+        actor: Any = self.pi_features_extractor
+        self.vf_features_extractor = self.make_critic_columns(actor.inner if self._shares else None)
+        super()._build_mlp_extractor()
+
+
 class PrivilegedSACPolicy(Privileged, SACPolicy):
     """SAC's networks."""
 
@@ -157,6 +188,7 @@ class PrivilegedTQCPolicy(Privileged, TQCPolicy):
 POLICIES: dict[str, Any] = {
     "ppo": PrivilegedActorCriticPolicy,
     "a2c": PrivilegedActorCriticPolicy,
+    "recurrent_ppo": PrivilegedRecurrentPolicy,
     "sac": PrivilegedSACPolicy,
     "tqc": PrivilegedTQCPolicy,
 }

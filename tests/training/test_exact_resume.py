@@ -58,6 +58,14 @@ CASES = {
         settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"], randomize=True, privileged={}),
     ),
     "sac, privileged": (STOOL, settings("sac", randomize=True, privileged={}, **NORMALIZED)),
+    "recurrent_ppo, privileged": (
+        STOOL,
+        settings("recurrent_ppo", randomize=True, privileged={}, policy_kwargs={"lstm_hidden_size": 8}),
+    ),
+    "recurrent_ppo, privileged, one LSTM": (
+        STOOL,
+        settings("recurrent_ppo", privileged={}, policy_kwargs={"lstm_hidden_size": 8, "enable_critic_lstm": False}),
+    ),
     "tqc, privileged": (STOOL, settings("tqc", randomize=True, privileged={"task": False})),
     "ppo, on hopper": ("hopper", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
     "a2c": ("Line", settings("a2c")),

@@ -131,7 +131,7 @@ def test_a_policy_with_a_privileged_critic_starts_another_training(train, tmp_pa
 @pytest.mark.parametrize(
     ("settings", "task", "message"),
     [
-        ({"algo": "td3"}, STOOL, "td3 has no critic that may see more than its actor; ppo, a2c, sac, tqc"),
+        ({"algo": "td3"}, STOOL, "td3 has no critic that may see more than its actor; ppo, a2c, rec"),
         ({}, "Line", "is a plain Gymnasium environment; only tasks have it"),
         ({}, "reach", "a critic of Reach would see no more than the actor"),
         ({"privileged": {"event": True}}, STOOL, "no key 'privileged.event'. Did you mean 'events'?"),
@@ -142,6 +142,11 @@ def test_a_policy_with_a_privileged_critic_starts_another_training(train, tmp_pa
             "mirror: supp",
         ),
         ({"mirror": True, "algo": "sac"}, "walk", "mirror: supported only for PPO"),
+        (
+            {"algo": "recurrent_ppo", "policy_kwargs": {"shared_lstm": True, "enable_critic_lstm": False}},
+            STOOL,
+            "shared_lstm: the critic sees more than the actor",
+        ),
         ({"policy_kwargs": {"policy_class": "own_nets.py:Policy"}}, STOOL, "policy_kwargs.policy_class"),
     ],
 )
