@@ -5,8 +5,8 @@ from rlctl_locomotion.walk import Walk
 SIDES_ONLY = (4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9)
 
 
-class Declares(Walk):
-    """The declaration of `walk` is sound."""
+class MirrorsTurning(Walk):
+    mirror = {**Walk.mirror, "gyroscope": (-1, 2, -3)}
 
 
 class MirrorsTurningLikeVectors(Walk):

@@ -10,7 +10,7 @@ from tests.checking.judging import case, check_case, findings, found, verdict_of
 pytest.importorskip("mujoco")
 
 FILE = "broken_mirrors.py"
-TWIN = f"{FILE}:Declares"
+TWIN = f"{FILE}:MirrorsTurning"
 CASES = [
     case(f"{FILE}:MirrorsTurningLikeVectors", ("RL119", "error"), twin=TWIN),
     case(f"{FILE}:TurnsHipsTheSameWay", ("RL119", "error"), twin=TWIN),
