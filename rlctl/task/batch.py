@@ -108,6 +108,7 @@ class OneWorld(Task):
 
     @property
     def level(self) -> float:
+        """How hard the next episode is; see `TaskDefinition.level`."""
         return float(self.batch.level[0])
 
     @level.setter

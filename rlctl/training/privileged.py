@@ -195,6 +195,11 @@ POLICIES: dict[str, Any] = {
 """The policy of each algorithm whose critic may see more than the actor."""
 
 
+def name_as_sb3(name: str) -> str:
+    """Return the name that a tensor of a policy has where its critic sees what the actor sees, as in policy files."""
+    return name.replace("_extractor.inner.", "_extractor.")
+
+
 def read_privileged(policy: Any) -> dict[str, int]:
     """Return the sizes of what only the critic of a policy sees, by name; empty if it sees what the actor sees."""
     return dict(policy.privileged) if has_privileged_critic(policy) else {}

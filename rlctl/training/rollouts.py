@@ -25,7 +25,7 @@ from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
 from rlctl.task.mirror import Mirror
 from rlctl.training.own_networks import write_graph
-from rlctl.training.privileged import widen, widen_space
+from rlctl.training.privileged import name_as_sb3, widen, widen_space
 from rlctl.training.snapshot import observation_statistics, pack, select_actor
 from rlctl.training.status import Progress
 from rlctl.training.updates.choice import choose_learner
@@ -272,7 +272,8 @@ class Rollouts(abc.ABC):
         model, workers = self.model, self.env.workers
         if self._policy_info is None:
             self._policy_info = pack(model, self._algo, workers.spec, workers.info).info
-        tensors = {f"policy/{name}": value.cpu().numpy() for name, value in model.policy.state_dict().items()}
+        state = {name_as_sb3(name): value for name, value in model.policy.state_dict().items()}
+        tensors = {f"policy/{name}": value.cpu().numpy() for name, value in state.items()}
         for key, moments in statistics.items():
             mean, var = (select_actor(part, model.policy) for part in moments)
             tensors |= {f"normalize/{key}/mean": mean, f"normalize/{key}/var": var}

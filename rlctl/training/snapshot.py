@@ -18,7 +18,7 @@ from rlctl.errors import ArtifactError, DivergedError
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.torch_policy import describe_network, policy_name
 from rlctl.training.own_networks import write_graph
-from rlctl.training.privileged import has_privileged_critic, read_privileged
+from rlctl.training.privileged import has_privileged_critic, name_as_sb3, read_privileged
 from rlctl.version import collect_versions
 
 Tensors = dict[str, NDArray[Any]]
@@ -34,7 +34,8 @@ def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> Policy
     """Return a copy of a model's policy, with its current normalisation."""
     normalizer = model.get_vec_normalize_env()
     statistics = observation_statistics(normalizer)
-    tensors = {f"policy/{key}": value.cpu().numpy().copy() for key, value in model.policy.state_dict().items()}
+    state = {name_as_sb3(name): value for name, value in model.policy.state_dict().items()}
+    tensors = {f"policy/{key}": value.cpu().numpy().copy() for key, value in state.items()}
     for key, rms in statistics.items():
         for part, values in (("mean", rms.mean), ("var", rms.var)):
             actor = select_actor(values, model.policy)

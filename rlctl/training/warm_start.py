@@ -69,9 +69,11 @@ def load_source(source: Mapping[str, Any], model: Any, env: EnvInfo) -> str:
 
 def _check_network(file: Path, info: PolicyInfo, model: Any, weights: Mapping[str, Any]) -> None:
     from rlctl.policy.torch_policy import describe_network
+    from rlctl.training.privileged import name_as_sb3
 
     ours = describe_network(model.policy)
-    network = {f"policy/{name}": tuple(tensor.shape) for name, tensor in model.policy.state_dict().items()}
+    state = {name_as_sb3(name): tensor for name, tensor in model.policy.state_dict().items()}
+    network = {f"policy/{name}": tuple(tensor.shape) for name, tensor in state.items()}
     given = {f"policy/{name}": tensor.shape for name, tensor in weights.items()}
     wrong = [name for name, shape in given.items() if network.get(name) != shape]
     wrong += [name for name in list_actor_tensors(info.algo, list(network)) if name not in given]
@@ -88,11 +90,14 @@ def _check_network(file: Path, info: PolicyInfo, model: Any, weights: Mapping[st
 def _load_weights(info: PolicyInfo, model: Any, weights: Mapping[str, Any]) -> None:
     import torch
 
+    from rlctl.training.privileged import name_as_sb3
+
     state = {name: torch.from_numpy(tensor.copy()) for name, tensor in weights.items()}
     actor, target = _TARGETS.get(info.algo, ("", ""))
     if actor and not any(name.startswith(target) for name in state):
         state |= {target + name.removeprefix(actor): tensor for name, tensor in state.items() if name.startswith(actor)}
-    model.policy.load_state_dict(state, strict=False)  # the critic may be missing
+    named = {name: state[found] for name in model.policy.state_dict() if (found := name_as_sb3(name)) in state}
+    model.policy.load_state_dict(named, strict=False)  # the critic may be missing
 
 
 def _load_normalization(file: Path, info: PolicyInfo, model: Any, tensors: Mapping[str, Any]) -> None:

@@ -1,5 +1,7 @@
 """A critic that sees more than the actor: what it sees, what the actor does not, and what is refused."""
 
+from pathlib import Path
+
 import numpy as np
 import onnx
 import pytest
@@ -19,6 +21,7 @@ from tests.training.comparing import assert_same_run
 
 pytest.importorskip("mujoco")
 
+NETS = Path(__file__).with_name("own_nets.py")
 STOOL = "tests.task.batches:Stool"
 SEEN = {"task": True, "events": True}
 SMALL = {
@@ -112,6 +115,28 @@ def test_only_the_actor_is_exported(train, tmp_path):
     (report,) = export_policy(ExportRequest(str(run.path), ("onnx",), "last", None))
     ports = onnx.load(str(report.path)).graph.input
     assert [[axis.dim_value for axis in port.type.tensor_type.shape.dim][1:] for port in ports] == [[observed]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("algo", "own"),
+    [
+        ("ppo", {}),
+        ("ppo", {"share_features_extractor": False}),
+        ("sac", {}),
+        ("recurrent_ppo", {"lstm_hidden_size": 8}),
+    ],
+)
+def test_networks_of_ones_own(train, algo, own):
+    kwargs = {"features_extractor_class": f"{NETS}:Gated", "features_extractor_kwargs": {"features_dim": 6}, **own}
+    of_algorithm = {"algo_kwargs": {"learning_starts": 16, "batch_size": 16}} if algo == "sac" else {}
+    run = train(STOOL, {**SMALL, "algo": algo, "policy_kwargs": kwargs, **of_algorithm}, envs="").run
+    (report,) = export_policy(ExportRequest(str(run.path), ("onnx",), "last", None))
+    assert report.not_verified == ""
+    again = train(
+        STOOL, {**SMALL, "algo": algo, "policy_kwargs": kwargs, **of_algorithm}, envs="", initial_policy=str(run.path)
+    )
+    assert again.run.path != run.path
 
 
 @pytest.mark.slow
