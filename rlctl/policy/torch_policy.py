@@ -156,9 +156,10 @@ class TorchPolicy(Policy):
     @classmethod
     def _build(cls, policy: PolicyFile) -> Self:
         network = build_network(policy.info)
-        weights = policy.actor_only().weights
-        if policy.info.privileged:  # the actor's may include the critic's, which had other inputs
-            weights = {name: value for name, value in weights.items() if "mlp_extractor.value_net" not in name}
+        weights = policy.weights
+        if policy.info.privileged:  # the critic's have other inputs than this network
+            actor = policy.actor_only().weights
+            weights = {name: value for name, value in actor.items() if "mlp_extractor.value_net" not in name}
         state = {name: torch.from_numpy(value.copy()) for name, value in weights.items()}
         mismatch = network.load_state_dict(state, strict=False)
         # A shipped policy has no critic, and acting needs none.

@@ -57,9 +57,7 @@ class Stage(Section):
     events: dict[str, dict[str, Any]] = {}
     """Changes of the recipe's `events`."""
     level: Annotated[Number, Field(ge=0, le=1)] | FollowingLevel = 1.0
-    """How hard it is, from 0 to 1: the width of event ranges written `{from: ..., to: ...}`, where 0 is `from` and 1 is
-    `to`, and `self.level` of the task. With start, up and down each environment has its own level, which follows the
-    success of its episodes; evaluations have level 1."""
+    """Difficulty: `self.level` of the task, and ranges `{from: ..., to: ...}` of events; or how each environment's follows."""
     promote: Promotion | None = None
     """When the stage ends; the last stage has none."""
 

@@ -272,8 +272,8 @@ class Rollouts(abc.ABC):
         model, workers = self.model, self.env.workers
         if self._policy_info is None:
             self._policy_info = pack(model, self._algo, workers.spec, workers.info).info
-        state = {name_as_sb3(name): value for name, value in model.policy.state_dict().items()}
-        tensors = {f"policy/{name}": value.cpu().numpy() for name, value in state.items()}
+        weights = {name_as_sb3(name): value for name, value in model.policy.state_dict().items()}
+        tensors = {f"policy/{name}": value.cpu().numpy() for name, value in weights.items()}
         for key, moments in statistics.items():
             mean, var = (select_actor(part, model.policy) for part in moments)
             tensors |= {f"normalize/{key}/mean": mean, f"normalize/{key}/var": var}
