@@ -57,7 +57,7 @@ class Stage(Section):
     events: dict[str, dict[str, Any]] = {}
     """Changes of the recipe's `events`."""
     level: Annotated[Number, Field(ge=0, le=1)] | FollowingLevel = 1.0
-    """Difficulty: `self.level` of the task, and ranges `{from: ..., to: ...}` of events; or how each environment's follows."""
+    """Difficulty: `self.level` of the task, and event ranges `{from: ..., to: ...}`; or how it follows success."""
     promote: Promotion | None = None
     """When the stage ends; the last stage has none."""
 
