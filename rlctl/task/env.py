@@ -16,7 +16,7 @@ from rlctl.task.batch import BatchTask, OneWorld, as_single
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
 from rlctl.task.events.event import Drawn
-from rlctl.task.joints import Joints
+from rlctl.task.joints import check_joints
 from rlctl.task.mirror import ACTION, check_declaration
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.observation import Observation, ObservationFormat
@@ -85,7 +85,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             self._signals = Signals(self.events, first, self.action_space, task.observation_bounds)
             self._signals.try_once()
             self._examples = task.privileged(), drawn | self._signals.drawn
-            _check_joints(task)
+            check_joints(task)
             # A task knows its markers after a reset; they are added to the world as it was built.
             markers = list(task.markers()) if render_mode is not None else []
             if self.events or render_mode is not None:
@@ -292,13 +292,3 @@ def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]
         check_name(name, weights, f"reward_weights: {type(task).__name__} has no term", RecipeError)
         weights[name] = float(weight)
     return weights
-
-
-def _check_joints(task: Task) -> None:
-    joints, count = task.describe_joints(), math.prod(task.action_space.shape or ())
-    if joints is not None and (not isinstance(joints, Joints) or len(joints.names) != count):
-        given = list(joints.names) if isinstance(joints, Joints) else joints
-        raise TaskError(
-            f"{type(task).__name__}: describe_joints() returned {short_repr(given)}; "
-            f"return body.describe_joints(names) with {count} names, one per element of the action"
-        )

@@ -3,8 +3,9 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
-from rlctl.errors import TaskError
+from rlctl.errors import TaskError, short_repr
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,3 +37,14 @@ class Joints:
         if odd := [name for name in self.names if not isinstance(name, str)]:
             raise TaskError(f"joints: names must be text, not {odd[0]!r}")
         object.__setattr__(self, "names", tuple(self.names))
+
+
+def check_joints(task: Any) -> None:
+    """Raise `TaskError` if what a task's `describe_joints` returns does not fit its action."""
+    joints, count = task.describe_joints(), math.prod(task.action_space.shape or ())
+    if joints is not None and (not isinstance(joints, Joints) or len(joints.names) != count):
+        given = list(joints.names) if isinstance(joints, Joints) else joints
+        raise TaskError(
+            f"{type(task).__name__}: describe_joints() returned {short_repr(given)}; "
+            f"return body.describe_joints(names) with {count} names, one per element of the action"
+        )

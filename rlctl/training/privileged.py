@@ -91,32 +91,8 @@ class Privileged:
         return CriticColumns(self.observation_space, inner or self.make_inner(), self.actor_size)
 
 
-class PrivilegedActorCriticPolicy(Privileged, ActorCriticPolicy):
-    """PPO's and A2C's networks."""
-
-    def __init__(
-        self, *args: Any, privileged: Mapping[str, int], share_features_extractor: bool = True, **kwargs: Any
-    ) -> None:
-        self.privileged, self._shares = privileged, share_features_extractor
-        # For SB3 they are two extractors, because they return different features.
-        kwargs["share_features_extractor"] = False
-        super().__init__(*args, **kwargs)
-
-    def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """Return the actor's extractor; `_build_mlp_extractor` makes the critic's."""
-        return self.make_actor_columns()
-
-    def _build_mlp_extractor(self) -> None:
-        actor: Any = self.pi_features_extractor
-        self.vf_features_extractor = self.make_critic_columns(actor.inner if self._shares else None)
-        arguments = self.net_arch, self.activation_fn, self.device
-        self.mlp_extractor = MlpExtractor(actor.features_dim, *arguments)
-        critic = MlpExtractor(self.vf_features_extractor.features_dim, *arguments)
-        self.mlp_extractor.value_net = critic.value_net
-
-
-class PrivilegedRecurrentPolicy(Privileged, RecurrentActorCriticPolicy):
-    """Recurrent PPO's networks; each has its own LSTM, or the critic has none."""
+class _PrivilegedOnPolicy(Privileged):
+    """What the policies of on-policy algorithms share."""
 
     def __init__(
         self, *args: Any, privileged: Mapping[str, int], share_features_extractor: bool = True, **kwargs: Any
@@ -124,7 +100,35 @@ class PrivilegedRecurrentPolicy(Privileged, RecurrentActorCriticPolicy):
         if kwargs.get("shared_lstm"):
             raise ValueError("shared_lstm: the critic sees more than the actor, so they share no LSTM")
         self.privileged, self._shares = privileged, share_features_extractor
-        kwargs["share_features_extractor"] = False
+        # For SB3 they are two extractors, because they return different features.
+        super().__init__(*args, **{**kwargs, "share_features_extractor": False})
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        """Return the actor's extractor; `set_critic_columns` makes the critic's."""
+        return self.make_actor_columns()
+
+    def set_critic_columns(self) -> None:
+        """Replace the critic's extractor, which SB3 has made as the actor's."""
+        policy: Any = self
+        inner = policy.pi_features_extractor.inner if self._shares else None
+        policy.vf_features_extractor = self.make_critic_columns(inner)
+
+
+class PrivilegedActorCriticPolicy(_PrivilegedOnPolicy, ActorCriticPolicy):
+    """PPO's and A2C's networks."""
+
+    def _build_mlp_extractor(self) -> None:
+        self.set_critic_columns()
+        arguments = self.net_arch, self.activation_fn, self.device
+        self.mlp_extractor = MlpExtractor(self.pi_features_extractor.features_dim, *arguments)
+        critic = MlpExtractor(self.vf_features_extractor.features_dim, *arguments)
+        self.mlp_extractor.value_net = critic.value_net
+
+
+class PrivilegedRecurrentPolicy(_PrivilegedOnPolicy, RecurrentActorCriticPolicy):
+    """Recurrent PPO's networks; each has its own LSTM, or the critic has none."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         # SB3 has made the critic's for the actor's features.
         size, hidden = self.vf_features_extractor.features_dim, self.lstm_output_dim
@@ -135,54 +139,38 @@ class PrivilegedRecurrentPolicy(Privileged, RecurrentActorCriticPolicy):
         rate = self.optimizer.param_groups[0]["lr"]
         self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
-    def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """Return the actor's extractor; `_build_mlp_extractor` makes the critic's."""
-        return self.make_actor_columns()
-
     def _build_mlp_extractor(self) -> None:
-        actor: Any = self.pi_features_extractor
-        self.vf_features_extractor = self.make_critic_columns(actor.inner if self._shares else None)
+        self.set_critic_columns()
         super()._build_mlp_extractor()
 
 
-class PrivilegedSACPolicy(Privileged, SACPolicy):
+class _PrivilegedOffPolicy(Privileged):
+    """What the policies of off-policy algorithms share."""
+
+    def __init__(
+        self, *args: Any, privileged: Mapping[str, int], share_features_extractor: bool = False, **kwargs: Any
+    ) -> None:
+        if share_features_extractor:
+            raise ValueError("share_features_extractor: the critic sees more than the actor, so they share none")
+        self.privileged = privileged
+        super().__init__(*args, **kwargs)
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        """Return a critic's extractor; `make_actor` makes the actor's."""
+        return self.make_critic_columns()
+
+    def make_actor(self, features_extractor: Any = None) -> Any:
+        """Return the actor, which sees its own part."""
+        parent: Any = super()
+        return parent.make_actor(self.make_actor_columns())
+
+
+class PrivilegedSACPolicy(_PrivilegedOffPolicy, SACPolicy):
     """SAC's networks."""
 
-    def __init__(
-        self, *args: Any, privileged: Mapping[str, int], share_features_extractor: bool = False, **kwargs: Any
-    ) -> None:
-        if share_features_extractor:
-            raise ValueError("share_features_extractor: the critic sees more than the actor, so they share none")
-        self.privileged = privileged
-        super().__init__(*args, **kwargs)
 
-    def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """Return a critic's extractor; `make_actor` makes the actor's."""
-        return self.make_critic_columns()
-
-    def make_actor(self, features_extractor: Any = None) -> Any:
-        """Return the actor, which sees its own part."""
-        return super().make_actor(self.make_actor_columns())
-
-
-class PrivilegedTQCPolicy(Privileged, TQCPolicy):
+class PrivilegedTQCPolicy(_PrivilegedOffPolicy, TQCPolicy):
     """TQC's networks."""
-
-    def __init__(
-        self, *args: Any, privileged: Mapping[str, int], share_features_extractor: bool = False, **kwargs: Any
-    ) -> None:
-        if share_features_extractor:
-            raise ValueError("share_features_extractor: the critic sees more than the actor, so they share none")
-        self.privileged = privileged
-        super().__init__(*args, **kwargs)
-
-    def make_features_extractor(self) -> BaseFeaturesExtractor:
-        """Return a critic's extractor; `make_actor` makes the actor's."""
-        return self.make_critic_columns()
-
-    def make_actor(self, features_extractor: Any = None) -> Any:
-        """Return the actor, which sees its own part."""
-        return super().make_actor(self.make_actor_columns())
 
 
 POLICIES: dict[str, Any] = {

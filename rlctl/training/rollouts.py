@@ -6,7 +6,7 @@ The normalisation statistics are constant while a segment is played, and are upd
 import abc
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from rlctl.environments.dict_spaces import Observations, join, split_space
+from rlctl.environments.dict_spaces import Observations, count_outside, join
 from rlctl.errors import EpisodeFailed
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.players.player import Exploration
@@ -29,24 +29,6 @@ from rlctl.training.privileged import name_as_sb3, widen, widen_space
 from rlctl.training.snapshot import observation_statistics, pack, select_actor
 from rlctl.training.status import Progress
 from rlctl.training.updates.choice import choose_learner
-
-
-def _count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[Any]]) -> tuple[int, str]:
-    """Count observations, shape (n_envs, steps, ...), outside their space; return also a message about one."""
-    outside: Any = False  # later an array, one element per observation
-    message = ""
-    for key, box in split_space(space).items():
-        if not isinstance(box, spaces.Box) or box.dtype == np.uint8:
-            continue
-        values = observations[key]
-        wrong = ((values < box.low) | (values > box.high)).reshape(*values.shape[:2], -1)
-        if wrong.any():
-            outside |= wrong.any(axis=2)
-            env, step, element = np.argwhere(wrong)[0].tolist()
-            value, low, high = (array.ravel()[element] for array in (values[env, step], box.low, box.high))
-            name = f"observation {key!r}" if key else "observation"
-            message = f"{name} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
-    return int(np.count_nonzero(outside)), message
 
 
 class WorkerVecEnv(VecEnv):
@@ -145,7 +127,7 @@ class WorkerVecEnv(VecEnv):
         last = segment.first(steps, ended)
         last = dataclasses.replace(last, observation=widen(last.observation), final=widen(last.final))
         seen = {key: rows[:, 1:] for key, rows in last.observation.items()}
-        count, message = _count_outside(self.observation_space, seen)
+        count, message = count_outside(self.observation_space, seen)
         self.outside, self.outside_message = self.outside + count, self.outside_message or message
         self.last_segment = last
         return last
