@@ -5,6 +5,7 @@ policy's parameters are in shared memory.
 """
 
 import contextlib
+import dataclasses
 import gc
 from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
@@ -110,9 +111,9 @@ class Worker:
         for episode in self._episodes:
             episode.write = CriticWriter(writer, episode.env).write if self._privileged else writer.write
         gc.freeze()  # present objects live long: later collections skip them
-        lockstep, sizes = self._batch is not None, self._privileged
         mirror = getattr(getattr(envs[0].unwrapped, "task", None), "mirror", {}) if checked else {}
-        return Answer((), (), self._info, lockstep, shared_world, privileged=sizes, mirror=mirror)
+        built = Answer(info=self._info, lockstep=self._batch is not None, shared_world=shared_world)
+        return dataclasses.replace(built, privileged=self._privileged, mirror=mirror)
 
     def _set_events(self, message: messages.SetEvents) -> EnvInfo:
         spec, added = message.spec, {}
