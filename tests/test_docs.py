@@ -281,7 +281,7 @@ def test_the_page_on_tasks_has_all_that_a_task_has():
     from rlctl.task import Body, Task, events, rewards
     from rlctl.task.task import TaskDefinition
 
-    definition = {name for name in TaskDefinition.__annotations__ if name != "sim"}
+    definition = {name for name in TaskDefinition.__annotations__ if name not in ("sim", "level")}
     assert first_column(section("docs/task.md", "The definition")) == definition
     methods = {
         name

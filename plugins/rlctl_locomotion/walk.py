@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rlctl.task import BatchTask, Box, CommandTerm, Event, Joints, Sim, WorldRngs, events, rewards, terms
+from rlctl.task import BatchTask, Body, Box, CommandTerm, Event, Joints, Sim, WorldRngs, events, rewards, terms
 from rlctl.task.rotations import rotate_inverse
 from rlctl_locomotion.quadruped import JOINTS
 
@@ -16,7 +16,7 @@ START_HEIGHT, HEIGHT, FALLEN = 0.30, 0.28, 0.14  # [m], of the trunk
 LOWEST = np.array([-0.5, -0.4, -0.8])  # commanded velocities forwards and sideways [m/s], and of turning [rad/s]
 HIGHEST = np.array([1.0, 0.4, 0.8])
 VELOCITIES = {"lin_vel_x": "m/s", "lin_vel_y": "m/s", "ang_vel_z": "rad/s"}  # their names and units
-SCALE = 0.5  # [m/s] and [rad/s]; so far from the command, tracking is worth 1/e
+OTHER_SIDE = (-4, 5, 6, -1, 2, 3, -10, 11, 12, -7, 8, 9)  # joints of the mirror image: hips turn the other way
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -61,7 +61,14 @@ class Walk(BatchTask):
         "fall": -1.0,
         "velocity_error": 0.0,  # a metric [m/s]
     }
+    scale = 0.5  # [m/s] and [rad/s]; so far from the command, tracking is worth 1/e
     per_world = {"command": (3,), "last_action": (12,), "action_change": (12,), "error_sum": (), "steps": ()}
+    mirror = {
+        "gyroscope": (-1, 2, -3),
+        "gravity": (1, -2, 3),
+        "command": (1, -2, -3),
+        **dict.fromkeys(("joint_positions", "joint_velocities", "last_action", "action"), OTHER_SIDE),
+    }
     events = {  # with `randomize: true`
         "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
         "friction": Event("reset", events.set_friction, body="ground", friction=(0.4, 1.2)),
@@ -79,13 +86,17 @@ class Walk(BatchTask):
 
     def build(self, sim: Sim) -> None:
         """Load the ground and the robot."""
-        self.ground = sim.load("ground", "plane.urdf", fixed=True)
+        self.ground = self.load_ground(sim)
         self.ground.set_friction(0.8)
         self.body = sim.load("robot", "a1.urdf", position=(0.0, 0.0, START_HEIGHT))
         self.body.set_friction(1.0)  # times the ground's
         self.body.set_drives(STIFFNESS, DAMPING, armature=ARMATURE)
         self.body.set_joint_damping(0.3)  # [N m s/rad], of the gears
         self.joints = self.body.find_joints(JOINTS)
+
+    def load_ground(self, sim: Sim) -> Body:
+        """Load the body `ground`."""
+        return sim.load("ground", "plane.urdf", fixed=True)
 
     def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
         """Stand, with a commanded velocity."""
@@ -112,10 +123,14 @@ class Walk(BatchTask):
         self.velocity = rotate_inverse(orientation, self.body.base_velocity)  # [m/s], of the trunk, in its frame
         self.turning = rotate_inverse(orientation, self.body.base_angular_velocity)  # [rad/s], in its frame
         self.gravity = rotate_inverse(orientation, DOWN)
-        self.height = self.body.base_position[:, 2]
+        self.height = self.measure_height()
         self.fallen = (self.gravity[:, 2] > -0.5) | (self.height < FALLEN)
         self.error = np.linalg.norm(self.command[:, :2] - self.velocity[:, :2], axis=1)  # [m/s]
         self.error_sum += self.error
+
+    def measure_height(self) -> np.ndarray:
+        """Return the height of the trunk above the ground [m]."""
+        return self.body.base_position[:, 2]
 
     def observe(self) -> dict[str, np.ndarray]:
         """Return what the robot's own sensors measure, the command and the last action; see `observation_terms`."""
@@ -132,8 +147,8 @@ class Walk(BatchTask):
     def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
         """Return how well the command is followed, and how calmly."""
         return {
-            "tracking": rewards.closeness(self.error, SCALE),
-            "turning": rewards.closeness(self.command[:, 2] - self.turning[:, 2], SCALE),
+            "tracking": rewards.closeness(self.error, self.scale),
+            "turning": rewards.closeness(self.command[:, 2] - self.turning[:, 2], self.scale),
             "bounce": self.velocity[:, 2] ** 2,
             "sway": np.sum(self.turning[:, :2] ** 2, axis=1),
             "smoothness": rewards.squared(self.action_change),

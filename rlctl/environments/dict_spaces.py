@@ -59,6 +59,24 @@ def split_names(observations: Any, sizes: Mapping[str, int]) -> dict[str, NDArra
     return dict(zip(sizes, np.split(newest, np.cumsum([*sizes.values()])[:-1], axis=1), strict=True))
 
 
+def count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[Any]]) -> tuple[int, str]:
+    """Count observations, shape (n_envs, steps, ...), outside their space; return also a message about one."""
+    outside: Any = False  # later an array, one element per observation
+    message = ""
+    for key, box in split_space(space).items():
+        if not isinstance(box, spaces.Box) or box.dtype == np.uint8:
+            continue
+        values = observations[key]
+        wrong = ((values < box.low) | (values > box.high)).reshape(*values.shape[:2], -1)
+        if wrong.any():
+            outside |= wrong.any(axis=2)
+            env, step, element = np.argwhere(wrong)[0].tolist()
+            value, low, high = (array.ravel()[element] for array in (values[env, step], box.low, box.high))
+            name = f"observation {key!r}" if key else "observation"
+            message = f"{name} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
+    return int(np.count_nonzero(outside)), message
+
+
 def is_image(space: spaces.Space[Any]) -> bool:
     """Return whether a space is of images, as Stable-Baselines3 defines them: uint8 from 0 to 255, three axes."""
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) != 3:

@@ -45,6 +45,8 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
     """Clip of normalised observations; None where observations are not normalised."""
     normalized_keys: list[str] = []
     """Keys of the normalised parts of a dict observation; `""` for any other observation."""
+    privileged: dict[str, int] = {}
+    """Size of each observation that only the critic saw in training, by name."""
     env: EnvInfo
     spec: PolicySpec  # how to build the environment; for a curriculum, its last stage
     stages: list[PolicySpec] = []  # stages of the curriculum

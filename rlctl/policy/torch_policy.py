@@ -74,7 +74,7 @@ def network_space(space: spaces.Space[Any]) -> spaces.Space[Any]:
 
 def is_own(cls: type) -> bool:
     """Return whether a policy or a features extractor is a user's own, not one of Stable-Baselines3."""
-    return cls.__module__.partition(".")[0] not in ("stable_baselines3", "sb3_contrib")
+    return cls.__module__.partition(".")[0] not in ("stable_baselines3", "sb3_contrib", "rlctl")
 
 
 def describe_network(policy: BasePolicy) -> dict[str, Any]:
@@ -156,7 +156,11 @@ class TorchPolicy(Policy):
     @classmethod
     def _build(cls, policy: PolicyFile) -> Self:
         network = build_network(policy.info)
-        state = {name: torch.from_numpy(value.copy()) for name, value in policy.weights.items()}
+        weights = policy.weights
+        if policy.info.privileged:  # the critic's have other inputs than this network
+            actor = policy.actor_only().weights
+            weights = {name: value for name, value in actor.items() if "mlp_extractor.value_net" not in name}
+        state = {name: torch.from_numpy(value.copy()) for name, value in weights.items()}
         mismatch = network.load_state_dict(state, strict=False)
         # A shipped policy has no critic, and acting needs none.
         missing = list_actor_tensors(policy.info.algo, [f"policy/{name}" for name in mismatch.missing_keys])

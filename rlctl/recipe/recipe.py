@@ -14,7 +14,7 @@ from rlctl.errors import RecipeError, UsageError, short_repr
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS, decide_by
 from rlctl.recipe.hyperparameters import ON_POLICY as ON_POLICY
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
-from rlctl.recipe.stages import Stage, check_promotions
+from rlctl.recipe.stages import FollowingLevel, Stage, check_promotions
 from rlctl.storage import validation, yaml_text
 from rlctl.storage.validation import Number, Section, Switch, Whole
 
@@ -22,6 +22,9 @@ Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", 
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
 """Algorithms with hindsight replay: those with a replay buffer, except crossq, which has no network for Dict spaces."""
+
+WITH_PRIVILEGED: tuple[Algorithm, ...] = ("ppo", "a2c", "recurrent_ppo", "sac", "tqc")
+"""Algorithms whose critic may see more than the actor."""
 
 SCHEMA_FILE = Path(__file__).with_name("recipe.schema.json")
 """The JSON schema of recipes for editors; `docs/generate.py` writes it."""
@@ -70,6 +73,15 @@ class Hindsight(Section):
     """Which of the goals that the episode reached later replace the desired goal."""
 
 
+class PrivilegedSettings(Section):
+    """What the critic sees besides the actor's observation, in training only."""
+
+    task: Switch = True
+    """Whether it sees what the task names in `privileged()`."""
+    events: Switch = True
+    """Whether it sees the values that the acting events drew, such as a mass or a push."""
+
+
 class CheckpointSettings(Section):
     """Which checkpoints are kept."""
 
@@ -98,6 +110,10 @@ class Recipe(Section):
     """Parameters of the networks; see the algorithm's own table."""
     her: Hindsight | None = None
     """Hindsight experience replay, for tasks with goals; null: off."""
+    privileged: PrivilegedSettings | None = None
+    """A critic that sees more than the actor, for tasks with flat observations; null: it sees the same."""
+    mirror: Switch = False
+    """PPO: whether to learn from the mirror image of every step too, for tasks that declare their symmetry."""
     normalize: NormalizeSettings | None = Field(
         None, json_schema_extra=decide_by("both for ppo, a2c, recurrent_ppo; else neither")
     )
@@ -166,6 +182,18 @@ class Recipe(Section):
             raise ValueError(f"{algo} does not support hindsight replay; {', '.join(IN_HINDSIGHT)} do")
         return value
 
+    @pydantic.field_validator("privileged")
+    @classmethod
+    def _check_critic(
+        cls, value: PrivilegedSettings | None, others: pydantic.ValidationInfo
+    ) -> PrivilegedSettings | None:
+        algo = others.data.get("algo")
+        if value is not None and algo is not None and algo not in WITH_PRIVILEGED:
+            raise ValueError(
+                f"{algo} has no critic that may see more than its actor; {', '.join(WITH_PRIVILEGED)} have"
+            )
+        return value
+
     def env_specs(self, task: str, named_by: str = "") -> list[EnvSpec]:
         """Return the `EnvSpec` of each stage; a list of one for a recipe without stages.
 
@@ -189,7 +217,7 @@ class Recipe(Section):
                 reward_weights={**self.reward_weights, **stage.reward_weights},
                 events=merge(self.events, stage.events),
                 stage=number,
-                level=stage.level,
+                level=1.0 if isinstance(stage.level, FollowingLevel) else stage.level,
             )
             for number, stage in enumerate(self.stages, start=1)
         ] or [base]

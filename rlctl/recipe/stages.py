@@ -1,7 +1,7 @@
 """Curricula: the stages of a recipe, from an easy task to the full task."""
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import pydantic
 from pydantic import Field
@@ -33,6 +33,17 @@ class Promotion(Section):
         return self.success if self.success is not None else self.mean_return or 0.0
 
 
+class FollowingLevel(Section):
+    """A level of each environment that follows the success of its own episodes: what it has mastered gets harder."""
+
+    start: Number = Field(0.0, ge=0, le=1)
+    """Level of the first episode of each environment."""
+    up: Number = Field(0.1, gt=0, le=1)
+    """How much the level rises after an episode that succeeded."""
+    down: Number = Field(0.05, ge=0, le=1)
+    """How much it falls after one that did not."""
+
+
 class Stage(Section):
     """What a stage changes in the recipe's own `task`, `reward_weights` and `events`, and when it ends.
 
@@ -45,8 +56,8 @@ class Stage(Section):
     """Changes of the recipe's `reward_weights`."""
     events: dict[str, dict[str, Any]] = {}
     """Changes of the recipe's `events`."""
-    level: Number = Field(1.0, ge=0, le=1)
-    """Width of event ranges written `{from: ..., to: ...}`: 0 is `from`, 1 is `to`."""
+    level: Annotated[Number, Field(ge=0, le=1)] | FollowingLevel = 1.0
+    """Difficulty: `self.level` of the task, and event ranges `{from: ..., to: ...}`; or how it follows success."""
     promote: Promotion | None = None
     """When the stage ends; the last stage has none."""
 
@@ -55,7 +66,10 @@ class Stage(Section):
         changes += [f"reward_weights.{name} {value:g}" for name, value in self.reward_weights.items()]
         for event, parameters in self.events.items():
             changes += [f"{event}.{name} {value}" for name, value in parameters.items()] or [event]
-        changes += [f"level {self.level:g}"] if self.level != 1 else []
+        if isinstance(self.level, FollowingLevel):
+            changes.append(f"levels from {self.level.start:g} that follow success")
+        elif self.level != 1:
+            changes.append(f"level {self.level:g}")
         return ", ".join(changes) or "the recipe's own task"
 
 

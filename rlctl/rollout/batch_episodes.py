@@ -15,7 +15,7 @@ from rlctl.printed_lines import print_line
 from rlctl.rollout import messages
 from rlctl.rollout.messages import EpisodeResult, FailedInEpisode
 from rlctl.rollout.seeds import list_training_seeds
-from rlctl.rollout.shared_arrays import SharedArrays
+from rlctl.rollout.shared_arrays import CRITIC, SharedArrays
 from rlctl.task.batch_env import BatchEnv, BatchStep
 
 Worlds = NDArray[np.int64]
@@ -45,10 +45,11 @@ class BatchEpisodes:
             [self.seeds[worlds], np.zeros(len(worlds), np.int64), np.full(len(worlds), -1)], axis=1
         )
         try:
-            first = self.env.reset(worlds, [int(seed) for seed in seeds])
+            first = self.env.reset(worlds, [int(seed) for seed in seeds], arrays.level[self._first + worlds])
         except BaseException as error:  # a plugin may raise anything, SystemExit too
             self._fail(error, int(worlds[0]))
         arrays.observation[SINGLE][self._first + worlds] = first
+        self._show_critic(arrays.observation, worlds, self._first + worlds)
         inside[worlds, 1] = -1
         return first
 
@@ -80,6 +81,7 @@ class BatchEpisodes:
                 break
             result = self._step(np.stack([actions[env][step] for env in running.tolist()]), running)
             arrays.observation[SINGLE][self._first + running] = result.observation
+            self._show_critic(arrays.observation, running, self._first + running)
             ended = result.terminated | result.truncated
             left += running[ended].tolist()
             running = running[~ended]
@@ -93,6 +95,15 @@ class BatchEpisodes:
         self._return[worlds] += result.reward
         self._sums[worlds] += result.terms
         return result
+
+    def _show_critic(self, target: Mapping[str, NDArray[Any]], worlds: Worlds, index: Any) -> None:
+        """Write what only the critic sees now into rows of arrays."""
+        if CRITIC not in target:
+            return
+        try:
+            target[CRITIC][index] = self.env.observe_privileged(worlds)
+        except BaseException as error:  # a plugin may raise anything, SystemExit too
+            self._fail(error, int(worlds[0]))
 
     def _fail(self, error: BaseException, world: int) -> NoReturn:
         world = getattr(error, "world", world)  # of `WorldFailed` and `in_world`
@@ -111,7 +122,8 @@ class BatchEpisodes:
             env: list_training_seeds(asked.run_seed, env, number) for env, number in asked.next_episodes.items()
         }
         segment, now = arrays.segment, arrays.segment.observation[SINGLE]
-        now[envs, 0] = arrays.observation[SINGLE][envs]
+        for key, rows in segment.observation.items():
+            rows[envs, 0] = arrays.observation[key][envs]
         inside = arrays.inside
         inside[envs, 0] = self.seeds[worlds]
         players.begin_segment(self.seeds, self.env.step_of, worlds)
@@ -129,23 +141,32 @@ class BatchEpisodes:
             if asked.record:
                 segment.terms[envs, row] = result.terms
             now[envs, row + 1] = result.observation
+            self._show_critic(segment.observation, worlds, (envs, row + 1))
             self._measure_contacts(worlds[np.isin(envs, asked.contacts)])
             done = result.terminated | result.truncated
             if done.any():
                 for k in np.flatnonzero(done).tolist():
                     world = int(worlds[k])
                     ended.append(self._summarize(k, world, row, result, players.report(world)))
-                segment.final[SINGLE][envs[done], row] = result.observation[done]
+                for key, rows in segment.final.items():
+                    rows[envs[done], row] = segment.observation[key][envs[done], row + 1]
                 if following:
                     fresh = [next(following[int(env)]) for env in envs[done]]
-                    now[envs[done], row + 1] = self.begin(arrays, worlds[done], fresh)
+                    if asked.levels is not None:
+                        for last in ended[-len(fresh) :]:
+                            level = float(arrays.level[last.env])
+                            arrays.level[last.env] = asked.levels.follow(level, last.success)
+                    self.begin(arrays, worlds[done], fresh)
+                    for key, rows in segment.observation.items():
+                        rows[envs[done], row + 1] = arrays.observation[key][envs[done]]
                     players.begin_episodes(worlds[done])
                 else:
                     arrays.observation[SINGLE][envs[done]] = result.observation[done]
                     envs, worlds = envs[~done], worlds[~done]
                     if not len(envs):
                         break
-        arrays.observation[SINGLE][envs] = now[envs, asked.steps]
+        for key, rows in segment.observation.items():
+            arrays.observation[key][envs] = rows[envs, asked.steps]
         inside[self._first : self._first + self.env.worlds, 1] = -1
         players.end_segment(played)
         return sorted(

@@ -2,7 +2,7 @@
 
 import dataclasses
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,7 @@ class Build:
     """Close the environments, if there are any, and build those of a spec."""
 
     spec: EnvSpec
+    privileged: Mapping[str, bool] | None = None  # what only the critic sees; the arguments of `TaskEnv.show_critic`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +84,19 @@ class LimitActions:
 
 
 @dataclasses.dataclass(frozen=True)
+class LevelRule:
+    """How the level of an environment follows the success of its episodes."""
+
+    start: float
+    up: float
+    down: float
+
+    def follow(self, level: float, success: bool | None) -> float:
+        """Return the level of the episode after one at `level`; rounded, so that equal levels are equal numbers."""
+        return round(min(1.0, level + self.up) if success else max(0.0, level - self.down), 9)
+
+
+@dataclasses.dataclass(frozen=True)
 class Play:
     """Play a segment in some environments, one after the other."""
 
@@ -91,6 +105,7 @@ class Play:
     next_episodes: dict[int, int] = dataclasses.field(default_factory=dict)
     """Per environment the number of the training episode that follows when one ends; empty: none follows."""
     run_seed: int = 0
+    levels: LevelRule | None = None  # of the episodes that follow
     exploration: Exploration = dataclasses.field(default_factory=Exploration)
     record: bool = False  # whether to write reward terms
     contacts: Sequence[int] = ()  # the environments in which to measure after every step how far bodies overlap
@@ -145,6 +160,9 @@ class Answer:
     info: EnvInfo | None = None  # description of the environments, if it has changed
     lockstep: bool = False  # whether they are the worlds of a `BatchTask`, which play together
     shared_world: SharedWorld | None = None  # of environments that were built
+    privileged: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """Size of each observation that only the critic sees, by name."""
+    mirror: Mapping[str, Sequence[int]] = dataclasses.field(default_factory=dict)  # the task's declaration
     rewards: NDArray[np.float64] | None = None  # those of `ComputeRewards`, shape (n,)
 
 

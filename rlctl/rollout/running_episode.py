@@ -2,7 +2,7 @@
 
 import math
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,12 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import SINGLE, split, split_space
-from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import RecipeError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.output import format_count
 from rlctl.rollout.messages import EpisodeResult
-from rlctl.rollout.shared_arrays import observation_fields
+from rlctl.rollout.shared_arrays import CRITIC, observation_fields
+from rlctl.task.env import TaskEnv
 
 _STEP = ("observation", "reward", "terminated", "truncated", "info")
 _RESET = ("observation", "info")
@@ -25,7 +27,10 @@ class RunningEpisode:
     def __init__(self, env: Any, index: int, metrics: Sequence[str] = ()) -> None:
         self.env = env
         self.index = index  # number of the environment
+        self.write: Callable[[Mapping[str, NDArray[Any]], int, Any], None]
+        """Writes an observation into row `index` of each array."""
         self._metrics = metrics  # reward terms of weight 0
+        self._is_task = isinstance(env.unwrapped, TaskEnv)
         self._discrete = isinstance(env.action_space, spaces.Discrete)
         self._clear(-1)
 
@@ -39,9 +44,11 @@ class RunningEpisode:
         self._raw_sums = dict.fromkeys(self._metrics, 0.0)
         self._deepest_contact: float | None = None
 
-    def start(self, seed: int) -> Any:
-        """Begin the episode of a seed; return its first observation."""
+    def start(self, seed: int, level: float) -> Any:
+        """Begin the episode of a seed, of a task at this level; return its first observation."""
         self._clear(seed)
+        if self._is_task:
+            self.env.unwrapped.set_level(level)
         observation, info = _check_tuple(self.env.reset(seed=seed), _RESET, "reset")
         _check_info(info)
         return observation
@@ -179,6 +186,32 @@ def _category_bounds(space: spaces.Space[Any]) -> NDArray[Any] | None:
         start = np.asarray(space.start)
         return np.stack([start, start + space.nvec - 1])
     return None
+
+
+class CriticWriter:
+    """Writes a task's observations with an `ObservationWriter`, and beside them what only the critic sees."""
+
+    def __init__(self, writer: ObservationWriter, env: Any) -> None:
+        self._writer, self._env = writer, env.unwrapped
+
+    def write(self, target: Mapping[str, NDArray[Any]], index: int, observation: Any) -> None:
+        """Write an observation into row `index` of each array."""
+        self._writer.write(target, index, observation)
+        target[CRITIC][index] = self._env.observe_privileged()
+
+
+def show_critic(spec: EnvSpec, env: Any, privileged: Mapping[str, bool]) -> dict[str, int]:
+    """Let an environment observe what only the critic sees; return its sizes by name, or raise `RecipeError`."""
+    inner, space = env.unwrapped, env.observation_space
+    if not isinstance(inner, TaskEnv):
+        raise RecipeError(f"privileged: {spec.task} is a plain Gymnasium environment; only tasks have it")
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise RecipeError(
+            f"privileged: {spec.task} observes {space}; a critic sees more only beside a flat observation"
+        )
+    inner.show_critic(**privileged)
+    assert inner.privileged is not None
+    return inner.privileged.sizes
 
 
 def compute_rewards(env: Any, achieved: NDArray[Any], desired: NDArray[Any]) -> NDArray[np.float64]:

@@ -17,6 +17,8 @@ from rlctl.rollout.messages import EpisodeResult
 
 Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]  # shape and dtype per name
 
+CRITIC = "critic"
+"""Key of what only the critic sees, beside the keys of the observation."""
 _ALIGNMENT = 64  # [bytes], a cache line: two workers never write one
 _ROWS = ("stored", "action", "reward", "terminated", "truncated", "terms")
 """The arrays of a segment that have a row for each step."""
@@ -55,9 +57,12 @@ class SharedArrays:
     The file has no name, so nothing is left behind if the processes are killed. Unused pages take no memory.
     """
 
-    def __init__(self, descriptor: int, info: EnvInfo, n_envs: int, steps: int) -> None:
+    def __init__(self, descriptor: int, info: EnvInfo, n_envs: int, steps: int, privileged: int = 0) -> None:
+        """Map the arrays; `privileged` is the number of values that only the critic sees, under the key `CRITIC`."""
         observation_space, action_space = info.spaces()
-        observation, action = observation_fields(observation_space), _leaf(action_space)
+        observation, action = dict(observation_fields(observation_space)), _leaf(action_space)
+        if privileged:
+            observation[CRITIC] = (privileged,), np.dtype(np.float32)
         stored = np.dtype(np.float32 if isinstance(action_space, spaces.Box) else np.int64)
         of_segment: Layout = {
             "stored": ((max(1, int(np.prod(action[0]))),), stored),
@@ -71,7 +76,7 @@ class SharedArrays:
         # Segments come last, so that the other arrays do not move when segments get longer.
         arrays = map_arrays(
             descriptor,
-            {"inside": ((n_envs, 3), np.dtype(np.int64))}
+            {"inside": ((n_envs, 3), np.dtype(np.int64)), "level": ((n_envs,), np.dtype(np.float64))}
             | {f"observation/{key}": ((n_envs, *shape), dtype) for key, (shape, dtype) in observation.items()}
             | {f"segment/{name}": ((n_envs, steps, *shape), dtype) for name, (shape, dtype) in of_segment.items()}
             | {f"segment/observation/{k}": ((n_envs, steps + 1, *shape), d) for k, (shape, d) in observation.items()},
@@ -79,6 +84,8 @@ class SharedArrays:
         self.inside = arrays["inside"]
         """Episode seed, step and row of the segment during a call of each environment, shape (n_envs, 3); errors name
         them if a worker dies or hangs. Step 0 is the reset; the step is negative outside of calls."""
+        self.level = arrays["level"]
+        """How hard the episode of each environment is, or the next one that begins, from 0 to 1; shape (n_envs,)."""
         self.observation = {key: arrays[f"observation/{key}"] for key in observation}  # the current ones, by key
         self.segment = SegmentArrays(
             {key: arrays[f"segment/observation/{key}"] for key in observation},

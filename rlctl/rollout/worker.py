@@ -5,8 +5,9 @@ policy's parameters are in shared memory.
 """
 
 import contextlib
+import dataclasses
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
 from time import perf_counter
 from typing import Any
@@ -30,7 +31,13 @@ from rlctl.processes.pool import answer_messages
 from rlctl.rollout import messages
 from rlctl.rollout.batch_episodes import BatchEpisodes, Players
 from rlctl.rollout.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
-from rlctl.rollout.running_episode import ObservationWriter, RunningEpisode, compute_rewards
+from rlctl.rollout.running_episode import (
+    CriticWriter,
+    ObservationWriter,
+    RunningEpisode,
+    compute_rewards,
+    show_critic,
+)
 from rlctl.rollout.seeds import list_training_seeds
 from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
 from rlctl.rollout.shared_world import make_watched
@@ -51,8 +58,8 @@ class Worker:
         self._make_player: Callable[[], Player]
         self._states: NDArray[np.float32] | None = None
         self._info: EnvInfo
+        self._privileged: dict[str, int] = {}  # sizes of what only the critic sees
         self._arrays: SharedArrays
-        self._writer: ObservationWriter
 
     def answer(self, message: Message) -> Answer:
         """Execute a message and return the answer."""
@@ -64,18 +71,19 @@ class Worker:
             case messages.ComputeRewards():
                 return Answer(rewards=compute_rewards(self._episodes[0].env, message.achieved, message.desired))
             case messages.Build():
-                return self._build(message.spec)
+                return self._build(message.spec, message.privileged)
             case messages.SetEvents():
                 return Answer(info=self._set_events(message))
             case messages.Attach():
-                self._arrays = SharedArrays(self._job.memory, self._info, self._job.total, message.steps)
+                size = sum(self._privileged.values())
+                self._arrays = SharedArrays(self._job.memory, self._info, self._job.total, message.steps, size)
             case messages.LoadPolicy():
                 self._load_policy(message)
             case messages.LimitActions():
                 self._limit_actions(message)
         return Answer()
 
-    def _build(self, spec: EnvSpec) -> Answer:
+    def _build(self, spec: EnvSpec, privileged: Mapping[str, bool] | None) -> Answer:
         if self._episodes:
             self.close()
             gc.unfreeze()
@@ -86,19 +94,26 @@ class Worker:
         else:
             first = spec.make()
         envs = [first]
+        self._privileged = {} if privileged is None else show_critic(spec, first, privileged)
         if (batch := spec.make_batch(first, self._job.count)) is not None:
             self._batch = BatchEpisodes(batch, self._job.first)
         elif shared_world is None:
             envs += [spec.make() for _ in range(self._job.count - 1)]
+            for env in envs[1:] if privileged is not None else ():
+                show_critic(spec, env, privileged or {})
         self._info = describe(envs[0])
         metrics = [name for name, weight in self._info.reward_weights.items() if weight == 0]
         self._episodes = [RunningEpisode(env, self._job.first + index, metrics) for index, env in enumerate(envs)]
         space = envs[0].observation_space
         # A task's environment checks its observations itself.
         checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
-        self._writer = ObservationWriter(space, checked=checked)
+        writer = ObservationWriter(space, checked=checked)
+        for episode in self._episodes:
+            episode.write = CriticWriter(writer, episode.env).write if self._privileged else writer.write
         gc.freeze()  # present objects live long: later collections skip them
-        return Answer(info=self._info, lockstep=self._batch is not None, shared_world=shared_world)
+        mirror = getattr(getattr(envs[0].unwrapped, "task", None), "mirror", {}) if checked else {}
+        built = Answer(info=self._info, lockstep=self._batch is not None, shared_world=shared_world)
+        return dataclasses.replace(built, privileged=self._privileged, mirror=mirror)
 
     def _set_events(self, message: messages.SetEvents) -> EnvInfo:
         spec, added = message.spec, {}
@@ -169,7 +184,8 @@ class Worker:
 
     def _begin(self, episode: RunningEpisode, seed: int) -> None:
         self._arrays.inside[episode.index] = seed, 0, -1
-        self._writer.write(self._arrays.observation, episode.index, episode.start(seed))
+        first = episode.start(seed, float(self._arrays.level[episode.index]))
+        episode.write(self._arrays.observation, episode.index, first)
 
     def _replay(self, episode: RunningEpisode, actions: NDArray[np.generic]) -> bool:
         """Take steps with recorded actions; return whether the episode ended."""
@@ -177,7 +193,7 @@ class Worker:
             episode.step += 1
             self._arrays.inside[episode.index, 1] = episode.step
             observation, _, terminated, truncated, _ = episode.take_step(action)
-            self._writer.write(self._arrays.observation, episode.index, observation)
+            episode.write(self._arrays.observation, episode.index, observation)
             if terminated or truncated:
                 return True
         return False
@@ -206,7 +222,7 @@ class Worker:
         self, episode: RunningEpisode, asked: messages.Play, next_seeds: Iterator[int] | None
     ) -> list[EpisodeResult]:
         """Play a segment of one environment; without `next_seeds` it stops when an episode ends."""
-        arrays, index, player, write = self._arrays, episode.index, self._loaded_player, self._writer.write
+        arrays, index, player, write = self._arrays, episode.index, self._loaded_player, episode.write
         segment, inside = arrays.segment.of(index), arrays.inside[index]
         now = segment.observation
         single = now.get(SINGLE)
@@ -244,7 +260,9 @@ class Worker:
                     write(segment.final, row - 1, observation)
                     seed = next(next_seeds)
                     inside[:] = seed, 0, row
-                    observation = episode.start(seed)
+                    if asked.levels is not None:
+                        arrays.level[index] = asked.levels.follow(float(arrays.level[index]), ended[-1].success)
+                    observation = episode.start(seed, float(arrays.level[index]))
                     if player.state is not None:
                         player.state[:] = 0.0
             write(now, row, observation)

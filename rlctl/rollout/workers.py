@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import itertools
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -51,8 +51,10 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         n_workers: int | None = None,
         timeout_s: float = DEFAULT_TIMEOUT_S,
         printed: PrintedLines | None = None,
+        privileged: Mapping[str, bool] | None = None,
     ) -> None:
         self.n_envs = n_envs
+        self._privileged = privileged  # what the critic of a training sees; see `TaskEnv.show_critic`
         self.timeout_s = timeout_s
         self.spec = spec  # spec of the environments
         self.shared_world: messages.SharedWorld | None = None  # why each environment has a process of its own
@@ -89,6 +91,18 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         return self._info
 
     @property
+    def privileged_sizes(self) -> Mapping[str, int]:
+        """Size of each observation that only the critic sees, by name; waits until the environments are built."""
+        self._wait_until_built()
+        return self._privileged_sizes
+
+    @property
+    def mirror(self) -> Mapping[str, Sequence[int]]:
+        """The mirror symmetry that the task declares; empty without one. Waits until the environments are built."""
+        self._wait_until_built()
+        return self._mirror
+
+    @property
     def arrays(self) -> SharedArrays:
         """The shared arrays, a row per environment; waits until the environments are built."""
         self._wait_until_built()
@@ -122,7 +136,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
     def _begin_to_build(self) -> None:
         for worker in range(len(self._ranges)):
-            self._send(worker, messages.Build(self.spec))
+            self._send(worker, messages.Build(self.spec, self._privileged))
 
     def _wait_until_built(self) -> None:
         if self._ready:
@@ -132,9 +146,11 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
             self._give_each_a_process(shared[0])
             return
         self._info, self._lockstep = _info_of(answers), answers[0].lockstep
+        self._privileged_sizes, self._mirror = answers[0].privileged, answers[0].mirror
         self._numbers.forget()
         self._ready = True
         self._attach(self._steps)
+        self._arrays.level[:] = self.spec.level
 
     def _give_each_a_process(self, shared_world: messages.SharedWorld) -> None:
         self._pool.close(grace_s=0.0)  # their close could end the world of another environment
@@ -148,7 +164,8 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
     def _attach(self, steps: int) -> None:
         self._steps = steps
-        self._arrays = SharedArrays(self._memories[0], self._info, self.n_envs, steps)
+        size = sum(self._privileged_sizes.values())
+        self._arrays = SharedArrays(self._memories[0], self._info, self.n_envs, steps, size)
         self._arrays.inside[:] = -1
         self._ask_all(messages.Attach(steps), "attaching")
 
@@ -160,6 +177,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         """
         self._wait_until_built()
         self.spec = spec
+        self._arrays.level[:] = spec.level
         self._info = _info_of(self._ask_all(messages.SetEvents(spec, dict(push) if push else None), "changing events"))
         return self._info
 

@@ -61,6 +61,10 @@ class BatchTask(TaskDefinition):
         """Return the raw reward terms, each of shape (worlds,), by the names of `reward_weights`."""
         raise NotImplementedError
 
+    def privileged(self) -> dict[str, NDArray[np.float64]]:
+        """Return what only a critic sees, by name, each of shape (worlds, size); see `Task.privileged`. Optional."""
+        return {}
+
     def is_success(self) -> Any:
         """Return whether the goal is reached now, shape (worlds,). Optional."""
         return None
@@ -83,7 +87,7 @@ class BatchTask(TaskDefinition):
 
     def prepare(self, sim: Sim, worlds: int) -> None:
         """Set the number of worlds and the attributes of `per_world`, and build the world. rlctl calls it."""
-        self.sim, self.worlds = sim, worlds
+        self.sim, self.worlds, self.level = sim, worlds, np.ones(worlds)
         for name, shape in self.per_world.items():
             setattr(self, name, np.zeros((worlds, *shape)))
         self.build(sim)
@@ -111,11 +115,23 @@ class OneWorld(Task):
         self.batch.clear_kept(np.zeros(1, np.int64))
         self.batch.reset(WorldRngs([rng]), np.zeros(1, np.int64))
 
+    @property
+    def level(self) -> float:
+        """How hard the next episode is; see `TaskDefinition.level`."""
+        return float(self.batch.level[0])
+
+    @level.setter
+    def level(self, value: float) -> None:
+        self.batch.level[:] = value
+
     def act(self, action: NDArray[Any]) -> None:
         self.batch.act(np.asarray(action)[None])
 
     def observe(self) -> dict[str, Any]:
         return self._read("observe", self.batch.observe(), 2)
+
+    def privileged(self) -> dict[str, NDArray[np.float64]]:
+        return self._read("privileged", self.batch.privileged(), 2)
 
     def rewards(self, action: NDArray[Any]) -> dict[str, float]:
         terms = self._read("rewards", self.batch.rewards(np.asarray(action)[None]), 1)
@@ -184,7 +200,9 @@ def as_single(task: Task | BatchTask) -> Task:
         raise TaskError(
             f"{type(task).__name__} does not define {', '.join(missing)}; a task needs {', '.join(required)}"
         )
-    values = {name: getattr(task, name) for name in TaskDefinition.__annotations__ if hasattr(task, name)}
+    values = {
+        name: getattr(task, name) for name in TaskDefinition.__annotations__ if name != "level" and hasattr(task, name)
+    }
     if type(task).is_success is not BatchTask.is_success:
         values["is_success"] = _is_success
     single: Task = type(type(task).__name__, (OneWorld,), values | {"__doc__": type(task).__doc__})()

@@ -1,7 +1,7 @@
 """`BatchEnv`: n worlds of a `BatchTask`, stepped together; the same episodes as of one world at a time."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from rlctl.task.batch import BatchTask, WorldRngs, read_rows
 from rlctl.task.env import TaskEnv
 from rlctl.task.events.acting import ActingEvents, Streams, seed_streams
 from rlctl.task.events.batch_signals import BatchSignals
+from rlctl.task.events.event import Drawn
 from rlctl.task.history import HistoryRows
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.observation import compute_terms
@@ -74,19 +75,25 @@ class BatchEnv:
         self._single = single
         self._events = single.events
         self._acting = ActingEvents(self._events, self.task.control_dt)
+        shown = single.privileged
+        self._privileged = None if shown is None else np.zeros((self.worlds, shown.size), np.float32)
         self._signals: BatchSignals | None = None
         if any(event.event.when in ("observation", "action") for event in self._events.values()):
             assert isinstance(self._space, spaces.Box)
             bounds = self.task.observation_bounds
             self._signals = BatchSignals(self.worlds, self._events, single._first, self._space, bounds)
 
-    def reset(self, worlds: Worlds, seeds: Sequence[int]) -> NDArray[np.float32]:
-        """Begin the episodes of `seeds` in `worlds`; return their first observations, shape (k, size)."""
+    def reset(self, worlds: Worlds, seeds: Sequence[int], levels: Array | None = None) -> NDArray[np.float32]:
+        """Begin the episodes of `seeds` in `worlds`; return their first observations, shape (k, size).
+
+        `levels`, shape (k,), is how hard they are; by default as the single environment's.
+        """
         self.sim.restore(worlds)
         self.step_of[worlds] = 0
         generators = [np_random(int(seed))[0] for seed in seeds]
-        level = self._single.level
-        self._levels[worlds] = level
+        self._levels[worlds] = self.task.level[worlds] = self._single.level if levels is None else levels
+        if self._privileged is not None:
+            self._privileged[worlds] = 0.0  # what is of an event that has not acted yet
         for world, seed in zip(worlds.tolist(), seeds, strict=True):
             self._streams[world] = seed_streams(self._events, int(seed))
             self._act("reset", world)
@@ -95,18 +102,45 @@ class BatchEnv:
         for world in worlds.tolist():
             self._act("start", world)
             if self._signals is not None:
-                self._signals.begin(world, self._streams[world], level)
+                self._signals.begin(world, self._streams[world], float(self._levels[world]))
         if self._history is not None:
             self._history.begin(worlds)
         with self._leave_others(worlds):
             observation = self._observe(worlds)
             self._check_kept("reset")
+        if self._signals is not None:
+            for world in worlds.tolist():
+                self._note(world, self._signals.drawn[world])
         return observation
+
+    def observe_privileged(self, worlds: Worlds) -> NDArray[np.float32]:
+        """Return what only the critic sees now in some worlds, shape (k, size); call `show_critic` of the single."""
+        shown, rows = self._single.privileged, self._privileged
+        assert shown is not None
+        assert rows is not None
+        with self._leave_others(worlds):
+            parts = shown.read_task(self.task)
+            for name, value in parts.items() if isinstance(parts, dict) else ():
+                read_rows(self.name, f"privileged()[{name!r}]", value, (self.worlds, None), np.float64)
+            shown.write_task(rows, parts)
+        chosen = rows[worlds]
+        bad = ~np.isfinite(chosen.sum(axis=1))
+        if bad.any():
+            row = int(bad.argmax())
+            self._fail(worlds[row], f"privileged {shown.find_fault(chosen[row])!r} is not finite")
+        return chosen
+
+    def _note(self, world: int, drawn: Mapping[str, Drawn]) -> None:
+        """Let the critic see what events drew."""
+        if self._privileged is not None and self._single.privileged is not None:
+            with in_world(world):
+                self._single.privileged.write_events(self._privileged[world], drawn)
 
     def _act(self, when: Literal["reset", "start"], world: int) -> None:
         if self._events:
             with in_world(world):
-                self._acting.run(when, self.sim.one(world), self._streams[world], float(self._levels[world]))
+                drawn = self._acting.run(when, self.sim.one(world), self._streams[world], float(self._levels[world]))
+            self._note(world, drawn)
 
     def step(self, action: NDArray[Any], worlds: Worlds | None = None) -> BatchStep:
         """Advance all worlds, or some, by a control step; `action` has a row for each of them, shape (k, ...)."""
@@ -206,7 +240,8 @@ class BatchEnv:
         for world in rows[due].tolist():
             step, level = int(self.step_of[world]), float(self._levels[world])
             with in_world(world):
-                self._acting.run_due(step, self.sim.one(world), self._streams[world], level)
+                drawn = self._acting.run_due(step, self.sim.one(world), self._streams[world], level)
+            self._note(world, drawn)
 
     def _observe(self, rows: Worlds) -> NDArray[np.float32]:
         parts = self.task.observe()

@@ -2,7 +2,6 @@
 
 import copy
 import math
-import numbers
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
@@ -10,17 +9,22 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
+from numpy.typing import NDArray
 
 from rlctl.errors import RecipeError, TaskError, UsageError, check_name, short_repr
 from rlctl.task.batch import BatchTask, OneWorld, as_single
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
+from rlctl.task.events.event import Drawn
 from rlctl.task.history import TermHistory
 from rlctl.task.joints import check_joints
+from rlctl.task.mirror import ACTION, check_declaration
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.observation import Observation, ObservationFormat, compute_terms
+from rlctl.task.privileged import PrivilegedFormat
 from rlctl.task.pybullet.library import is_installed
 from rlctl.task.pybullet.sim import PybulletSim
+from rlctl.task.returned import not_a_number, not_by_name, term_mismatch
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_definition, check_parameters
 
@@ -70,17 +74,21 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self._running = self._closed = False
         self._streams: Streams = {}
         self._markers: dict[str, int] = {}
+        self._drawn: dict[str, Drawn] = {}
+        """Values that the events of this episode drew, the last ones of those at an interval."""
+        self.privileged: PrivilegedFormat | None = None  # what only a critic sees, after `show_critic`
         try:
             self._build()
-            self._acting.try_once(["reset"], self.sim)
+            drawn = self._acting.try_once(["reset"], self.sim)
             task.reset(np.random.default_rng(0))
-            self._acting.try_once(["start", "interval"], self.sim)
+            drawn |= self._acting.try_once(["start", "interval"], self.sim)
             observed = task.observe()
             if not isinstance(observed, dict) or not observed:
-                raise _not_by_name(self.name, "observe", observed)
-            self._first = first = self._compute_terms(observed)
+                raise not_by_name(self.name, "observe", observed)
+            self._first = first = self.compute_terms(observed)
             self._signals = Signals(self.events, first, self.action_space, task.observation_bounds)
             self._signals.try_once()
+            self._examples = task.privileged(), drawn | self._signals.drawn
             quantities = [name for term in task.observation_terms.values() for name in term.inputs]
             check_joints(self.name, task.describe_joints(), self.action_space, [*first, *quantities])
             # A task knows its markers after a reset; they are added to the world as it was built.
@@ -95,10 +103,24 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self._format = ObservationFormat(task, first)
         self._history = TermHistory(task.observation_history, task.history_start)
         self.observation_sizes, self.observation_space = self._format.sizes, self._format.space
+        sizes = {**self.observation_sizes, ACTION: math.prod(self.action_space.shape or ())}
+        check_declaration(self.name, task.mirror, sizes, self._examples[0])
 
     def set_level(self, level: float) -> None:
-        """Set the level of ranges written `{from: ..., to: ...}`, from 0 (`from`) to 1 (`to`), for the next resets."""
+        """Set the level of the task, and of ranges written `{from: ..., to: ...}`, from 0 to 1, for the next resets."""
         self.level = float(level)
+
+    def show_critic(self, *, task: bool, events: bool) -> None:
+        """Let `observe_privileged` return what the task names, and the values of events, from the next reset on.
+
+        Raises `RecipeError` if there is neither.
+        """
+        self.privileged = PrivilegedFormat.of(self.name, *self._examples, task=task, events=events)
+
+    def observe_privileged(self) -> NDArray[np.float32]:
+        """Return what only the critic sees now, shape (size,); call `show_critic` once before."""
+        assert self.privileged is not None
+        return self.privileged.observe(self.task, self._drawn, self._step)
 
     def set_events(self, events: EventSettings, added: Mapping[str, Event] | None = None) -> None:
         """Let only the events of `events` and the `added` ones act; call `reset` afterwards.
@@ -148,7 +170,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             self._build()
             if self._markers:
                 self._add_markers(list(self._markers))
-        self._episode_level = self.level
+        self._episode_level = self.task.level = self.level
         if self.events and (seed is not None or not self._streams):
             base = int(self.np_random.integers(2**63)) if seed is None else seed
             self._streams = seed_streams(self.events, base)
@@ -161,6 +183,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self._running = True
         observation = self._observe()
         drawn |= self._signals.drawn
+        self._drawn = dict(drawn)
         info: dict[str, Any] = {"events": drawn} if drawn else {}
         if self.render_mode == "human":
             self.move_markers()
@@ -179,15 +202,15 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         truncated = not terminated and self._step >= self.max_steps
         raw = task.rewards(action)
         if not isinstance(raw, dict):
-            raise _not_by_name(self.name, "rewards", raw)
+            raise not_by_name(self.name, "rewards", raw)
         weights = self.reward_weights
         if raw.keys() != weights.keys():
-            raise _term_mismatch(self.name, raw, weights)
+            raise term_mismatch(self.name, raw, weights)
         try:
             terms = {name: weight * raw[name] for name, weight in weights.items()}
             reward = float(sum(terms.values()))
         except (TypeError, ValueError):
-            raise _not_a_number(self.name, raw, self._step) from None
+            raise not_a_number(self.name, raw, self._step) from None
         if not math.isfinite(reward):
             bad = next((name for name, term in terms.items() if not math.isfinite(term)), "sum")
             raise TaskError(f"{self.name}: reward term {bad!r} is {terms.get(bad, reward)} at step {self._step}")
@@ -195,6 +218,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         if self._acting.periods:
             drawn = self._acting.run_due(self._step, self.sim, self._streams, self._episode_level)
             info.update({"events": drawn} if drawn else {})
+            self._drawn.update(drawn)
         if self.has_success:
             info["is_success"] = self._read_flag("is_success")
         self._running = not (terminated or truncated)
@@ -228,10 +252,11 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         return action
 
     def _observe(self) -> Observation:
-        parts = self._signals.observe(self._compute_terms(self.task.observe()))
+        parts = self._signals.observe(self.compute_terms(self.task.observe()))
         return self._format.assemble(self._history.add(parts), self._step)
 
-    def _compute_terms(self, observed: Any) -> Any:
+    def compute_terms(self, observed: Any) -> Any:
+        """Return what `Task.observe` returned with its terms computed, as the policy sees it without noise."""
         terms = self.task.observation_terms
         if not terms or not isinstance(observed, dict):
             return observed
@@ -283,18 +308,3 @@ def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]
         check_name(name, weights, f"reward_weights: {type(task).__name__} has no term", RecipeError)
         weights[name] = float(weight)
     return weights
-
-
-def _not_by_name(task: str, method: str, value: Any) -> TaskError:
-    return TaskError(f"{task}: {method}() returned {short_repr(value)}, not a dict of values by name: {{'speed': ...}}")
-
-
-def _not_a_number(task: str, raw: Mapping[str, Any], step: int) -> TaskError:
-    name = next((name for name, value in raw.items() if not isinstance(value, numbers.Real)), "sum")
-    return TaskError(f"{task}: reward term {name!r} is {short_repr(raw.get(name))} at step {step}, not a number")
-
-
-def _term_mismatch(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:
-    problems = [f"rewards() returns {name!r}, which has no weight" for name in raw if name not in weights]
-    problems += [f"reward_weights has {name!r}, which rewards() does not return" for name in weights if name not in raw]
-    return TaskError(f"{task}: {problems[0]}")

@@ -14,6 +14,7 @@ from rlctl.task.commands import CommandTerm
 from rlctl.task.events import Event
 from rlctl.task.history import Start
 from rlctl.task.joints import Joints
+from rlctl.task.mirror import Declaration
 from rlctl.task.sim import Sim
 from rlctl.task.terms import Term
 
@@ -52,6 +53,10 @@ class TaskDefinition:
     """Range per observation name, in its unit; other observations are unbounded."""
     reward_weights: ClassVar[Mapping[str, float]] = {}
     """Weight per reward term; a term with weight 0 is a metric."""
+    mirror: ClassVar[Declaration] = {}
+    """How the robot's mirror image, left and right exchanged, is observed and acts: per observation, and for `action`,
+    which element is each element of the mirrored array, counted from 1, with its sign: `{"gyroscope": (-1, 2, -3)}`.
+    The recipe's key `mirror` uses it. Names of `privileged`, and `events/NAME`, may have an entry too."""
     events: ClassVar[Mapping[str, Event]] = {}
     stages: ClassVar[Sequence[Mapping[str, Any]]] = ()
     """Stages of a curriculum, such as `{"task": {"tolerance": 0.2}, "promote": {"success": 0.8, "window": 100}}`; the
@@ -60,6 +65,9 @@ class TaskDefinition:
     """Reset by restoring the built world. False loads the world again at every reset, which is a hundred times slower:
     for worlds whose contacts do not repeat bit for bit after a restore."""
 
+    level: Any = 1.0
+    """How hard the episode is that `reset` begins, from 0 to 1: the `level` of the curriculum's stage, 1 without one.
+    For a `BatchTask` an array of shape (worlds,)."""
     sim: Sim
     """The simulation this task was built in; set before `build`."""
 
@@ -123,6 +131,14 @@ class Task(TaskDefinition):
     def is_terminated(self) -> bool:
         """Return whether the episode ends, for example after a fall; the time limit is not part of it. Optional."""
         return False
+
+    def privileged(self) -> dict[str, NDArray[np.float64]]:
+        """Return what only a critic sees, by name, such as the true velocity or the friction of the ground. Optional.
+
+        Called after `observe` in a training whose recipe has the key `privileged`, and nowhere else: policies, players
+        and exported files never see it.
+        """
+        return {}
 
     def compute_reward(self, achieved_goal: NDArray[Any], desired_goal: NDArray[Any], info: Any) -> NDArray[Any]:
         """Return the rewards, shape (n,), of steps for other desired goals; goals have shape (n, size). Optional.

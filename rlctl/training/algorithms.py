@@ -17,12 +17,16 @@ from rlctl.errors import RecipeError, RlctlError, UsageError, short_repr
 from rlctl.policy.own_modules import import_named
 from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
 from rlctl.recipe.recipe import ON_POLICY, NormalizeSettings, Recipe
+from rlctl.rollout.workers import Workers
 from rlctl.storage.untrusted import measure_free_memory
+from rlctl.task.mirror import ACTION, join_places
 from rlctl.training.device import describe_device, find_fastest
 from rlctl.training.off_policy import replay_arguments
 from rlctl.training.own_networks import check_policy_class, write_graph
+from rlctl.training.privileged import POLICIES, has_privileged_critic
 from rlctl.training.rollouts import WorkerVecEnv
 from rlctl.training.snapshot import pack
+from rlctl.training.updates.ppo import PpoUpdate
 
 # The system provides a replay buffer's memory only when it is written, so one that is too large fails hours later.
 _FLOAT32 = 4  # [bytes]
@@ -66,6 +70,12 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
     if isinstance(activation := policy_kwargs.get("activation_fn"), str):
         policy_kwargs["activation_fn"] = ACTIVATIONS[activation]
     own_policy = policy_kwargs.pop("policy_class", None)
+    if env.workers.privileged_sizes:
+        if own_policy is not None:
+            raise RecipeError(
+                "policy_kwargs.policy_class: a critic that sees more (privileged) has its own policy class"
+            )
+        own_policy, policy_kwargs["privileged"] = POLICIES[recipe.algo], dict(env.workers.privileged_sizes)
     base = next(iter(cls.policy_aliases.values()))
     if own_policy is not None and not issubclass(own_policy, base):
         raise RecipeError(f"policy_kwargs.policy_class: {own_policy.__name__} is not a subclass of {base.__name__}")
@@ -80,8 +90,10 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         )
         if recipe.algo in _DELAYED_BY_US:
             model.policy_delay = recipe.algo_kwargs.get("policy_delay", 1)  # type: ignore[attr-defined]
+        if recipe.mirror:
+            add_mirror(model, env.workers)
         write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # reports faults of a user's network
-        if own_policy is not None:
+        if own_policy is not None and not has_privileged_critic(model.policy):
             use_sde = {"use_sde": True} if getattr(model, "use_sde", False) else {}
             model.policy.own_arguments = model.policy_kwargs | use_sde  # type: ignore[assignment]
             check_policy_class(model, recipe.algo, pack(model, recipe.algo, env.workers.spec, env.workers.info))
@@ -93,6 +105,20 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         if not own and not isinstance(error, AssertionError | ValueError | TypeError | RuntimeError):
             raise
         raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error) or error, 300)}") from error
+
+
+def add_mirror(model: Any, workers: Workers) -> None:
+    """Let a PPO model learn from mirror images too; raises `RecipeError` where it cannot."""
+    task, info = workers.spec.task, workers.info
+    if not workers.mirror:
+        raise RecipeError(f"mirror: {task} declares no mirror symmetry; leave the key out")
+    if workers.spec.frame_stack > 1 or workers.spec.time_feature:
+        raise RecipeError("mirror: observations with frame_stack or time_feature cannot be mirrored; leave them out")
+    if not PpoUpdate.supports(model):
+        raise RecipeError("mirror: supported only for PPO with multi-layer perceptrons with tanh or ReLU on the CPU")
+    sizes = {**info.observation_sizes, **workers.privileged_sizes}
+    action = {ACTION: len(workers.mirror[ACTION])}
+    model.mirror = join_places(workers.mirror, sizes), join_places(workers.mirror, action)
 
 
 def keep_compiler_out() -> None:

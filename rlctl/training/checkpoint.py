@@ -177,9 +177,10 @@ def find_differences(before: dict[str, str], now: dict[str, str]) -> list[str]:
 def environment_tensors(env: WorkerVecEnv) -> Tensors:
     """Return the numbers, actions and last observations of the running episodes."""
     histories = [env.join_actions(index) for index in range(env.num_envs)]
-    last = split(env.last_observations())
+    last = env.last_observations()
     return {
         "environments/episodes_started": np.array(env.episodes_started, np.int64),
+        "environments/level": env.levels,
         "environments/steps": np.array([len(actions) for actions in histories], np.int64),
         "environments/actions": np.concatenate(histories),
         **{f"environments/observation/{key}": observation for key, observation in last.items()},
@@ -191,6 +192,7 @@ def restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
     steps = tensors["environments/steps"].tolist()
     if len(steps) != env.num_envs:
         raise ArtifactError(f"it was saved with {len(steps)} environments, not {env.num_envs}")
+    env.levels = tensors["environments/level"]
     started = tensors["environments/episodes_started"].tolist()
     mismatch = set(env.replay_actions(started, np.split(tensors["environments/actions"], np.cumsum(steps)[:-1])))
     for key, observation in env.workers.arrays.observation.items():

@@ -161,7 +161,7 @@ class Checkpoints:
         except (ArtifactError, KeyError) as error:
             raise ArtifactError(f"{saved.folder}: {error}") from None
         # SB3 resets the environments if this is None; it has no other use here.
-        learner.model._last_obs = learner.env.workers.observations()
+        learner.model._last_obs = learner.env.observations()
         now = checkpoint.describe_computation(learner.model.device)
         inexact = [*changed, *checkpoint.find_differences(saved.state.computed_with, now)]
         if mismatch is not None:

@@ -18,8 +18,8 @@ from rlctl.errors import RecipeError, RlctlError
 from rlctl.output import format_count
 from rlctl.policy.file import PolicyFile
 from rlctl.recipe.recipe import Recipe
-from rlctl.recipe.stages import Promotion, Stage, format_title
-from rlctl.rollout.messages import EpisodeResult
+from rlctl.recipe.stages import FollowingLevel, Promotion, Stage, format_title
+from rlctl.rollout.messages import EpisodeResult, LevelRule
 from rlctl.rollout.workers import Workers
 from rlctl.training.display import percent
 from rlctl.training.rollouts import Rollouts
@@ -43,6 +43,12 @@ class Curriculum:
     def _rule(self) -> Promotion | None:
         """Promotion rule of the current stage; None for the last."""
         return self.stages[self._progress.stage - 1].promote if self.stages else None
+
+    @property
+    def level_rule(self) -> LevelRule | None:
+        """How the levels of the environments follow success in the current stage; None where they do not."""
+        level = self.stages[self._progress.stage - 1].level if self.stages else 1.0
+        return LevelRule(**level.model_dump()) if isinstance(level, FollowingLevel) else None
 
     @property
     def title(self) -> str:
@@ -130,13 +136,16 @@ class Learner:
     def begin_next_stage(self) -> tuple[str, str]:
         """Cut the running episodes short and begin the next stage; return its title and the reason."""
         self.env.workers.rebuild(self.curriculum.specs[self.progress.stage])
+        begun = self.curriculum.enter_next_stage(self.steps)
+        self.env.follow_success(self.curriculum.level_rule)
         begin_next_episodes(self.model)
-        return self.curriculum.enter_next_stage(self.steps)
+        return begun
 
 
 def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
     """Build an environment of every stage; raise an error if it differs from that of the first; return the last."""
-    first = info = workers.info
+    first, seen = workers.info, workers.privileged_sizes
+    info = first
     for number, spec in enumerate(specs[1:], start=2):
         where = f"stage {number} of {len(specs)}"
         try:
@@ -145,6 +154,12 @@ def check_stages(specs: Sequence[EnvSpec], workers: Workers) -> EnvInfo:
             raise type(error)(f"{where}: {error}", details=error.details) from None
         if difference := info.find_difference(first, "stage 1's"):
             raise RecipeError(f"{where}: {difference}. One policy learns in all stages: leave out what changes it")
+        if workers.privileged_sizes != seen:
+            names = ", ".join(name for name, _ in set(workers.privileged_sizes.items()) ^ set(seen.items()))
+            raise RecipeError(
+                f"{where}: its critic does not see the same as stage 1's: {names}. Let the same events act in all "
+                "stages, or add --set privileged.events=false"
+            )
         if list(info.reward_weights) != list(first.reward_weights):
             raise RecipeError(
                 f"{where}: its reward terms are {', '.join(info.reward_weights)}, "

@@ -4,12 +4,13 @@ Checkpoints are written between segments only. Steps decide what is done at a bo
 run equals one that was never stopped. Only the time of checkpoints depends on the clock, and they change no result.
 """
 
+import dataclasses
 import functools
 import shlex
 import time
 from pathlib import Path
 
-from rlctl.errors import ArtifactError, Interrupted, TaskError
+from rlctl.errors import ArtifactError, EpisodeFailed, Interrupted, TaskError
 from rlctl.training import status
 from rlctl.training.checkpoints import Checkpoints
 from rlctl.training.display import Display
@@ -134,7 +135,11 @@ class TrainingLoop:
             raise ArtifactError(f"{self.checkpoints.run.path}: the training is done, but could not be saved: {problem}")
 
     def _explain_fault(self, error: TaskError) -> TaskError:
-        lines = [str(self.evaluator.episodes.keep_failed(error, self.learner.env.workers.spec))]
+        workers = self.learner.env.workers
+        spec = workers.spec
+        if isinstance(error, EpisodeFailed):
+            spec = dataclasses.replace(spec, level=float(workers.arrays.level[error.env]))
+        lines = [str(self.evaluator.episodes.keep_failed(error, spec))]
         if step := self.checkpoints.saved_step:  # at step 0 there is nothing to resume
             lines.append(f"checkpoint at step {step:,} is intact; resume with: {self._resume_command}")
         return TaskError("\n".join(lines), details=error.details)

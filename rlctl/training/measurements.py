@@ -61,7 +61,7 @@ def measure(model: BaseAlgorithm, env: WorkerVecEnv, last_row: int, total_timest
     if last is not None and steps // part > last_row // part:
         if last.values is None:
             last = dataclasses.replace(last, values=estimate_values(model, last))
-        for name, values in collect_histograms(last, env.workers.info).items():
+        for name, values in collect_histograms(last, env.workers.info, env.workers.privileged_sizes).items():
             model.logger.record(name, values)
     return row
 
@@ -160,10 +160,15 @@ def recent_gradient_norm(optimizer: torch.optim.Optimizer) -> float | None:
     return math.sqrt(sum(squares)) if squares else None
 
 
-def collect_histograms(last: LastSteps, info: EnvInfo) -> dict[str, torch.Tensor]:
-    """Return the samples of TensorBoard's histograms: actions, values, and observations by name."""
+def collect_histograms(
+    last: LastSteps, info: EnvInfo, privileged: Mapping[str, int] | None = None
+) -> dict[str, torch.Tensor]:
+    """Return the samples of TensorBoard's histograms: actions, values, and observations by name.
+
+    `privileged` has the sizes of those that only the critic sees.
+    """
     rows = join({key: values.reshape(-1, *values.shape[2:]) for key, values in last.observation.items()})
-    named = split_names(rows, info.observation_sizes)
+    named = split_names(rows, {**info.observation_sizes, **(privileged or {})})
     samples = {name: values for name, values in named.items() if name and np.issubdtype(values.dtype, np.floating)}
     samples |= {"actions": last.action} | ({} if last.values is None else {"values": last.values})
     flat = {name: np.asarray(values, np.float32).ravel() for name, values in samples.items()}

@@ -17,6 +17,7 @@ from rlctl.policy.file import ACTOR_CRITIC, GRAPH, PolicyFile, Tensors
 from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.policy.onnx_policy import OWN_INPUT, OWN_OUTPUT
 from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy, is_own
+from rlctl.training.privileged import has_privileged_critic
 
 _COMPARED = 10  # number of random observations
 _HEADS = {"dqn": "q_net", "td3": "actor.mu", "ddpg": "actor.mu"} | dict.fromkeys(
@@ -75,10 +76,12 @@ class _Actor(torch.nn.Module):
             name = "q_net" if algo == "dqn" else "actor"
             owner, trunk = getattr(policy, name), {"dqn": "q_net", "td3": "mu", "ddpg": "mu"}.get(algo, "latent_pi")
             self.prefixes = {"extractor.": f"{name}.features_extractor.", "trunk.": f"{name}.{trunk}."}
-        self.extractor = owner.pi_features_extractor if owner is policy else owner.features_extractor
+        extractor = owner.pi_features_extractor if owner is policy else owner.features_extractor
+        self.extractor = extractor.inner if has_privileged_critic(policy) else extractor
         self.trunk = None if algo == "recurrent_ppo" else getattr(owner, trunk)
         self.parts = split_space(raw_space)
-        self._space, self._normalize_images = policy.observation_space, policy.normalize_images
+        self._space = raw_space if has_privileged_critic(policy) else policy.observation_space
+        self._normalize_images = policy.normalize_images
 
     def compute_features(self, *parts: torch.Tensor) -> torch.Tensor:
         network_spaces = split_space(self._space)

@@ -4,8 +4,9 @@ The normalisation statistics are constant while a segment is played, and are upd
 """
 
 import abc
+import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,37 +14,21 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from rlctl.environments.dict_spaces import Observations, join, split_space
+from rlctl.environments.dict_spaces import Observations, count_outside, join
 from rlctl.errors import EpisodeFailed
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import Recipe
-from rlctl.rollout.messages import EpisodeResult, Play
+from rlctl.rollout.messages import EpisodeResult, LevelRule, Play
 from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.rollout.shared_arrays import SegmentArrays
 from rlctl.rollout.workers import Workers
+from rlctl.task.mirror import Mirror
 from rlctl.training.own_networks import write_graph
-from rlctl.training.snapshot import observation_statistics, pack
+from rlctl.training.privileged import name_as_sb3, widen, widen_space
+from rlctl.training.snapshot import observation_statistics, pack, select_actor
 from rlctl.training.status import Progress
 from rlctl.training.updates.choice import choose_learner
-
-
-def _count_outside(space: spaces.Space[Any], observations: Mapping[str, NDArray[Any]]) -> tuple[int, str]:
-    """Count observations, shape (n_envs, steps, ...), outside their space; return also a message about one."""
-    outside: Any = False  # later an array, one element per observation
-    message = ""
-    for key, box in split_space(space).items():
-        if not isinstance(box, spaces.Box) or box.dtype == np.uint8:
-            continue
-        values = observations[key]
-        wrong = ((values < box.low) | (values > box.high)).reshape(*values.shape[:2], -1)
-        if wrong.any():
-            outside |= wrong.any(axis=2)
-            env, step, element = np.argwhere(wrong)[0].tolist()
-            value, low, high = (array.ravel()[element] for array in (values[env, step], box.low, box.high))
-            name = f"observation {key!r}" if key else "observation"
-            message = f"{name} is outside its space: element {element} is {value:.6g}, not {low:g} to {high:g}"
-    return int(np.count_nonzero(outside)), message
 
 
 class WorkerVecEnv(VecEnv):
@@ -54,13 +39,32 @@ class WorkerVecEnv(VecEnv):
         self.run_seed = run_seed
         self.episodes_started = [0] * workers.n_envs  # per environment the number of episodes that have begun
         self._actions: list[list[NDArray[Any]]] = []  # of the running episodes: by environment, in parts
+        self._levels: NDArray[np.float64] = workers.arrays.level.copy()  # when the last segment had ended
+        self._level_rule: LevelRule | None = None
         self.outside, self.outside_message = 0, ""  # observations outside their space since it was set to 0
         self.ended: list[EpisodeResult] = []  # episodes that ended since the list was emptied
         self.last_segment: SegmentArrays | None = None  # of `finish`; the next segment overwrites its arrays
         self.waited_s = 0.0  # time spent waiting for the environments to play [s], since it was set to 0
         self._steps = 0
         self._is_playing = False  # whether a segment has been started and not finished
-        super().__init__(workers.n_envs, *workers.info.spaces())
+        observation_space, action_space = workers.info.spaces()
+        privileged = sum(workers.privileged_sizes.values())
+        super().__init__(workers.n_envs, widen_space(observation_space, privileged), action_space)
+
+    def follow_success(self, rule: LevelRule | None) -> None:
+        """Begin the next episode of each environment at the rule's first level; without a rule at that of the spec."""
+        self._level_rule = rule
+        self.levels = np.full(self.num_envs, self.workers.spec.level if rule is None else rule.start)
+
+    @property
+    def levels(self) -> NDArray[np.float64]:
+        """How hard the running episode of each environment is, from 0 to 1, shape (n_envs,)."""
+        return self._levels
+
+    @levels.setter
+    def levels(self, levels: NDArray[np.float64]) -> None:
+        self._levels = levels.copy()
+        self.workers.arrays.level[:] = levels
 
     def _seed(self, env: int, episode: int) -> int:
         return episode_seed(self.run_seed, Stream.TRAIN, env, episode)
@@ -74,7 +78,11 @@ class WorkerVecEnv(VecEnv):
             raise
         self.episodes_started = [number + 1 for number in self.episodes_started]
         self._actions = [[actions] for actions in self.workers.arrays.segment.action[:, :0]]
-        return self.workers.observations()
+        return self.observations()
+
+    def observations(self) -> Observations:
+        """Return a copy of the current observations, with what only the critic sees, shape (n_envs, ...)."""
+        return join(widen({key: rows.copy() for key, rows in self.workers.arrays.observation.items()}))
 
     def join_actions(self, env: int) -> NDArray[Any]:
         """Return the actions of an environment's running episode so far, shape (steps, ...)."""
@@ -94,7 +102,8 @@ class WorkerVecEnv(VecEnv):
         self._steps, self._is_playing = steps, True
         self.workers.arrays.inside[:, 2] = -1
         running, next_episodes = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
-        self.workers.start_playing(Play(steps, running, next_episodes, self.run_seed, exploration=exploration))
+        rule = self._level_rule
+        self.workers.start_playing(Play(steps, running, next_episodes, self.run_seed, rule, exploration))
 
     def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
         """Wait for the steps that `start` began; `check` is called several times a second."""
@@ -105,6 +114,7 @@ class WorkerVecEnv(VecEnv):
             error.actions = self._failed_actions(error)
             raise
         self._is_playing = False
+        self._levels = self.workers.arrays.level.copy()
         self.waited_s += time.monotonic() - began
         segment, steps = self.workers.arrays.segment, self._steps
         last_rows = {episode.env: episode.row for episode in ended}  # where the last episode of the segment ended
@@ -114,26 +124,28 @@ class WorkerVecEnv(VecEnv):
         for env, actions in enumerate(segment.action[:, :steps]):
             self._actions[env].append(actions[last_rows.get(env, -1) + 1 :].copy())
         self.ended += ended
-        seen = {key: rows[:, 1 : steps + 1] for key, rows in segment.observation.items()}
-        count, message = _count_outside(self.observation_space, seen)
+        last = segment.first(steps, ended)
+        last = dataclasses.replace(last, observation=widen(last.observation), final=widen(last.final))
+        seen = {key: rows[:, 1:] for key, rows in last.observation.items()}
+        count, message = count_outside(self.observation_space, seen)
         self.outside, self.outside_message = self.outside + count, self.outside_message or message
-        self.last_segment = segment.first(steps, ended)
-        return self.last_segment
+        self.last_segment = last
+        return last
 
     @property
     def steps_in_segment(self) -> int:
         """How many steps of the segment that is being played were begun so far, by all environments."""
         return int((self.workers.arrays.inside[:, 2] + 1).sum()) if self._is_playing else 0
 
-    def last_observations(self) -> Observations:
-        """Return the last observations of all segments that were finished, shape (n_envs, ...) or a dict of such."""
+    def last_observations(self) -> dict[str, NDArray[Any]]:
+        """Return the last observations, by key, of all segments that were finished, shape (n_envs, ...)."""
         arrays = self.workers.arrays
         observations = {key: array.copy() for key, array in arrays.observation.items()}
         if self._is_playing:
             begun = arrays.inside[:, 2] >= 0  # row 0 was written before; those done have replaced the other
             for key, array in observations.items():
                 array[begun] = arrays.segment.observation[key][begun, 0]
-        return join(observations)
+        return observations
 
     def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any]:
         """Return the actions of a failed episode; the last is that of the failed step."""
@@ -195,6 +207,7 @@ class Rollouts(abc.ABC):
         self._progress = progress
         self._learner = choose_learner(model)
         self._policy_info: PolicyInfo | None = None
+        self._mirror = Mirror(model.mirror[0]) if hasattr(model, "mirror") else None  # of observations
         self.rehearse: Callable[[int], None] = lambda updates: None  # called after so many off-policy updates
 
     def begin(self, total_timesteps: int) -> None:
@@ -241,8 +254,10 @@ class Rollouts(abc.ABC):
         model, workers = self.model, self.env.workers
         if self._policy_info is None:
             self._policy_info = pack(model, self._algo, workers.spec, workers.info).info
-        tensors = {f"policy/{name}": value.cpu().numpy() for name, value in model.policy.state_dict().items()}
-        for key, (mean, var) in statistics.items():
+        weights = {name_as_sb3(name): value for name, value in model.policy.state_dict().items()}
+        tensors = {f"policy/{name}": value.cpu().numpy() for name, value in weights.items()}
+        for key, moments in statistics.items():
+            mean, var = (select_actor(part, model.policy) for part in moments)
             tensors |= {f"normalize/{key}/mean": mean, f"normalize/{key}/var": var}
         tensors |= write_graph(model, self._algo, workers.info.spaces()[0])
         workers.set_policy(PolicyFile(self._policy_info, tensors))
@@ -269,7 +284,9 @@ class Rollouts(abc.ABC):
         model = self.model
         for key, rms in observation_statistics(model.get_vec_normalize_env()).items():
             rows = segment.observation[key][:, 1:]
-            rms.update(rows.reshape(-1, *rows.shape[2:]))
+            rows = rows.reshape(-1, *rows.shape[2:])
+            # Symmetric statistics: normalised, the mirror image of an observation is the mirrored observation.
+            rms.update(rows if self._mirror is None else np.concatenate([rows, self._mirror(rows)]))
         model._last_episode_starts = segment.done[:, -1]
         model._update_current_progress_remaining(model.num_timesteps, model._total_timesteps)
 

@@ -26,6 +26,7 @@ from rlctl.output import format_count
 from rlctl.printed_lines import PrintedLines
 from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import ON_POLICY, Recipe
+from rlctl.recipe.stages import FollowingLevel
 from rlctl.rollout.shared_world import explain_processes
 from rlctl.rollout.workers import Workers, count_envs
 from rlctl.run import directory
@@ -59,7 +60,8 @@ def set_up(start: Start, display: Display, printed: PrintedLines) -> Iterator[Tr
         stack.callback(printed.report)
         # The workers build their environments, and the check runs, while this process imports torch.
         make_workers = functools.partial(Workers, timeout_s=request.env_timeout_s)
-        workers = stack.enter_context(make_workers(specs[start.stage - 1], recipe.n_envs))
+        privileged = None if recipe.privileged is None else recipe.privileged.model_dump()
+        workers = stack.enter_context(make_workers(specs[start.stage - 1], recipe.n_envs, privileged=privileged))
         checked = _begin_check(specs[-1], request.env_timeout_s) if request.check and start.run is None else None
         from rlctl.training.evaluator import EvaluationEpisodes, Evaluator
         from rlctl.training.loop import TrainingLoop
@@ -135,11 +137,14 @@ def _build_learner(
     pin_threads()
     recipe, goal = start.recipe, workers.info
     if len(specs) > 1:  # check every stage now, not after hours of training
-        with make_workers(specs[0], 1) as probe:
+        privileged = None if recipe.privileged is None else recipe.privileged.model_dump()
+        with make_workers(specs[0], 1, privileged=privileged) as probe:
             goal = check_stages(specs, probe)
     # A plain Gymnasium environment shows only at the end of an episode whether it reports success.
     if workers.info.reward_weights and not workers.info.has_success:
         _refuse_success_rates(start)
+    if any(isinstance(stage.level, FollowingLevel) for stage in recipe.stages) and not workers.info.reward_weights:
+        raise RecipeError(f"level: {start.task} is a plain Gymnasium environment; only tasks have levels")
     # A policy that begins trained is evaluated first: it may be better than all later ones.
     next_eval = 0 if start.is_trained else recipe.eval.every_steps or recipe.total_timesteps
     progress = start.checkpoint.state.progress if start.checkpoint else status.Progress(next_eval)
@@ -156,7 +161,9 @@ def _build_learner(
 
         display.phase("cloning demonstrations")
         clone(start, rollouts, goal, display.message)
-    return Learner(recipe, rollouts, Curriculum(recipe.stages, specs, goal, progress), progress)
+    curriculum = Curriculum(recipe.stages, specs, goal, progress)
+    env.follow_success(curriculum.level_rule)
+    return Learner(recipe, rollouts, curriculum, progress)
 
 
 def _refuse_success_rates(start: Start) -> None:
@@ -164,6 +171,8 @@ def _refuse_success_rates(start: Start) -> None:
     if recipe.stop_success is not None:
         raise RecipeError(f"stop_success: {problem}; leave it out")
     for number, stage in enumerate(recipe.stages, start=1):
+        if isinstance(stage.level, FollowingLevel):
+            raise RecipeError(f"stage {number} of {len(recipe.stages)}: level: {problem}, which it would follow")
         if stage.promote is not None and stage.promote.success is not None:
             raise RecipeError(
                 f"stage {number} of {len(recipe.stages)}: promote.success: {problem}; "

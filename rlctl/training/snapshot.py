@@ -18,6 +18,7 @@ from rlctl.errors import ArtifactError, DivergedError
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.torch_policy import describe_network, policy_name
 from rlctl.training.own_networks import write_graph
+from rlctl.training.privileged import has_privileged_critic, name_as_sb3, read_privileged
 from rlctl.version import collect_versions
 
 Tensors = dict[str, NDArray[Any]]
@@ -33,21 +34,32 @@ def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> Policy
     """Return a copy of a model's policy, with its current normalisation."""
     normalizer = model.get_vec_normalize_env()
     statistics = observation_statistics(normalizer)
-    tensors = {f"policy/{key}": value.cpu().numpy().copy() for key, value in model.policy.state_dict().items()}
+    state = {name_as_sb3(name): value for name, value in model.policy.state_dict().items()}
+    tensors = {f"policy/{key}": value.cpu().numpy().copy() for key, value in state.items()}
     for key, rms in statistics.items():
-        tensors |= {f"normalize/{key}/mean": rms.mean.copy(), f"normalize/{key}/var": rms.var.copy()}
+        for part, values in (("mean", rms.mean), ("var", rms.var)):
+            actor = select_actor(values, model.policy)
+            tensors[f"normalize/{key}/{part}"] = actor.copy()
+            if len(actor) < len(values):  # not needed to act
+                tensors[f"critic/{part}"] = values[len(actor) :].copy()
     info = PolicyInfo(
         algo=algo,
         policy=policy_name(algo, env.spaces()[0]),
         policy_kwargs=describe_network(model.policy),
         clip_observation=normalizer.clip_obs if normalizer is not None and statistics else None,
         normalized_keys=list(statistics),
+        privileged=read_privileged(model.policy),
         env=env,
         spec=spec,
         training_steps=model.num_timesteps,
         versions=collect_versions(),
     )
     return PolicyFile(info, {**tensors, **write_graph(model, algo, env.spaces()[0])})
+
+
+def select_actor(values: NDArray[Any], policy: Any) -> NDArray[Any]:
+    """Return the part of the elements of an observation that the actor of a policy sees, which comes first."""
+    return values[: policy.actor_size] if has_privileged_critic(policy) else values
 
 
 def observation_statistics(normalizer: VecNormalize | None) -> dict[str, RunningMeanStd]:
@@ -170,7 +182,8 @@ def _restore_normalizer(model: BaseAlgorithm, tensors: Tensors) -> None:
     normalizer.returns = tensors["normalize/returns"].copy()
     for key, rms in {**observation_statistics(normalizer), "return": normalizer.ret_rms}.items():
         rms.mean, rms.var = (tensors[f"normalize/{key}/{part}"].copy() for part in ("mean", "var"))
-        rms.count = float(tensors[f"normalize/{key}/count"])
+        count = tensors[f"normalize/{key}/count"]
+        rms.count = count.copy() if count.ndim else float(count)  # type: ignore[assignment]
 
 
 def _rollout_tensors(model: BaseAlgorithm) -> Tensors:

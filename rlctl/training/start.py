@@ -112,6 +112,8 @@ def _find_new(request: TrainRequest, task: str) -> Start:
     source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
     if request.demos is not None and (algo := recipe.algo) in ("dqn", "recurrent_ppo"):
         raise RecipeError(f"--demos: {algo} cannot clone demonstrations; use ppo, a2c, sac, tqc, crossq, td3 or ddpg")
+    if request.demos is not None and recipe.privileged is not None:
+        raise RecipeError("--demos: demonstrations do not hold what only the critic sees; add --set privileged=null")
     notes = tuple(filter(None, [describe_rounding(recipe)]))
     demos = describe_demonstrations(Path(request.demos)) if request.demos is not None else None
     return Start(request, task, recipe, notes=notes, callbacks=callbacks, source=source, demos=demos)

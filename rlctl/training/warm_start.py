@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic_core import to_jsonable_python
 
 from rlctl.environments import installed
@@ -44,11 +45,21 @@ def load_source(source: Mapping[str, Any], model: Any, env: EnvInfo) -> str:
     policy = PolicyFile.read(file)
     info = policy.info
     info.check_fits(env, file)
+    from rlctl.training.privileged import read_privileged
+
+    has_critic = len(policy.actor_only().tensors) < len(policy.tensors)
+    privileged = read_privileged(model.policy)
+    if has_critic and info.privileged != privileged:
+        there, here = (", ".join(names) or "nothing else" for names in (info.privileged, privileged))
+        raise UsageError(
+            f"--from {file}: its critic saw {there} besides the actor's observation, the recipe's sees {here}: "
+            "make the key privileged of the recipe the same"
+        )
     _check_network(file, info, model, policy.weights)
     _load_weights(info, model, policy.weights)
     _load_normalization(file, info, model, policy.tensors)
     text = f"starts from {file} ({info.algo}, {info.training_steps:,} steps on {info.spec.task})"
-    if len(policy.actor_only().tensors) < len(policy.tensors):
+    if has_critic:
         return f"{text}: its actor, critic and normalisation"
     return (
         f"{text}: its actor and normalisation; it has no critic, so training starts with a new one: the first "
@@ -58,9 +69,11 @@ def load_source(source: Mapping[str, Any], model: Any, env: EnvInfo) -> str:
 
 def _check_network(file: Path, info: PolicyInfo, model: Any, weights: Mapping[str, Any]) -> None:
     from rlctl.policy.torch_policy import describe_network
+    from rlctl.training.privileged import name_as_sb3
 
     ours = describe_network(model.policy)
-    network = {f"policy/{name}": tuple(tensor.shape) for name, tensor in model.policy.state_dict().items()}
+    state = {name_as_sb3(name): tensor for name, tensor in model.policy.state_dict().items()}
+    network = {f"policy/{name}": tuple(tensor.shape) for name, tensor in state.items()}
     given = {f"policy/{name}": tensor.shape for name, tensor in weights.items()}
     wrong = [name for name, shape in given.items() if network.get(name) != shape]
     wrong += [name for name in list_actor_tensors(info.algo, list(network)) if name not in given]
@@ -77,11 +90,14 @@ def _check_network(file: Path, info: PolicyInfo, model: Any, weights: Mapping[st
 def _load_weights(info: PolicyInfo, model: Any, weights: Mapping[str, Any]) -> None:
     import torch
 
+    from rlctl.training.privileged import name_as_sb3
+
     state = {name: torch.from_numpy(tensor.copy()) for name, tensor in weights.items()}
     actor, target = _TARGETS.get(info.algo, ("", ""))
     if actor and not any(name.startswith(target) for name in state):
         state |= {target + name.removeprefix(actor): tensor for name, tensor in state.items() if name.startswith(actor)}
-    model.policy.load_state_dict(state, strict=False)  # the critic may be missing
+    named = {name: state[found] for name in model.policy.state_dict() if (found := name_as_sb3(name)) in state}
+    model.policy.load_state_dict(named, strict=False)  # the critic may be missing
 
 
 def _load_normalization(file: Path, info: PolicyInfo, model: Any, tensors: Mapping[str, Any]) -> None:
@@ -103,6 +119,11 @@ def _load_normalization(file: Path, info: PolicyInfo, model: Any, tensors: Mappi
             f"{normalizer.clip_obs:g}; add --set normalize.clip_observation={info.clip_observation:g}"
         )
     for key, moments in statistics.items():
-        moments.mean[...] = tensors[f"normalize/{key}/mean"]
-        moments.var[...] = tensors[f"normalize/{key}/var"]
-        moments.count = max(float(info.training_steps), 1.0)  # number of observations so far
+        steps = max(float(info.training_steps), 1.0)  # number of observations so far
+        for name, values in (("mean", moments.mean), ("var", moments.var)):
+            actor, critic = tensors[f"normalize/{key}/{name}"], tensors.get(f"critic/{name}")
+            values[...] = np.concatenate([actor, values[len(actor) :] if critic is None else critic])
+        of_critic = "critic/mean" in tensors or len(actor) == len(values)
+        # What a shipped policy's critic saw is not known: these elements begin anew.
+        seen = np.arange(len(values)) < len(actor)
+        moments.count = steps if of_critic else np.where(seen, steps, moments.count)  # type: ignore[assignment]

@@ -123,8 +123,11 @@ def test_what_looks_wrong_and_is_right(tmp_path):
         ("task=3", "task: expected a mapping, got 3"),
         ("stages=3", "stages: expected a list, each element a mapping of task, reward_weights, events, level, pr"),
         ("stages=[{}, {}]", "stages: stage 1 of 2 (the recipe's own task) has no promotion rule"),
-        ("stages=[{level: .nan}]", "stage 1: level: expected a number in [0, 1], got nan"),
-        ("stages=[{level: 2}]", "stage 1: level: expected a number in [0, 1], got 2"),
+        (
+            "stages=[{level: .nan}]",
+            "stage 1: level: expected a number in [0, 1] or a mapping of start, up, down, got nan",
+        ),
+        ("stages=[{level: 2}]", "stage 1: level: expected a number in [0, 1] or a mapping of start, up, down, got 2"),
         ("stages=[{promote: {}}]", "stage 1: promote: give one of success and return"),
         (
             "stages=[{promote: {success: 0.5, window: 0}}]",

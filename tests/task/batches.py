@@ -85,6 +85,10 @@ class Stool(BatchTask):
             "last": self.last,
         }
 
+    def privileged(self) -> dict[str, np.ndarray]:
+        goal = np.where(self.failing("privileged"), np.inf, self.goal)
+        return {"goal": goal[:, None], "place": self.body.base_position}
+
     def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
         far = np.abs(self.body.base_position[:, 2] - self.goal)
         if self.failing("unstable").any():

@@ -28,6 +28,10 @@ NORMALIZED = {"normalize": {"observation": True, "reward": True}}
 STAGES = {
     "stages": [{"task": {"tolerance": 0.5}, "promote": {"success": 0.5, "window": 6}}, {"task": {"tolerance": 0.3}}]
 }
+LEVELS = {
+    "stages": [{"level": {"start": 0.1, "up": 0.3, "down": 0.2}}],
+    "events": {"mass": {"factor": {"from": [1.0, 1.0], "to": [0.5, 2.0]}}, "kick": {}},
+}
 WIDE = {"policy_kwargs": {"net_arch": [128, 128]}}
 STOOL = "tests.task.batches:Stool"
 CASES = {
@@ -45,6 +49,24 @@ CASES = {
     "ppo, on reach": ("reach", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
     "ppo, on worlds in batches": (STOOL, settings("ppo", randomize=True)),
     "recurrent_ppo, on worlds in batches": (STOOL, settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
+    "ppo, privileged, on worlds in batches": (STOOL, settings("ppo", randomize=True, privileged={})),
+    "ppo, mirrored": ("walk", settings("ppo", mirror=True, randomize=True, task={"episode_s": 0.4})),
+    "ppo, levels, on worlds in batches": (STOOL, settings("ppo", **LEVELS)),
+    "sac, levels": (STOOL, settings("sac", **LEVELS)),
+    "ppo, privileged, on reach": (
+        "reach",
+        settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"], randomize=True, privileged={}),
+    ),
+    "sac, privileged": (STOOL, settings("sac", randomize=True, privileged={}, **NORMALIZED)),
+    "recurrent_ppo, privileged": (
+        STOOL,
+        settings("recurrent_ppo", randomize=True, privileged={}, policy_kwargs={"lstm_hidden_size": 8}),
+    ),
+    "recurrent_ppo, privileged, one LSTM": (
+        STOOL,
+        settings("recurrent_ppo", privileged={}, policy_kwargs={"lstm_hidden_size": 8, "enable_critic_lstm": False}),
+    ),
+    "tqc, privileged": (STOOL, settings("tqc", randomize=True, privileged={"task": False})),
     "ppo, on hopper": ("hopper", settings("ppo", n_envs=2, total_timesteps=128, eval=SHORT["eval"])),
     "a2c": ("Line", settings("a2c")),
     "recurrent_ppo": ("Line", settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
@@ -71,7 +93,7 @@ CASES = {
 # trainings of plain ppo and sac are in tests/crash.
 QUICK = {
     *("ppo with gSDE", "ppo, curriculum", "recurrent_ppo", "sac, hindsight, normalised"),
-    "ppo, on worlds in batches",
+    "ppo, privileged, on worlds in batches",
 }
 
 

@@ -38,7 +38,7 @@ def test_inside_a_segment_the_state_is_that_of_its_beginning():
         np.testing.assert_array_equal(tensors["environments/observation/"], first)
         assert tensors["environments/steps"].tolist() == [0, 0, 0]
         env.finish()
-        np.testing.assert_array_equal(env.last_observations(), workers.observations())
+        np.testing.assert_array_equal(env.last_observations()[""], workers.observations())
         assert env.steps_in_segment == 0
 
 

@@ -13,6 +13,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rlctl.environments.dict_spaces import map_parts, split
 from rlctl.errors import RecipeError
+from rlctl.task.mirror import Mirror
+from rlctl.training.privileged import POLICIES
 from rlctl.training.updates.choice import choose_learner
 from rlctl.training.updates.crossq import CrossQUpdate
 from rlctl.training.updates.ppo import PpoUpdate
@@ -67,7 +69,9 @@ def assert_same_weights(one, other, before):
         torch.testing.assert_close(one[name], other[name], rtol=1e-4, atol=1e-5, msg=name)
 
 
+PRIVILEGED = {"privileged": {"velocity": 2}}  # of VECTOR the actor sees the first three elements
 PPO_CASES = {
+    "privileged": {"policy": POLICIES["ppo"], "network": PRIVILEGED},
     "tanh": {},
     "relu": {"network": {"activation_fn": torch.nn.ReLU}},
     "gSDE": {"use_sde": True},
@@ -91,6 +95,26 @@ def test_ppo_updates_as_sb3(name):
     set_random_seed(1)
     one.train()
     set_random_seed(1)
+    PpoUpdate(other).train()
+    assert_same_weights(weights(one), weights(other), before)
+    expected, logged = one.logger.name_to_value, other.logger.name_to_value
+    assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
+
+
+def test_mirror_images_are_learned_from_as_if_they_had_been_played():
+    places = (-2, -1, 3, 5, 4), (1, -3, -2)
+    one, other = (make_ppo(batch_size=100, n_epochs=1, normalize_advantage=False) for _ in range(2))
+    other.mirror = places
+    buffer = one.rollout_buffer
+    one.batch_size = 200
+    for name, mirror in (("observations", Mirror(places[0])), ("actions", Mirror(places[1]))):
+        values = getattr(buffer, name)
+        setattr(buffer, name, np.concatenate([values, mirror(values)]))
+    for name in ("advantages", "returns", "values", "log_probs"):
+        setattr(buffer, name, np.concatenate([getattr(buffer, name)] * 2))
+    buffer.buffer_size *= 2
+    before = weights(one)
+    one.train()
     PpoUpdate(other).train()
     assert_same_weights(weights(one), weights(other), before)
     expected, logged = one.logger.name_to_value, other.logger.name_to_value
@@ -162,7 +186,9 @@ SAC_CASES = {
 }
 
 
+SAC_CASES["privileged"] = {"policy": POLICIES["sac"], "network": PRIVILEGED, "normalize": True}
 TQC_CASES = {
+    "tqc, privileged": {"policy": POLICIES["tqc"], "network": PRIVILEGED},
     "tqc": {"network": {"n_quantiles": 7, "n_critics": 3}},
     "tqc, gSDE, nothing dropped": {"use_sde": True, "top_quantiles_to_drop_per_net": 0},
 }

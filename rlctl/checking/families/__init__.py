@@ -46,7 +46,7 @@ PROCESSES = {
         *("hindsight", "leaks", "goals"),
     ),
     "instances": (
-        *("instances", "worlds", "batches", "unseeded", "action effects"),
+        *("instances", "worlds", "batches", "mirror", "unseeded", "action effects"),
         *("hidden state", "nan action", "variants", "rendering"),
     ),
 }

@@ -36,6 +36,7 @@ class RobotPlayer:
         controller: ControlProgram,
         *,
         task: str,
+        level: float,
         timeout_s: float,
         realtime: bool,
         comparison: CommandComparison | None,
@@ -43,7 +44,7 @@ class RobotPlayer:
         metrics = [name for name, weight in info.reward_weights.items() if weight == 0]
         self._episode = RunningEpisode(env, 0, metrics)
         self._info, self._layout, self._space = info, ObservationLayout(info), env.action_space
-        self._task, self._timeout_s, self._realtime = task, timeout_s, realtime
+        self._task, self._level, self._timeout_s, self._realtime = task, level, timeout_s, realtime
         self._controller, self._comparison = controller, comparison
         self._dt = info.control_dt or math.inf
         self._loop = asyncio.get_running_loop()
@@ -76,7 +77,7 @@ class RobotPlayer:
         self._waiting: dict[int, tuple[float, float, bool]] = {}  # by sequence: when it was sent, delay, loss
         self._controller.arrivals.clear()
         action = self._first_action
-        observation = self._call(lambda: self._episode.start(seed))
+        observation = self._call(lambda: self._episode.start(seed, self._level))
         self._begin_s = self._loop.time()
         while True:
             step = self._episode.step

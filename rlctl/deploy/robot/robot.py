@@ -170,6 +170,7 @@ class _Test:
                 self._info,
                 controller,
                 task=self._spec.task,
+                level=self._spec.level,
                 timeout_s=request.timeout_s,
                 realtime=request.realtime,
                 comparison=self._comparison,

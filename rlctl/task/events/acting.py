@@ -45,8 +45,12 @@ class ActingEvents:
         due = zip(self._events["interval"], self.periods, strict=True)
         return {event.name: event(sim, streams[event.name], level) for event, period in due if step % period == 0}
 
-    def try_once(self, moments: Iterable[When], sim: Sim) -> None:
-        """Call events once, to find mistakes: a name that the world does not have, or a result of the wrong type."""
+    def try_once(self, moments: Iterable[When], sim: Sim) -> dict[str, Drawn]:
+        """Call events once, to find mistakes: a name that the world does not have, or a result of the wrong type.
+
+        Return the values that they drew, by name.
+        """
+        all_drawn: dict[str, Drawn] = {}
         for when in moments:
             for event in self._events[when]:
                 try:
@@ -54,6 +58,8 @@ class ActingEvents:
                 except RlctlError as error:
                     raise event.error(f"events.{event.name}: {error}") from None
                 _check_drawn(event.name, drawn)
+                all_drawn[event.name] = drawn
+        return all_drawn
 
 
 class Signals:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rlctl.errors import in_world
 from rlctl.task.events.acting import Signals, Streams, start_signal
 from rlctl.task.events.changes import delay, noise
-from rlctl.task.events.event import BoundEvent, Parts, Signal, Widening
+from rlctl.task.events.event import BoundEvent, Drawn, Parts, Signal, Widening
 
 Array = NDArray[np.float64]
 Worlds = NDArray[np.int64]
@@ -25,8 +25,8 @@ class RowsSignal(Protocol):
 
     def __init__(self, event: BoundEvent, worlds: int, sizes: Mapping[str, int]) -> None: ...
 
-    def begin(self, world: int, rng: np.random.Generator, first: Array, level: float) -> None:
-        """Begin the episode of a world, whose first values have the shape (elements,)."""
+    def begin(self, world: int, rng: np.random.Generator, first: Array, level: float) -> Drawn:
+        """Begin the episode of a world, whose first values have the shape (elements,); return the drawn values."""
 
     def __call__(self, values: Array, rows: Worlds) -> Array:
         """Return the values of some worlds with noise or delay, shape (rows, elements)."""
@@ -43,11 +43,12 @@ class NoiseRows:
         self._numbers = np.zeros((worlds, _BLOCK, self._size))
         self._next = np.zeros(worlds, np.int64)
 
-    def begin(self, world: int, rng: np.random.Generator, first: Array, level: float) -> None:
+    def begin(self, world: int, rng: np.random.Generator, first: Array, level: float) -> Drawn:
         """Draw the standard deviation of the episode."""
         self._std[world] = rng.uniform(*self._event.read("std", level))
         self._rngs[world] = rng
         self._next[world] = _BLOCK
+        return {"std": float(self._std[world, 0])}
 
     def __call__(self, values: Array, rows: Worlds) -> Array:
         """Add the numbers of the worlds' next step."""
@@ -69,11 +70,12 @@ class DelayRows:
         self._past = np.zeros((int(max(steps.start[1], steps.end[1])) + 1, worlds, sum(sizes.values())))
         self._steps, self._place = np.zeros(worlds, np.int64), np.zeros(worlds, np.int64)
 
-    def begin(self, world: int, rng: np.random.Generator, first: Array, level: float) -> None:
+    def begin(self, world: int, rng: np.random.Generator, first: Array, level: float) -> Drawn:
         """Draw the number of steps of the episode; until then the first values are the past."""
         low, high = self._event.read("steps", level)
         self._steps[world] = rng.integers(int(low), int(high) + 1)
         self._past[:, world] = first
+        return {"steps": float(self._steps[world])}
 
     def __call__(self, values: Array, rows: Worlds) -> Array:
         """Return the values of earlier steps."""
@@ -94,10 +96,11 @@ class OwnRows:
     def _split(self, values: Array) -> Parts:
         return dict(zip(self._names, np.split(values.copy(), self._ends), strict=True))
 
-    def begin(self, world: int, rng: np.random.Generator, first: Array, level: float) -> None:
+    def begin(self, world: int, rng: np.random.Generator, first: Array, level: float) -> Drawn:
         """Call the function."""
         with in_world(world):
-            self._signals[world] = start_signal(self._event, rng, self._split(first), level)[1]
+            drawn, self._signals[world] = start_signal(self._event, rng, self._split(first), level)
+        return drawn
 
     def __call__(self, values: Array, rows: Worlds) -> Array:
         """Call the signal of each world."""
@@ -126,6 +129,8 @@ class BatchSignals:
         single = Signals(events, first, action_space, bounds)
         self._streams: list[Streams] = [{} for _ in range(worlds)]
         self._levels, self._is_new = np.ones(worlds), np.zeros(worlds, bool)
+        self.drawn: list[dict[str, Drawn]] = [{} for _ in range(worlds)]
+        """Per world the values drawn for its episode, by event."""
         self._space = action_space
         self._low, self._high = action_space.low.ravel(), action_space.high.ravel()
         self._on_action = [(event.name, _make(event, worlds, {_ACTION: len(self._low)})) for event in single.on_action]
@@ -145,7 +150,7 @@ class BatchSignals:
         self._streams[world], self._levels[world], self._is_new[world] = streams, level, True
         zero = np.clip(np.zeros(len(self._low)), self._low, self._high)
         for name, signal in self._on_action:
-            signal.begin(world, streams[name], zero, level)
+            self.drawn[world][name] = signal.begin(world, streams[name], zero, level)
 
     def observe(self, values: Array, rows: Worlds) -> Array:
         """Return observations of some worlds, shape (rows, size), with noise and delay; changes `values`."""
@@ -155,7 +160,8 @@ class BatchSignals:
             exact = values[:, columns]
             for row in new:  # events on observations begin with the first one
                 world = int(rows[row])
-                signal.begin(world, self._streams[world][name], exact[row], float(self._levels[world]))
+                stream, level = self._streams[world][name], float(self._levels[world])
+                self.drawn[world][name] = signal.begin(world, stream, exact[row], level)
             values[:, columns] = signal(exact, rows)
             for part, bounds in clipped:
                 values[:, part] = np.clip(values[:, part], *bounds)

@@ -15,6 +15,7 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution, Sta
 from stable_baselines3.common.utils import explained_variance
 
 from rlctl.environments.dict_spaces import map_parts
+from rlctl.training.privileged import has_privileged_critic
 from rlctl.training.updates.adam import VectorAdam
 from rlctl.training.updates.blocks import Blocks, count_blocks
 from rlctl.training.updates.mlp import bind, bind_networks, is_mlp, list_sizes, uses_tanh
@@ -39,6 +40,7 @@ class PpoUpdate:
             sde_epsilon=float(self._policy.action_dist.epsilon) if self._policy.use_sde else None,
             ent_coef=model.ent_coef,
             vf_coef=model.vf_coef,
+            mirror=getattr(model, "mirror", None),
         )
         shapes = settings.list_shapes()
         self._weights = sum(math.prod(shape) for shape in shapes)
@@ -58,7 +60,7 @@ class PpoUpdate:
     def supports(model: Any) -> bool:
         """Return whether this class can update a model; SB3 updates all others."""
         policy = model.policy
-        if type(model) is not PPO or not policy.share_features_extractor:
+        if type(model) is not PPO or not (policy.share_features_extractor or has_privileged_critic(policy)):
             return False
         distribution = policy.action_dist
         if isinstance(distribution, StateDependentNoiseDistribution):
@@ -73,11 +75,17 @@ class PpoUpdate:
         """Return the values of a rollout's observations and the log-probabilities of its actions, shape (rows,)."""
         rows = len(actions)
         count = self._count_blocks(rows)
-        self._arrays["features"][:] = self._policy.extract_features(observations).numpy()
+        self._arrays["features"][:] = self._extract(observations)
         self._arrays["actions"][:] = actions
         self._arrays["minibatch"][:] = 0, rows, count
         self._blocks.run(EVALUATE, 2 * count)
         return self._arrays["values"].copy(), self._arrays["log_probs"].copy()
+
+    def _extract(self, observations: Any) -> NDArray[Any]:
+        """Return the features: those of the critic, if it sees more than the actor, whose own come first."""
+        features = self._policy.extract_features(observations)
+        wide: NDArray[Any] = (features[1] if has_privileged_critic(self._policy) else features).numpy()
+        return wide
 
     @torch.no_grad()
     def train(self) -> None:
@@ -105,7 +113,7 @@ class PpoUpdate:
         """Write the rollout into the shared arrays, shape (steps * environments, ...) each; return its advantages."""
         buffer = self._model.rollout_buffer
         observations = map_parts(lambda rows: torch.from_numpy(buffer.swap_and_flatten(rows)), buffer.observations)
-        self._arrays["features"][:] = self._policy.extract_features(observations).numpy()
+        self._arrays["features"][:] = self._extract(observations)
         self._arrays["actions"][:] = buffer.swap_and_flatten(buffer.actions)  # the buffer has the type of the space
         for name in ("values", "log_probs", "returns"):
             self._arrays[name][:] = buffer.swap_and_flatten(getattr(buffer, name)).ravel()

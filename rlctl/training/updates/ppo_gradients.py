@@ -8,6 +8,7 @@ import dataclasses
 import numpy as np
 
 from rlctl.rollout.shared_arrays import Layout
+from rlctl.task.mirror import Mirror
 from rlctl.training.updates.blocks import MAX_BLOCKS, Arrays, BlockWork, select_block
 from rlctl.training.updates.perceptrons import LOG_SQRT_TAU, Floats, MlpStack, Shapes, list_shapes, split_vector
 
@@ -29,6 +30,7 @@ class PpoSettings:
     sde_epsilon: float | None  # None without gSDE
     ent_coef: float
     vf_coef: float
+    mirror: tuple[tuple[int, ...], tuple[int, ...]] | None = None  # the places of features and actions; see `Mirror`
 
     def list_shapes(self) -> Shapes:
         """Return the shapes of the parameters: of the actor, of the critic, of the deviation."""
@@ -39,7 +41,7 @@ class PpoSettings:
         floats, numbers = np.dtype(np.float32), np.dtype(np.float64)
         return {
             "losses": ((MAX_BLOCKS, len(LOSSES)), numbers),  # sums of each block
-            "features": ((self.rows, self.actor[0]), floats),
+            "features": ((self.rows, self.critic[0]), floats),  # the actor sees the first of them
             "actions": ((self.rows, self.actor[-1]), floats),
             **dict.fromkeys(("values", "log_probs", "returns"), ((self.rows,), floats)),
             "order": ((self.rows,), np.dtype(np.int64)),  # of the rows in this epoch
@@ -59,6 +61,10 @@ class PpoGradients(BlockWork):
         self._actor = MlpStack(networks[:layers], uses_tanh=settings.actor_uses_tanh)
         self._critic = MlpStack(networks[layers:], uses_tanh=settings.critic_uses_tanh)
         gradients = [split_vector(row, shapes) for row in arrays["gradients"]]
+        places = settings.mirror
+        self._mirrors = {} if places is None else {"features": Mirror(places[0]), "actions": Mirror(places[1])}
+        self._copies = 1 if places is None else 2
+        """How often each row of a minibatch is learned from: a second time as its mirror image."""
         self._gradients = [(parts[:layers], parts[layers:-1], parts[-1]) for parts in gradients]
 
     def compute(self, phase: int, task: int) -> None:
@@ -74,7 +80,7 @@ class PpoGradients(BlockWork):
     def _evaluate_actor(self, rows: slice) -> None:
         """Write the log-probabilities of the rollout's actions."""
         for part in _split(rows):
-            actor = self._actor.run(self._arrays["features"][None, part], "actor")
+            actor = self._actor.run(self._arrays["features"][None, part, : self._settings.actor[0]], "actor")
             z = self._arrays["actions"][part] - actor[-1][0]
             std = self._compute_std(actor)
             z /= std
@@ -86,19 +92,27 @@ class PpoGradients(BlockWork):
             self._arrays["values"][part] = self._critic.run(self._arrays["features"][None, part], "critic")[-1].ravel()
 
     def _take(self, name: str, rows: slice) -> Floats:
-        return self._arrays[name].take(self._arrays["order"][rows], axis=0)
+        """Return rows of the rollout, in this epoch's order, and after them their mirror images."""
+        values: Floats = self._arrays[name].take(self._arrays["order"][rows], axis=0)
+        return self._add_mirrored(name, values)
+
+    def _add_mirrored(self, name: str, values: Floats) -> Floats:
+        if self._copies == 1:
+            return values
+        return np.concatenate([values, self._mirrors[name](values) if name in self._mirrors else values])
 
     def _differentiate_actor(self, block: int, rows: slice, size: int) -> None:
         """Set a block's gradients of the minibatch's mean loss, and its sums of what is logged."""
+        size *= self._copies
         clip_range = float(self._arrays["clip_ranges"][0])
-        actor = self._actor.run(self._take("features", rows)[None], "actor")
+        actor = self._actor.run(self._take("features", rows)[None, :, : self._settings.actor[0]], "actor")
         std = self._compute_std(actor)
         z = self._take("actions", rows) - actor[-1][0]
         z /= std
         log_std, squared = np.log(std), np.square(z)
         log_ratio = _compute_log_prob(squared, log_std) - self._take("log_probs", rows)
         ratio = np.exp(log_ratio)
-        advantages = self._arrays["advantages"][rows]
+        advantages = self._add_mirrored("advantages", self._arrays["advantages"][rows])
         unclipped, clipped = advantages * ratio, advantages * ratio.clip(1 - clip_range, 1 + clip_range)
         # If the clipped term is smaller, the loss does not depend on the policy.
         to_log_prob = (unclipped * (unclipped <= clipped) / np.float32(-size))[:, None]
@@ -117,8 +131,10 @@ class PpoGradients(BlockWork):
             np.count_nonzero(np.abs(ratio - 1) > clip_range),
             float((ratio - 1 - log_ratio).sum()),
         )
+        self._arrays["losses"][block, :4] /= self._copies
 
     def _differentiate_critic(self, block: int, rows: slice, size: int) -> None:
+        size *= self._copies
         clip_range = float(self._arrays["clip_ranges"][1])
         critic = self._critic.run(self._take("features", rows)[None], "critic")
         errors = critic[-1].ravel() - self._take("returns", rows)
@@ -128,7 +144,7 @@ class PpoGradients(BlockWork):
             moved = critic[-1].ravel() - before
             errors = before + moved.clip(-clip_range, clip_range) - self._take("returns", rows)
             to_value = errors * (np.abs(moved) <= clip_range)
-        self._arrays["losses"][block, 4] = np.vdot(errors, errors)
+        self._arrays["losses"][block, 4] = np.vdot(errors, errors) / self._copies
         to_value = to_value * np.float32(2 * self._settings.vf_coef / size)
         self._critic.backpropagate(critic, to_value[None, :, None], self._gradients[block][1])
 

@@ -122,7 +122,7 @@ class SacUpdate:
         logged: dict[str, list[float]] = collections.defaultdict(list)
         followed = torch.from_numpy(self._arrays["parameters"][self._parts[CRITICS]])
         following = torch.from_numpy(self._arrays["targets"])
-        for step, batch in enumerate(sample_batches(model, model.actor, gradient_steps, batch_size)):
+        for step, batch in enumerate(sample_batches(model, model.critic, gradient_steps, batch_size)):
             learns_actor = (model._n_updates + step + self.first_update) % self._policy_delay == 0
             self._update(batch, logged, learns_actor=learns_actor, with_loss=step % _LOSS_EVERY == 0)
             if self.has_targets and step % model.target_update_interval == 0:

@@ -51,8 +51,8 @@ class SacSettings:
         normal = (self.rows, self.actions) if self.log_std is None else self.log_std
         return {
             "targets": ((count_floats(self.list_critic_shapes()),), floats),  # parameters of the target critics
-            "features": ((self.rows, self.actor[0]), floats),
-            "next_features": ((self.rows, self.actor[0]), floats),
+            "features": ((self.rows, self.critic[0] - self.actions), floats),  # the actor sees the first of them
+            "next_features": ((self.rows, self.critic[0] - self.actions), floats),
             "actions": ((self.rows, self.actions), floats),
             "rewards": ((self.rows, 1), floats),
             "discounts": ((self.rows, 1), floats),
@@ -97,7 +97,7 @@ class SacGradients(BlockWork):
     def _differentiate_critics(self, block: int, rows: slice) -> None:
         coefficient, with_loss, _ = self._arrays["numbers"].tolist()
         features = self._take("next_features", rows)
-        sample = self._actor.sample(features, "next", self._take("next_normal", rows))
+        sample = self._actor.sample(features[:, : self._settings.actor[0]], "next", self._take("next_normal", rows))
         estimates = self._targets.run(np.concatenate([features, sample.action], 1)[None], "target")[-1]
         values = self._choose_estimates(estimates) - np.float32(coefficient) * sample.log_prob
         target = self._take("rewards", rows) + self._take("discounts", rows) * values
@@ -110,7 +110,7 @@ class SacGradients(BlockWork):
     def _differentiate_actor(self, block: int, rows: slice) -> None:
         coefficient, features = float(self._arrays["numbers"][0]), self._take("features", rows)
         normal = self._take("normal", rows)
-        sample = self._actor.sample(features, "learning", normal)
+        sample = self._actor.sample(features[:, : self._settings.actor[0]], "learning", normal)
         passed = self._critics.run(np.concatenate([features, sample.action], 1)[None], "actor")
         value, to_outputs = self._value(passed[-1])
         sums = self._arrays["sums"][block]

@@ -1,0 +1,102 @@
+"""Walk on rough ground that the robot does not see: `walk` with pushes, slippery ground, noise and delay."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rlctl.task import Body, Event, Sim, TaskError, WorldRngs, events, rough_heights
+from rlctl.task.rotations import rotate_inverse
+from rlctl_locomotion.quadruped import FEET
+from rlctl_locomotion.walk import HIGHEST, LOWEST, STANCE, START_HEIGHT, Walk
+
+HIGHEST_BUMPS = 0.1  # [m]; above, the legs are too short
+CELL = 0.2  # [m], between the points of the ground
+SIZE = (50.0, 80.0)  # [m], of the ground along x and y: in an episode at most 22 m are walked
+FLAT, FULL = -30.0, 0.0  # [m]: from y = FLAT to FULL the bumps grow from 0 to their height
+START = 2.0  # [m], half of the length of the square in which episodes begin
+EASIEST, HARDEST = FLAT, 15.0  # [m]: y of the middle of that square at level 0 and at level 1
+PUSH = {"from": (0.0, 0.3), "to": (0.0, 1.0)}  # [m/s], at level 0 and at level 1
+SCANNED = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.2, 0.2, 3), indexing="ij"), -1).reshape(-1, 2)
+"""Points around the robot [m] whose heights the critic sees, in its own frame without roll and pitch."""
+
+
+@dataclass
+class WalkRough(Walk):
+    """Follow velocity commands over bumps that it does not see, on slippery ground, with pushes, noise and delay."""
+
+    rough: float = 0.05  # [m], height of the bumps
+    terrain_seed: int = 0
+    episode_s: float = 20.0
+
+    scale = 0.4
+    # Lower than on flat ground, for quick corrections after pushes; what -0.012 does here was not measured.
+    reward_weights = {**Walk.reward_weights, "smoothness": -0.005}
+
+    mirror = {
+        **Walk.mirror,
+        "velocity": (1, -2, 3),
+        "height": (1,),
+        "foot_heights": (2, 1, 4, 3),
+        "ground": (3, 2, 1, 6, 5, 4, 9, 8, 7, 12, 11, 10, 15, 14, 13),
+        "events/push": (1, -2),  # speed and direction
+    }
+    events = {
+        "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2), enabled=True),
+        "friction": Event("reset", events.set_friction, body="ground", friction=(0.3, 1.3), enabled=True),
+        "motor_strength": Event("reset", events.scale_motor_strength, body="robot", factor=(0.8, 1.0), enabled=True),
+        "gyroscope_noise": Event("observation", events.noise, of="gyroscope", std=(0.0, 0.2), enabled=True),  # [rad/s]
+        "gravity_noise": Event("observation", events.noise, of="gravity", std=(0.0, 0.03), enabled=True),
+        "position_noise": Event("observation", events.noise, of="joint_positions", std=(0.0, 0.01), enabled=True),
+        "velocity_noise": Event("observation", events.noise, of="joint_velocities", std=(0.0, 1.0), enabled=True),
+        "action_delay": Event("action", events.delay, steps=(0, 1), enabled=True),  # of 20 ms
+        "push": Event("interval", events.kick, every_s=4.0, body="robot", speed=PUSH, enabled=True),
+    }
+
+    def load_ground(self, sim: Sim) -> Body:
+        """Load rough ground, whose bumps grow along y; raises `TaskError` for bumps that are too high."""
+        if not 0 <= self.rough <= HIGHEST_BUMPS:
+            raise TaskError(f"rough: bumps of {self.rough:g} m; give a height from 0 to {HIGHEST_BUMPS:g} m")
+        heights = rough_heights(self.terrain_seed, size=SIZE, cell=CELL, roughness=self.rough)
+        y = (np.arange(heights.shape[1]) - (heights.shape[1] - 1) / 2) * CELL
+        self.heights = heights * np.clip((y - FLAT) / (FULL - FLAT), 0.0, 1.0)
+        return sim.add_height_field("ground", self.heights, cell=CELL)
+
+    def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
+        """Stand somewhere, with a commanded velocity."""
+        place = rng.uniform(-START, START, 2)
+        place[:, 1] += EASIEST + (HARDEST - EASIEST) * self.level[worlds]
+        around = self.find_heights(place[:, None] + SCANNED)
+        self.body.set_base(np.column_stack([place, START_HEIGHT + around.max(axis=1)]), worlds=worlds)
+        self.body.set_joints(STANCE + rng.uniform(-self.start_noise, self.start_noise, 12), worlds=worlds)
+        self.command[worlds] = rng.uniform(LOWEST, HIGHEST)
+
+    def privileged(self) -> dict[str, np.ndarray]:
+        """Return the velocity, the heights of trunk and feet above the ground, and the ground around the robot."""
+        position, orientation = self.body.base_position, self.body.base_orientation
+        x, y, z, w = orientation.T
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))[:, None]
+        forward, left = SCANNED.T
+        around = np.stack([np.cos(yaw) * forward - np.sin(yaw) * left, np.sin(yaw) * forward + np.cos(yaw) * left], -1)
+        ground = self.find_heights(position[:, :2])
+        feet = np.stack([self.body.link_position(foot) for foot in FEET], 1)
+        return {
+            "velocity": rotate_inverse(orientation, self.body.base_velocity),
+            "height": (position[:, 2] - ground)[:, None],
+            "foot_heights": feet[..., 2] - self.find_heights(feet[..., :2]),
+            "ground": self.find_heights(position[:, None, :2] + around) - ground[:, None],
+        }
+
+    def find_heights(self, places: np.ndarray) -> np.ndarray:
+        """Return the heights of the ground [m] at places (..., 2) [m], between the points of the grid bilinearly."""
+        last = np.array(self.heights.shape) - 1
+        position = np.clip(places / CELL + last / 2, 0.0, last - 1e-9)
+        corner = position.astype(int)
+        (x, y), (right, up) = np.moveaxis(corner, -1, 0), np.moveaxis(position - corner, -1, 0)
+        low = self.heights[x, y] * (1 - right) + self.heights[x + 1, y] * right
+        high = self.heights[x, y + 1] * (1 - right) + self.heights[x + 1, y + 1] * right
+        return low * (1 - up) + high * up
+
+    def measure_height(self) -> np.ndarray:
+        """Return the height of the trunk above the ground [m]."""
+        position = self.body.base_position
+        return position[:, 2] - self.find_heights(position[:, :2])

@@ -1,0 +1,25 @@
+"""Errors about what the methods of a task returned."""
+
+import numbers
+from collections.abc import Mapping
+from typing import Any
+
+from rlctl.errors import TaskError, short_repr
+
+
+def not_by_name(task: str, method: str, value: Any) -> TaskError:
+    """Return the error for a method that returned anything but a dict."""
+    return TaskError(f"{task}: {method}() returned {short_repr(value)}, not a dict of values by name: {{'speed': ...}}")
+
+
+def not_a_number(task: str, raw: Mapping[str, Any], step: int) -> TaskError:
+    """Return the error for a reward term that is not a number."""
+    name = next((name for name, value in raw.items() if not isinstance(value, numbers.Real)), "sum")
+    return TaskError(f"{task}: reward term {name!r} is {short_repr(raw.get(name))} at step {step}, not a number")
+
+
+def term_mismatch(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:
+    """Return the error for reward terms and weights of different names."""
+    problems = [f"rewards() returns {name!r}, which has no weight" for name in raw if name not in weights]
+    problems += [f"reward_weights has {name!r}, which rewards() does not return" for name in weights if name not in raw]
+    return TaskError(f"{task}: {problems[0]}")

@@ -1,0 +1,22 @@
+"""Declarations of a mirror symmetry with one mistake each, which shows only in the simulation."""
+
+from rlctl_locomotion.walk import Walk
+
+SIDES_ONLY = (4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9)
+
+
+class MirrorsTurning(Walk):
+    mirror = {**Walk.mirror, "gyroscope": (-1, 2, -3)}
+
+
+class MirrorsTurningLikeVectors(Walk):
+    mirror = {**Walk.mirror, "gyroscope": (1, -2, 3)}
+
+
+class TurnsHipsTheSameWay(Walk):
+    mirror = {**Walk.mirror, "action": SIDES_ONLY, "last_action": SIDES_ONLY}
+
+
+class PrefersItsLeft(Walk):
+    def rewards(self, action):
+        return {**super().rewards(action), "tracking": 10.0 * self.turning[:, 2]}

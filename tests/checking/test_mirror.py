@@ -1,0 +1,69 @@
+"""A mirror symmetry that a task declares is compared with the simulation."""
+
+import pytest
+
+from rlctl.errors import TaskError
+from rlctl.task.env import TaskEnv
+from rlctl_locomotion.walk import Walk
+from tests.checking.judging import case, check_case, findings, found, verdict_of
+
+pytest.importorskip("mujoco")
+
+FILE = "broken_mirrors.py"
+TWIN = f"{FILE}:MirrorsTurning"
+CASES = [
+    case(f"{FILE}:MirrorsTurningLikeVectors", ("RL120", "error"), twin=TWIN),
+    case(f"{FILE}:TurnsHipsTheSameWay", ("RL120", "error"), twin=TWIN),
+    case(f"{FILE}:PrefersItsLeft", ("RL120", "error"), twin=TWIN),
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+@pytest.mark.parametrize("task", ["walk", "walk-rough"])
+def test_sound_declarations(task):
+    assert found(task, "RL120") == set()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("MirrorsTurningLikeVectors", "after 1 step from a mirrored state, with mirrored actions, gyroscope["),
+        ("TurnsHipsTheSameWay", "at the start from a mirrored state"),
+        ("PrefersItsLeft", "after 1 step from a mirrored state, with mirrored actions, reward term tracking is"),
+    ],
+)
+def test_the_message_names_what_is_wrong(name, message):
+    (finding,) = findings(f"{FILE}:{name}", "RL120")
+    assert finding.message.startswith(message)
+
+
+def test_tasks_without_a_symmetry():
+    assert verdict_of("broken_batches.py:Point", "RL120").not_applicable == {"RL120": "it declares no mirror symmetry"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"gravity": (1, 2)},
+            r"'gravity' has 3 elements, so each number from 1 to 3 is needed once, with a sign; got \[1, 2\]",
+        ),
+        ({"gravitiy": (1, -2, 3)}, "Walk: mirror: nothing is called 'gravitiy'. Did you mean 'gravity'?"),
+    ],
+)
+def test_declarations_that_do_not_fit(changes, message, monkeypatch):
+    monkeypatch.setattr(Walk, "mirror", {**Walk.mirror, **changes})
+    with pytest.raises(TaskError, match=message):
+        TaskEnv(Walk(), sim="mujoco")
+
+
+def test_an_observation_without_an_entry(monkeypatch):
+    monkeypatch.setattr(Walk, "mirror", {"action": Walk.mirror["action"]})
+    with pytest.raises(
+        TaskError, match="mirror: 'gyroscope' is missing; each observation and the action need an entry"
+    ):
+        TaskEnv(Walk(), sim="mujoco")

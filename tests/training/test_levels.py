@@ -1,0 +1,83 @@
+"""Levels that follow the success of each environment's own episodes."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from rlctl.errors import RecipeError, TaskError
+from rlctl.rollout.messages import LevelRule
+from rlctl.run.directory import RunDirectory
+from rlctl.run.episode import load_episode
+from rlctl.training import checkpoint
+
+pytest.importorskip("mujoco")
+
+TASK = "tests.training.levelled:Levelled"
+BATCH = "tests.training.levelled:LevelledBatch"
+BROKEN = r"broken at level 0\.5"
+SMALL = {
+    "n_envs": 4,
+    "total_timesteps": 128,
+    "eval": {"episodes": 2, "every_steps": 128},
+    "algo_kwargs": {"n_steps": 16, "batch_size": 32, "n_epochs": 1},
+    "sim": "mujoco",
+}
+
+
+def following(**rule):
+    return {**SMALL, "stages": [{"level": {"start": 0.0, "up": 0.25, "down": 0.1, **rule}}]}
+
+
+def test_a_level_follows_success():
+    rule = LevelRule(0.0, 0.3, 0.1)
+    levels = [0.5]
+    for success in (True, True, True, False, None):
+        levels.append(rule.follow(levels[-1], success))
+    assert levels == [0.5, 0.8, 1.0, 1.0, 0.9, 0.8]
+    assert rule.follow(0.05, False) == 0.0
+
+
+@pytest.mark.parametrize("task", [TASK, BATCH])
+def test_what_is_mastered_gets_harder(train, task):
+    # An episode takes 5 steps and succeeds up to level 0.6: 0, 0.25, 0.5, 0.75, then 0.65, then 0.55, 0.8 ..
+    run = train(task, following(), envs="").run
+    with run.metrics_file.open() as file:
+        rows = list(csv.DictReader(file))
+    # After 16 steps three episodes have ended, after 32 steps six.
+    assert [float(row["level"]) for row in rows] == [0.75, 0.8]
+    saved, _ = checkpoint.read_newest(run)
+    assert saved.tensors["environments/level"].tolist() == [0.8] * 4
+    (first, *_) = [load_episode(file) for file in sorted(run.episodes.glob("*.npz"))]
+    assert first.info.spec.level == 1.0  # evaluations
+    assert first.observations[0, 0] == 1.0  # what the task observes is its level
+
+
+def test_the_episode_that_failed_is_reproduced_at_its_level(train, tmp_path):
+    settings = {**following(), "task": {"faulty_level": 0.5}}
+    with pytest.raises(TaskError, match=BROKEN):
+        train(BATCH, settings, envs="")
+    (run,) = (RunDirectory(path) for path in (tmp_path / "runs").rglob("*_s0"))
+    (file,) = run.episodes.glob("*.npz")
+    episode = load_episode(file)
+    assert episode.info.spec.level == 0.5
+    env = episode.info.spec.make()
+    assert env.reset(seed=episode.info.seed)[0][0] == np.float32(0.5)
+    for action in episode.actions[:-1]:
+        env.step(action)
+    with pytest.raises(RuntimeError, match=BROKEN):
+        env.step(episode.actions[-1])
+
+
+@pytest.mark.parametrize(
+    ("task", "settings", "message"),
+    [
+        (BATCH, following(up=0), "level"),
+        ("Line", {**following(), "sim": None}, "is a plain Gymnasium environment; only tasks have levels"),
+        ("tests.training.levelled:Unjudged", following(), "does not report success, which it would follow"),
+    ],
+)
+def test_what_is_not_supported_is_refused(train, task, settings, message):
+    with pytest.raises(RecipeError) as caught:
+        train(task, settings, **({} if task == "Line" else {"envs": ""}))
+    assert message in str(caught.value)
