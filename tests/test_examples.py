@@ -37,6 +37,7 @@ def findings(task: str, cwd: Path, *options: str) -> set[str]:
     return {finding["rule"] for finding in json.loads(done.stdout)["findings"]}
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_broken_env_has_the_mistakes_that_its_text_names(tmp_path: Path) -> None:
     source = (EXAMPLES / "broken_env/pushed_ball.py").read_text()

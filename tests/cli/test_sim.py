@@ -29,6 +29,7 @@ def test_an_evaluation_says_where_it_was_played(rlctl, sim, engine):
     assert f"2 episodes, seed 0, {engine}, not randomised" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_policy_contains_the_engine_of_its_training(rlctl, tmp_path):
     done = rlctl("train", "reach", "--sim", "mujoco:0.01", "-n", "200", "--n-envs", "2", "--no-check", "--json", "-")
     assert done.returncode == 0, done.stderr

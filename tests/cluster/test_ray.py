@@ -79,6 +79,7 @@ def lose(cluster, node, pid):
     wait_for(lambda: has_ended(pid), 10)
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_cells_are_equal_and_a_lost_node_is_no_end(cluster, node, block_run, toy, tmp_path, capsys):
     """One test, because each process of the test run would start a cluster of its own."""

@@ -15,6 +15,7 @@ from rlctl.run.episode import load_episode
 from tests.playing.pages import play
 
 
+@pytest.mark.slow
 def test_a_walker_follows_commands_pushes_and_the_clock():
     with play("walk") as (page, results):
         first = page.wait_for(lambda frame: frame["time"] > 0.1)

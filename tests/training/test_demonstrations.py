@@ -144,6 +144,7 @@ def test_noise_and_normalisation_after_cloning(record, train, monkeypatch, case,
     assert 0.5 < tensors["normalize//var"] / observations.var() < 2.0
 
 
+@pytest.mark.slow
 def test_off_policy_updates_repeat_the_demonstrations(record, train, monkeypatch):
     monkeypatch.setattr(demonstrations, "_UPDATES", 300)
     env, settings = CASES["sac with gSDE, normalised"]

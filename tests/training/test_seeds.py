@@ -135,6 +135,7 @@ def test_a_changed_task_is_one_warning_for_all_seeds(group, capsys):
     assert capsys.readouterr().err.count("warning: ") == 1
 
 
+@pytest.mark.slow
 def test_what_is_done_stays_and_a_damaged_run_stops_no_other(group, tmp_path):
     file = group.find_run(5).status_file
     content = file.read_text()
