@@ -24,6 +24,7 @@ def rlctl_without(tmp_path, monkeypatch):
     return run
 
 
+@pytest.mark.slow
 def test_a_task_with_a_model_of_pybullet_names_what_is_missing(rlctl_without):
     done = rlctl_without("train", "kuka-grasp", "-n", "100")
     assert done.returncode == 3

@@ -169,6 +169,7 @@ def test_a_baseline_that_is_a_device_is_refused():
         read_baseline(Path("/dev/zero"))
 
 
+@pytest.mark.slow
 def test_findings_of_the_baseline_fail_nothing(tmp_path):
     task, file = f"{BROKEN}:ArrayReward", str(tmp_path / "report.json")
     assert rlctl(task, "--select", "RL2", "--json", file).returncode == 1

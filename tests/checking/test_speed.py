@@ -113,12 +113,14 @@ def test_connecting_in_reset_is_named_however_fast_it_is():
     assert (finding.rule, finding.severity) == ("RL904", "info")
 
 
+@pytest.mark.slow
 def test_a_task_that_says_that_it_reloads_may_load():
     evidence = measured("broken_speed.py:ReloadingTask")
     assert evidence.facts["speed"].rebuilds
     assert findings(evidence) == []
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_calls_through_a_bullet_client_are_seen():
     finding, *more = findings(measured("broken_speed.py:CameraAtEveryStep"))
@@ -127,6 +129,7 @@ def test_calls_through_a_bullet_client_are_seen():
     assert finding.evidence["share"] > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_rebuilding_is_named_with_its_calls():
     (finding,) = findings(measured("broken_speed.py:Rebuilds"))

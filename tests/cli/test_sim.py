@@ -49,13 +49,14 @@ def test_a_batch_has_no_worlds_in_pybullet(rlctl):
     assert done.stderr == "error: Walk simulates its worlds in MuJoCo: sim: mujoco, or --sim mujoco\n"
 
 
-@pytest.mark.parametrize("verb", [("check-env", "reach"), ("replay", "reach", "--policy", "zero"), ("train", "reach")])
+@pytest.mark.parametrize("verb", [("check-env", "reach"), ("train", "reach")])
 def test_an_engine_that_does_not_exist(rlctl, verb):
     done = rlctl(*verb, "--sim", "bullet")
     assert done.returncode == 2
     assert "sim 'bullet': give pybullet, mujoco, or mujoco:SOLREF with 0 < SOLREF < 1 s" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_look_in_mujoco(rlctl):
     done = rlctl("replay", "reach", "--policy", "zero", "--sim", "mujoco", "--json", "-")
     assert done.returncode == 0, done.stderr

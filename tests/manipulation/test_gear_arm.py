@@ -117,7 +117,7 @@ def grasp_and_lift(env, seed):
     return np.array(rows), info
 
 
-@pytest.mark.parametrize("stage", [slow("grasp"), "lift"])
+@pytest.mark.parametrize("stage", [slow("grasp"), slow("lift")])
 def test_an_object_can_be_grasped_and_lifted(stage):
     env = TaskEnv(GearArm(stage=stage))
     lifted = []

@@ -118,7 +118,7 @@ def test_alignment_by_hand(env):
     assert misaligned(math.pi / 6) == pytest.approx(0.75)  # cos(30 degrees)^2
 
 
-@pytest.mark.parametrize("randomize", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("randomize", [pytest.param(value, marks=pytest.mark.slow) for value in (False, True)])
 def test_grasps_repeat_bit_for_bit(randomize):
     def make():
         return TaskEnv(KukaGrasp(), events=EventSettings(randomize))

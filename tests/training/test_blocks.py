@@ -109,9 +109,13 @@ def compute(kind, settings, cores):
     return {name: array.tobytes() for name, array in arrays.items()}
 
 
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
     ("kind", "settings"),
-    [(PpoGradients, PPO), (SacGradients, SAC), (TqcGradients, TQC), (Td3Gradients, TD3), (DqnGradients, DQN)],
+    [(PpoGradients, PPO), (SacGradients, SAC), (TqcGradients, TQC), slow(Td3Gradients, TD3), slow(DqnGradients, DQN)],
     ids=["ppo", "sac", "tqc", "td3", "dqn"],
 )
 def test_any_number_of_processes_computes_the_same_bits(kind, settings):

@@ -78,7 +78,11 @@ def start(tmp_path):
 
 @pytest.mark.parametrize(
     ("number", "code"),
-    [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143), (signal.SIGUSR1, 143)],
+    [
+        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
+        (signal.SIGTERM, 143),
+        pytest.param(signal.SIGUSR1, 143, marks=pytest.mark.slow),
+    ],
 )
 def test_a_signal_saves_a_checkpoint_and_leaves_no_child(start, rlctl, tmp_path, number, code):
     training = start(tmp_path)
@@ -128,6 +132,7 @@ def test_two_processes_cannot_write_one_run(start, rlctl, tmp_path):
     assert f"another process is writing this run (pid {training.process.pid} on " in second.stderr
 
 
+@pytest.mark.slow
 def test_a_process_that_has_lost_its_run_writes_nothing_more(start, rlctl, tmp_path):
     training = start(tmp_path, "--set", "eval.every_steps=64")
     wait_for(lambda: list(tmp_path.glob("runs/*/*/checkpoints/0*")))
