@@ -22,7 +22,9 @@ def rlctl(tmp_path, monkeypatch):
     return run
 
 
-@pytest.mark.parametrize(("sim", "engine"), [((), "PyBullet"), (("--sim", "mujoco"), "MuJoCo")])
+@pytest.mark.parametrize(
+    ("sim", "engine"), [((), "PyBullet"), pytest.param(("--sim", "mujoco"), "MuJoCo", marks=pytest.mark.slow)]
+)
 def test_an_evaluation_says_where_it_was_played(rlctl, sim, engine):
     done = rlctl("eval", "reach", "--policy", "zero", "--episodes", "2", *sim)
     assert done.returncode == 0, done.stderr

@@ -31,6 +31,7 @@ def train(request_of_line, slurm):
     return run
 
 
+@pytest.mark.slow
 def test_a_preempted_job_is_requeued(toy, slurm, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cluster.yaml").write_text("cpus: 1\nsbatch: [--time=1:00:00]\nsetup: [export SET_UP=1]\n")

@@ -92,6 +92,7 @@ def test_resolving_a_name_leaves_the_path_alone(my_env):
     assert sys.path == [*before, str(my_env.parent)]
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_strangers_modules_in_the_current_folder_are_not_run(installed_rlctl, write_module):
     for name in ("numpy", "json", "signal", "torch", "gymnasium", "rlctl_manipulation", "typer"):

@@ -42,6 +42,7 @@ def env():
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("held_for", "steps"), [slow(1, 3000), (10, 1000), slow(10, 3000), slow(50, 3000)])
 def test_the_linkage_and_the_gears_hold(env, held_for, steps):
     """20 or 60 s of random torques, new ones every `held_for` control steps: 1 mm, 0.5 degrees."""

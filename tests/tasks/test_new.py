@@ -69,6 +69,7 @@ def test_it_reads_like_the_rest(plugin):
     run("ruff", "check", "--isolated", "--line-length", "120", "--select", rules, cwd=plugin.folder)
 
 
+@pytest.mark.slow
 def test_it_passes_every_check_before_it_is_installed(rlctl, plugin):
     result = rlctl("check-env", PATH_FORM, "--strict")
     assert result.returncode == 0, result.stdout

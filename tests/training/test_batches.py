@@ -50,6 +50,7 @@ def trained(rlctl, tmp_path):
     return rlctl
 
 
+@pytest.mark.slow
 def test_what_is_done_with_its_policy(trained, tmp_path):
     rlctl = trained
     result = rlctl("eval", "--episodes", "20", "--json", "-")

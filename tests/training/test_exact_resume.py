@@ -89,10 +89,10 @@ CASES = {
     "ppo, blocks": ("Line", settings("ppo", algo_kwargs={"n_steps": 32, "batch_size": 128}, **WIDE)),
     "tqc, blocks": ("Line", settings("tqc", algo_kwargs={"batch_size": 64}, **WIDE)),
 }
-# A kind of state each: noise matrices, stages, hidden states, whole episodes with their goals and statistics. Killed
+# A kind of state each: noise matrices, stages, whole episodes with their goals and statistics. Killed
 # trainings of plain ppo and sac are in tests/crash.
 QUICK = {
-    *("ppo with gSDE", "ppo, curriculum", "recurrent_ppo", "sac, hindsight, normalised"),
+    *("ppo with gSDE", "ppo, curriculum", "sac, hindsight, normalised"),
     "ppo, privileged, on worlds in batches",
 }
 

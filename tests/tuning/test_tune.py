@@ -378,6 +378,7 @@ def wait_for(condition, timeout_s=120.0):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_trainings_that_are_real(rlctl, tmp_path):
     settings = ["-n", "128", "--n-envs", "2", "--set", "algo_kwargs.n_steps=16", "--set", "eval.episodes=1"]
     search = ["--search", "algo_kwargs.gamma=0.5,0.99", "--trials", "2", "--jobs", "2"]
