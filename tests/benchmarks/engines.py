@@ -92,8 +92,8 @@ def reach_batch_learns(repeat: int) -> Row:
 
 def _learn_reach(seed: int, folder: str) -> tuple[float, float]:
     began = time.perf_counter()
-    settings = ("--no-check", "--set", "eval.every_steps=60_000")
-    _rlctl("train", "reach-batch", "--seed", str(seed), "-n", "60000", "-o", folder, *settings)
+    settings = ("--no-check", "--set", "eval.every_steps=55_040")
+    _rlctl("train", "reach-batch", "--seed", str(seed), "-n", "55040", "-o", folder, *settings)
     seconds = time.perf_counter() - began
     (run,) = Path(folder).glob(f"reach-batch/*_s{seed}")
     return seconds, json.loads(_rlctl("eval", str(run), "--seed", "1000", "--json", "-"))["success_rate"]
