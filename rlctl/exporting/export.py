@@ -261,13 +261,19 @@ def describe_policy(policy: TorchPolicy, target: Path) -> dict[str, Any]:
     return {"path": target, "policy": policy.file.path, **about}
 
 
+def check_verified(path: Path, policy: Path | None, agreement: Agreement, loop: ClosedLoop) -> None:
+    """Raise `AnswerIsNo` for a file at `path` that acts otherwise than the policy."""
+    if agreement.agrees and (loop.agrees or not loop.is_conclusive):
+        return
+    why = f"it does not act as {policy} does"
+    if agreement.agrees:
+        why = "all actions agree, but the episodes differ"
+    numbers = f"{format_agreement(agreement)}\n{format_closed_loop(loop)}"
+    raise AnswerIsNo(f"{path}: not verified, not written: {why}\n{numbers}")
+
+
 def _verify(policy: TorchPolicy, workers: Workers, target: Path, exported: Policy, file: Path) -> dict[str, Any]:
     """Return how a file was verified, as fields of its report; raises `AnswerIsNo` if it acts differently."""
     agreement, loop = verify(policy, exported, file, workers)
-    if not agreement.agrees or (loop.is_conclusive and not loop.agrees):
-        why = f"it does not act as {policy.file.path} does"
-        if agreement.agrees:
-            why = "all actions agree, but the episodes differ"
-        numbers = f"{format_agreement(agreement)}\n{format_closed_loop(loop)}"
-        raise AnswerIsNo(f"{target}: not verified, not written: {why}\n{numbers}")
+    check_verified(target, policy.file.path, agreement, loop)
     return {"agreement": agreement, "closed_loop": loop, "latency": measure_latency(policy, exported)}

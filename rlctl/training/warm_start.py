@@ -124,6 +124,6 @@ def _load_normalization(file: Path, info: PolicyInfo, model: Any, tensors: Mappi
             actor, critic = tensors[f"normalize/{key}/{name}"], tensors.get(f"critic/{name}")
             values[...] = np.concatenate([actor, values[len(actor) :] if critic is None else critic])
         of_critic = "critic/mean" in tensors or len(actor) == len(values)
-        # What a shipped policy's critic saw is not known: these elements begin anew.
+        # What a shipped policy's critic saw is not known: the statistics of these elements start again.
         seen = np.arange(len(values)) < len(actor)
         moments.count = steps if of_critic else np.where(seen, steps, moments.count)  # type: ignore[assignment]

@@ -4,8 +4,11 @@ import dataclasses
 import functools
 import itertools
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from rlctl.checking import children, families
 from rlctl.checking.bullet_worlds import find_clients
@@ -46,6 +49,12 @@ class Case:
 
 def case(broken: str, *expected: tuple[str, str], **settings: Any) -> Case:
     return Case(broken, frozenset(expected), **settings)
+
+
+def mark_slow(cases: Sequence[Case]) -> list[Any]:
+    """Return the cases as parameters; all but the first one that expects the same findings are slow."""
+    quick = {case.expected: case for case in reversed(cases)}.values()
+    return [case if case in quick else pytest.param(case, marks=pytest.mark.slow) for case in cases]
 
 
 IN_PROCESSES = [

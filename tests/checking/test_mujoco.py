@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.checking.judging import case, check_case, findings
+from tests.checking.judging import case, check_case, findings, mark_slow
 
 pytest.importorskip("mujoco")
 
@@ -48,14 +48,7 @@ CASES = [
 ]
 
 
-FIRST_OF_A_RULE = {case.expected: case for case in reversed(CASES)}.values()
-
-
-@pytest.mark.parametrize(
-    "case",
-    [case if case in FIRST_OF_A_RULE else pytest.param(case, marks=pytest.mark.slow) for case in CASES],
-    ids=lambda case: case.broken,
-)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 

@@ -149,7 +149,7 @@ def test_a_policy_with_a_privileged_critic_starts_another_training(train, tmp_pa
         train(STOOL, merge(SMALL, {"privileged": None}), envs="", initial_policy=str(run.last_policy))
     source.actor_only().write(shipped := tmp_path / "shipped.safetensors")
     later = train(STOOL, merge(SMALL, {"total_timesteps": 64}), envs="", initial_policy=str(shipped)).run
-    # The critic's own statistics begin anew: of two rollouts of 64 steps they have those steps only.
+    # The critic's own statistics start again: of two rollouts of 64 steps they have those steps only.
     assert PolicyFile.read(later.last_policy).tensors["critic/var"].max() > 0
 
 

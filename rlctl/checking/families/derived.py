@@ -224,7 +224,7 @@ def _find_never_computed(instance: Instance, calls: MujocoCalls, plain: Sequence
         if columns and pair is not None:
             verb = "is" if len(columns) == 1 else "are"
             what = f"{name_columns(columns, pair[0].shape[1] - 1)} {verb} computed from data.{name}"
-            message = f"{what}, which is zero for ever: nothing calls {NEVER_COMPUTED[name]}"
+            message = f"{what}, which stays zero: nothing calls {NEVER_COMPUTED[name]}"
             yield RuleFinding("RL818", message, {"element": f"data.{name}", "value": 0.0})
             simulation = find_mujoco(instance.env)
             if simulation is not None:

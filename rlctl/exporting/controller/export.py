@@ -14,7 +14,7 @@ import numpy as np
 from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import AnswerIsNo, TaskError, UsageError
+from rlctl.errors import TaskError, UsageError
 from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
 from rlctl.exporting.controller.graph import build_graph
@@ -24,11 +24,10 @@ from rlctl.exporting.controller.source import ControllerSource
 from rlctl.exporting.export import (
     ExportReport,
     check_environment,
+    check_verified,
     describe_policy,
     explain_unverifiable,
     find_source,
-    format_agreement,
-    format_closed_loop,
 )
 from rlctl.exporting.request import ExportRequest
 from rlctl.exporting.verify import Latency, change_last_bits, measure_sb3
@@ -169,12 +168,7 @@ class _Export:
         if agreement.agrees and not loop.agrees:
             repeats, magnified = self._check_conclusive(is_limited)
             loop = dataclasses.replace(loop, repeats=repeats, magnified=magnified)
-        if not agreement.agrees or (loop.is_conclusive and not loop.agrees):
-            why = f"it does not act as {self.torch_policy.file.path} does"
-            if agreement.agrees:
-                why = "all actions agree, but the episodes differ"
-            numbers = f"{format_agreement(agreement)}\n{format_closed_loop(loop)}"
-            raise AnswerIsNo(f"{path}: not verified, not written: {why}\n{numbers}")
+        check_verified(path, self.torch_policy.file.path, agreement, loop)
         fields = {"agreement": agreement, "closed_loop": loop, "max_target_difference": result.max_target_difference}
         return fields, recorded
 
