@@ -54,7 +54,8 @@ def evaluate(
     json: Json = None,
 ) -> None:
     """Evaluate a policy: success rate with its interval, returns, reward terms."""
-    from rlctl.evaluation.evaluate import evaluate_group, run_evaluation
+    from rlctl.evaluation.evaluate import run_evaluation
+    from rlctl.evaluation.group_scores import evaluate_group
     from rlctl.evaluation.report import show, show_group, show_robustness
     from rlctl.run.directory import is_group
     from rlctl.run.group import read_group
@@ -84,6 +85,8 @@ def evaluate(
         show_robustness(robustness, json)
         return check_gates(robustness, gates)
     if request.run is not None and request.baseline is None and is_group(folder := Path(request.run)):
+        if request.decide_early:
+            raise UsageError("--decide-early is for one run: of a group every seed plays all episodes")
         scores = evaluate_group(read_group(folder), request)
         show_group(scores, json)
         return scores.check(gates)

@@ -10,7 +10,8 @@ from rich.text import Text
 from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.evaluation.episode_statistics import Spread
-from rlctl.evaluation.evaluate import Evaluation, GroupScore, SeedScore
+from rlctl.evaluation.evaluate import Evaluation
+from rlctl.evaluation.group_scores import GroupScore, SeedScore
 from rlctl.evaluation.request import NO_GATES, Gates
 from rlctl.evaluation.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
 from rlctl.evaluation.sequential import is_decided

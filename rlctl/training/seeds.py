@@ -10,7 +10,7 @@ from pathlib import Path
 from rlctl import output
 from rlctl.environments import named_task
 from rlctl.errors import RlctlError, UsageError
-from rlctl.evaluation.evaluate import GroupScore, evaluate_group
+from rlctl.evaluation.group_scores import GroupScore, evaluate_group
 from rlctl.evaluation.request import EvalRequest
 from rlctl.run.directory import RunLock
 from rlctl.run.group import Group, create_group, parse_seeds, read_group

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.environments import installed, registry
-from rlctl.evaluation.evaluate import evaluate_group
+from rlctl.evaluation.group_scores import evaluate_group
 from rlctl.evaluation.request import EvalRequest
 from rlctl.run.directory import GROUP_FILE
 from rlctl.run.group import Group, parse_seeds, read_group

@@ -8,7 +8,8 @@ import pytest
 from rlctl.environments.spec import EnvChanges
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.episode_statistics import Spread, mean_terms, success_interval, success_rate
-from rlctl.evaluation.evaluate import GroupScore, SeedScore, measure_score, run_evaluation
+from rlctl.evaluation.evaluate import measure_score, run_evaluation
+from rlctl.evaluation.group_scores import GroupScore, SeedScore
 from rlctl.evaluation.report import as_json
 from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.rollout.messages import EpisodeResult

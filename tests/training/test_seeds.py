@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rlctl.errors import ArtifactError, Interrupted, RecipeError, UsageError
-from rlctl.evaluation.evaluate import evaluate_group
+from rlctl.evaluation.group_scores import evaluate_group
 from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.run.directory import RunLock, is_being_written
 from rlctl.run.group import create_group, find_group, parse_seeds, read_group
