@@ -1,0 +1,222 @@
+"""What a world in MuJoCo consists of, before it is compiled: files, motors, pairs that collide, and constraints."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from rlctl.errors import TaskError
+from rlctl.task.attachments import Attachment
+from rlctl.task.model_files import find_model_file
+from rlctl.task.mujoco.files import ModelFile, is_colliding, read_model_file
+from rlctl.task.mujoco.parts import WORLD, Parts
+from rlctl.task.mujoco.pictures import add_checker, light_scene
+from rlctl.task.mujoco.world import Array
+
+_RIGID = (0.9999, 0.9999, 0.001, 0.5, 2)  # impedance of constraints: as stiff as PyBullet's
+_WXYZ = [3, 0, 1, 2]
+_WIDE = 5.0  # [m], of half a box
+_HIDDEN = 3  # group of geoms that neither pictures nor recordings show
+_GROUND_THICKNESS = 0.5  # [m], of rough ground
+
+
+class Scene:
+    """The `MjSpec` of a world, and the parts of its bodies by name.
+
+    A single world is solved more exactly than one of many (`single=False`), and has shapes that are only looked at
+    (`visuals`). `solref` [s] is the time constant of contacts of the files that follow.
+    """
+
+    def __init__(
+        self, mujoco: Any, *, timestep: float, iterations: int, solref: float, single: bool, visuals: bool
+    ) -> None:
+        self.mujoco, self.solref, self._visuals = mujoco, solref, visuals
+        self.parts: dict[str, Parts] = {}
+        self.pairs: list[tuple[str, str]] = []
+        """Links whose geoms collide, each as BODY/LINK."""
+        self.spec = mujoco.MjSpec()
+        light_scene(self.spec)
+        option = self.spec.option
+        option.timestep = timestep
+        option.gravity = [0.0, 0.0, -9.81]
+        # Both take the motors' damping implicitly. The first solves motors and contacts together, which holds stiff
+        # motors stable; batches take what is faster.
+        kinds = mujoco.mjtIntegrator
+        option.integrator = kinds.mjINT_DISCRETE if single else kinds.mjINT_IMPLICITFAST
+        if single:
+            option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+            option.impratio = 10.0  # otherwise feet that stand slide slowly; batches take what is twice as fast
+        option.iterations = iterations
+        # A world that is no longer finite is an error, not a silent reset.
+        option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+
+    def add_file(
+        self,
+        name: str,
+        file: str | Path,
+        *,
+        position: Sequence[float],
+        orientation: Sequence[float],
+        fixed: bool,
+        self_collision: bool,
+        inertia: Literal["file", "shape"],
+    ) -> Parts:
+        """Add what a model file describes, with a motor for each joint; raises `TaskError` if it cannot be read."""
+        source = read_model_file(find_model_file(file), fixed=fixed, inertia=inertia, visuals=self._visuals)
+        child = source.spec
+        for joint in child.joints:
+            joint.actfrclimited = False  # the force limits are those of the motors
+        is_urdf = source.path.suffix == ".urdf"
+        free = any(joint.type == self.mujoco.mjtJoint.mjJNT_FREE for joint in child.joints)
+        fixed = (fixed or not any(link.mass > 0 for link in child.bodies)) if is_urdf else not free
+        if fixed and not child.joints:
+            self._flatten_ground(child)
+        drawn = {geom.parent.name for geom in child.geoms if is_urdf and not is_colliding(geom)}
+        for geom in filter(is_colliding, child.geoms):
+            geom.group = _HIDDEN if geom.parent.name in drawn else geom.group
+        parts = Parts(name, source, fixed, child)
+        for number, geom in enumerate(child.geoms):
+            geom.name = str(number)
+            # Only the pairs of `_add_pairs` collide.
+            geom.contype = geom.conaffinity = 0
+        frame = self.spec.worldbody.add_frame(pos=list(position), quat=[orientation[part] for part in _WXYZ])
+        for option in dir(self.spec.option):  # the file's are not used, and MuJoCo warns of them
+            if not option.startswith("_"):
+                setattr(child.option, option, getattr(self.spec.option, option))
+        self.spec.attach(child, prefix=f"{name}/", frame=frame)
+        if not fixed and is_urdf:
+            self.spec.body(f"{name}/{parts.base_name}").add_freejoint(name=f"{name}/free")
+        self._add_motors(parts)
+        for other in self.parts.values():
+            self._add_pairs(parts, other)
+        self._add_own_pairs(parts, self_collision)
+        self.parts[name] = parts
+        return parts
+
+    def add_height_field(self, name: str, heights: Array, cell: float, color: Sequence[float]) -> Parts:
+        """Add rough ground: heights [m] of shape (nx, ny), `cell` [m] apart."""
+        child, (rows, columns) = self.mujoco.MjSpec(), heights.shape
+        half = [(count - 1) / 2 * cell for count in (rows, columns)]
+        lowest, top = float(heights.min()), float(np.ptp(heights))
+        scaled = (heights - lowest) / (top or 1.0)
+        # MuJoCo's rows run along y.
+        size = [*half, top or 1e-3, _GROUND_THICKNESS]
+        child.add_hfield(name="heights", size=size, nrow=columns, ncol=rows, userdata=scaled.T.ravel())
+        body = child.worldbody.add_body(name="ground")
+        geom = body.add_geom(type=self.mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="heights", rgba=[*color, 1.0])
+        geom.pos, geom.name = [0.0, 0.0, lowest], "0"
+        source = ModelFile(Path("height field"), child, {}, {}, {"ground": 0.5}, {"ground": 0.0}, {})
+        parts = Parts(name, source, True, child)
+        geom.contype = geom.conaffinity = 0
+        x, y = ((np.arange(count) - (count - 1) / 2) * cell for count in heights.shape)
+        parts.terrain = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1)
+        self.spec.attach(child, prefix=f"{name}/", frame=self.spec.worldbody.add_frame())
+        for other in self.parts.values():
+            self._add_pairs(other, parts)
+        self.parts[name] = parts
+        return parts
+
+    def connect(self, kind: Any, first: Attachment, second: Attachment) -> None:
+        """Add a constraint of a kind of `mjtEq` between two places on links."""
+        names = {"name1": self._add_site(first), "name2": self._add_site(second)}
+        self.add_equality(kind, objtype=self.mujoco.mjtObj.mjOBJ_SITE, **names)
+
+    def add_equality(self, kind: Any, **values: Any) -> None:
+        """Add a constraint of a kind of `mjtEq`, as stiff as the physics step permits."""
+        solref = [2 * self.spec.option.timestep, 1.0]
+        self.spec.add_equality(type=kind, solref=solref, solimp=_RIGID, **values)
+        # It solves motors and constraints together: otherwise strong motors pull gears and pins apart.
+        self.spec.option.integrator = self.mujoco.mjtIntegrator.mjINT_DISCRETE
+
+    def add_force_sensor(self, joint: str, link: str) -> None:
+        """Measure force and torque of a joint at the centre of mass of `link`; both names are "BODY/NAME"."""
+        part, kinds = self.spec.body(link), self.mujoco.mjtSensor
+        part.add_site(name=joint, pos=part.ipos)
+        for name, kind in ((joint, kinds.mjSENS_FORCE), (f"{joint} torque", kinds.mjSENS_TORQUE)):
+            self.spec.add_sensor(name=name, type=kind, objtype=self.mujoco.mjtObj.mjOBJ_SITE, objname=joint)
+
+    def compile(self, model: Any, data: Any) -> tuple[Any, Any]:
+        """Return the model and its data, with the state and the changes of those that were compiled before.
+
+        Raises `TaskError` naming the newest file if MuJoCo refuses.
+        """
+        try:
+            new_model, new_data = self.spec.recompile(model, data)  # keeps the state
+        except ValueError as error:
+            newest = list(self.parts.values())[-1]  # those before it have been compiled
+            raise TaskError(f"MuJoCo cannot load {newest.file.path}: {' '.join(str(error).split())}") from None
+        _keep_changes(model, new_model)
+        for parts in self.parts.values():
+            parts.bind(new_model)
+        return new_model, new_data
+
+    def _flatten_ground(self, child: Any) -> None:
+        """Make a wide box that is fixed, such as the ground of `plane.urdf`, a plane: faster, and exact."""
+        box, plane = self.mujoco.mjtGeom.mjGEOM_BOX, self.mujoco.mjtGeom.mjGEOM_PLANE
+        grounds = [geom for geom in child.geoms if geom.type == box and min(geom.size[:2]) > _WIDE]
+        for geom in filter(is_colliding, grounds):
+            geom.pos = [*geom.pos[:2], geom.pos[2] + geom.size[2]]
+            geom.type, geom.size = plane, [geom.size[0], geom.size[1], 1.0]
+            geom.material = add_checker(child)
+        if grounds:  # recordings draw them themselves
+            used = {geom.meshname for geom in child.geoms if is_colliding(geom)}
+            unused = [mesh for mesh in child.meshes if mesh.name not in used]
+            for part in [*(geom for geom in child.geoms if not is_colliding(geom)), *unused]:
+                child.delete(part)
+
+    def _add_motors(self, parts: Parts) -> None:
+        """Add a motor to each joint: its force is `ctrl + b1 * position + b2 * velocity`, within a range."""
+        mujoco = self.mujoco
+        for joint in parts.joint_names:
+            motor = self.spec.add_actuator(
+                name=f"{parts.name}/motor {joint}", target=f"{parts.name}/{joint}", trntype=mujoco.mjtTrn.mjTRN_JOINT
+            )
+            motor.gainprm[0], motor.biastype = 1.0, mujoco.mjtBias.mjBIAS_AFFINE
+            motor.forcelimited, motor.forcerange = True, [-1e9, 1e9]
+
+    def _add_pairs(self, first: Parts, second: Parts) -> None:
+        for (one, link), (two, other) in itertools.product(first.collision_geoms, second.collision_geoms):
+            if link in first.moving or other in second.moving:
+                self._add_pair(first, one, link, second, two, other)
+
+    def _add_own_pairs(self, parts: Parts, self_collision: bool) -> None:
+        for (one, link), (two, other) in itertools.combinations(parts.collision_geoms, 2):
+            if WORLD in (link, other):  # the floor of an MJCF file
+                collide = link in parts.moving or other in parts.moving
+            else:
+                related = link == other or link in parts.ancestors[other] or other in parts.ancestors[link]
+                collide = self_collision and not related
+            if collide:
+                self._add_pair(parts, one, link, parts, two, other)
+
+    def _add_pair(self, first: Parts, one: int, link: str, second: Parts, two: int, other: str) -> None:
+        spins = first.file.spin.get(link, 0.0) + second.file.spin.get(other, 0.0)
+        self.spec.add_pair(
+            geomname1=f"{first.name}/{one}",
+            geomname2=f"{second.name}/{two}",
+            condim=4 if spins else 3,
+            solref=[self.solref, 1.0],
+        )
+        self.pairs.append((first.full_name(link), second.full_name(other)))
+
+    def _add_site(self, end: Attachment) -> str:
+        name, link = f"site {len(self.spec.sites)}", self.spec.body(f"{end.body.name}/{end.link}")
+        origin = link.ipos if end.link == end.body.base_name else np.zeros(3)
+        link.add_site(name=name, pos=origin + end.position, quat=[end.orientation[part] for part in _WXYZ])
+        return name
+
+
+def _keep_changes(before: Any, after: Any) -> None:
+    # What a task has changed in `build` before the last change of structure, by the names of bodies and joints.
+    for body in range(1, before.nbody):
+        number = after.body(before.body(body).name).id
+        for name in ("body_mass", "body_inertia", "body_pos", "body_quat"):
+            getattr(after, name)[number] = getattr(before, name)[body]
+    for actuator in range(before.nu):
+        number = after.actuator(before.actuator(actuator).name).id
+        for name in ("actuator_biasprm", "actuator_forcerange"):
+            getattr(after, name)[number] = getattr(before, name)[actuator]
