@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from rlctl.deploy.filter.bounds import Bounds
 from rlctl.deploy.filter.limits import JointLimits, Limits
-from rlctl.deploy.filter.observation import ObservationLayout
+from rlctl.deploy.filter.observation import MeasuredPositions, ObservationLayout
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RecipeError, UsageError, check_name
 from rlctl.task.joints import Joints
+from rlctl.task.terms import Scaled
 
 Array = NDArray[np.float64]
 
@@ -35,7 +36,7 @@ class FittedLimits:
     space: spaces.Space[Any]  # the action space
     control_dt: float | None
     bounds: Bounds | None  # None where actions are choices
-    measured: slice | None  # where the joints' positions are in the flat observation
+    measured: MeasuredPositions | None
     home: Array | None
     safe: Array  # the command while holding or stopped, if commands are values
 
@@ -73,7 +74,7 @@ def _fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
         raise UsageError(
             "limits: the actions of this policy are discrete choices; only continuous actions can be limited"
         )
-    measured = _find_measured(limits, layout, count)
+    measured = _find_measured(limits, layout, info, count)
     home = _read_list(limits, "home", count)
     if (limits.lowpass_hz or limits.blend_in_s) and control_dt is None:
         raise RecipeError(_NO_CONTROL_DT)
@@ -227,14 +228,20 @@ def _gather(joints: list[JointLimits], key: str, default: float, end: int) -> Ar
     return np.array([default if (ends := getattr(joint, key)) is None else ends[end] for joint in joints])
 
 
-def _find_measured(limits: Limits, layout: ObservationLayout, count: int) -> slice | None:
+def _find_measured(limits: Limits, layout: ObservationLayout, info: EnvInfo, count: int) -> MeasuredPositions | None:
     if (name := limits.measured.position) is None:
         return None
     check_name(name, layout.slices, "limits: measured.position: no observation", RecipeError, listed="Known")
     part = layout.slices[name]
     if (size := part.stop - part.start) != count:
         raise RecipeError(f"limits: measured.position: {name} has {size} elements, the action has {count}")
-    return part
+    term = info.observation_terms.get(name)
+    if term is None:
+        return MeasuredPositions(part)
+    if not isinstance(term, Scaled) or 0.0 in term.scale:
+        raise RecipeError(f"limits: measured.position: {name} is computed; positions cannot be read from it")
+    scale, offset = (np.array(numbers) if numbers else None for numbers in (term.scale, term.offset))
+    return MeasuredPositions(part, scale, offset)
 
 
 def _read_list(limits: Limits, key: str, count: int) -> Array | None:
@@ -255,7 +262,9 @@ def _check_home(limits: Limits, bounds: Bounds | None, home: Array | None) -> No
         raise RecipeError("limits: home: outside the position limits")
 
 
-def _check_measured(limits: Limits, bounds: Bounds | None, measured: slice | None, layout: ObservationLayout) -> None:
+def _check_measured(
+    limits: Limits, bounds: Bounds | None, measured: MeasuredPositions | None, layout: ObservationLayout
+) -> None:
     if measured is not None or bounds is None:
         return
     moves = bounds.speed is not None or bounds.change is not None or limits.blend_in_s > 0

@@ -1,5 +1,6 @@
 """Converts clients' observations to the form that the policy takes, and checks their values."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -130,6 +131,21 @@ def _join(names: list[Any]) -> str:
 
 def _is_image(space: spaces.Space[Any]) -> bool:
     return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MeasuredPositions:
+    """Where the flat observation has the joints' positions, and how it has them: `(position - offset) * scale`."""
+
+    part: slice
+    scale: Array | None = None  # None: the positions themselves
+    offset: Array | None = None
+
+    def read(self, values: Array) -> Array:
+        """Return the positions in the joints' units, in which limits are written."""
+        positions = values[self.part]
+        positions = positions if self.scale is None else positions / self.scale
+        return positions if self.offset is None else positions + self.offset
 
 
 Fault = tuple[str, float, float]  # kind and name of the observation, value and limit

@@ -166,7 +166,7 @@ class SafetyFilter:
         if (fault := self._sensors.check(values, float(age))) is not None:
             return self.fail(*fault)
         if self._measured is not None and self.command is not None:
-            self.command.measure(values[self._measured])
+            self.command.measure(self._measured.read(values))
         self._fault = ""
         return True
 

@@ -106,7 +106,7 @@ class LimitsSource:
     @property
     def measured(self) -> int | None:
         """Where the quantities have the joints' positions; None if they are not measured."""
-        return None if self.fitted.measured is None else self.fitted.measured.start
+        return None if self.fitted.measured is None else self.fitted.measured.part.start
 
     @functools.cached_property
     def _sensors(self) -> SensorChecks:

@@ -6,6 +6,7 @@ from gymnasium import spaces
 from rlctl.deploy import SafetyFilter, read_limits
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.errors import ArtifactError, RecipeError
+from rlctl.task import terms
 from rlctl.task.joints import Joints
 from tests.deploy.conftest import make_arm, observe_at
 
@@ -168,3 +169,15 @@ def test_a_file_that_is_not_there(tmp_path):
 def test_a_scale_that_rounding_would_swallow(write, arm):
     with pytest.raises(RecipeError, match="scale is too small next to offset"):
         SafetyFilter(arm, write("{command: position, scale: 1.0e-10, offset: 100}"))
+
+
+def test_positions_that_the_policy_observes_scaled_and_from_a_default_pose(write, arm):
+    text = "command: position\nscale: 1\nlimits: {all: {speed: 1}}\nmeasured: {position: positions}"
+    scaled = terms.Scaled("joint_positions", offset=(0.5, -0.5), scale=2.0)
+    safety = SafetyFilter(arm.model_copy(update={"observation_terms": {"positions": scaled}}), write(text))
+    safety.observe(observe_at(0.2, 0.0))
+    # The joints are at 0.2 / 2 + 0.5 = 0.6 and -0.5 rad; 1 rad/s over 0.1 s from there.
+    assert safety.limit([5.0, 5.0]) == pytest.approx([0.7, -0.4])
+    gravity = arm.model_copy(update={"observation_terms": {"positions": terms.Gravity()}})
+    with pytest.raises(RecipeError, match=r"measured\.position: positions is computed; positions cannot be read"):
+        SafetyFilter(gravity, write(text))
