@@ -207,7 +207,10 @@ def explain_left_out(module: str | None) -> str | None:
     if _read_requirements("rlctl-core") is None or _read_requirements("rlctl") is not None:
         return None
     needed = (module or "").partition(".")[0]
-    return f"this needs {needed}, which is not part of rlctl-core: pip install rlctl"
+    extra = re.compile(rf"""{re.escape(needed)}\b.*;.*extra == ['"](\w+)['"]""")
+    extras = [match[1] for line in _read_requirements("rlctl-core") or [] if (match := extra.match(line))]
+    package = shlex.quote(f"rlctl-core[{extras[0]}]") if extras else "rlctl"
+    return f"this needs {needed}, which is not part of rlctl-core: pip install {package}"
 
 
 def _read_requirements(distribution: str) -> list[str] | None:

@@ -50,14 +50,24 @@ class CheckReport:
     strict: bool = False  # Whether warnings count as errors
 
     @property
+    def out_of_time(self) -> list[str]:
+        """Rules that were not judged because the time of an experiment ended."""
+        cut = {name for name, end in self.records.finished.items() if end.is_cut}
+        return [rule for rule in self.verdict.not_judged if rule in RULES and families.find_needs([rule]) & cut]
+
+    @property
     def exit_code(self) -> int:
-        """70 if a rule crashed, 3 if no instance could be built, 1 for errors, 0 otherwise."""
+        """70 if a rule crashed, 3 if no instance could be built, 1 for errors, 0 otherwise.
+
+        A strict check has 1 also for warnings, and for rules that it had no time to judge.
+        """
         if self.verdict.crashed:
             return 70
         if self.records.built is None:
             return 3
         bad = (Severity.ERROR, Severity.WARNING) if self.strict else (Severity.ERROR,)
-        return int(any(finding.severity in bad for finding in self.verdict.findings))
+        is_bad = any(finding.severity in bad for finding in self.verdict.findings)
+        return int(is_bad or (self.strict and bool(self.out_of_time)))
 
     def locate(self, finding: RuleFinding) -> tuple[Path, int] | None:
         """Return file and line of what causes a finding: a call, else the method that it is about, else the class."""
@@ -88,10 +98,17 @@ class CheckReport:
         waived = f", {len(verdict.waived)} waived" if verdict.waived else ""
         waived += f", {len(verdict.known)} known from the baseline" if verdict.known else ""
         rules = output.format_count(len(verdict.judged), "rule")
-        return f"{self.task}: {counted or 'no findings'}{waived}; {rules} judged in {self.seconds:.1f} s"
+        cut = f", {len(self.out_of_time)} not for lack of time: --budget SECONDS" if self.out_of_time else ""
+        return f"{self.task}: {counted or 'no findings'}{waived}; {rules} judged in {self.seconds:.1f} s{cut}"
 
     def subtract(self, baseline: Collection[str]) -> None:
-        """Take out the findings whose fingerprints a baseline has: they are known, and fail nothing."""
+        """Take out the findings whose fingerprints a baseline has: they are known, and fail nothing.
+
+        Raises `UsageError` for a baseline of another task.
+        """
+        if baseline and not any(known.startswith(f"{self.task} ") for known in baseline):
+            other = min(baseline).partition(" ")[0]
+            raise UsageError(f"--baseline: its findings are of {other}, not of {self.task}: write the task as there")
         findings = self.verdict.findings
         self.verdict.known += [finding for finding in findings if self.fingerprint(finding) in baseline]
         self.verdict.findings = [finding for finding in findings if self.fingerprint(finding) not in baseline]

@@ -4,7 +4,7 @@ import io
 import itertools
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, find_ru
 from rlctl.checking.tool_formats import Row, action_rows, observation_rows, to_annotations, to_json, to_sarif
 from rlctl.environments.info import describe_randomization
 from rlctl.environments.places import format_place
+from rlctl.errors import UsageError
 from rlctl.storage import files
 
 STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO: "cyan"}
@@ -38,6 +39,14 @@ def show(report: CheckReport, form: str, target: str | None) -> None:
     else:
         output.results().write(FORMATS[form](report))
         output.results().flush()
+
+
+def pair_targets(forms: Sequence[str], targets: Sequence[str]) -> list[tuple[str, str | None]]:
+    """Return each format of a report with its file, or stdout; raises `UsageError` if not one at most goes there."""
+    forms = list(forms) or ["text"]
+    if not len(forms) - 1 <= len(targets) <= len(forms):
+        raise UsageError(f"{len(forms)} --format and {len(targets)} -o: give each format its -o, in the same order")
+    return list(itertools.zip_longest(forms, targets))
 
 
 def show_crashes(report: CheckReport) -> None:
@@ -108,6 +117,11 @@ def _facts(report: CheckReport) -> Iterator[str]:
     for rule, findings in itertools.groupby(verdict.waived, key=lambda finding: finding.rule):
         reason = built.waivers[rule] if built else ""
         yield f"waived {rule} ({'; '.join(finding.message for finding in findings)}): {reason}"
+    waived = {finding.rule for finding in verdict.waived}
+    if built is not None and (
+        unused := [rule for rule in built.waivers if rule in verdict.judged and rule not in waived]
+    ):
+        yield f"waived without need now: {', '.join(unused)}"
     if built is not None:
         yield f"observation {built.observation_space}"
         yield from _table(observation_rows(report.records))

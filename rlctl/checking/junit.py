@@ -16,9 +16,14 @@ def to_junit(report: CheckReport) -> str:
     findings: dict[str, list[RuleFinding]] = defaultdict(list)
     for finding in verdict.findings:
         findings[finding.rule].append(finding)
+    waivers = report.records.built.waivers if report.records.built else {}
+    waived = {finding.rule: waivers[finding.rule] for finding in verdict.waived}
     suite = ElementTree.Element("testsuite", name=f"rlctl check-env {report.task}", time=f"{report.seconds:.3f}")
     for rule in dict.fromkeys([*verdict.judged, *findings]):
-        _add_texts(_add_case(suite, rule), findings[rule], strict=report.strict)
+        case = _add_case(suite, rule)
+        _add_texts(case, findings[rule], strict=report.strict)
+        if rule in waived and not findings[rule]:
+            _add(case, "skipped", message=f"waived: {waived[rule]}")
     for rule, reason in {**verdict.not_applicable, **verdict.not_judged}.items():
         if rule not in findings:
             _add(_add_case(suite, rule), "skipped", message=reason)

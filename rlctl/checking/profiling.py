@@ -69,7 +69,9 @@ class Profile:
 
     def __init__(self, profile: cProfile.Profile, is_own: Callable[[str], bool]) -> None:
         profile.create_stats()
-        self._stats: dict[Function, Any] = profile.stats
+        self._stats: dict[Function, Any] = {
+            function: stats for function, stats in profile.stats.items() if "_lsprof.Profiler" not in function[2]
+        }
         """Per function the number of calls, twice, the time in itself and with all it calls [s], the same by caller."""
         self._own = {function for function in self._stats if function[0] != "~" and is_own(function[0])}
         modules = {getattr(module, "__dict__", {}).get("__file__"): name for name, module in list(sys.modules.items())}

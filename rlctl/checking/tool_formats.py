@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from rlctl.version import __version__
 SCHEMA = Path(__file__).with_name("report.schema.json")
 ELEMENTS_SHOWN = 8  # So many numbers without names get a row each; more of them share one
 SARIF_LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "note"}
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 GITHUB_COMMANDS = SARIF_LEVELS | {Severity.INFO: "notice"}
 
 
@@ -231,6 +233,11 @@ def to_annotations(report: CheckReport) -> str:
         command = f"::{GITHUB_COMMANDS[finding.severity]} {_annotate_place(report, finding)}"
         lines.append(f"{command}title={title}::{message}")
     lines += [f"::error title={name} crashed::a bug in rlctl" for name in report.verdict.crashed]
+    if cut := report.out_of_time:
+        severity = "error" if report.strict else "warning"
+        lines.append(
+            f"::{severity} title={len(cut)} rules not judged::time ran out for {', '.join(cut)}: --budget SECONDS"
+        )
     return "\n".join([*lines, report.summarize()]) + "\n"
 
 
@@ -244,7 +251,8 @@ def _annotate_place(report: CheckReport, finding: RuleFinding) -> str:
 
 
 def _escape_data(text: str) -> str:
-    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+    escaped = text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+    return _CONTROL.sub("?", escaped)
 
 
 def _escape_property(text: str) -> str:

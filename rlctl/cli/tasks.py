@@ -1,7 +1,8 @@
 """`rlctl check-env`, `rlctl tasks` and its commands, and `rlctl recipe`."""
 
+import enum
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -9,10 +10,12 @@ from rlctl.cli.arguments import command, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.options import Argument, EnvTimeout, Json, Option, OptionalTask, Settings, Sim, TaskName
 
+ReportFormat = enum.StrEnum("ReportFormat", ["text", "json", "sarif", "junit", "github"])
+
 
 @command_in_panels(
     {
-        "Options": ["settings", "sim", "env_timeout"],
+        "Options": ["settings", "sim", "env_timeout", "budget"],
         "Rules": ["select", "ignore", "strict", "baseline"],
         "Output": ["form", "output", "json"],
         "Instead of a check": ["list_rules", "explain"],
@@ -24,19 +27,24 @@ def check_env(
     sim: Sim = None,
     select: Annotated[list[str], Option("Check only these rules: RL3,RL501.", metavar="RULES")] = [],
     ignore: Annotated[list[str], Option("Skip these rules: RL106.", metavar="RULES")] = [],
-    strict: Annotated[bool, Option("Exit 1 for warnings too.", ("--strict",))] = False,
+    strict: Annotated[
+        bool, Option("Exit 1 for warnings, and for rules without time to judge them.", ("--strict",))
+    ] = False,
     form: Annotated[
-        Literal["text", "json", "sarif", "junit", "github"] | None,
-        Option("Format of the report.", ("--format",), default_text="text"),
-    ] = None,
+        list[ReportFormat],
+        Option("Format of the report; several, each with its -o.", ("--format",), default_text="text"),
+    ] = [],
     output: Annotated[
-        str | None, Option("File of the report.", ("--output", "-o"), metavar="FILE", default_text="stdout")
-    ] = None,
+        list[str], Option("File of the report.", ("--output", "-o"), metavar="FILE", default_text="stdout")
+    ] = [],
     json: Json = None,
     baseline: Annotated[
         str | None, Option("An earlier report of --json; its findings are not reported again.", metavar="FILE")
     ] = None,
     env_timeout: EnvTimeout = 10.0,
+    budget: Annotated[
+        float, Option("Computing time of each process of the check [s]; slow environments need more.", min=1)
+    ] = 18.0,
     list_rules: Annotated[bool, Option("List all rules and exit.", ("--list",))] = False,
     explain: Annotated[
         str | None, Option("Explain a rule, or a finding of a training, such as Q10.", metavar="RULE")
@@ -62,15 +70,17 @@ def check_env(
         raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")
     if json == "-" and (form or output):
         raise UsageError("--json - prints only JSON: leave out --format and -o, or give --json a file")
+    targets = formats.pair_targets(form, output)
     known = set() if baseline is None else read_baseline(Path(baseline))
     spec = parse_changes(settings, sim).apply(EnvSpec(task))
-    report = check(spec, rules=choose_rules(select, ignore), strict=strict, env_timeout_s=env_timeout)
+    rules = choose_rules(select, ignore)
+    report = check(spec, rules=rules, strict=strict, env_timeout_s=env_timeout, budget_s=budget)
     report.subtract(known)
     formats.show_crashes(report)
     if json is not None:
         formats.show(report, "json", json)
-    if json != "-":
-        formats.show(report, form or "text", output)
+    for name, target in targets if json != "-" else ():
+        formats.show(report, name, target)
     raise typer.Exit(report.exit_code)
 
 

@@ -14,7 +14,7 @@ from rlctl.evaluation import episode_statistics
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, find_player, load_baseline
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
-from rlctl.evaluation.sequential import find_interval, is_decided
+from rlctl.evaluation.sequential import find_interval, is_decided, is_settled
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.players.player import Exploration
 from rlctl.policy.shipped import MeasuredScore
@@ -174,7 +174,8 @@ def _play_until_decided(workers: Workers, request: EvalRequest, gates: Gates) ->
                 gates.check_possible(episode.result.success is not None)
                 episodes.append(episode)
                 successes += bool(episode.result.success)
-                if is_decided(successes, len(episodes), rate):
+                count = len(episodes)
+                if is_decided(successes, count, rate) or is_settled(successes, count, len(seeds), rate):
                     return episodes
     return episodes
 

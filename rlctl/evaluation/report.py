@@ -14,7 +14,7 @@ from rlctl.evaluation.evaluate import Evaluation
 from rlctl.evaluation.group_scores import GroupScore, SeedScore
 from rlctl.evaluation.request import NO_GATES, Gates
 from rlctl.evaluation.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
-from rlctl.evaluation.sequential import is_decided
+from rlctl.evaluation.sequential import is_decided, is_settled
 from rlctl.evaluation.vary import format_command
 from rlctl.policy.shipped import Interval, MeasuredScore
 from rlctl.version import collect_versions
@@ -59,7 +59,11 @@ def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
 
 def _format_decision(result: Evaluation, planned: int, rate: float) -> str:
     count = len(result.played)
-    if not is_decided(sum(bool(episode.result.success) for episode in result.played), count, rate):
+    successes = sum(bool(episode.result.success) for episode in result.played)
+    if count < planned and is_settled(successes, count, planned, rate):
+        kind = f"{successes} successes" if successes / planned >= rate else f"{count - successes} failures"
+        return f"decided after {count} of {planned} episodes: with {kind} the others cannot change the answer"
+    if not is_decided(successes, count, rate):
         return (
             f"not decided after {count} episodes: {rate:g} is in the interval, so the rate itself is compared with it"
         )

@@ -17,6 +17,12 @@ def is_decided(successes: int, episodes: int, rate: float) -> bool:
     return _log_ratio(successes, episodes, rate) >= -math.log(ALPHA)
 
 
+def is_settled(successes: int, episodes: int, planned: int, rate: float) -> bool:
+    """Return whether the remaining episodes of those planned cannot change on which side of `rate` their rate is."""
+    failures = episodes - successes
+    return successes / planned >= rate or (planned - failures) / planned < rate
+
+
 def find_interval(successes: int, episodes: int) -> tuple[float, float]:
     """Return the lowest and highest success rate that the episodes do not exclude."""
     estimate = successes / episodes

@@ -139,7 +139,8 @@ def _find_policy(text: str | None, which: str, root: Path) -> FoundPolicy:
         path = Path(text)
         if not path.exists():
             raise ArtifactError(f"{path}: no such file")
-        return FoundPolicy(path, find_owner(path))
+        owner = find_owner(path)
+        return FoundPolicy(path, owner, () if owner else _warn_of_changed_task(path))
     run = find_run(text, root)
     if text is not None and (Path(text) / "run.json").is_file():
         return FoundPolicy(run.policy_file(which), run)
@@ -159,12 +160,16 @@ def _find_policy(text: str | None, which: str, root: Path) -> FoundPolicy:
 def _find_shipped(task: str | None) -> FoundPolicy:
     file = find_shipped_policy(task)
     info = PolicyFile.read_info(file)
-    notes = [f"shipped policy {file}: step {info.training_steps:,}"]
-    if info.provenance is not None:
-        digest = info.provenance.source_sha256
-        if change := _describe_source_change(info.spec.task, digest, "this policy was exported"):
-            notes.append(f"warning: {change}; its score may have changed")
-    return FoundPolicy(file, None, tuple(notes))
+    notes = (f"shipped policy {file}: step {info.training_steps:,}", *_warn_of_changed_task(file))
+    return FoundPolicy(file, None, notes)
+
+
+def _warn_of_changed_task(file: Path) -> tuple[str, ...]:
+    """Return a note if the task's source has changed since a policy file was exported; none of other files."""
+    if file.suffix != ".safetensors" or (provenance := (info := PolicyFile.read_info(file)).provenance) is None:
+        return ()
+    change = _describe_source_change(info.spec.task, provenance.source_sha256, "this policy was exported")
+    return (f"warning: {change}; its score may have changed",) if change else ()
 
 
 def find_owner(file: Path) -> RunDirectory | None:

@@ -16,8 +16,8 @@ from gymnasium import spaces
 
 from rlctl.checking import families, tool_formats
 from rlctl.checking.check import CheckReport, CheckVerdict, judge
-from rlctl.checking.formats import FORMATS, to_text
-from rlctl.checking.records import Built, Records
+from rlctl.checking.formats import FORMATS, pair_targets, to_text
+from rlctl.checking.records import Built, Finished, Records
 from rlctl.checking.rules import FAMILIES, RULES, Severity, choose_rules, find_rule
 from rlctl.checking.values import find_leaves
 from rlctl.errors import UsageError
@@ -269,7 +269,41 @@ def test_junit_counts_what_it_lists(report):
     errors = {finding.rule for finding in report.verdict.findings if finding.severity == "error"}
     assert {case.get("name")[:5] for case in failed} == errors
     assert int(suite.get("errors")) == len(report.verdict.crashed)
-    assert int(suite.get("skipped")) <= len({**report.verdict.not_applicable, **report.verdict.not_judged})
+    unjudged = {**report.verdict.not_applicable, **report.verdict.not_judged}
+    assert int(suite.get("skipped")) <= len({*unjudged, *(finding.rule for finding in report.verdict.waived)})
+    skipped = [case.find("skipped").get("message") for case in cases if case.find("skipped") is not None]
+    reasons = report.records.built.waivers if report.records.built else {}
+    assert {f"waived: {reasons[finding.rule]}" for finding in report.verdict.waived} <= set(skipped)
+
+
+def test_a_strict_check_fails_for_rules_without_time_to_judge_them(report):
+    cut = dataclasses.replace(report.records, finished={**report.records.finished})
+    assert report.out_of_time == [] or any(end.is_cut for end in report.records.finished.values())
+    cut.finished["episodes"] = Finished("episodes", 1.0, is_complete=True, is_cut=True)
+    verdict = CheckVerdict(not_judged={"RL501": "time ran out", "RL301": "reset takes no seed"})
+    late = dataclasses.replace(report, records=cut, verdict=verdict)
+    assert late.out_of_time == ["RL501"]
+    assert (late.exit_code, dataclasses.replace(late, strict=True).exit_code) == (
+        (3, 3) if cut.built is None else (0, 1)
+    )
+    assert "1 not for lack of time: --budget SECONDS" in late.summarize()
+    assert "::warning title=1 rules not judged::time ran out for RL501" in FORMATS["github"](late)
+
+
+@pytest.mark.parametrize(
+    ("forms", "targets", "pairs"),
+    [([], [], [("text", None)]), (["sarif", "junit"], ["a", "b"], [("sarif", "a"), ("junit", "b")]),
+     (["junit", "text"], ["a"], [("junit", "a"), ("text", None)])],
+)  # fmt: skip
+def test_formats_and_their_files(forms, targets, pairs):
+    assert pair_targets(forms, targets) == pairs
+    with pytest.raises(UsageError, match="give each format its -o, in the same order"):
+        pair_targets(forms, [*targets, "c", "d"])
+
+
+def test_a_baseline_of_another_task_is_refused(report):
+    with pytest.raises(UsageError, match=r"--baseline: its findings are of other:Env, not of "):
+        report.subtract({"other:Env RL501"})
 
 
 def test_in_junit_warnings_fail_with_strict_only(broken):

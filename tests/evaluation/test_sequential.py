@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from rlctl.evaluation.sequential import ALPHA, find_interval, is_decided
+from rlctl.evaluation.sequential import ALPHA, find_interval, is_decided, is_settled
 
 
 @pytest.mark.parametrize("rate", [0.5, 0.9])
@@ -48,3 +48,10 @@ def test_it_needs_a_gate_on_success(rlctl):
     done = rlctl("eval", "reach", "--policy", "zero", "--decide-early")
     assert done.returncode == 2
     assert done.stderr.startswith("error: --decide-early needs --min-success")
+
+
+def test_what_the_remaining_episodes_cannot_change():
+    assert is_settled(0, 1, 100, 0.995)  # at most 99 of 100
+    assert not is_settled(0, 1, 100, 0.99)
+    assert is_settled(95, 96, 100, 0.95)
+    assert not is_settled(94, 94, 100, 0.95)
