@@ -166,9 +166,13 @@ def _find_shipped(task: str | None) -> FoundPolicy:
 
 def _warn_of_changed_task(file: Path) -> tuple[str, ...]:
     """Return a note if the task's source has changed since a policy file was exported; none of other files."""
-    if file.suffix != ".safetensors" or (provenance := (info := PolicyFile.read_info(file)).provenance) is None:
+    try:
+        info = PolicyFile.read_info(file) if file.suffix == ".safetensors" else None
+    except ArtifactError:  # whoever reads the tensors raises it too
         return ()
-    change = _describe_source_change(info.spec.task, provenance.source_sha256, "this policy was exported")
+    if info is None or info.provenance is None:
+        return ()
+    change = _describe_source_change(info.spec.task, info.provenance.source_sha256, "this policy was exported")
     return (f"warning: {change}; its score may have changed",) if change else ()
 
 
