@@ -6,6 +6,8 @@ mkdocstrings fills in. A file that a page links to is copied.
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import os
 import re
 import shutil
@@ -20,15 +22,16 @@ ROOT = Path(__file__).parent.parent
 TARGET = ROOT / "build" / "pages"
 LINK = re.compile(r"(\]\(|src=\")(?!https?://|#)([^)\s#\"]+)")
 ELSEWHERE = ("CONTRIBUTING.md", "CHANGELOG.md", "plugins/*/README.md", "examples/*.md", "examples/*/README.md")
-API = {  # modules, or names with the classes that they return
+API = {  # modules, names with the classes that they return, or with `.*` all that a package imports from its modules
     "rlctl": [
         *("rlctl.check_env", "rlctl.train", "rlctl.evaluate", "rlctl.load_policy", "rlctl.make"),
         *("rlctl.checking.rules.RuleFinding", "rlctl.training.request.TrainResult"),
         *("rlctl.evaluation.evaluate.Evaluation", "rlctl.policy.policy.Policy"),
     ],
-    "rlctl.task": ["rlctl.task"],
+    "rlctl.task": ["rlctl.task.*"],
     "rlctl.task.rewards": ["rlctl.task.rewards"],
-    "rlctl.task.events": ["rlctl.task.events"],
+    "rlctl.task.terms": ["rlctl.task.terms"],
+    "rlctl.task.events": ["rlctl.task.events.*"],
     "rlctl.deploy": [f"rlctl.deploy.filter.{name}" for name in ("limits", "safety_filter", "bounds.SafetyEvent")],
     "rlctl.errors": ["rlctl.errors"],
 }
@@ -43,8 +46,20 @@ def write_pages() -> None:
         _write(TARGET / name, (ROOT / "docs" / name).read_text(encoding="utf-8"))
     _write(TARGET / "commands.md", render_commands())
     for page, objects in API.items():
-        parts = [f"::: {name}\n    options: {{show_root_heading: {page == 'rlctl'}}}" for name in objects]
+        names = [name for written in objects for name in _list_objects(written)]
+        headed = len(names) > len(objects) or page == "rlctl"
+        parts = [f"::: {name}\n    options: {{show_root_heading: {headed}}}" for name in names]
         _write(TARGET / "api" / f"{page}.md", "\n\n".join([f"# {page}", *parts]))
+
+
+def _list_objects(written: str) -> list[str]:
+    """Return a name, or for `package.*` the functions and classes that the package imports, where they are defined."""
+    package, star, _ = written.partition(".*")
+    if not star:
+        return [written]
+    values = vars(importlib.import_module(package)).values()
+    own = [value for value in values if inspect.isclass(value) or inspect.isfunction(value)]
+    return [f"{value.__module__}.{value.__qualname__}" for value in own if value.__module__.startswith(package)]
 
 
 def render_commands() -> str:

@@ -85,11 +85,11 @@ def test_ci_workflow_uses_options_that_exist() -> None:
         assert [word for word in verb if word.startswith("--") and word not in page] == []
 
 
-def test_ci_workflow_installs_rlctl_from_a_place_that_exists() -> None:
+def test_ci_workflow_installs_what_its_variable_names() -> None:
     workflow = yaml.safe_load((EXAMPLES / "ci" / "rlctl.yml").read_text())
     (install,) = [step["run"] for step in workflow["jobs"]["learn"]["steps"] if "pip install" in step.get("run", "")]
     assert install == 'pip install "$RLCTL" .'
-    assert workflow["env"]["RLCTL"].startswith("./")
+    assert workflow["env"]["RLCTL"] == "rlctl"
 
 
 @pytest.mark.slow
@@ -104,7 +104,8 @@ def test_ci_workflow_and_a_new_plugin_install_without_an_index(tmp_path: Path) -
     scripts = _environment_without_rlctl(tmp_path / "venv")
     workflow = yaml.safe_load((EXAMPLES / "ci" / "rlctl.yml").read_text())
     offline = {"PIP_NO_INDEX": "1", "PIP_NO_BUILD_ISOLATION": "0"}  # pip reads the second the wrong way round
-    env = {**os.environ, **offline, **workflow["env"], "PATH": f"{scripts}:{os.environ['PATH']}"}
+    place = {"RLCTL": "./rlctl", "PIP_CONSTRAINT": "rlctl/constraints.txt"}
+    env = {**os.environ, **offline, **workflow["env"], **place, "PATH": f"{scripts}:{os.environ['PATH']}"}
 
     def shell(command: str) -> str:
         done = subprocess.run(command, shell=True, cwd=repository, env=env, capture_output=True, text=True, check=False)
