@@ -34,8 +34,15 @@ def test_a_task_with_a_model_of_pybullet_names_what_is_missing(rlctl_without):
     assert "Traceback" not in done.stderr
 
 
-def test_a_policy_of_pybullet_says_how_to_install_it_or_to_do_without(rlctl_without):
-    done = rlctl_without("eval", "reach", "--pretrained")
+def test_a_policy_of_pybullet_acts_in_mujoco_with_a_warning(rlctl_without):
+    done = rlctl_without("eval", "reach", "--pretrained", "--episodes", "4", "--min-success", "1")
+    assert done.returncode == 0, done.stderr
+    assert "warning: trained in PyBullet, which is not installed, so MuJoCo simulates; scores may differ" in done.stderr
+    assert "4 episodes, seed 0, MuJoCo, not randomised" in done.stdout
+
+
+def test_pybullet_that_was_asked_for_is_an_error_that_says_how_to_install_it(rlctl_without):
+    done = rlctl_without("eval", "reach", "--pretrained", "--set", "sim=pybullet")
     assert done.returncode == 2
     *_, missing, instead = done.stderr.splitlines()
     assert missing.startswith("error: PyBullet is not installed: pip install ")

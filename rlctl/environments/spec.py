@@ -85,6 +85,17 @@ class EnvSpec:
             env.close()
             raise
 
+    @property
+    def lacks_pybullet(self) -> bool:
+        """Whether its engine is PyBullet, which is not installed."""
+        from rlctl.task.pybullet.library import is_installed
+
+        return self.sim == "pybullet" and not is_installed()
+
+    def replace_missing_engine(self) -> EnvSpec:
+        """Return the spec with the default engine if PyBullet is not installed, as where a policy comes from."""
+        return dataclasses.replace(self, sim="") if self.lacks_pybullet else self
+
     def resolve(self) -> EnvSpec:
         """Return the spec with its engine: PyBullet if it is installed, for a `BatchTask` and otherwise MuJoCo."""
         if self.sim or not is_task(self.constructor()):

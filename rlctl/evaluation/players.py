@@ -61,7 +61,7 @@ def choose_spec(info: PolicyInfo, request: EvalRequest) -> EnvSpec:
         raise UsageError(f"--stage: the policy has only stages of {info.spec.task}; leave out --task")
     if not 1 <= stage <= len(info.stages):
         raise UsageError(f"--stage {stage}: this policy has {output.format_count(len(info.stages), 'stage')}")
-    return request.changes.apply(info.stages[stage - 1])
+    return request.changes.apply(info.stages[stage - 1].replace_missing_engine())
 
 
 def find_player(

@@ -172,7 +172,7 @@ def _export(source: FoundPolicy, targets: list[Path], sim: str | None) -> list[E
         import_named(source.run.recipe().policy_kwargs)
     # The environments are built while torch is imported.
     n_envs = 1
-    spec = source.locate(info.spec if sim is None else dataclasses.replace(info.spec, sim=sim))
+    spec = source.locate(dataclasses.replace(info.spec, sim=sim) if sim else info.spec.replace_missing_engine())
     with contextlib.suppress(UsageError, TaskError):  # `_check_environment` says what does not build
         n_envs = count_envs(spec, EPISODES)
     with Workers(spec, n_envs) as workers:

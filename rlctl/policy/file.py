@@ -59,7 +59,8 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
         """Return the spec of the environment it was trained in, or of another task, with `changes`."""
         if task is not None and task != self.spec.task:
             return changes.apply(EnvSpec(task, frame_stack=self.spec.frame_stack, time_feature=self.spec.time_feature))
-        return changes.apply(dataclasses.replace(self.spec, named_by=POLICY if task is None else ""))
+        own = self.spec.replace_missing_engine()
+        return changes.apply(dataclasses.replace(own, named_by=POLICY if task is None else ""))
 
     def check_fits(self, env: EnvInfo, file: Path) -> None:
         """Raise `ArtifactError` if the policy in `file` was made for other spaces than `env` has."""

@@ -109,10 +109,15 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> Fou
     if text is not None and which != PRETRAINED and store.is_address(text):
         text = str(store.fetch(text))
     policy = _find_policy(text, which, root)
-    change = None if policy.run is None else describe_source_change(policy.run)
-    if change is None:
-        return policy
-    return dataclasses.replace(policy, notes=(*policy.notes, f"warning: {change}; its score may have changed"))
+    notes = []
+    if policy.run is not None and (change := describe_source_change(policy.run)):
+        notes.append(f"warning: {change}; its score may have changed")
+    info = None
+    with contextlib.suppress(ArtifactError):  # whoever reads the whole file raises it too
+        info = PolicyFile.read_info(policy.file) if policy.file.suffix == ".safetensors" else None
+    if info is not None and info.spec.lacks_pybullet:
+        notes.append("warning: trained in PyBullet, which is not installed, so MuJoCo simulates; scores may differ")
+    return dataclasses.replace(policy, notes=(*policy.notes, *notes))
 
 
 def describe_source_change(run: RunDirectory) -> str | None:
