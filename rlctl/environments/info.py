@@ -72,6 +72,20 @@ class EnvInfo(pydantic.BaseModel):
             return f"its observations have {ours}, {whose} have {theirs}"
         return None
 
+    def list_other_meanings(self, other: EnvInfo) -> list[str]:
+        """Describe what has another name, unit or meaning in `other`, whose spaces are equal."""
+        own, theirs = self.observation_sizes, other.observation_sizes
+        if list(own.values()) == list(theirs.values()):
+            changes = [f"{now} was {was}" for was, now in zip(own, theirs, strict=True) if was != now]
+        else:
+            changes = [f"the observations are {', '.join(theirs)}, and were {', '.join(own)}"]
+        for name, unit in self.observation_units.items():
+            if name in other.observation_units and other.observation_units[name] != unit:
+                changes.append(f"{name} is in {other.observation_units[name]}, and was in {unit}")
+        if self.action_meaning != other.action_meaning and self.action_meaning and other.action_meaning:
+            changes.append(f"actions are {other.action_meaning!r}, and were {self.action_meaning!r}")
+        return changes
+
     def _describe_history(self) -> str:
         counts = {name: count for name, count in self.observation_history.items() if count > 1}
         listed = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))

@@ -122,6 +122,8 @@ def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalReques
     with start_workers(spec, request) as workers:
         limits = None if request.limits is None else _read_limits(request.limits, workers.info)
         actor.give_to(workers)
+        if actor.info is not None and (changes := actor.info.env.list_other_meanings(workers.info)):
+            output.print_notes([f"warning: since the training {'; '.join(changes)}"])
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
         episodes = _play_until_decided(workers, request, gates) if request.decide_early else _play(workers, request)

@@ -133,3 +133,20 @@ def test_the_order_of_the_observations_counts():
         "its observations are in the order position, speed, the environment's in the order speed, position"
     )
     assert one.find_difference(renamed) is None
+
+
+def test_what_got_another_meaning_in_equal_spaces():
+    box = space_to_json(spaces.Box(-1, 1, (3,)))
+    common = {"observation_space": box, "action_space": box}
+    one = EnvInfo(
+        **common, observation_sizes={"angle": 1, "last": 2}, observation_units={"angle": "rad"}, action_meaning="a"
+    )
+    assert one.list_other_meanings(one) == []
+    new = {"observation_sizes": {"angle": 1, "target": 2}, "observation_units": {"angle": "deg"}, "action_meaning": "b"}
+    assert one.list_other_meanings(EnvInfo(**common, **new)) == [
+        "target was last",
+        "angle is in deg, and was in rad",
+        "actions are 'b', and were 'a'",
+    ]
+    split = EnvInfo(**common, observation_sizes={"angle": 1, "speed": 1, "last": 1})
+    assert one.list_other_meanings(split) == ["the observations are angle, speed, last, and were angle, last"]
