@@ -25,6 +25,7 @@ Model = TypeVar("Model", bound="BaseModel")
 _CGROUPS = Path("/sys/fs/cgroup")
 JSON_LIMIT = 16 * 2**20  # [bytes]
 _DEEPEST = 100  # levels of JSON; writing or printing more may exceed a recursion limit
+_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 _ALWAYS_READ = 1_000_000  # [bytes]
 _MEMBERS = 1000  # maximum number of arrays in a file
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -56,9 +57,17 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
             raise ArtifactError(f"{path}: too large: {format_bytes(size)}, the limit is {format_bytes(limit)}")
         _check_size(path, size)
         try:
-            return file.read()
+            content = file.read()
         except OSError as error:
             raise ArtifactError(f"{path}: cannot be read: {error.strerror or error}") from None
+    _check_content(path, content)
+    return content
+
+
+def _check_content(path: Path, content: bytes) -> None:
+    """Raise `ArtifactError` for the text that Git LFS leaves in place of a file."""
+    if content.startswith(_LFS_POINTER):
+        raise ArtifactError(f"{path}: a pointer of Git LFS, not the file itself: git lfs pull")
 
 
 def _check_size(path: Path, size: int, what: str = "") -> None:
@@ -73,6 +82,7 @@ def check_safetensors(path: Path) -> None:
     """Raise `ArtifactError` for a policy file that is not a regular file, or too large for the memory."""
     with open_file(path) as file:
         _check_size(path, os.fstat(file.fileno()).st_size)
+        _check_content(path, file.read(len(_LFS_POINTER)))
 
 
 def parse_json(text: str | bytes) -> Any:

@@ -299,3 +299,11 @@ def test_a_run_with_a_link_within_is_written(tmp_path):
     (tmp_path / "latest").symlink_to("best")
     (tmp_path / "itself").symlink_to("itself")
     RunDirectory(tmp_path).lock().release()
+
+
+@pytest.mark.parametrize("name", ["policy.safetensors", "policy.onnx"])
+def test_what_git_lfs_leaves_in_place_of_a_file(tmp_path, name):
+    file = tmp_path / name
+    file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:aa\nsize 24000\n")
+    with pytest.raises(ArtifactError, match=r"policy\.\w+: a pointer of Git LFS, not the file itself: git lfs pull$"):
+        untrusted.check_safetensors(file) if name.endswith("s") else untrusted.read_bytes(file)
