@@ -14,7 +14,7 @@ from rlctl.errors import ArtifactError, UsageError
 from rlctl.run.directory import RunDirectory, RunLock, is_being_written
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.run.lookup import FoundPolicy, find_policy
-from rlctl.storage import files
+from rlctl.storage import files, untrusted
 from rlctl.storage.table import Table
 
 INFO = EpisodeInfo(spec=EnvSpec("reach"), seed=1, total_reward=0.0, term_names=["distance"])
