@@ -120,6 +120,13 @@ class Recipe(Section):
     """Running normalisation of observations and rewards."""
     frame_stack: Whole = Field(1, ge=1, le=1000)
     """Number of latest observations that the policy gets, stacked."""
+    observe: list[str] = []
+    """What the policy observes: names of what the task's `observe` or `privileged` returns; empty: all of `observe`.
+
+    In a plain environment keys of a Dict space, or numbers of elements, from 0.
+    """
+    observation_history: dict[str, Annotated[Whole, Field(ge=1, le=1000)]] = {}
+    """Number of last values, oldest first, of observations that become histories, by name; see `frame_stack` for all."""
     time_feature: Switch = False
     """Whether the policy also observes the remaining fraction of the episode, from 1 to 0, as rl-zoo3's agents do."""
     overlap: Switch = True
@@ -207,6 +214,8 @@ class Recipe(Section):
             self.events,
             self.frame_stack,
             self.time_feature,
+            tuple(self.observe),
+            self.observation_history,
             sim=self.sim or "",
             named_by=named_by,
         )

@@ -1,6 +1,7 @@
 """Mirror symmetry of a robot: what its left side does is what its right side does, with some signs changed."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -32,9 +33,12 @@ class Mirror:
         return mirrored
 
 
-def join_places(declared: Declaration, sizes: Mapping[str, int]) -> tuple[int, ...]:
+def join_places(
+    declared: Declaration, sizes: Mapping[str, int], frames: Mapping[str, int] = MappingProxyType({})
+) -> tuple[int, ...]:
     """Return the places of several arrays one after the other, as a flat observation has them.
 
+    `frames` has the number of values of those that are histories; `sizes` are those of one value.
     What events drew is unchanged unless it is declared, as a mass is. Raises `TaskError` for a missing or an invalid
     entry.
     """
@@ -48,8 +52,9 @@ def join_places(declared: Declaration, sizes: Mapping[str, int]) -> tuple[int, .
                 f"mirror: {name!r} has {size} elements, so each number from 1 to {size} is needed once, with a sign; "
                 f"got {places}"
             )
-        first = len(joined)
-        joined += [place + first if place > 0 else place - first for place in places]
+        for _ in range(frames.get(name, 1)):
+            first = len(joined)
+            joined += [place + first if place > 0 else place - first for place in places]
     return tuple(joined)
 
 

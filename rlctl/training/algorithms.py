@@ -116,9 +116,11 @@ def add_mirror(model: Any, workers: Workers) -> None:
         raise RecipeError("mirror: observations with frame_stack or time_feature cannot be mirrored; leave them out")
     if not PpoUpdate.supports(model):
         raise RecipeError("mirror: supported only for PPO with multi-layer perceptrons with tanh or ReLU on the CPU")
-    sizes = {**info.observation_sizes, **workers.privileged_sizes}
+    frames = info.observation_history
+    newest = {name: size // frames.get(name, 1) for name, size in info.observation_sizes.items()}
+    sizes = {**newest, **workers.privileged_sizes}
     action = {ACTION: len(workers.mirror[ACTION])}
-    model.mirror = join_places(workers.mirror, sizes), join_places(workers.mirror, action)
+    model.mirror = join_places(workers.mirror, sizes, frames), join_places(workers.mirror, action)
 
 
 def keep_compiler_out() -> None:

@@ -97,13 +97,13 @@ class WorkerVecEnv(VecEnv):
         self._actions = [[actions_of_episode] for actions_of_episode in actions]
         return ended
 
-    def start(self, steps: int, exploration: Exploration) -> None:
-        """Begin to play `steps` steps of each environment."""
+    def start(self, steps: int, exploration: Exploration, taught: Sequence[int] = ()) -> None:
+        """Begin to play `steps` steps of each environment; in those that are `taught` the teacher acts."""
         self._steps, self._is_playing = steps, True
         self.workers.arrays.inside[:, 2] = -1
         running, next_episodes = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
         rule = self._level_rule
-        self.workers.start_playing(Play(steps, running, next_episodes, self.run_seed, rule, exploration))
+        self.workers.start_playing(Play(steps, running, next_episodes, self.run_seed, rule, exploration, taught=taught))
 
     def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
         """Wait for the steps that `start` began; `check` is called several times a second."""
