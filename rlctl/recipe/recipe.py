@@ -126,7 +126,7 @@ class Recipe(Section):
     In a plain environment keys of a Dict space, or numbers of elements, from 0.
     """
     observation_history: dict[str, Annotated[Whole, Field(ge=1, le=1000)]] = {}
-    """Number of last values, oldest first, of observations that become histories, by name; see `frame_stack` for all."""
+    """Number of last values of observations that become histories, by name; `frame_stack` stacks all."""
     time_feature: Switch = False
     """Whether the policy also observes the remaining fraction of the episode, from 1 to 0, as rl-zoo3's agents do."""
     overlap: Switch = True
