@@ -259,11 +259,11 @@ class BatchEnv:
         if self.task.observation_terms:
             parts = compute_terms(self.name, self.task.observation_terms, parts)
         exact = self._read_columns("observe", parts, self._sizes)[rows]
-        seen = exact if self._signals is None else self._signals.observe(exact, rows)
         try:
             if self._teacher_view is not None:
                 columns = self._add_privileged(exact, self._single.teacher_view, rows)
                 self.for_teacher[rows] = self._teacher_view.assemble(columns, rows)
+            seen = exact if self._signals is None else self._signals.observe(exact, rows)
             return self._view.assemble(self._add_privileged(seen, self._single.view, rows), rows)
         except RowFault as fault:
             self._fail(rows[fault.row], str(fault))

@@ -6,7 +6,6 @@ import torch
 from rlctl.recipe import recipe as recipes
 from rlctl.rollout.workers import available_cores
 from rlctl.training import checkpoints
-from rlctl.training.rollouts import WorkerVecEnv
 from tests.training.comparing import Killed, assert_same_run, rows
 from tests.training.conftest import FAULTY, SMALL
 
@@ -95,39 +94,6 @@ QUICK = {
     *("ppo with gSDE", "ppo, curriculum", "sac, hindsight, normalised"),
     "ppo, privileged, on worlds in batches",
 }
-
-
-@pytest.fixture
-def kill_after(monkeypatch):
-    """End the training in the middle of a step, so many steps of each environment after it began."""
-
-    def kill(steps):
-        done = asked = 0
-        started, finished = WorkerVecEnv.start, WorkerVecEnv.finish
-
-        def killed():
-            raise Killed
-
-        def start(env, count, exploration):
-            nonlocal asked
-            asked = count
-            started(env, count, exploration)
-
-        def finish(env, check=None):
-            nonlocal done
-            segment = finished(env, killed if done + asked > steps else check)  # while the workers play
-            done += segment.reward.shape[1]
-            return segment
-
-        def undo():
-            monkeypatch.setattr(WorkerVecEnv, "start", started)
-            monkeypatch.setattr(WorkerVecEnv, "finish", finished)
-
-        monkeypatch.setattr(WorkerVecEnv, "start", start)
-        monkeypatch.setattr(WorkerVecEnv, "finish", finish)
-        return undo
-
-    return kill
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def distill(request: DistillRequest) -> DistillResult:
     settings = make_settings(request, spec)
     recipe = resolve_with_stages(spec.task, None, settings)
     if recipe.algo not in ON_POLICY:
-        raise RecipeError(f"distill: a student learns with {', '.join(ON_POLICY)}, not with {recipe.algo}")
+        raise RecipeError(f"distill: a student learns with {', '.join(sorted(ON_POLICY))}, not with {recipe.algo}")
     teacher = Teacher.read(found.file, recipe.total_timesteps)
     settings = {**settings, "total_timesteps": teacher.steps + request.then_ppo}
     train_request = TrainRequest(

@@ -98,7 +98,7 @@ class DistillingRollouts(OnPolicyRollouts):
         with torch.no_grad():
             set_noise(model)
         model._n_updates += getattr(model, "n_epochs", _EPOCHS)
-        for name, mean in zip(("imitation_loss", "value_loss"), np.mean(losses, axis=0), strict=True):
+        for name, mean in zip(("policy_loss", "value_loss"), np.mean(losses, axis=0), strict=True):
             model.logger.record(f"train/{name}", float(mean))
         model.logger.record("train/learning_rate", self._optimizer.param_groups[0]["lr"])
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
