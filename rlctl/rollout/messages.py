@@ -37,7 +37,7 @@ class WorkerJob:
 
 
 @dataclasses.dataclass(frozen=True)
-class Teacher:
+class LabellingPolicy:
     """A policy whose actions label the steps of segments: what it would do in the student's place."""
 
     policy: str  # absolute path of a .safetensors or .onnx file
@@ -50,7 +50,7 @@ class Build:
 
     spec: EnvSpec
     privileged: Mapping[str, bool] | None = None  # what only the critic sees; the arguments of `TaskEnv.show_critic`
-    teacher: Teacher | None = None
+    teacher: LabellingPolicy | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,7 +24,7 @@ Worlds = NDArray[np.int64]
 class EpisodeTeacher:
     """The teacher of one environment, which was made with its `TeacherView`."""
 
-    def __init__(self, teacher: messages.Teacher, env: Any) -> None:
+    def __init__(self, teacher: messages.LabellingPolicy, env: Any) -> None:
         self._view = find_teacher_view(env)
         self._player = ExportedPlayer(teacher.policy)
 
@@ -36,7 +36,7 @@ class EpisodeTeacher:
 class BatchTeacher:
     """The teacher of the worlds of a `BatchEnv`: one pass for all rows, or a player per world."""
 
-    def __init__(self, teacher: messages.Teacher, env: BatchEnv) -> None:
+    def __init__(self, teacher: messages.LabellingPolicy, env: BatchEnv) -> None:
         self._env = env
         path = Path(teacher.policy)
         policy = None if path.suffix == ".onnx" else PolicyFile.read(path)
@@ -56,7 +56,7 @@ class BatchTeacher:
         return np.stack([player.act(observation, seed, step)[1] for player, observation, seed, step in rows])
 
 
-def check_teacher(teacher: messages.Teacher, env: Any) -> None:
+def check_teacher(teacher: messages.LabellingPolicy, env: Any) -> None:
     """Raise `ArtifactError` if a teacher does not fit what an environment shows it."""
     view, info = find_teacher_view(env), load_policy(Path(teacher.policy)).info
     observation_space, action_space = info.env.spaces()

@@ -52,7 +52,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         timeout_s: float = DEFAULT_TIMEOUT_S,
         printed: PrintedLines | None = None,
         privileged: Mapping[str, bool] | None = None,
-        teacher: messages.Teacher | None = None,
+        teacher: messages.LabellingPolicy | None = None,
     ) -> None:
         self.n_envs = n_envs
         self._teacher = teacher  # labels the steps of segments

@@ -1,7 +1,6 @@
 """Mirror symmetry of a robot: what its left side does is what its right side does, with some signs changed."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -33,17 +32,14 @@ class Mirror:
         return mirrored
 
 
-def join_places(
-    declared: Declaration, sizes: Mapping[str, int], frames: Mapping[str, int] = MappingProxyType({})
-) -> tuple[int, ...]:
-    """Return the places of several arrays one after the other, as a flat observation has them.
+def join_places(declared: Declaration, sizes: Iterable[tuple[str, int]]) -> tuple[int, ...]:
+    """Return the places of several arrays one after the other, as a flat observation has them; `sizes` by name.
 
-    `frames` has the number of values of those that are histories; `sizes` are those of one value.
     What events drew is unchanged unless it is declared, as a mass is. Raises `TaskError` for a missing or an invalid
     entry.
     """
     joined: list[int] = []
-    for name, size in sizes.items():
+    for name, size in sizes:
         if name not in declared and not name.startswith(EVENTS):
             raise TaskError(f"mirror: {name!r} is missing; each observation and the action need an entry")
         places = list(declared.get(name, range(1, size + 1)))
@@ -52,9 +48,8 @@ def join_places(
                 f"mirror: {name!r} has {size} elements, so each number from 1 to {size} is needed once, with a sign; "
                 f"got {places}"
             )
-        for _ in range(frames.get(name, 1)):
-            first = len(joined)
-            joined += [place + first if place > 0 else place - first for place in places]
+        first = len(joined)
+        joined += [place + first if place > 0 else place - first for place in places]
     return tuple(joined)
 
 
@@ -65,7 +60,7 @@ def check_declaration(task: str, declared: Declaration, sizes: Mapping[str, int]
     """
     if not declared:
         return
-    join_places(declared, sizes)
+    join_places(declared, sizes.items())
     for name in declared:
         if not name.startswith(EVENTS):
             check_name(name, [*sizes, *others], f"{task}: mirror: nothing is called", TaskError, listed="There are")

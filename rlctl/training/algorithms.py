@@ -116,11 +116,13 @@ def add_mirror(model: Any, workers: Workers) -> None:
         raise RecipeError("mirror: observations with frame_stack or time_feature cannot be mirrored; leave them out")
     if not PpoUpdate.supports(model):
         raise RecipeError("mirror: supported only for PPO with multi-layer perceptrons with tanh or ReLU on the CPU")
-    frames = info.observation_history
-    newest = {name: size // frames.get(name, 1) for name, size in info.observation_sizes.items()}
-    sizes = {**newest, **workers.privileged_sizes}
-    action = {ACTION: len(workers.mirror[ACTION])}
-    model.mirror = join_places(workers.mirror, sizes, frames), join_places(workers.mirror, action)
+    frames = {name: info.observation_history.get(name, 1) for name in info.observation_sizes}
+    newest = [
+        (name, size // frames[name]) for name, size in info.observation_sizes.items() for _ in range(frames[name])
+    ]
+    action = [(ACTION, len(workers.mirror[ACTION]))]
+    observed = [*newest, *workers.privileged_sizes.items()]
+    model.mirror = join_places(workers.mirror, observed), join_places(workers.mirror, action)
 
 
 def keep_compiler_out() -> None:

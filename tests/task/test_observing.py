@@ -11,6 +11,7 @@ from rlctl.environments.teacher_view import TeacherView
 from rlctl.environments.wrappers import select_observations
 from rlctl.errors import RecipeError
 from rlctl.task.env import TaskEnv
+from rlctl.task.mirror import Mirror, join_places
 from rlctl.task.observation import Observing
 from tests.task.test_terms import Clock
 
@@ -72,6 +73,12 @@ def test_one_world_and_many_see_the_same_and_so_do_their_teachers():
         body = env.unwrapped.task.batch.body
         np.testing.assert_allclose(env.seen[:2], body.joint_positions[0], rtol=1e-6)
         assert env.seen[2] == np.float32(env.unwrapped.task.batch.goal[0])
+
+
+def test_the_mirror_image_of_a_history_by_hand():
+    declared = {"hips": (2, 1), "roll": (-1,)}
+    places = join_places(declared, [("hips", 2), ("hips", 2), ("roll", 1)])
+    assert Mirror(places)(np.array([1.0, 2.0, 3.0, 4.0, 5.0])).tolist() == [2.0, 1.0, 4.0, 3.0, -5.0]
 
 
 class Pointer(gymnasium.Env):

@@ -50,6 +50,17 @@ CASES = {
     "recurrent_ppo, on worlds in batches": (STOOL, settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
     "ppo, privileged, on worlds in batches": (STOOL, settings("ppo", randomize=True, privileged={})),
     "ppo, mirrored": ("walk", settings("ppo", mirror=True, randomize=True, task={"episode_s": 0.4})),
+    "ppo, mirrored, with a history": (
+        "walk-rough",
+        settings(
+            "ppo",
+            mirror=True,
+            privileged={},
+            observe=["gyroscope", "joint_positions", "velocity"],
+            observation_history={"joint_positions": 2},
+            task={"episode_s": 0.4},
+        ),
+    ),
     "ppo, levels, on worlds in batches": (STOOL, settings("ppo", **LEVELS)),
     "sac, levels": (STOOL, settings("sac", **LEVELS)),
     "ppo, privileged, on reach": (

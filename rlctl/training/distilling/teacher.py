@@ -49,6 +49,6 @@ class Teacher:
         """Write the copy that a resume reads."""
         files.write_bytes(run.teacher_file(self.file.suffix), self.file.read_bytes())
 
-    def to_message(self) -> messages.Teacher:
+    def to_message(self) -> messages.LabellingPolicy:
         """Return the teacher for workers."""
-        return messages.Teacher(str(self.file.absolute()), self.info.spec)
+        return messages.LabellingPolicy(str(self.file.absolute()), self.info.spec)
