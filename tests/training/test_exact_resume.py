@@ -81,6 +81,11 @@ CASES = {
     "a2c": ("Line", settings("a2c")),
     "recurrent_ppo": ("Line", settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
     "sac": ("Line", settings("sac", algo_kwargs={"train_freq": 1}, policy_kwargs={"net_arch": [256, 256]})),
+    "sac, frame stack": ("Line", settings("sac", frame_stack=3, algo_kwargs={"buffer_size": 60})),
+    "sac, histories": (
+        STOOL,
+        settings("sac", randomize=True, observation_history={"hips": 3, "seen": 2}, algo_kwargs={"buffer_size": 60}),
+    ),
     "sac with gSDE": ("Line", settings("sac", **SDE)),
     "sac, normalised": ("Line", settings("sac", **NORMALIZED)),
     "sac, dict": ("DictObservation", settings("sac", **NORMALIZED)),
