@@ -1,4 +1,4 @@
-"""What a teacher sees of an environment that a student plays: the observations of its own spec, without noise."""
+"""What a teacher sees of an environment that a student plays: the observations of its own spec."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from rlctl.task.env import TaskEnv
+from rlctl.task.events import EventSettings
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -25,7 +26,7 @@ class TeacherView(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         inner = env.unwrapped
         if isinstance(inner, TaskEnv):
-            view = inner.show_teacher(teacher.observing)
+            view = inner.show_teacher(teacher.observing, EventSettings(teacher.randomize, teacher.events))
             self.sizes = view.format.sizes
             """Elements per name of what the teacher sees, without its wrappers; empty for a plain environment."""
             space: spaces.Space[Any] = view.format.space

@@ -67,7 +67,9 @@ class BatchEnv:
         self._view = self._make_view(single.view)
         self._teacher_view = None if single.teacher_view is None else self._make_view(single.teacher_view)
         self.for_teacher = np.zeros((worlds, 0 if self._teacher_view is None else self._teacher_view.size), np.float32)
-        """What a teacher sees now of each world, without noise and delay, shape (worlds, size)."""
+        """What a teacher sees now of each world, shape (worlds, size)."""
+        disturbed = [[name in single.disturbed_for_teacher] * size for name, size in self._sizes.items()]
+        self._disturbed = np.concatenate(disturbed)  # columns that it sees with noise and delay
 
     @property
     def _views(self) -> list[BatchView]:
@@ -259,11 +261,13 @@ class BatchEnv:
         if self.task.observation_terms:
             parts = compute_terms(self.name, self.task.observation_terms, parts)
         exact = self._read_columns("observe", parts, self._sizes)[rows]
+        changed = exact if self._teacher_view is None else exact.copy()
+        seen = exact if self._signals is None else self._signals.observe(changed, rows)
         try:
             if self._teacher_view is not None:
-                columns = self._add_privileged(exact, self._single.teacher_view, rows)
+                taught = np.where(self._disturbed, seen, exact)
+                columns = self._add_privileged(taught, self._single.teacher_view, rows)
                 self.for_teacher[rows] = self._teacher_view.assemble(columns, rows)
-            seen = exact if self._signals is None else self._signals.observe(exact, rows)
             return self._view.assemble(self._add_privileged(seen, self._single.view, rows), rows)
         except RowFault as fault:
             self._fail(rows[fault.row], str(fault))

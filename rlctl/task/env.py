@@ -105,7 +105,9 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.observation_sizes, self.observation_space = self.view.format.sizes, self.view.format.space
         self.teacher_view: View | None = None  # what a teacher sees, after `show_teacher`
         self.for_teacher: Observation | None = None
-        """What the teacher sees now, without noise and delay."""
+        """What the teacher sees now."""
+        self.disturbed_for_teacher: set[str] = set()
+        """The observations that it sees with noise and delay; all others it sees exactly."""
         sizes = {name: int(np.size(value)) for name, value in first.items()}
         sizes[ACTION] = math.prod(self.action_space.shape or ())
         check_declaration(self.name, task.mirror, sizes, self._examples[0])
@@ -113,8 +115,13 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def _make_view(self, observing: Observing) -> View:
         return View(self.task, observing, self._first, self._examples[0])
 
-    def show_teacher(self, observing: Observing) -> View:
-        """Observe for a teacher too, from the next reset on: `for_teacher`. Raises `RecipeError` for wrong names."""
+    def show_teacher(self, observing: Observing, events: EventSettings) -> View:
+        """Observe for a teacher too, from the next reset on: `for_teacher`. Raises `RecipeError` for wrong names.
+
+        It sees noise and delay on what its own `events` disturb: a policy acts best on what it was trained with.
+        """
+        own = Signals(events.apply(self.task.events), self._first, self.action_space, self.task.observation_bounds)
+        self.disturbed_for_teacher = {name for names in own.of.values() for name in names}
         self.teacher_view = self._make_view(observing)
         return self.teacher_view
 
@@ -268,11 +275,12 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def _observe(self) -> Observation:
         exact = self.compute_terms(self.task.observe())
         seen = self._signals.observe(exact)
-        if self.view.privileged:
-            seen = {**self._read_privileged(self.view), **seen}
         if self.teacher_view is not None:
-            exact = {**self._read_privileged(self.teacher_view), **exact}
-            self.for_teacher = self.teacher_view.assemble(exact, self._step)
+            taught = {**exact, **{name: seen[name] for name in self.disturbed_for_teacher}}
+            taught |= self._read_privileged(self.teacher_view)
+            self.for_teacher = self.teacher_view.assemble(taught, self._step)
+        if self.view.privileged:
+            seen = {**seen, **self._read_privileged(self.view)}
         return self.view.assemble(seen, self._step)
 
     def _read_privileged(self, view: View) -> dict[str, Any]:

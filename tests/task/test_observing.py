@@ -55,7 +55,7 @@ def test_wrong_names(names, history, message):
 def test_one_world_and_many_see_the_same_and_so_do_their_teachers():
     pytest.importorskip("mujoco")
     student = EnvSpec(STOOL, randomize=True, observe=("speeds", "hips", "place"), observation_history={"hips": 3})
-    teacher = EnvSpec(STOOL, observe=("hips", "goal"))
+    teacher = EnvSpec(STOOL, events={"late_noise": {}}, observe=("hips", "speeds", "goal"))
     env = student.make(teacher=teacher)
     assert describe(env).observation_sizes == {"hips": 6, "speeds": 2, "place": 3}  # in the order of the task
     batch = student.make_batch(env, 3)
@@ -72,7 +72,8 @@ def test_one_world_and_many_see_the_same_and_so_do_their_teachers():
         np.testing.assert_array_equal(batch.for_teacher[world], env.seen)
         body = env.unwrapped.task.batch.body
         np.testing.assert_allclose(env.seen[:2], body.joint_positions[0], rtol=1e-6)
-        assert env.seen[2] == np.float32(env.unwrapped.task.batch.goal[0])
+        np.testing.assert_array_equal(env.seen[2:4], observation[6:8])  # with the noise it was trained with
+        assert env.seen[4] == np.float32(env.unwrapped.task.batch.goal[0])
 
 
 def test_the_mirror_image_of_a_history_by_hand():

@@ -112,7 +112,7 @@ def _count_steps(task: str, settings: Mapping[str, Any]) -> int:
 def compare(result: training.TrainResult, teacher: Teacher, request: DistillRequest) -> tuple[PlayedScore, PlayedScore]:
     """Return the scores of the student's best policy and of the teacher, in the student's environment.
 
-    The teacher observes without noise and delay, as when it labelled the student's steps.
+    The teacher observes as when it labelled the student's steps.
     """
     student = PolicyFile.read(result.run.best_policy)
     spec = dataclasses.replace(student.info.spec, task=lookup.locate_task(student.info.spec.task, result.run))
