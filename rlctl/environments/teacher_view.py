@@ -26,12 +26,10 @@ class TeacherView(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         inner = env.unwrapped
         if isinstance(inner, TaskEnv):
-            view = inner.show_teacher(teacher.observing, EventSettings(teacher.randomize, teacher.events))
-            self.sizes = view.format.sizes
+            sight = inner.show_teacher(teacher.observing, EventSettings(teacher.randomize, teacher.events))
+            self.sizes = sight.view.format.sizes
             """Elements per name of what the teacher sees, without its wrappers; empty for a plain environment."""
-            space: spaces.Space[Any] = view.format.space
-            task_env: TaskEnv = inner
-            self._source = _Source(env, space, lambda: task_env.for_teacher)
+            self._source = _Source(env, sight.view.format.space, lambda: sight.seen)
         else:
             self.sizes = {}
             self._source = _Source(env, env.observation_space, lambda: self._observation)

@@ -65,11 +65,12 @@ class BatchEnv:
         self.set_events(single)
         self._sizes = {name: int(np.size(value)) for name, value in single._first.items()}
         self._view = self._make_view(single.view)
-        self._teacher_view = None if single.teacher_view is None else self._make_view(single.teacher_view)
+        teacher = single.teacher
+        self._teacher_view = None if teacher is None else self._make_view(teacher.view)
         self.for_teacher = np.zeros((worlds, 0 if self._teacher_view is None else self._teacher_view.size), np.float32)
         """What a teacher sees now of each world, shape (worlds, size)."""
-        disturbed = [[name in single.disturbed_for_teacher] * size for name, size in self._sizes.items()]
-        self._disturbed = np.concatenate(disturbed)  # columns that it sees with noise and delay
+        disturbed = () if teacher is None else teacher.disturbed
+        self._disturbed = np.concatenate([[name in disturbed] * size for name, size in self._sizes.items()])
 
     @property
     def _views(self) -> list[BatchView]:
@@ -264,9 +265,9 @@ class BatchEnv:
         changed = exact if self._teacher_view is None else exact.copy()
         seen = exact if self._signals is None else self._signals.observe(changed, rows)
         try:
-            if self._teacher_view is not None:
+            if self._teacher_view is not None and self._single.teacher is not None:
                 taught = np.where(self._disturbed, seen, exact)
-                columns = self._add_privileged(taught, self._single.teacher_view, rows)
+                columns = self._add_privileged(taught, self._single.teacher.view, rows)
                 self.for_teacher[rows] = self._teacher_view.assemble(columns, rows)
             return self._view.assemble(self._add_privileged(seen, self._single.view, rows), rows)
         except RowFault as fault:

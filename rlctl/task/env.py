@@ -19,7 +19,7 @@ from rlctl.task.events.event import Drawn
 from rlctl.task.joints import check_joints
 from rlctl.task.mirror import ACTION, check_declaration
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
-from rlctl.task.observation import Observation, Observing, View, check_names, compute_terms
+from rlctl.task.observation import Observation, Observing, TeacherSight, View, check_names, compute_terms
 from rlctl.task.privileged import PrivilegedFormat
 from rlctl.task.pybullet.library import is_installed
 from rlctl.task.pybullet.sim import PybulletSim
@@ -103,11 +103,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         check_names(task, first)
         self.view = self._make_view(observing)
         self.observation_sizes, self.observation_space = self.view.format.sizes, self.view.format.space
-        self.teacher_view: View | None = None  # what a teacher sees, after `show_teacher`
-        self.for_teacher: Observation | None = None
-        """What the teacher sees now."""
-        self.disturbed_for_teacher: set[str] = set()
-        """The observations that it sees with noise and delay; all others it sees exactly."""
+        self.teacher: TeacherSight | None = None  # after `show_teacher`
         sizes = {name: int(np.size(value)) for name, value in first.items()}
         sizes[ACTION] = math.prod(self.action_space.shape or ())
         check_declaration(self.name, task.mirror, sizes, self._examples[0])
@@ -115,15 +111,13 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def _make_view(self, observing: Observing) -> View:
         return View(self.task, observing, self._first, self._examples[0])
 
-    def show_teacher(self, observing: Observing, events: EventSettings) -> View:
-        """Observe for a teacher too, from the next reset on: `for_teacher`. Raises `RecipeError` for wrong names.
-
-        It sees noise and delay on what its own `events` disturb: a policy acts best on what it was trained with.
-        """
-        own = Signals(events.apply(self.task.events), self._first, self.action_space, self.task.observation_bounds)
-        self.disturbed_for_teacher = {name for names in own.of.values() for name in names}
-        self.teacher_view = self._make_view(observing)
-        return self.teacher_view
+    def show_teacher(self, observing: Observing, events: EventSettings) -> TeacherSight:
+        """Observe for a teacher with its own `events` too, from the next reset on; `RecipeError` for wrong names."""
+        signals = Signals(events.apply(self.task.events), self._first, self.action_space, self.task.observation_bounds)
+        self.teacher = TeacherSight(
+            self._make_view(observing), {name for names in signals.of.values() for name in names}
+        )
+        return self.teacher
 
     def set_level(self, level: float) -> None:
         """Set the level of the task, and of ranges written `{from: ..., to: ...}`, from 0 to 1, for the next resets."""
@@ -198,8 +192,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         drawn |= self._acting.run("start", self.sim, self._streams, self.level)
         self._signals.begin(self._streams, self.level)
         self.view.begin()
-        if self.teacher_view is not None:
-            self.teacher_view.begin()
+        if self.teacher is not None:
+            self.teacher.view.begin()
         self._step = 0
         self._running = True
         observation = self._observe()
@@ -275,10 +269,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def _observe(self) -> Observation:
         exact = self.compute_terms(self.task.observe())
         seen = self._signals.observe(exact)
-        if self.teacher_view is not None:
-            taught = {**exact, **{name: seen[name] for name in self.disturbed_for_teacher}}
-            taught |= self._read_privileged(self.teacher_view)
-            self.for_teacher = self.teacher_view.assemble(taught, self._step)
+        if self.teacher is not None:
+            self.teacher.look({**exact, **self._read_privileged(self.teacher.view)}, seen, self._step)
         if self.view.privileged:
             seen = {**seen, **self._read_privileged(self.view)}
         return self.view.assemble(seen, self._step)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -187,6 +187,23 @@ class View:
         """Return the observation of a step; raises `TaskError` if it is not in the space."""
         chosen = parts if self._names is None else {name: parts[name] for name in self._names if name in parts}
         return self.format.assemble(self._history.add(chosen), step)
+
+
+class TeacherSight:
+    """What a teacher sees of a task that a student plays: noise and delay only where its own events `disturb`.
+
+    A policy acts best on what it was trained with.
+    """
+
+    def __init__(self, view: View, disturbed: Collection[str]) -> None:
+        self.view, self.disturbed = view, disturbed
+        self.seen: Observation | None = None
+        """Its observation of the present step."""
+
+    def look(self, exact: Mapping[str, Any], disturbed: Mapping[str, Any], step: int) -> None:
+        """Observe; `exact` has everything without noise and delay, `disturbed` what the student's events change."""
+        parts = {name: disturbed[name] if name in self.disturbed else value for name, value in exact.items()}
+        self.seen = self.view.assemble(parts, step)
 
 
 def compute_terms(name: str, terms: Mapping[str, Term], observed: Mapping[str, Any]) -> dict[str, Any]:
