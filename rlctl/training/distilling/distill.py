@@ -58,6 +58,7 @@ def distill(request: DistillRequest) -> DistillResult:
     found = lookup.find_policy(request.teacher, request.checkpoint)
     output.print_notes(found.notes)
     spec = found.locate(Teacher.read(found.file, 1).info.derive_spec())
+    spec.constructor()  # the policy file may come from somebody else: it may name environments only
     settings = make_settings(request, spec)
     recipe = resolve_with_stages(spec.task, None, settings)
     if recipe.algo not in ON_POLICY:
