@@ -32,6 +32,7 @@ def _root(
 COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "check-env": tasks.check_env,
     "train": train.train,
+    "distill": train.distill,
     "tune": train.tune,
     "eval": eval.evaluate,
     "export": export.export,
@@ -97,7 +98,11 @@ def _call(arguments: list[str]) -> int:
         raise KeyboardInterrupt from None
     except Exception as error:
         option = getattr(error, "option_name", None)  # of Typer's error for an option that does not exist
-        if option is not None and arguments[0] in ("train", "tune") and (setting := train.suggest_setting(option)):
+        if (
+            option is not None
+            and arguments[0] in ("train", "distill", "tune")
+            and (setting := train.suggest_setting(option))
+        ):
             raise UsageError(f"no option {option}; set the recipe's key instead: {setting}VALUE") from None
         raise
     if code == error_boundary.INTERRUPTED:

@@ -1,12 +1,13 @@
-"""`rlctl train` and `rlctl tune`."""
+"""`rlctl train`, `rlctl distill` and `rlctl tune`."""
 
 import dataclasses
 from typing import Annotated, Any
 
-from rlctl.cli.arguments import command_in_panels
+from rlctl.cli.arguments import choose_checkpoint, command_in_panels
 from rlctl.errors import UsageError
-from rlctl.options import Cluster, Jobs, Json, On, Option, Settings, Sim
+from rlctl.options import Cluster, Jobs, Json, On, Option, Pretrained, Settings, Sim
 from rlctl.run.train_request import TrainRequest
+from rlctl.training.distilling.distill_request import DistillRequest
 from rlctl.tuning.tune_request import TuneRequest
 
 
@@ -109,6 +110,40 @@ def train(
     from rlctl.training.request import run_training, show
 
     return show(run_training(request), json)
+
+
+@dataclasses.dataclass(frozen=True)
+class DistillFlags(RecipeFlags):
+    """The keys of a student's recipe that have a flag of `rlctl distill`."""
+
+    algo: Annotated[str | None, Option("ppo, a2c or recurrent_ppo.", completes="algorithm")] = None
+    total_timesteps: Annotated[
+        str | None,
+        Option(
+            "Environment steps with the teacher.",
+            ("--total-timesteps", "-n"),
+            metavar="STEPS",
+            default_text="a quarter of the recipe's",
+        ),
+    ] = None
+
+
+@command_in_panels(
+    {
+        "Options": ["observe", "settings", "total_timesteps", "then_ppo", "algo", "seed"],
+        "Teacher": ["checkpoint", "pretrained"],
+        "How": ["sim", "n_envs", "device", "check", "env_timeout_s"],
+        "Output": ["root", "track", "json"],
+    }
+)
+def distill(flags: DistillFlags, request: DistillRequest, pretrained: Pretrained = False, json: Json = None) -> None:
+    """Train a student with other observations from a policy's actions (DAgger), and compare it with its teacher."""
+    from rlctl.training.distilling.distill import distill as run_distilling
+    from rlctl.training.distilling.distill import show
+
+    checkpoint = choose_checkpoint(request.checkpoint, pretrained)
+    request = dataclasses.replace(request, checkpoint=checkpoint, settings=flags.merge())
+    return show(run_distilling(request), json)
 
 
 @dataclasses.dataclass(frozen=True)

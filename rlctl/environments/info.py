@@ -106,14 +106,17 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
     if isinstance(inner, TaskEnv):
         task, time = inner.task, find_time_feature(env)
         sizes = inner.observation_sizes
+        terms = {name: term for name, term in task.observation_terms.items() if name in sizes}
+        quantities = {name for term in terms.values() for name in term.inputs}
+        units = {name: unit for name, unit in task.observation_units.items() if name in sizes or name in quantities}
         values = {
             **common,
             "observation_sizes": sizes if time is None else time.extend_sizes(sizes),
-            "observation_units": dict(task.observation_units),
-            "observation_history": dict(task.observation_history),
+            "observation_units": units,
+            "observation_history": inner.view.format.frames,
             "history_start": task.history_start,
-            "observation_terms": dict(task.observation_terms),
-            "quantity_sizes": find_quantity_sizes(task.observation_terms, inner.measured),
+            "observation_terms": terms,
+            "quantity_sizes": find_quantity_sizes(terms, inner.measured),
             "action_meaning": task.action_meaning,
             "control_dt": task.control_dt,
             "reward_weights": inner.reward_weights,

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import gymnasium
 
     from rlctl.task.batch_env import BatchEnv
+    from rlctl.task.observation import Observing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +43,10 @@ class EnvSpec:
     """Events that act, with the parameters that differ from the task's."""
     frame_stack: Annotated[int, Ge(1)] = 1  # number of latest observations that are stacked into one
     time_feature: bool = False  # whether the fraction of the episode that is left is observed
+    observe: tuple[str, ...] = ()
+    """Names of what the policy observes; empty: all that the task's `observe` returns."""
+    observation_history: Mapping[str, Annotated[int, Ge(1)]] = dataclasses.field(default_factory=dict)
+    """Numbers of last values by name, which replace the task's own."""
     stage: Annotated[int, Ge(0)] = 0  # stage of the curriculum, from 1; 0 without a curriculum
     level: Annotated[float, Ge(0), Le(1)] = 1.0
     """How far ranges written `{from: ..., to: ...}` have widened, from 0 (`from`) to 1 (`to`)."""
@@ -57,8 +62,13 @@ class EnvSpec:
         """Import the environment's constructor; raises `ArtifactError` if a file names anything else."""
         return named_task.load(self.task, self.named_by) if self.named_by else load(self.task)
 
-    def make(self, render_mode: Literal["human", "rgb_array", "ansi"] | None = None) -> gymnasium.Env[Any, Any]:
-        """Build the environment; raises `UsageError` for wrong names or parameters, `TaskError` if it fails."""
+    def make(
+        self, render_mode: Literal["human", "rgb_array", "ansi"] | None = None, *, teacher: EnvSpec | None = None
+    ) -> gymnasium.Env[Any, Any]:
+        """Build the environment; raises `UsageError` for wrong names or parameters, `TaskError` if it fails.
+
+        With a `teacher` it also observes what a policy of that spec sees; see `rlctl.environments.teacher_view`.
+        """
         if render_mode == "rgb_array" and not os.environ.get("DISPLAY"):
             os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it at import; its default needs a display
         constructor = self.constructor()
@@ -66,21 +76,17 @@ class EnvSpec:
         if is_task(constructor):
             env = self._make_task_env(constructor, render_mode)
         else:
-            for key in ("reward_weights", "randomize", "events", "level", "sim"):
+            for key in ("reward_weights", "randomize", "events", "level", "sim", "observation_history"):
                 # Files of plain environments that were written before engines could be chosen name PyBullet.
                 if getattr(self, key) not in (getattr(EnvSpec(self.task), key), "pybullet"):
                     raise RecipeError(f"{key}: {self.task} is a plain Gymnasium environment; only tasks have them")
             env = self._make_plain_env(constructor, render_mode)
         try:
-            if self.time_feature:
-                from rlctl.environments.wrappers import TimeFeature
+            if teacher is not None:
+                from rlctl.environments.teacher_view import TeacherView
 
-                env = TimeFeature(env)
-            if self.frame_stack > 1:
-                from rlctl.environments.wrappers import stack_frames
-
-                env = stack_frames(env, self.frame_stack)
-            return env
+                env = TeacherView(env, teacher)
+            return self.wrap(env)
         except RecipeError:
             env.close()
             raise
@@ -95,6 +101,29 @@ class EnvSpec:
     def replace_missing_engine(self) -> EnvSpec:
         """Return the spec with the default engine if PyBullet is not installed, as where a policy comes from."""
         return dataclasses.replace(self, sim="") if self.lacks_pybullet else self
+
+    def wrap(self, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+        """Return an environment with the wrappers that change its observations; raises `RecipeError`."""
+        from rlctl.task.env import TaskEnv
+
+        if self.observe and not isinstance(env.unwrapped, TaskEnv):
+            from rlctl.environments.wrappers import select_observations
+
+            env = select_observations(env, self.observe)
+        if self.time_feature:
+            from rlctl.environments.wrappers import TimeFeature
+
+            env = TimeFeature(env)
+        if self.frame_stack > 1:
+            from rlctl.environments.wrappers import stack_frames
+
+            env = stack_frames(env, self.frame_stack)
+        return env
+
+    def observe_as(self, other: EnvSpec) -> EnvSpec:
+        """Return the spec with what another one observes: names, histories, stacked frames, time."""
+        names = ("observe", "observation_history", "frame_stack", "time_feature")
+        return dataclasses.replace(self, **{name: getattr(other, name) for name in names})
 
     def resolve(self) -> EnvSpec:
         """Return the spec with its engine: PyBullet if it is installed, for a `BatchTask` and otherwise MuJoCo."""
@@ -113,6 +142,13 @@ class EnvSpec:
         return "PyBullet" if self.resolve().sim == "pybullet" else "MuJoCo"
 
     @property
+    def observing(self) -> Observing:
+        """What the policy observes of a task."""
+        from rlctl.task.observation import Observing
+
+        return Observing(self.observe, self.observation_history)
+
+    @property
     def is_batch(self) -> bool:
         """Whether the task is a `BatchTask`; it is imported."""
         from rlctl.task.batch import BatchTask
@@ -122,6 +158,7 @@ class EnvSpec:
 
     def make_batch(self, env: gymnasium.Env[Any, Any], worlds: int) -> BatchEnv | None:
         """Return so many worlds of a `BatchTask`, of which `env` is one; None for any other environment."""
+        from rlctl.environments.teacher_view import strip_teacher_view
         from rlctl.task.batch import OneWorld
         from rlctl.task.batch_env import BatchEnv
         from rlctl.task.env import TaskEnv
@@ -130,7 +167,7 @@ class EnvSpec:
         if not isinstance(single, TaskEnv) or not isinstance(single.task, OneWorld):
             return None
         described: TaskEnv = single
-        if env is not described:
+        if strip_teacher_view(env) is not described:
             raise RecipeError(f"{self.task} is a BatchTask, whose worlds have no frame_stack and no time_feature")
         constructor: Any = self.constructor()
         parameters, sim = check_fields(constructor, self.parameters), self.resolve().sim
@@ -145,10 +182,13 @@ class EnvSpec:
         check_parameters(constructor)
         parameters = check_fields(constructor, self.parameters)
         weights, events, sim = self.reward_weights, EventSettings(self.randomize, self.events), self.resolve().sim
+        observing = self.observing
 
         def build() -> TaskEnv:
             task = constructor(**parameters)
-            return TaskEnv(task, render_mode=render_mode, reward_weights=weights, events=events, sim=sim)
+            return TaskEnv(
+                task, render_mode=render_mode, reward_weights=weights, events=events, sim=sim, observing=observing
+            )
 
         env: TaskEnv = call_plugin(self.task, build)
         env.set_level(self.level)

@@ -1,6 +1,7 @@
 """Wrappers around an environment: time left as an observation, stacked frames, and time limits found in them."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -9,7 +10,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation, TimeLimit, TransformObservation
 
 from rlctl.environments.dict_spaces import LARGEST_SPACE
-from rlctl.errors import RecipeError
+from rlctl.errors import RecipeError, check_name
 from rlctl.task.env import TaskEnv
 
 NAME = "time_left"  # name of the added observation
@@ -93,10 +94,31 @@ def find_time_limit(env: Any) -> int | None:
     return min(limits, default=None)
 
 
+def select_observations(env: gymnasium.Env[Any, Any], names: Sequence[str]) -> gymnasium.Env[Any, Any]:
+    """Observe some entries of a Dict space by name, or some elements of a flat observation by number, from 0."""
+    space, what = env.observation_space, f"observe: {type(env.unwrapped).__name__} has no"
+    if isinstance(space, spaces.Dict):
+        for name in names:
+            check_name(name, space.spaces, f"{what} observation", RecipeError)
+        kept = {key: part for key, part in space.spaces.items() if key in names}
+        selected = spaces.Dict([*kept.items()])  # pairs, because Gymnasium sorts a mapping by key
+        return TransformObservation(env, lambda observation: {key: observation[key] for key in kept}, selected)
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise RecipeError(
+            f"observe: only of flat observations and of Dict spaces a part can be observed, not of {space}"
+        )
+    for name in names:
+        check_name(name, map(str, range(space.shape[0])), f"{what} element", RecipeError)
+    columns = sorted({int(name) for name in names})
+    flat = spaces.Box(space.low[columns], space.high[columns], dtype=space.dtype.type)
+    return TransformObservation(env, lambda observation: np.asarray(observation)[columns], flat)
+
+
 def stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any, Any]:
     """Observe the last `frames` observations, oldest first, along the last axis."""
     space = env.observation_space
-    if history := getattr(getattr(env.unwrapped, "task", None), "observation_history", None):
+    inner = env.unwrapped
+    if isinstance(inner, TaskEnv) and (history := inner.view.format.frames):
         raise RecipeError(f"frame_stack: the task declares a history of {', '.join(history)}; set frame_stack: 1")
     if not isinstance(space, spaces.Box) or len(space.shape) not in (1, 3):
         raise RecipeError(f"frame_stack: only flat and image observations can be stacked, this task has {space}")

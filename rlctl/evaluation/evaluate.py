@@ -103,7 +103,7 @@ def _choose_task(request: EvalRequest) -> EnvSpec:
             "--pretrained, --stage, --stochastic and --task"
         )
     if request.spec is not None:
-        return dataclasses.replace(request.spec, frame_stack=1, time_feature=False)
+        return request.spec.observe_as(EnvSpec(request.spec.task))
     return request.changes.apply(choose_task(request.run, name, "eval"))
 
 

@@ -53,8 +53,7 @@ def load_player(path: Path, deterministic: bool) -> LoadedPolicy:
 def choose_spec(info: PolicyInfo, request: EvalRequest) -> EnvSpec:
     """Return the environment to evaluate in: of the policy's task, another task, or a stage, with changes."""
     if request.spec is not None:  # only the observation settings come from the policy
-        own = info.spec
-        return dataclasses.replace(request.spec, frame_stack=own.frame_stack, time_feature=own.time_feature)
+        return request.spec.observe_as(info.spec)
     if (stage := request.stage) is None:
         return info.derive_spec(request.task, request.changes)
     if request.task is not None and request.task != info.spec.task:
@@ -133,4 +132,4 @@ def resolve_task(task: str) -> EnvSpec:
     from rlctl.recipe.sources import resolve_with_stages
 
     spec = resolve_with_stages(task).env_specs(task)[-1].resolve()
-    return dataclasses.replace(spec, frame_stack=1, time_feature=False, stage=0)
+    return dataclasses.replace(spec.observe_as(EnvSpec(task)), stage=0)

@@ -58,7 +58,7 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
     def derive_spec(self, task: str | None = None, changes: EnvChanges = UNCHANGED) -> EnvSpec:
         """Return the spec of the environment it was trained in, or of another task, with `changes`."""
         if task is not None and task != self.spec.task:
-            return changes.apply(EnvSpec(task, frame_stack=self.spec.frame_stack, time_feature=self.spec.time_feature))
+            return changes.apply(EnvSpec(task).observe_as(self.spec))
         own = self.spec.replace_missing_engine()
         return changes.apply(dataclasses.replace(own, named_by=POLICY if task is None else ""))
 

@@ -120,6 +120,10 @@ class Recipe(Section):
     """Running normalisation of observations and rewards."""
     frame_stack: Whole = Field(1, ge=1, le=1000)
     """Number of latest observations that the policy gets, stacked."""
+    observe: list[str] = []
+    """What the policy observes, by names of the task's `observe` or `privileged`; empty: all of `observe`."""
+    observation_history: dict[str, Annotated[Whole, Field(ge=1, le=1000)]] = {}
+    """Number of last values of observations that become histories, by name; `frame_stack` stacks all."""
     time_feature: Switch = False
     """Whether the policy also observes the remaining fraction of the episode, from 1 to 0, as rl-zoo3's agents do."""
     overlap: Switch = True
@@ -207,6 +211,8 @@ class Recipe(Section):
             self.events,
             self.frame_stack,
             self.time_feature,
+            tuple(self.observe),
+            self.observation_history,
             sim=self.sim or "",
             named_by=named_by,
         )

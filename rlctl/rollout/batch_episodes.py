@@ -16,6 +16,7 @@ from rlctl.rollout import messages
 from rlctl.rollout.messages import EpisodeResult, FailedInEpisode
 from rlctl.rollout.seeds import list_training_seeds
 from rlctl.rollout.shared_arrays import CRITIC, SharedArrays
+from rlctl.rollout.teaching import BatchTeacher
 from rlctl.task.batch_env import BatchEnv, BatchStep
 
 Worlds = NDArray[np.int64]
@@ -32,6 +33,7 @@ class BatchEpisodes:
         self._sums = np.zeros((count, len(env.weights)))
         self._deepest = np.full(count, np.nan)  # how far bodies overlapped at most [m]; NaN: it was not measured
         self._weights = np.array([*env.weights.values()])
+        self.teacher: BatchTeacher | None = None
 
     def begin(self, arrays: SharedArrays, worlds: Worlds, seeds: Sequence[int]) -> NDArray[np.float32]:
         """Begin episodes; return their first observations, which are written into the shared arrays too."""
@@ -79,6 +81,8 @@ class BatchEpisodes:
             running = np.array([env for env in running.tolist() if step < len(actions[env])], np.int64)
             if not len(running):
                 break
+            if self.teacher is not None:
+                self.teacher.act(self.seeds[running], running)  # it may have a recurrent state
             result = self._step(np.stack([actions[env][step] for env in running.tolist()]), running)
             arrays.observation[SINGLE][self._first + running] = result.observation
             self._show_critic(arrays.observation, running, self._first + running)
@@ -131,6 +135,10 @@ class BatchEpisodes:
         for row in range(asked.steps):
             began = perf_counter()
             stored, action = self._choose(players, now[envs, row], worlds)
+            if self.teacher is not None:
+                segment.label[envs, row] = label = self.teacher.act(self.seeds[worlds], worlds)
+                taught = np.isin(envs, asked.taught)
+                stored[taught], action[taught] = label.reshape(stored.shape)[taught], label[taught]
             acted = perf_counter()
             segment.stored[envs, row], segment.action[envs, row] = stored, action
             inside[envs, 1], inside[envs, 2] = self.env.step_of[worlds] + 1, row

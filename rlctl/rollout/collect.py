@@ -56,12 +56,13 @@ def play_episodes(
     exploration: Exploration = Exploration(),  # noqa: B008 (it cannot change)
     *,
     record: bool = False,
+    taught: bool = False,
     watch: Callable[[int], None] = lambda done: None,
 ) -> list[Episode]:
     """Play an episode per seed with the workers' policy and return them in the order of `seeds`.
 
     Each worker plays in its first environment, or in all worlds of a `BatchTask`. An episode depends on its seed and
-    the policy only, not on the worker.
+    the policy only, not on the worker. With `taught` the workers' teacher acts instead of the policy.
     `watch` is called with the number of finished episodes, several times a second; if it raises, the caller must close
     the workers. Raises `TaskError` if an environment fails, and for an episode that does not end.
     """
@@ -82,7 +83,10 @@ def play_episodes(
                 running[env] = _Recorder(index, record)
         contacts = [env for env in begin if terms and running[env].index < _CONTACTS_MEASURED]
         if begin:
-            workers.start_playing(Play(steps, begin, exploration=exploration, record=terms, contacts=contacts))
+            acting = [*begin] if taught else []
+            workers.start_playing(
+                Play(steps, begin, exploration=exploration, record=terms, taught=acting, contacts=contacts)
+            )
 
     for envs in workers.playable_envs:
         play(envs)

@@ -37,11 +37,20 @@ class WorkerJob:
 
 
 @dataclasses.dataclass(frozen=True)
+class LabellingPolicy:
+    """A policy whose actions label the steps of segments: what it would do in the student's place."""
+
+    policy: str  # absolute path of a .safetensors or .onnx file
+    spec: EnvSpec  # whose observations it sees
+
+
+@dataclasses.dataclass(frozen=True)
 class Build:
     """Close the environments, if there are any, and build those of a spec."""
 
     spec: EnvSpec
     privileged: Mapping[str, bool] | None = None  # what only the critic sees; the arguments of `TaskEnv.show_critic`
+    teacher: LabellingPolicy | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +117,7 @@ class Play:
     levels: LevelRule | None = None  # of the episodes that follow
     exploration: Exploration = dataclasses.field(default_factory=Exploration)
     record: bool = False  # whether to write reward terms
+    taught: Sequence[int] = ()  # the environments in which the teacher acts instead of the policy
     contacts: Sequence[int] = ()  # the environments in which to measure after every step how far bodies overlap
 
 

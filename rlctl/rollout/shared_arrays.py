@@ -20,7 +20,7 @@ Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]  # shape and dtype 
 CRITIC = "critic"
 """Key of what only the critic sees, beside the keys of the observation."""
 _ALIGNMENT = 64  # [bytes], a cache line: two workers never write one
-_ROWS = ("stored", "action", "reward", "terminated", "truncated", "terms")
+_ROWS = ("stored", "action", "label", "reward", "terminated", "truncated", "terms")
 """The arrays of a segment that have a row for each step."""
 
 
@@ -67,6 +67,7 @@ class SharedArrays:
         of_segment: Layout = {
             "stored": ((max(1, int(np.prod(action[0]))),), stored),
             "action": action,
+            "label": action,
             "reward": ((), np.dtype(np.float64)),
             "terminated": ((), np.dtype(np.bool_)),
             "truncated": ((), np.dtype(np.bool_)),
@@ -104,6 +105,7 @@ class SegmentArrays:
     final: dict[str, NDArray[Any]]  # the last observation of an episode, in the row of its last step
     stored: NDArray[Any]  # actions of the policy before clipping, or scaled to [-1, 1]; shape (n_envs, steps, elements)
     action: NDArray[Any]  # actions that the environments received
+    label: NDArray[Any]  # actions that the teacher would take, if there is one
     reward: NDArray[np.float64]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]

@@ -63,17 +63,17 @@ def _read_own_memory() -> int:
     return 0
 
 
-def make_watched(spec: EnvSpec) -> tuple[Any, SharedWorld | None]:
+def make_watched(spec: EnvSpec, teacher: EnvSpec | None = None) -> tuple[Any, SharedWorld | None]:
     """Build an environment and try it for a few steps; return it, and how it shares its world with others, or None.
 
     Tasks of rlctl and environments without PyBullet are only built. An error in the trial is left to the first episode.
     """
     constructor = spec.constructor()
     if is_task(constructor):
-        return spec.make(), None
+        return spec.make(teacher=teacher), None
     before = _find_clients()
     with record_calls(with_results=()) as calls:
-        env = spec.make()
+        env = spec.make(teacher=teacher)
     if "pybullet" not in sys.modules or not _find_clients() | before:
         return env, None
     with record_calls(with_results=()) as later:

@@ -7,7 +7,7 @@ policy's parameters are in shared memory.
 import contextlib
 import dataclasses
 import gc
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from time import perf_counter
 from typing import Any
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import SINGLE
 from rlctl.environments.info import EnvInfo, describe
-from rlctl.environments.spec import EnvSpec
+from rlctl.environments.teacher_view import strip_teacher_view
 from rlctl.errors import describe_exception
 from rlctl.library_output import print_whole_lines
 from rlctl.policy.file import PolicyFile
@@ -41,6 +41,7 @@ from rlctl.rollout.running_episode import (
 from rlctl.rollout.seeds import list_training_seeds
 from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
 from rlctl.rollout.shared_world import make_watched
+from rlctl.rollout.teaching import BatchTeacher, EpisodeTeacher, check_teacher
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import Event, EventSettings, push
 
@@ -71,7 +72,7 @@ class Worker:
             case messages.ComputeRewards():
                 return Answer(rewards=compute_rewards(self._episodes[0].env, message.achieved, message.desired))
             case messages.Build():
-                return self._build(message.spec, message.privileged)
+                return self._build(message)
             case messages.SetEvents():
                 return Answer(info=self._set_events(message))
             case messages.Attach():
@@ -83,30 +84,38 @@ class Worker:
                 self._limit_actions(message)
         return Answer()
 
-    def _build(self, spec: EnvSpec, privileged: Mapping[str, bool] | None) -> Answer:
+    def _build(self, message: messages.Build) -> Answer:
+        spec, privileged, teacher = message.spec, message.privileged, message.teacher
+        taught_by = None if teacher is None else teacher.spec
         if self._episodes:
             self.close()
             gc.unfreeze()
             gc.collect()  # environments may hold themselves in cycles
         shared_world = None
         if self._job.count > 1 and not spec.is_batch:
-            first, shared_world = make_watched(spec)
+            first, shared_world = make_watched(spec, taught_by)
         else:
-            first = spec.make()
+            first = spec.make(teacher=taught_by)
         envs = [first]
+        if teacher is not None:
+            check_teacher(teacher, first)
         self._privileged = {} if privileged is None else show_critic(spec, first, privileged)
         if (batch := spec.make_batch(first, self._job.count)) is not None:
             self._batch = BatchEpisodes(batch, self._job.first)
+            self._batch.teacher = None if teacher is None else BatchTeacher(teacher, batch)
         elif shared_world is None:
-            envs += [spec.make() for _ in range(self._job.count - 1)]
+            envs += [spec.make(teacher=taught_by) for _ in range(self._job.count - 1)]
             for env in envs[1:] if privileged is not None else ():
                 show_critic(spec, env, privileged or {})
         self._info = describe(envs[0])
         metrics = [name for name, weight in self._info.reward_weights.items() if weight == 0]
         self._episodes = [RunningEpisode(env, self._job.first + index, metrics) for index, env in enumerate(envs)]
+        if teacher is not None and self._batch is None:
+            for episode in self._episodes:
+                episode.teacher = EpisodeTeacher(teacher, episode.env)
         space = envs[0].observation_space
         # A task's environment checks its observations itself.
-        checked = isinstance(envs[0], TaskEnv) and not isinstance(space, spaces.Dict)
+        checked = isinstance(strip_teacher_view(envs[0]), TaskEnv) and not isinstance(space, spaces.Dict)
         writer = ObservationWriter(space, checked=checked)
         for episode in self._episodes:
             episode.write = CriticWriter(writer, episode.env).write if self._privileged else writer.write
@@ -190,6 +199,8 @@ class Worker:
     def _replay(self, episode: RunningEpisode, actions: NDArray[np.generic]) -> bool:
         """Take steps with recorded actions; return whether the episode ended."""
         for action in actions:
+            if episode.teacher is not None:
+                episode.teacher.act(episode.seed, episode.step)  # it may have a recurrent state
             episode.step += 1
             self._arrays.inside[episode.index, 1] = episode.step
             observation, _, terminated, truncated, _ = episode.take_step(action)
@@ -239,6 +250,10 @@ class Worker:
             observation = single[row] if single is not None else {key: rows[row] for key, rows in now.items()}
             began = perf_counter()
             chosen, action = player.act(observation, episode.seed, episode.step)
+            if episode.teacher is not None:
+                segment.label[row] = episode.teacher.act(episode.seed, episode.step)
+                if index in asked.taught:
+                    chosen = action = segment.label[row]
             acted = perf_counter()
             segment.stored[row] = np.ravel(chosen)
             segment.action[row] = action

@@ -52,8 +52,10 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         timeout_s: float = DEFAULT_TIMEOUT_S,
         printed: PrintedLines | None = None,
         privileged: Mapping[str, bool] | None = None,
+        teacher: messages.LabellingPolicy | None = None,
     ) -> None:
         self.n_envs = n_envs
+        self._teacher = teacher  # labels the steps of segments
         self._privileged = privileged  # what the critic of a training sees; see `TaskEnv.show_critic`
         self.timeout_s = timeout_s
         self.spec = spec  # spec of the environments
@@ -136,7 +138,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 
     def _begin_to_build(self) -> None:
         for worker in range(len(self._ranges)):
-            self._send(worker, messages.Build(self.spec, self._privileged))
+            self._send(worker, messages.Build(self.spec, self._privileged, self._teacher))
 
     def _wait_until_built(self) -> None:
         if self._ready:

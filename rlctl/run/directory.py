@@ -62,6 +62,10 @@ class RunDirectory:
     onnx_file = _RunPath("exports/policy.onnx")  # the default file of an export
     replay_segments = _RunPath("checkpoints/replay")  # the folder of the replay buffer that checkpoints share
 
+    def teacher_file(self, suffix: str) -> Path:
+        """Return the file of the policy that a student was distilled from, `.safetensors` or `.onnx`."""
+        return self.path / "policies" / f"teacher{suffix}"
+
     def checkpoint(self, steps: int) -> Path:
         """Return the folder of the checkpoint at a training step."""
         return self.path / "checkpoints" / f"{steps:09d}"

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
 from gymnasium import spaces
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, WorldFailed, in_world, short_repr
 from rlctl.task.batch import BatchTask, WorldRngs, read_rows
+from rlctl.task.batch_view import BatchView, RowFault
 from rlctl.task.env import TaskEnv
 from rlctl.task.events.acting import ActingEvents, Streams, seed_streams
 from rlctl.task.events.batch_signals import BatchSignals
 from rlctl.task.events.event import Drawn
-from rlctl.task.history import HistoryRows
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
-from rlctl.task.observation import compute_terms
+from rlctl.task.observation import View, compute_terms
 
 Array = NDArray[np.float64]
 Worlds = NDArray[np.int64]
@@ -63,12 +63,23 @@ class BatchEnv:
         task.prepare(self.sim, worlds)
         self.sim.save()
         self.set_events(single)
-        sizes, frames = single._format.frame_sizes, task.observation_history
-        self._sizes, self._names = list(sizes.values()), list(sizes)
-        self._ends = np.cumsum([*single._format.sizes.values()])
-        self._history = HistoryRows(worlds, sizes, frames, task.history_start) if frames else None
-        low, high = single.observation_space.low, single.observation_space.high  # type: ignore[attr-defined]
-        self._bounds = (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
+        self._sizes = {name: int(np.size(value)) for name, value in single._first.items()}
+        self._view = self._make_view(single.view)
+        teacher = single.teacher
+        self._teacher_view = None if teacher is None else self._make_view(teacher.view)
+        self.for_teacher = np.zeros((worlds, 0 if self._teacher_view is None else self._teacher_view.size), np.float32)
+        """What a teacher sees now of each world, shape (worlds, size)."""
+        disturbed = () if teacher is None else teacher.disturbed
+        self._disturbed = np.concatenate([[name in disturbed] * size for name, size in self._sizes.items()])
+
+    @property
+    def _views(self) -> list[BatchView]:
+        return [self._view] if self._teacher_view is None else [self._view, self._teacher_view]
+
+    def _make_view(self, view: View) -> BatchView:
+        privileged = self._single._examples[0]
+        sizes = {**self._sizes, **{name: int(np.size(privileged[name])) for name in view.privileged}}
+        return BatchView(self.worlds, view, sizes, self.task.history_start)
 
     def set_events(self, single: TaskEnv) -> None:
         """Let the events of `single` act from the next resets on."""
@@ -103,8 +114,8 @@ class BatchEnv:
             self._act("start", world)
             if self._signals is not None:
                 self._signals.begin(world, self._streams[world], float(self._levels[world]))
-        if self._history is not None:
-            self._history.begin(worlds)
+        for view in self._views:
+            view.begin(worlds)
         with self._leave_others(worlds):
             observation = self._observe(worlds)
             self._check_kept("reset")
@@ -209,7 +220,7 @@ class BatchEnv:
         clipped: NDArray[Any] = np.minimum(np.maximum(given, space.low), space.high)
         return clipped
 
-    def _fail(self, world: int, message: str) -> None:
+    def _fail(self, world: int, message: str) -> NoReturn:
         raise WorldFailed(f"{self.name}: {message} at step {self.step_of[world]}", int(world))
 
     def _read_flags(self, method: str) -> NDArray[np.bool_]:
@@ -245,35 +256,37 @@ class BatchEnv:
 
     def _observe(self, rows: Worlds) -> NDArray[np.float32]:
         parts = self.task.observe()
-        if not isinstance(parts, dict) or list(parts) != self._names:
-            raise TaskError(f"{self.name}: observe() returned {short_repr(list(parts))}, at first {self._names}")
+        if not isinstance(parts, dict) or list(parts) != list(self._sizes):
+            names = list(self._sizes)
+            raise TaskError(f"{self.name}: observe() returned {short_repr(list(parts))}, at first {names}")
         if self.task.observation_terms:
             parts = compute_terms(self.name, self.task.observation_terms, parts)
-        columns = [
-            read_rows(self.name, f"observe()[{name!r}]", parts[name], (self.worlds, size), np.float64)
-            for name, size in zip(self._names, self._sizes, strict=True)
-        ]
-        exact = np.concatenate(columns, axis=1)[rows]
-        seen = exact if self._signals is None else self._signals.observe(exact, rows)
-        values = (seen if self._history is None else self._history.add(seen, rows)).astype(np.float32)
-        bad = ~np.isfinite(values.sum(axis=1))
-        if bad.any():
-            row = int(bad.argmax())
-            name = self._names[int(np.searchsorted(self._ends, (~np.isfinite(values[row])).argmax(), side="right"))]
-            self._fail(rows[row], f"observation {name!r} is not finite")
-        if self._bounds is not None:
-            values = self._clip(values, rows)
-        return values
+        exact = self._read_columns("observe", parts, self._sizes)[rows]
+        changed = exact if self._teacher_view is None else exact.copy()
+        seen = exact if self._signals is None else self._signals.observe(changed, rows)
+        try:
+            if self._teacher_view is not None and self._single.teacher is not None:
+                taught = np.where(self._disturbed, seen, exact)
+                columns = self._add_privileged(taught, self._single.teacher.view, rows)
+                self.for_teacher[rows] = self._teacher_view.assemble(columns, rows)
+            return self._view.assemble(self._add_privileged(seen, self._single.view, rows), rows)
+        except RowFault as fault:
+            self._fail(rows[fault.row], str(fault))
 
-    def _clip(self, values: NDArray[np.float32], rows: Worlds) -> NDArray[np.float32]:
-        assert self._bounds is not None
-        clipped = np.minimum(np.maximum(values, self._bounds[0]), self._bounds[1])
-        far = np.abs(clipped - values) > 1e-4
-        if far.any():
-            row, element = np.argwhere(far)[0]
-            name = self._names[int(np.searchsorted(self._ends, element, side="right"))]
-            self._fail(rows[row], f"observation {name!r} is {values[row, element]:g}, outside its bounds,")
-        return clipped
+    def _read_columns(self, method: str, parts: Mapping[str, Any], sizes: Mapping[str, int]) -> Array:
+        columns = [
+            read_rows(self.name, f"{method}()[{name!r}]", parts[name], (self.worlds, size), np.float64)
+            for name, size in sizes.items()
+        ]
+        return np.concatenate(columns, axis=1)
+
+    def _add_privileged(self, columns: Array, view: View | None, rows: Worlds) -> Array:
+        """Return columns with those that a view has of what the task's `privileged` returns, after them."""
+        if view is None or not view.privileged:
+            return columns
+        examples = self._single._examples[0]
+        sizes = {name: int(np.size(examples[name])) for name in view.privileged}
+        return np.concatenate([columns, self._read_columns("privileged", self.task.privileged(), sizes)[rows]], axis=1)
 
     def close(self) -> None:
         """End the simulation."""

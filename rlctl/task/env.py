@@ -16,11 +16,10 @@ from rlctl.task.batch import BatchTask, OneWorld, as_single
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Signals, Streams, seed_streams
 from rlctl.task.events.event import Drawn
-from rlctl.task.history import TermHistory
 from rlctl.task.joints import check_joints
 from rlctl.task.mirror import ACTION, check_declaration
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
-from rlctl.task.observation import Observation, ObservationFormat, compute_terms
+from rlctl.task.observation import Observation, Observing, TeacherSight, View, check_names, compute_terms
 from rlctl.task.privileged import PrivilegedFormat
 from rlctl.task.pybullet.library import is_installed
 from rlctl.task.pybullet.sim import PybulletSim
@@ -34,7 +33,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 
     `info` holds `reward_terms` (weighted; they add up to the reward), `metrics` (every raw term), `is_success`
     where the task defines it, and, in steps with events, `events` (the drawn values). `sim` is the engine:
-    `pybullet`, `mujoco`, `mujoco:SOLREF`; by default that of `choose_engine`.
+    `pybullet`, `mujoco`, `mujoco:SOLREF`; by default that of `choose_engine`. `observing` is what the policy sees.
     """
 
     def __init__(
@@ -45,6 +44,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         reward_weights: Mapping[str, float] | None = None,
         events: EventSettings | None = None,
         sim: str = "",
+        observing: Observing = Observing(),  # noqa: B008 (it cannot change)
     ) -> None:
         check_parameters(type(task))
         self.task = task = as_single(task)
@@ -100,11 +100,24 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         except BaseException:
             self.sim.close()
             raise
-        self._format = ObservationFormat(task, first)
-        self._history = TermHistory(task.observation_history, task.history_start)
-        self.observation_sizes, self.observation_space = self._format.sizes, self._format.space
-        sizes = {**self.observation_sizes, ACTION: math.prod(self.action_space.shape or ())}
+        check_names(task, first)
+        self.view = self._make_view(observing)
+        self.observation_sizes, self.observation_space = self.view.format.sizes, self.view.format.space
+        self.teacher: TeacherSight | None = None  # after `show_teacher`
+        sizes = {name: int(np.size(value)) for name, value in first.items()}
+        sizes[ACTION] = math.prod(self.action_space.shape or ())
         check_declaration(self.name, task.mirror, sizes, self._examples[0])
+
+    def _make_view(self, observing: Observing) -> View:
+        return View(self.task, observing, self._first, self._examples[0])
+
+    def show_teacher(self, observing: Observing, events: EventSettings) -> TeacherSight:
+        """Observe for a teacher with its own `events` too, from the next reset on; `RecipeError` for wrong names."""
+        signals = Signals(events.apply(self.task.events), self._first, self.action_space, self.task.observation_bounds)
+        self.teacher = TeacherSight(
+            self._make_view(observing), {name for names in signals.of.values() for name in names}
+        )
+        return self.teacher
 
     def set_level(self, level: float) -> None:
         """Set the level of the task, and of ranges written `{from: ..., to: ...}`, from 0 to 1, for the next resets."""
@@ -178,7 +191,9 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.task.reset(self.np_random)
         drawn |= self._acting.run("start", self.sim, self._streams, self.level)
         self._signals.begin(self._streams, self.level)
-        self._history.begin()
+        self.view.begin()
+        if self.teacher is not None:
+            self.teacher.view.begin()
         self._step = 0
         self._running = True
         observation = self._observe()
@@ -252,8 +267,17 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         return action
 
     def _observe(self) -> Observation:
-        parts = self._signals.observe(self.compute_terms(self.task.observe()))
-        return self._format.assemble(self._history.add(parts), self._step)
+        exact = self.compute_terms(self.task.observe())
+        seen = self._signals.observe(exact)
+        if self.teacher is not None:
+            self.teacher.look({**exact, **self._read_privileged(self.teacher.view)}, seen, self._step)
+        if self.view.privileged:
+            seen = {**seen, **self._read_privileged(self.view)}
+        return self.view.assemble(seen, self._step)
+
+    def _read_privileged(self, view: View) -> dict[str, Any]:
+        parts = self.task.privileged() if view.privileged else {}
+        return {name: parts[name] for name in view.privileged if name in parts}
 
     def compute_terms(self, observed: Any) -> Any:
         """Return what `Task.observe` returned with its terms computed, as the policy sees it without noise."""

@@ -32,14 +32,14 @@ class Mirror:
         return mirrored
 
 
-def join_places(declared: Declaration, sizes: Mapping[str, int]) -> tuple[int, ...]:
-    """Return the places of several arrays one after the other, as a flat observation has them.
+def join_places(declared: Declaration, sizes: Iterable[tuple[str, int]]) -> tuple[int, ...]:
+    """Return the places of several arrays one after the other, as a flat observation has them; `sizes` by name.
 
     What events drew is unchanged unless it is declared, as a mass is. Raises `TaskError` for a missing or an invalid
     entry.
     """
     joined: list[int] = []
-    for name, size in sizes.items():
+    for name, size in sizes:
         if name not in declared and not name.startswith(EVENTS):
             raise TaskError(f"mirror: {name!r} is missing; each observation and the action need an entry")
         places = list(declared.get(name, range(1, size + 1)))
@@ -60,7 +60,7 @@ def check_declaration(task: str, declared: Declaration, sizes: Mapping[str, int]
     """
     if not declared:
         return
-    join_places(declared, sizes)
+    join_places(declared, sizes.items())
     for name in declared:
         if not name.startswith(EVENTS):
             check_name(name, [*sizes, *others], f"{task}: mirror: nothing is called", TaskError, listed="There are")

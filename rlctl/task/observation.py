@@ -1,34 +1,84 @@
 """Checks what a task observes at every step, and assembles the environment's observation: a flat Box, or a Dict."""
 
+import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, did_you_mean
+from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean
+from rlctl.task.history import TermHistory
 from rlctl.task.task import Task
 from rlctl.task.terms import Term
 
 Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
 
-_ROUNDING = 1e-4
+ROUNDING = 1e-4
 """A value this far outside its bounds is clipped as a rounding error; farther outside it is an error of the task."""
 
 
-class ObservationFormat:
-    """The space of a task's observations, and their assembly; `first` is an example, by name."""
+@dataclasses.dataclass(frozen=True)
+class Observing:
+    """What a policy observes of a task; without names, all that the task's `observe` returns."""
 
-    def __init__(self, task: Task, first: Mapping[str, Any]) -> None:
+    names: Sequence[str] = ()
+    """Names of what `observe` or `privileged` returns."""
+    history: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """Numbers of last values by name, which replace the task's own."""
+
+    def list_names(self, task: str, observed: Mapping[str, Any], privileged: Mapping[str, Any]) -> list[str]:
+        """Return the names in the order of the task; raises `RecipeError` for a name that it does not have."""
+        known = [*observed, *(name for name in privileged if name not in observed)]
+        for name in self.names:
+            check_name(name, known, f"observe: {task} has no observation", RecipeError, listed="It has")
+        return [name for name in known if name in self.names] or list(observed)
+
+    def find_frames(self, task: Task, names: Sequence[str]) -> dict[str, int]:
+        """Return the numbers of last values by name; raises `RecipeError` for a name that is not observed."""
+        what = f"observation_history: {type(task).__name__} has no observation"
+        for name in self.history:
+            check_name(name, names, what if not self.names else "observation_history: not in observe:", RecipeError)
+        frames = {**task.observation_history, **self.history}
+        return {name: count for name, count in frames.items() if name in names and count > 1}
+
+
+def check_names(task: Task, observed: Mapping[str, Any]) -> None:
+    """Raise `TaskError` if a task declares something of an observation that it does not have."""
+    quantities = [name for term in task.observation_terms.values() for name in term.inputs]
+    for what, names, known in (
+        ("bounds or units", task.observation_bounds, observed),
+        ("a term", task.observation_terms, observed),
+        ("a history", task.observation_history, observed),
+        ("bounds or units", task.observation_units, [*observed, *quantities]),
+    ):
+        if unknown := [name for name in names if name not in known]:
+            raise TaskError(
+                f"{type(task).__name__}: {what} for {unknown[0]!r}, which is not observed."
+                f"{did_you_mean(unknown[0], known)}"
+            )
+
+
+class ObservationFormat:
+    """The space of observations, and their assembly; `first` is an example, by name.
+
+    `frames` has the number of last values of those that are histories.
+    """
+
+    def __init__(self, task: Task, first: Mapping[str, Any], frames: Mapping[str, int]) -> None:
         self._task = task
         self._name = type(task).__name__
-        self._bounds = task.observation_bounds
+        self._bounds = {name: bounds for name, bounds in task.observation_bounds.items() if name in first}
+        self.frames = dict(frames)
         self.frame_sizes = {name: int(np.size(value)) for name, value in first.items()}
         """Elements per name of one step, without histories."""
-        self._check_history(first)
-        frames = task.observation_history
+        for name in frames:
+            if len(shape := np.shape(first[name])) > 1:
+                raise TaskError(
+                    f"{self._name}: observation_history of {name!r}, of shape {shape}: only vectors have one"
+                )
         self._shapes = {
             name: (frames[name] * int(np.size(value)),) if name in frames else np.shape(value)
             for name, value in first.items()
@@ -44,25 +94,7 @@ class ObservationFormat:
         self.space = self._make_space()
         self._zeros = np.zeros(self.space.shape or (), np.float32)
 
-    def _check_history(self, first: Mapping[str, Any]) -> None:
-        for name in self._task.observation_history:
-            if len(shape := np.shape(first.get(name, ()))) > 1:
-                raise TaskError(
-                    f"{self._name}: observation_history of {name!r}, of shape {shape}: only vectors have one"
-                )
-
     def _make_space(self) -> Any:
-        quantities = [name for term in self._task.observation_terms.values() for name in term.inputs]
-        for what, names, known in (
-            ("bounds or units", self._bounds, self._shapes),
-            ("a term", self._task.observation_terms, self._shapes),
-            ("a history", self._task.observation_history, self._shapes),
-            ("bounds or units", self._task.observation_units, [*self._shapes, *quantities]),
-        ):
-            if unknown := [name for name in names if name not in known]:
-                raise TaskError(
-                    f"{self._name}: {what} for {unknown[0]!r}, which is not observed.{did_you_mean(unknown[0], known)}"
-                )
         parts: dict[str, Any] = {}
         for name, shape in self._shapes.items():
             is_picture = self._dtypes[name] is np.uint8 and self._task.observation_layout == "dict"
@@ -100,7 +132,7 @@ class ObservationFormat:
         self, values: NDArray[np.float32], low: Any, high: Any, parts: Mapping[str, Any], step: int
     ) -> Any:
         clipped = np.minimum(np.maximum(values, low), high)
-        if np.abs(clipped - values).max(initial=0.0) > _ROUNDING:
+        if np.abs(clipped - values).max(initial=0.0) > ROUNDING:
             raise self._out_of_bounds(parts, step)
         return clipped
 
@@ -122,12 +154,56 @@ class ObservationFormat:
     def _out_of_bounds(self, parts: Mapping[str, Any], step: int) -> TaskError:
         for name, (low, high) in self._bounds.items():
             worst = max(np.ravel(parts[name]).tolist(), key=lambda value: max(low - value, value - high))
-            if max(low - worst, worst - high) > _ROUNDING:
+            if max(low - worst, worst - high) > ROUNDING:
                 return TaskError(
                     f"{self._name}: observation {name!r} is {worst:g} at step {step}, "
                     f"outside its bounds [{low:g}, {high:g}]"
                 )
         return TaskError(f"{self._name}: observation outside its bounds at step {step}")
+
+
+class View:
+    """What one policy sees of a task in one world: some observations by name, with histories."""
+
+    def __init__(
+        self, task: Task, observing: Observing, observed: Mapping[str, Any], privileged: Mapping[str, Any]
+    ) -> None:
+        """`observed` and `privileged` are examples of what the task's methods return."""
+        privileged = privileged if isinstance(privileged, dict) else {}
+        names = observing.list_names(type(task).__name__, observed, privileged)
+        self._names = names if observing.names else None
+        self.privileged = [name for name in names if name not in observed]
+        """What it sees of what `privileged` returns."""
+        examples = {**privileged, **observed}
+        frames = observing.find_frames(task, names)
+        self.format = ObservationFormat(task, {name: examples[name] for name in names}, frames)
+        self._history = TermHistory(self.format.frames, task.history_start)
+
+    def begin(self) -> None:
+        """Begin an episode."""
+        self._history.begin()
+
+    def assemble(self, parts: Mapping[str, Any], step: int) -> Observation:
+        """Return the observation of a step; raises `TaskError` if it is not in the space."""
+        chosen = parts if self._names is None else {name: parts[name] for name in self._names if name in parts}
+        return self.format.assemble(self._history.add(chosen), step)
+
+
+class TeacherSight:
+    """What a teacher sees of a task that a student plays: noise and delay only where its own events `disturb`.
+
+    A policy acts best on what it was trained with.
+    """
+
+    def __init__(self, view: View, disturbed: Collection[str]) -> None:
+        self.view, self.disturbed = view, disturbed
+        self.seen: Observation | None = None
+        """Its observation of the present step."""
+
+    def look(self, exact: Mapping[str, Any], disturbed: Mapping[str, Any], step: int) -> None:
+        """Observe; `exact` has everything without noise and delay, `disturbed` what the student's events change."""
+        parts = {name: disturbed[name] if name in self.disturbed else value for name, value in exact.items()}
+        self.seen = self.view.assemble(parts, step)
 
 
 def compute_terms(name: str, terms: Mapping[str, Term], observed: Mapping[str, Any]) -> dict[str, Any]:

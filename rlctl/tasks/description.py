@@ -17,6 +17,7 @@ from pydantic_core import to_jsonable_python
 from rlctl.checking.values import Leaf, find_leaves
 from rlctl.environments import installed, registry
 from rlctl.environments.registry import call_plugin
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.recipe import recipe as recipes
@@ -46,7 +47,7 @@ def describe(task: str) -> Description:
     constructor: Any = registry.load(task)
     recipe = sources.resolve_with_stages(task)
     # The last stage is the full task. Parts of stacked observations have no names.
-    env = dataclasses.replace(recipe.env_specs(task)[-1], frame_stack=1, time_feature=False).make()
+    env = recipe.env_specs(task)[-1].observe_as(EnvSpec(task)).make()
     # Reading attributes of an environment also runs the plugin's code.
     try:
         about = call_plugin(task, lambda: _describe_env(task, constructor, env))

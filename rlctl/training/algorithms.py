@@ -9,6 +9,7 @@ import torch
 from gymnasium import spaces
 from rich.filesize import decimal as format_bytes
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -26,6 +27,8 @@ from rlctl.training.own_networks import check_policy_class, write_graph
 from rlctl.training.privileged import POLICIES, has_privileged_critic
 from rlctl.training.rollouts import WorkerVecEnv
 from rlctl.training.snapshot import pack
+from rlctl.training.stack_layout import find_layout
+from rlctl.training.stacked_replay import store_once
 from rlctl.training.updates.ppo import PpoUpdate
 
 # The system provides a replay buffer's memory only when it is written, so one that is too large fails hours later.
@@ -90,6 +93,9 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         )
         if recipe.algo in _DELAYED_BY_US:
             model.policy_delay = recipe.algo_kwargs.get("policy_delay", 1)  # type: ignore[attr-defined]
+        if isinstance(model, OffPolicyAlgorithm):
+            start = env.workers.info.history_start if env.workers.info.observation_history else "first"
+            store_once(model.replay_buffer, find_layout(env.workers, model.observation_space), start)
         if recipe.mirror:
             add_mirror(model, env.workers)
         write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # reports faults of a user's network
@@ -116,9 +122,13 @@ def add_mirror(model: Any, workers: Workers) -> None:
         raise RecipeError("mirror: observations with frame_stack or time_feature cannot be mirrored; leave them out")
     if not PpoUpdate.supports(model):
         raise RecipeError("mirror: supported only for PPO with multi-layer perceptrons with tanh or ReLU on the CPU")
-    sizes = {**info.observation_sizes, **workers.privileged_sizes}
-    action = {ACTION: len(workers.mirror[ACTION])}
-    model.mirror = join_places(workers.mirror, sizes), join_places(workers.mirror, action)
+    frames = {name: info.observation_history.get(name, 1) for name in info.observation_sizes}
+    newest = [
+        (name, size // frames[name]) for name, size in info.observation_sizes.items() for _ in range(frames[name])
+    ]
+    action = [(ACTION, len(workers.mirror[ACTION]))]
+    observed = [*newest, *workers.privileged_sizes.items()]
+    model.mirror = join_places(workers.mirror, observed), join_places(workers.mirror, action)
 
 
 def keep_compiler_out() -> None:
@@ -190,7 +200,7 @@ def _is_real(space: spaces.Space[Any]) -> bool:
     return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and not is_image_space(space)
 
 
-def _check_memory(recipe: Recipe, env: VecEnv) -> None:
+def _check_memory(recipe: Recipe, env: WorkerVecEnv) -> None:
     parts = [(math.prod(part.shape or ()), part.dtype) for part in split_space(env.observation_space).values()]
     action = math.prod(env.action_space.shape or ()) * _FLOAT32
     if recipe.algo in ON_POLICY:
@@ -198,6 +208,8 @@ def _check_memory(recipe: Recipe, env: VecEnv) -> None:
         row = sum(elements for elements, _ in parts) * _FLOAT32 + action + 6 * _FLOAT32
     else:  # observations before and after, in the space's dtype, action, reward and two flags
         key, rows = "buffer_size", int(recipe.algo_kwargs["buffer_size"])
+        if (layout := find_layout(env.workers, env.observation_space)) is not None:
+            parts = [(layout.size, env.observation_space.dtype)]
         observation = sum(elements * np.dtype(dtype or np.float32).itemsize for elements, dtype in parts)
         row = 2 * observation + action + 3 * _FLOAT32
     free = measure_free_memory()

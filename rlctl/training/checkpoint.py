@@ -30,6 +30,7 @@ from rlctl.run.directory import RunDirectory
 from rlctl.storage import files
 from rlctl.training.rollouts import WorkerVecEnv
 from rlctl.training.snapshot import Tensors
+from rlctl.training.stacked_replay import StackedRows
 from rlctl.training.status import Progress
 from rlctl.version import collect_versions
 
@@ -243,6 +244,9 @@ class ReplaySegments:
     def load(self, segments: Sequence[Segment], added: int) -> None:
         """Fill the buffer with the last of `added` transitions; raises `ArtifactError` if they do not fit it."""
         buffer = self.buffer
+        stacks = buffer.observations.stacks if isinstance(buffer.observations, StackedRows) else None
+        if stacks is not None:
+            stacks.added = added
         reached = max(0, added - buffer.buffer_size)
         for segment in segments:
             if segment.first > reached:
@@ -251,6 +255,8 @@ class ReplaySegments:
             reached = max(reached, segment.last)
         if reached != added:
             raise ArtifactError(f"{self.folder}: transitions after number {reached} are missing, of {added}")
+        if stacks is not None:
+            stacks.finish_loading()
         buffer.pos, buffer.full = added % buffer.buffer_size, added >= buffer.buffer_size
         self._segments, self._written = list(segments), added
 

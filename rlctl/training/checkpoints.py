@@ -117,7 +117,8 @@ class Checkpoints:
         learner = self._learner
         tensors, plain = snapshot.take(learner.model)
         of_callbacks, plain_of_callbacks = self.callbacks.take()
-        tensors |= of_callbacks | checkpoint.environment_tensors(learner.env)
+        of_rollouts, plain["rollouts"] = learner.rollouts.take()
+        tensors |= of_callbacks | of_rollouts | checkpoint.environment_tensors(learner.env)
         segments = []
         if self._replay is not None:
             segments = self._replay.save(self._added)
@@ -154,6 +155,7 @@ class Checkpoints:
             raise ArtifactError(f"{file}: {change}; restore it, or start a new training with --from {file}")
         try:
             snapshot.restore(learner.model, saved.tensors, saved.state.model)
+            learner.rollouts.restore(saved.tensors, saved.state.model.get("rollouts"))
             if self._replay is not None:
                 self._replay.load(saved.state.segments, self._added)
                 checkpoint.restore_hindsight(self._replay.buffer, saved.tensors)

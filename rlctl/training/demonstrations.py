@@ -199,7 +199,7 @@ class Cloning:
         model.policy.set_training_mode(False)
         with torch.no_grad():
             loss = float(self._compute_loss(slice(None)))
-            _set_noise(model)
+            set_noise(model)
         is_box = isinstance(model.action_space, spaces.Box)
         error = f"mean error {math.sqrt(loss):.3f}" if is_box else f"loss {loss:.3f}"
         return f"cloned {format_count(self._episodes, 'demonstration')} ({len(self._actions):,} steps, {error})"
@@ -256,7 +256,7 @@ class Cloning:
         return torch.nn.functional.mse_loss(chosen, targets)
 
 
-def _set_noise(model: Any) -> None:
+def set_noise(model: Any) -> None:
     """Give the actor a standard deviation of about `_STD` in the states of the last pass."""
     actor = getattr(model, "actor", model.policy)
     log_std = getattr(actor, "log_std", None)

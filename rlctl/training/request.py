@@ -3,6 +3,7 @@
 import dataclasses
 import shlex
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -45,14 +46,18 @@ class TrainResult:
         return f"TrainResult({self.task}, {self.recipe.algo}, {self.steps:,} steps, run {str(self.run.path)!r})"
 
 
-def run_training(request: TrainRequest) -> TrainResult:
-    """Train or resume to the end. Raises `Interrupted` after a signal, and `TaskError` if evaluations failed."""
-    with StopSignals() as signals, find_start(request) as start:
+def run_training(request: TrainRequest, find: Callable[[TrainRequest], Start] = find_start) -> TrainResult:
+    """Train or resume to the end. Raises `Interrupted` after a signal, and `TaskError` if evaluations failed.
+
+    `find` returns the start of the request.
+    """
+    with StopSignals() as signals, find(request) as start:
         if start.run is not None and start.checkpoint is not None and start.checkpoint.state.progress.done:
             return _report_finished(start, start.run, start.checkpoint.state.progress)
         engine = start.recipe.env_specs(start.task, named_by=RUN if start.run else "")[-1].engine
         how = ", ".join(filter(None, [start.recipe.algo, engine]))
-        title = f"{'train' if start.run is None else 'resume'} {start.task} ({how})"
+        verb = "resume" if start.run is not None else "train" if start.teacher is None else "distill"
+        title = f"{verb} {start.task} ({how})"
         display = make_display(title, start.recipe.total_timesteps)
         with display, collect() as printed, set_up(start, display, printed) as training:
             signals.begin(training)

@@ -26,7 +26,7 @@ from rlctl.rollout.workers import Workers
 from rlctl.task.mirror import Mirror
 from rlctl.training.own_networks import write_graph
 from rlctl.training.privileged import name_as_sb3, widen, widen_space
-from rlctl.training.snapshot import observation_statistics, pack, select_actor
+from rlctl.training.snapshot import Tensors, observation_statistics, pack, select_actor
 from rlctl.training.status import Progress
 from rlctl.training.updates.choice import choose_learner
 
@@ -45,6 +45,7 @@ class WorkerVecEnv(VecEnv):
         self.ended: list[EpisodeResult] = []  # episodes that ended since the list was emptied
         self.last_segment: SegmentArrays | None = None  # of `finish`; the next segment overwrites its arrays
         self.waited_s = 0.0  # time spent waiting for the environments to play [s], since it was set to 0
+        self.taught: Sequence[int] = ()  # environments in which the teacher acts in the next segments
         self._steps = 0
         self._is_playing = False  # whether a segment has been started and not finished
         observation_space, action_space = workers.info.spaces()
@@ -103,7 +104,9 @@ class WorkerVecEnv(VecEnv):
         self.workers.arrays.inside[:, 2] = -1
         running, next_episodes = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
         rule = self._level_rule
-        self.workers.start_playing(Play(steps, running, next_episodes, self.run_seed, rule, exploration))
+        self.workers.start_playing(
+            Play(steps, running, next_episodes, self.run_seed, rule, exploration, taught=self.taught)
+        )
 
     def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
         """Wait for the steps that `start` began; `check` is called several times a second."""
@@ -240,6 +243,13 @@ class Rollouts(abc.ABC):
     @abc.abstractmethod
     def learn(self) -> None:
         """Do the updates due for the stored segments."""
+
+    def take(self) -> tuple[Tensors, Any]:
+        """Return what a checkpoint needs beside the model: tensors and plain data."""
+        return {}, None
+
+    def restore(self, tensors: Tensors, plain: Any) -> None:  # noqa: B027 (most have nothing to restore)
+        """Restore what `take` returned."""
 
     def acting_statistics(self) -> Statistics:
         """Return a copy of the statistics; before the first segment has ended, mean 0 and variance 1."""

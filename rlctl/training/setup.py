@@ -61,7 +61,10 @@ def set_up(start: Start, display: Display, printed: PrintedLines) -> Iterator[Tr
         # The workers build their environments, and the check runs, while this process imports torch.
         make_workers = functools.partial(Workers, timeout_s=request.env_timeout_s)
         privileged = None if recipe.privileged is None else recipe.privileged.model_dump()
-        workers = stack.enter_context(make_workers(specs[start.stage - 1], recipe.n_envs, privileged=privileged))
+        teacher = None if start.teacher is None else start.teacher.to_message()
+        workers = stack.enter_context(
+            make_workers(specs[start.stage - 1], recipe.n_envs, privileged=privileged, teacher=teacher)
+        )
         checked = _begin_check(specs[-1], request.env_timeout_s) if request.check and start.run is None else None
         from rlctl.training.evaluator import EvaluationEpisodes, Evaluator
         from rlctl.training.loop import TrainingLoop
@@ -132,7 +135,7 @@ def _build_learner(
     from rlctl.training.learner import Curriculum, Learner, check_stages
     from rlctl.training.off_policy import OffPolicyRollouts
     from rlctl.training.on_policy import OnPolicyRollouts
-    from rlctl.training.rollouts import WorkerVecEnv
+    from rlctl.training.rollouts import Rollouts, WorkerVecEnv
 
     pin_threads()
     recipe, goal = start.recipe, workers.info
@@ -152,7 +155,12 @@ def _build_learner(
     model, line = build_on_device(recipe, env, start.request.device, cuda_available=torch.cuda.is_available())
     if line is not None:
         display.message(line)
-    rollouts = (OnPolicyRollouts if recipe.algo in ON_POLICY else OffPolicyRollouts)(model, env, recipe, progress)
+    if start.teacher is not None:
+        from rlctl.training.distilling.rollouts import DistillingRollouts
+
+        rollouts: Rollouts = DistillingRollouts(model, env, recipe, progress, start.teacher.steps)
+    else:
+        rollouts = (OnPolicyRollouts if recipe.algo in ON_POLICY else OffPolicyRollouts)(model, env, recipe, progress)
     rollouts.is_trained = start.is_trained
     if start.source is not None and start.checkpoint is None:
         display.message(load_source(start.source, model, goal))
@@ -195,6 +203,8 @@ def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Displa
         display.message(checkpoints.restore(start.checkpoint, start.inexact))
     for warning in checkpoints.cut_back(start.step) if start.run else ():
         display.message(warning)
+    if start.teacher is not None and start.run is None:
+        start.teacher.copy_to(run)
     status.write_start(run, start, str(learner.model.device))
     return checkpoints
 

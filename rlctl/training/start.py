@@ -28,6 +28,7 @@ from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.callbacks import Callback, Sb3Callback, call_callback, is_of_sb3
+from rlctl.training.distilling.teacher import Teacher
 from rlctl.training.tracking import check_installed
 from rlctl.training.warm_start import find_source
 
@@ -53,6 +54,7 @@ class Start(contextlib.AbstractContextManager["Start"]):
     callbacks: Mapping[str, Callback] = dataclasses.field(default_factory=dict)
     source: Mapping[str, Any] | None = None  # the policy of `--from`; see `warm_start.find_source`
     demos: Mapping[str, str] | None = None  # the demonstrations of `--demos`; see `describe_demonstrations`
+    teacher: Teacher | None = None  # of a student that `rlctl distill` trains
     inexact: tuple[str, ...] = ()  # reasons, known before the start, why the resume cannot be bit-exact
     began: float = dataclasses.field(default_factory=time.monotonic)
 
@@ -150,7 +152,9 @@ def _find_checkpoint(request: TrainRequest) -> Start:
                 f"to train further with it: rlctl train {task} --config {run.recipe_file} --from {run.path}"
             )
         callbacks, source, demos = _load_callbacks(recipe), status.get("from"), status.get("demos")
-        return Start(request, task, recipe, run, lock, newest, tuple(notes), callbacks, source, demos, tuple(changes))
+        teacher = Teacher.of_run(run, entry) if (entry := status.get("teacher")) is not None else None
+        sources = callbacks, source, demos, teacher
+        return Start(request, task, recipe, run, lock, newest, tuple(notes), *sources, tuple(changes))
     except BaseException:
         lock.release()
         raise

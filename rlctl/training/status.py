@@ -78,7 +78,8 @@ def write_start(run: RunDirectory, start: Start, device: str) -> None:
     else:
         folder = os.environ.get("RLCTL_FOLDER") or os.getcwd()  # a task's path may be relative to it
         changes |= {"id": uuid.uuid4().hex, "started": _now(), "folder": folder}
-        sources = {"from": start.source, "demos": start.demos}
+        teacher = None if start.teacher is None else start.teacher.describe()
+        sources = {"from": start.source, "demos": start.demos, "teacher": teacher}
         changes |= {name: source for name, source in sources.items() if source is not None}
     run.write_status(changes)
 

@@ -9,6 +9,8 @@ from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
 from rlctl.training import checkpoints
 from rlctl.training.request import TrainResult, run_training
+from rlctl.training.rollouts import WorkerVecEnv
+from tests.training.comparing import Killed
 
 ENVS = Path(__file__).with_name("envs.py")
 FAULTY = ENVS.with_name("faulty_envs.py")
@@ -77,3 +79,36 @@ def fail(train, tmp_path):
         return caught.value, RunDirectory(folder)
 
     return run
+
+
+@pytest.fixture
+def kill_after(monkeypatch):
+    """End the training in the middle of a step, so many steps of each environment after it began."""
+
+    def kill(steps):
+        done = asked = 0
+        started, finished = WorkerVecEnv.start, WorkerVecEnv.finish
+
+        def killed():
+            raise Killed
+
+        def start(env, count, exploration):
+            nonlocal asked
+            asked = count
+            started(env, count, exploration)
+
+        def finish(env, check=None):
+            nonlocal done
+            segment = finished(env, killed if done + asked > steps else check)  # while the workers play
+            done += segment.reward.shape[1]
+            return segment
+
+        def undo():
+            monkeypatch.setattr(WorkerVecEnv, "start", started)
+            monkeypatch.setattr(WorkerVecEnv, "finish", finished)
+
+        monkeypatch.setattr(WorkerVecEnv, "start", start)
+        monkeypatch.setattr(WorkerVecEnv, "finish", finish)
+        return undo
+
+    return kill

@@ -18,7 +18,6 @@ from rlctl.run.train_request import TrainRequest
 from tests.training import own_callbacks
 from tests.training.comparing import Killed, assert_same_run
 from tests.training.conftest import SMALL_PPO
-from tests.training.test_exact_resume import kill_after as kill_after
 from tests.training.test_exact_resume import settings
 
 FILE = Path(own_callbacks.__file__)

@@ -6,7 +6,6 @@ import torch
 from rlctl.recipe import recipe as recipes
 from rlctl.rollout.workers import available_cores
 from rlctl.training import checkpoints
-from rlctl.training.rollouts import WorkerVecEnv
 from tests.training.comparing import Killed, assert_same_run, rows
 from tests.training.conftest import FAULTY, SMALL
 
@@ -51,6 +50,17 @@ CASES = {
     "recurrent_ppo, on worlds in batches": (STOOL, settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
     "ppo, privileged, on worlds in batches": (STOOL, settings("ppo", randomize=True, privileged={})),
     "ppo, mirrored": ("walk", settings("ppo", mirror=True, randomize=True, task={"episode_s": 0.4})),
+    "ppo, mirrored, with a history": (
+        "walk-rough",
+        settings(
+            "ppo",
+            mirror=True,
+            privileged={},
+            observe=["gyroscope", "joint_positions", "velocity"],
+            observation_history={"joint_positions": 2},
+            task={"episode_s": 0.4},
+        ),
+    ),
     "ppo, levels, on worlds in batches": (STOOL, settings("ppo", **LEVELS)),
     "sac, levels": (STOOL, settings("sac", **LEVELS)),
     "ppo, privileged, on reach": (
@@ -71,6 +81,11 @@ CASES = {
     "a2c": ("Line", settings("a2c")),
     "recurrent_ppo": ("Line", settings("recurrent_ppo", policy_kwargs={"lstm_hidden_size": 8})),
     "sac": ("Line", settings("sac", algo_kwargs={"train_freq": 1}, policy_kwargs={"net_arch": [256, 256]})),
+    "sac, frame stack": ("Line", settings("sac", frame_stack=3, algo_kwargs={"buffer_size": 60})),
+    "sac, histories": (
+        STOOL,
+        settings("sac", randomize=True, observation_history={"hips": 3, "seen": 2}, algo_kwargs={"buffer_size": 60}),
+    ),
     "sac with gSDE": ("Line", settings("sac", **SDE)),
     "sac, normalised": ("Line", settings("sac", **NORMALIZED)),
     "sac, dict": ("DictObservation", settings("sac", **NORMALIZED)),
@@ -95,39 +110,6 @@ QUICK = {
     *("ppo with gSDE", "ppo, curriculum", "sac, hindsight, normalised"),
     "ppo, privileged, on worlds in batches",
 }
-
-
-@pytest.fixture
-def kill_after(monkeypatch):
-    """End the training in the middle of a step, so many steps of each environment after it began."""
-
-    def kill(steps):
-        done = asked = 0
-        started, finished = WorkerVecEnv.start, WorkerVecEnv.finish
-
-        def killed():
-            raise Killed
-
-        def start(env, count, exploration):
-            nonlocal asked
-            asked = count
-            started(env, count, exploration)
-
-        def finish(env, check=None):
-            nonlocal done
-            segment = finished(env, killed if done + asked > steps else check)  # while the workers play
-            done += segment.reward.shape[1]
-            return segment
-
-        def undo():
-            monkeypatch.setattr(WorkerVecEnv, "start", started)
-            monkeypatch.setattr(WorkerVecEnv, "finish", finished)
-
-        monkeypatch.setattr(WorkerVecEnv, "start", start)
-        monkeypatch.setattr(WorkerVecEnv, "finish", finish)
-        return undo
-
-    return kill
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ _HIDDEN = 3  # group of geoms that neither pictures nor recordings show
 _GROUND_THICKNESS = 0.5  # [m], of rough ground
 
 
-class Scene:
+class SceneSpec:
     """The `MjSpec` of a world, and the parts of its bodies by name.
 
     A single world is solved more exactly than one of many (`single=False`), and has shapes that are only looked at

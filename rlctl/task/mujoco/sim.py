@@ -21,7 +21,7 @@ from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.mujoco.body import MujocoBody
 from rlctl.task.mujoco.parts import WORLD, Parts
 from rlctl.task.mujoco.pictures import Marker, draw
-from rlctl.task.mujoco.scene import Scene
+from rlctl.task.mujoco.scene import SceneSpec
 from rlctl.task.mujoco.world import Array, Fields, MujocoWorld, Rows
 from rlctl.task.sim import Sim
 
@@ -66,7 +66,7 @@ class MujocoSim(Sim):
         self.bodies = {}
         self._pushes: list[_MujocoPush] = []
         self._markers: list[Marker] = []
-        self._scene = Scene(
+        self._scene = SceneSpec(
             self.mujoco,
             timestep=self._control_dt / self.world.substeps,
             iterations=self._iterations,

@@ -11,9 +11,10 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 
 from rlctl.environments.dict_spaces import join, map_parts, split
 from rlctl.training.snapshot import observation_statistics
+from rlctl.training.stacked_replay import StackedRows
 from rlctl.training.updates.perceptrons import Floats
 
-_Take = Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
+_Take = Callable[[Any, NDArray[Any]], NDArray[Any]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +55,9 @@ def _gather(model: Any, count: int, size: int) -> dict[str, Any]:
     rows, envs = (np.concatenate(numbers) for numbers in zip(*drawn, strict=True))
     statistics = observation_statistics(env)
 
-    def take(values: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
+    def take(values: Any, rows: NDArray[Any]) -> NDArray[Any]:
+        if isinstance(values, StackedRows):
+            return values[rows, envs]
         return values.reshape(-1, *values.shape[2:]).take(rows * buffer.n_envs + envs, axis=0)
 
     def take_observations(observations: Any, rows: NDArray[Any]) -> Any:
