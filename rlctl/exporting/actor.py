@@ -134,7 +134,7 @@ def make_metadata(info: PolicyInfo) -> dict[str, str]:
     """Return the metadata of a policy's ONNX file.
 
     The key `rlctl` has the whole description as JSON. The other keys are for programs without rlctl; lists are
-    separated by commas, in the order of the elements of the observation or the action.
+    separated by commas, units by semicolons, in the order of the elements of the observation or the action.
     """
     env, action_space = info.env, info.env.spaces()[1]
     plain = {
@@ -143,7 +143,7 @@ def make_metadata(info: PolicyInfo) -> dict[str, str]:
         "training_steps": str(info.training_steps),
         "observation_names": ",".join(env.observation_sizes),
         "observation_sizes": ",".join(str(size) for size in env.observation_sizes.values()),
-        "observation_units": ",".join(env.observation_units.get(name, "") for name in env.observation_sizes),
+        "observation_units": ";".join(env.observation_units.get(name, "") for name in env.observation_sizes),
         "observation_history": ",".join(f"{name}:{count}" for name, count in env.observation_history.items()),
         "frame_stack": str(info.spec.frame_stack),
         "action_meaning": env.action_meaning,

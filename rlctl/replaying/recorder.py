@@ -2,7 +2,9 @@
 
 import contextlib
 import dataclasses
+import functools
 import math
+import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -184,7 +186,7 @@ def _make_episode(
         seed=seed,
         policy=policy,
         success=steps[-1].success if steps else None,
-        total_reward=sum(rewards, 0.0),
+        total_reward=functools.reduce(operator.add, rewards, 0.0),  # as workers add; `sum` rounds differently
         term_names=list(about.reward_weights),
         versions=current_versions(spec.task),
     )

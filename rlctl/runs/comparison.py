@@ -206,9 +206,11 @@ def compare_runs(
             Candidate(
                 side,
                 _differences(baseline, side, of_recipes, len(others)),
-                find_recipe_changes(recipe[0], recipes[0][0]) if recipe and recipes[0] else None,
+                find_recipe_changes(recipe[0], recipes[0][0]) | _find_other_starts(group[0], groups[0][0])
+                if recipe and recipes[0]
+                else None,
             )
-            for side, recipe in zip(others, recipes[1:], strict=True)
+            for side, group, recipe in zip(others, groups[1:], recipes[1:], strict=True)
         ],
         episodes=request.episodes,
         threshold=_default_threshold(threshold, baseline.has_success),
@@ -222,6 +224,12 @@ def find_recipe_changes(recipe: Recipe, baseline: Recipe) -> dict[str, tuple[Any
         for key, (value, before) in find_difference(recipe, baseline).items()
     }
     return {key: pair for key, pair in changes.items() if pair[0] != pair[1]}
+
+
+def _find_other_starts(run: RunDirectory, baseline: RunDirectory) -> dict[str, tuple[Any, Any]]:
+    """Return the policies that two trainings began with, under the name of the option, if they differ."""
+    starts = [str((trained.status().get("from") or {}).get("policy", NOT_SET)) for trained in (run, baseline)]
+    return {} if starts[0] == starts[1] else {"--from": (starts[0], starts[1])}
 
 
 def _find_effective(recipe: Recipe, key: str, value: Any) -> Any:

@@ -1,7 +1,9 @@
 """`TaskEnv`: the Gymnasium environment around a task."""
 
 import copy
+import functools
 import math
+import operator
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
@@ -223,7 +225,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
             raise term_mismatch(self.name, raw, weights)
         try:
             terms = {name: weight * raw[name] for name, weight in weights.items()}
-            reward = float(sum(terms.values()))
+            # `sum` rounds differently since Python 3.12; a batch of worlds adds in this order.
+            reward = float(functools.reduce(operator.add, terms.values(), 0.0))
         except (TypeError, ValueError):
             raise not_a_number(self.name, raw, self._step) from None
         if not math.isfinite(reward):

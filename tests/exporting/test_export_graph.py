@@ -198,8 +198,8 @@ def test_file_says_what_it_is(train, tmp_path):
     metadata = {entry.key: entry.value for entry in proto.metadata_props}
     names = metadata["observation_names"].split(",")
     assert names[0] == "joint_positions"
-    assert len(names) == len(metadata["observation_sizes"].split(",")) == len(metadata["observation_units"].split(","))
-    assert metadata["observation_units"].split(",")[0] == "rad"
+    assert len(names) == len(metadata["observation_sizes"].split(",")) == len(metadata["observation_units"].split(";"))
+    assert metadata["observation_units"].split(";")[0] == "rad"
     assert metadata["action_low"] == ",".join(["-1"] * 7)
     assert metadata["action_high"] == ",".join(["1"] * 7)
     assert metadata["action_meaning"] == info.env.action_meaning
