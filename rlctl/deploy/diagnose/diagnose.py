@@ -16,6 +16,7 @@ from rlctl.deploy.diagnose.log import RobotLog, read_robot_log
 from rlctl.deploy.diagnose.mapping import CorrectedMapping, build_mapping
 from rlctl.deploy.diagnose.policy_match import SAME, Matcher, PolicyMatch
 from rlctl.deploy.diagnose.reference import record_reference
+from rlctl.deploy.diagnose.rows import ChosenRows, choose_rows
 from rlctl.deploy.diagnose.search import Search
 from rlctl.deploy.diagnose.signals import ACTIONS, LoggedSignals
 from rlctl.environments.spec import EnvSpec
@@ -23,7 +24,8 @@ from rlctl.errors import AnswerIsNo, ArtifactError
 from rlctl.policy.file import PolicyFile
 
 MOST = 5  # findings that are listed
-_STEPS_PER_ELEMENT, _FEWEST_STEPS, _MOST_STEPS = 250, 8000, 14_000  # of rollouts in simulation
+_STEPS_PER_ELEMENT, _FEWEST_STEPS, _MOST_STEPS = 400, 16_000, 20_000  # of rollouts in simulation
+_ROWS = 500  # of a log, for the answers in numbers
 _CERTAIN = 1e4  # evidence of what needs no statistics [nats]
 
 
@@ -150,14 +152,17 @@ class Doctor:
         is_variant = match.variant.normalizes == 0
         if not is_variant and normalised not in match.corrections:
             return match
-        rows = signals.inner_rows(self.likelihood.margin)
-        scorer = Scorer(self.likelihood, signals, rows[:: max(1, len(rows) // 400)])
+        scorer = Scorer(self.likelihood, signals, self._choose_rows(signals))
         others = [one for one in match.corrections if one != normalised]
         scorer.rebase(others)
         if scorer.gain(normalised) > 0:
             return dataclasses.replace(match, corrections=(normalised, *others), variant=RIGHT, also=())
         variant = next(one for one in self.actor.variants() if one.normalizes == 0)
         return dataclasses.replace(match, corrections=tuple(others), variant=variant, also=())
+
+    def _choose_rows(self, signals: LoggedSignals) -> ChosenRows:
+        rows = signals.inner_rows(self.likelihood.margin)
+        return choose_rows(signals, rows, self.likelihood.reference.statistics, _ROWS)
 
     def _describe_frozen(self, frozen: Sequence[Frozen], signals: LoggedSignals) -> list[MappingFinding]:
         return [
@@ -204,8 +209,7 @@ class Doctor:
         match: PolicyMatch,
         stuck: Sequence[tuple[str, int]],
     ) -> Answers:
-        rows = signals.inner_rows(self.likelihood.margin)
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), 600)).astype(int)]
+        rows = self._choose_rows(signals)
         before, after = Scorer(self.likelihood, signals, rows, stuck), Scorer(self.likelihood, corrected, rows, stuck)
         after.rebase(of_robot)
         terms = {name: (before.times_usual(name), after.times_usual(name)) for name in signals.sizes}

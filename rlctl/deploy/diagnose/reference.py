@@ -20,8 +20,8 @@ from rlctl.task.events import EventSettings, delay
 from rlctl.task.events.event import Widening
 
 _SOUND_SHARE, _HELD_OUT_SHARE = 0.4, 0.2  # of all steps; the others are with mistakes
-_LONGEST = 200  # steps of an episode, so that there are many different ones
-_SHORTEST = 12
+_SHORT, _LONG = 30, 160  # steps of an episode: short, so that there are many different ones
+_SHORTEST = 20  # steps of an episode that is used
 _NOISE = (0.0, 0.05, 0.2, 0.4)  # of half the range of an action
 
 
@@ -118,7 +118,7 @@ class _ReferencePlayer:
         observation, _ = env.reset(seed=int(rng.integers(2**31)))
         observations, actions = [], []
         disturbance = np.zeros(len(actor.low))
-        for _ in range(_LONGEST):
+        for _ in range(int(rng.integers(_SHORT, _LONG))):
             seen = np.array(observation, np.float64)
             for one in mistakes:
                 if one.term in slices:

@@ -8,7 +8,8 @@ import numpy as np
 from rlctl.deploy.diagnose.candidates import make_offset, make_scale
 from rlctl.deploy.diagnose.correction import Correction
 from rlctl.deploy.diagnose.evidence import Likelihood, Scorer
-from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
+from rlctl.deploy.diagnose.rows import choose_rows
+from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, LoggedSignals
 
 _ROWS = 300  # of a log, in each half
 _STARTS = 3  # best single corrections that are tried as parts of pairs
@@ -55,7 +56,8 @@ class Search:
         block = max(10, min(50, len(rows) // 10))
         is_second = (np.arange(len(rows)) // block) % 2 == 1
         self._search, self._confirm = (
-            Scorer(likelihood, signals, _thin(part), frozen, len(part)) for part in (rows[~is_second], rows[is_second])
+            Scorer(likelihood, signals, choose_rows(signals, part, likelihood.reference.statistics, _ROWS), frozen)
+            for part in (rows[~is_second], rows[is_second])
         )
         self._likelihood = likelihood
         allowed = likelihood.reference.allowed_delay
@@ -177,7 +179,3 @@ def _is_large(one: Correction) -> bool:
         return True
     factors = np.array(one.factor)
     return bool((np.abs(np.log(factors[factors != 1.0])) > np.log(_LEAST_FACTOR)).all())
-
-
-def _thin(rows: Array) -> Array:
-    return rows if len(rows) <= _ROWS else rows[np.linspace(0, len(rows) - 1, _ROWS).astype(int)]
