@@ -110,7 +110,7 @@ class Doctor:
             raise ArtifactError(f"the longest part without gaps has {longest} rows; diagnose needs {needed}")
         reference = self.likelihood.reference
         frozen = find_frozen(signals, (reference.sound, reference.varied))
-        match = self._match(signals, pairs=not frozen)
+        match = self._match(signals, frozen)
         findings = [*self._describe_frozen(frozen, signals), *self._describe_match(match, signals, bool(frozen))]
         corrected = correct(signals, match.corrections)
         stuck = [(one.term, element) for one in frozen for element in one.elements]
@@ -135,14 +135,26 @@ class Doctor:
         answers = self._answer(signals, corrected, of_robot, match, stuck)
         return findings[:MOST], answers, build_mapping(match.corrections, of_robot, dict(signals.sizes))
 
-    def _match(self, signals: LoggedSignals, *, pairs: bool) -> PolicyMatch:
+    def _match(self, signals: LoggedSignals, frozen: Sequence[Frozen]) -> PolicyMatch:
         std = self.likelihood.reference.statistics[ACTIONS].std
         if self.actor.in_rows:
-            return self._decide_normalisation(
-                Matcher(self.actor, signals, std, self.candidates).match(pairs=pairs), signals
-            )
+            match = Matcher(self.actor, signals, std, self.candidates).match(pairs=not frozen)
+            if frozen and not match.is_explained:  # the policy may have received what the log does not hold
+                unknown = self._list_unknown(frozen, signals)
+                if len(unknown) < len(std):
+                    match = Matcher(self.actor, signals, std, self.candidates, unknown).match(pairs=False)
+            return self._decide_normalisation(match, signals)
         difference = np.minimum(np.abs(signals.actions - self.actor.act_all(signals)) / std, 1.0)
         return PolicyMatch(float(difference.mean()), float(difference.mean()))
+
+    def _list_unknown(self, frozen: Sequence[Frozen], signals: LoggedSignals) -> dict[int, float]:
+        """Return the columns of frozen elements, with their usual values."""
+        statistics = self.likelihood.reference.statistics
+        return {
+            signals.slices[one.term].start + element: float(statistics[one.term].mean[element])
+            for one in frozen
+            for element in one.elements
+        }
 
     def _decide_normalisation(self, match: PolicyMatch, signals: LoggedSignals) -> PolicyMatch:
         """Tell logged values that are normalised already from a network that got none: the actions are the same."""

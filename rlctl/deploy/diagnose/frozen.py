@@ -10,6 +10,7 @@ from rlctl.deploy.diagnose.signals import Array, LoggedSignals
 _LONGER = 3.0  # than the longest time without a change in simulation
 _LONGER_AT_END = 10.0  # the same at an end of the range, where contacts and saturated actions stay
 _LEAST_ROWS = 20
+_LEAST_CHANGING = 0.25  # of the other elements, in a row in which something moves
 _LEAST_MOTION = 0.05  # of the standard deviations in simulation
 
 
@@ -38,22 +39,38 @@ def find_frozen(signals: LoggedSignals, references: Sequence[LoggedSignals]) -> 
     found = []
     ends = np.cumsum(signals.lengths).tolist()
     for name in signals.sizes:
-        runs = [_longest_run(column, signals.lengths) for column in signals.term(name).T]
+        moving = _find_moving(signals, references[0], name)
+        usual_moving = [_find_moving(one, references[0], name) for one in references]
+        runs = [_longest_run(column, signals.lengths, moving) for column in signals.term(name).T]
         stuck = [
             index
-            for index, (rows, first) in enumerate(runs)
-            if first + rows in ends
-            and _moves(signals, references[0], name, slice(first, first + rows))
-            and not _repeats_constant_action(signals, name, index, slice(first, first + rows - 1))
-            and rows >= max(_LEAST_ROWS, _count_least(references, name, index, signals.term(name)[first, index]))
+            for index, run in enumerate(runs)
+            if run.first + run.rows in ends
+            and _moves(signals, references[0], name, slice(run.first, run.first + run.rows))
+            and not _repeats_constant_action(signals, name, index, slice(run.first, run.first + run.rows - 1))
+            and run.moving
+            >= max(
+                _LEAST_ROWS,
+                _count_least(references, usual_moving, name, index, signals.term(name)[run.first, index]),
+            )
         ]
         if stuck:
-            rows, first = runs[stuck[0]]
+            run = runs[stuck[0]]
             # Those that often keep a value, such as a joint at its top speed, but here with the others.
-            stuck = [index for index, run in enumerate(runs) if index in stuck or run == (rows, first)]
-            value = float(signals.term(name)[first, stuck[0]])
-            found.append(Frozen(name, tuple(stuck), value, first, rows))
+            stuck = [index for index, other in enumerate(runs) if index in stuck or other == run]
+            value = float(signals.term(name)[run.first, stuck[0]])
+            found.append(Frozen(name, tuple(stuck), value, run.first, run.rows))
     return found
+
+
+def _find_moving(signals: LoggedSignals, sound: LoggedSignals, name: str) -> Array:
+    """Return in which rows the other observations change: at rest, all sensors of a simulation keep their values."""
+    others = np.delete(np.arange(signals.observations.shape[1]), np.r_[signals.slices[name]])
+    others = others[np.ptp(sound.observations[:, others], axis=0) > 0]
+    if not len(others):
+        return np.ones(len(signals.observations), bool)
+    changed = np.diff(signals.observations[:, others], axis=0) != 0
+    return np.append(True, changed.mean(axis=1) >= _LEAST_CHANGING)
 
 
 def _moves(signals: LoggedSignals, sound: LoggedSignals, name: str, rows: slice) -> bool:
@@ -73,10 +90,15 @@ def _repeats_constant_action(signals: LoggedSignals, name: str, index: int, rows
     return bool(np.ptp(actions) == 0 and signals.term(name)[rows.stop, index] == actions[-1])
 
 
-def _count_least(references: Sequence[LoggedSignals], name: str, index: int, value: float) -> float:
+def _count_least(
+    references: Sequence[LoggedSignals], moving: Sequence[Array], name: str, index: int, value: float
+) -> float:
     """Return for how many rows an element must keep a value: never, if it often does in simulation."""
     columns = [signals.term(name)[:, index] for signals in references]
-    usual = max(_longest_run(column, one.lengths)[0] for column, one in zip(columns, references, strict=True))
+    usual = max(
+        _longest_run(column, one.lengths, some).moving
+        for column, one, some in zip(columns, references, moving, strict=True)
+    )
     if usual >= max(max(one.lengths) for one in references) / 2:
         return np.inf
     low, high = min(column.min() for column in columns), max(column.max() for column in columns)
@@ -84,10 +106,18 @@ def _count_least(references: Sequence[LoggedSignals], name: str, index: int, val
     return (_LONGER if is_inside else _LONGER_AT_END) * usual
 
 
-def _longest_run(values: Array, lengths: tuple[int, ...]) -> tuple[int, int]:
-    """Return how many rows of a segment have the same value at most, and the first of them."""
-    same = np.concatenate([[False], np.diff(values) == 0])
-    same[np.cumsum((0, *lengths[:-1]))] = False
-    count = np.arange(len(values)) - np.maximum.accumulate(np.where(same, 0, np.arange(len(values))))
-    last = int(count.argmax())
-    return int(count[last]) + 1, last - int(count[last])
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    rows: int
+    first: int
+    moving: int  # rows of these in which the other observations change
+
+
+def _longest_run(values: Array, lengths: tuple[int, ...], moving: Array) -> _Run:
+    """Return the rows of a segment that have the same value while the others change for the longest time."""
+    begins = np.append(True, np.diff(values) != 0)
+    begins[np.cumsum((0, *lengths[:-1]))] = True
+    number = np.cumsum(begins) - 1
+    counts = np.bincount(number, weights=moving | begins)
+    longest = int(counts.argmax())
+    return _Run(int((number == longest).sum()), int(np.searchsorted(number, longest)), int(counts[longest]))

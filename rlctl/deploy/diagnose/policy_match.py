@@ -1,7 +1,7 @@
 """Question 1: does the policy, given the logged observations, produce the logged actions? If not, what is wrong?"""
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -16,6 +16,7 @@ _BETTER = 0.25  # of the difference before, below which a correction that explai
 _CLEARLY_BETTER = 0.5  # of the difference with one correction, which a pair must bring it to
 _ROWS = 100
 _STARTS = 6
+_ITERATIONS = 8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,8 +52,20 @@ class _ExplainedActions:
 class Matcher:
     """Compares logged actions with those of the policy under corrections of the log."""
 
-    def __init__(self, actor: Actor, signals: LoggedSignals, std: Array, candidates: Sequence[Correction]) -> None:
+    def __init__(
+        self,
+        actor: Actor,
+        signals: LoggedSignals,
+        std: Array,
+        candidates: Sequence[Correction],
+        unknown: Mapping[int, float] | None = None,
+    ) -> None:
+        """`unknown`: usual values of elements that the log does not hold, such as of a frozen sensor, by their column.
+
+        For each row the values are used with which the policy comes nearest to the logged action.
+        """
         self._actor, self._std = actor, np.maximum(std, 1e-6)
+        self._unknown = dict(unknown or {})
         self.signals = signals
         self._candidates = candidates
         rows = signals.inner_rows(MAX_DELAY + 1)
@@ -74,9 +87,44 @@ class Matcher:
 
     def _residuals(self, corrections: Sequence[Correction], variant: Variant = RIGHT) -> Array:
         corrected = correct(self._windows, corrections)
-        computed = self._actor.act(corrected.observations[self._middle], variant)
-        residuals: Array = (corrected.actions[self._middle] - computed) / self._std
+        observations, actions = corrected.observations[self._middle], corrected.actions[self._middle]
+        if self._unknown:
+            observations = self._complete(observations, actions, variant)
+        residuals: Array = (actions - self._actor.act(observations, variant)) / self._std
         return residuals
+
+    def _complete(self, observations: Array, actions: Array, variant: Variant) -> Array:
+        """Return the observations with the unknown elements that suit the actions, by Levenberg-Marquardt's method."""
+        columns = list(self._unknown)
+        best = observations.copy()
+        best[:, columns] = list(self._unknown.values())
+        residuals = (actions - self._actor.act(best, variant)) / self._std
+        damping = np.ones(len(best))
+        for _ in range(_ITERATIONS):
+            slopes = np.stack([self._slope(best, column, variant) for column in columns], axis=2)
+            squares = slopes.transpose(0, 2, 1) @ slopes
+            squares += (damping[:, None] * np.trace(squares, axis1=1, axis2=2)[:, None] + 1e-9)[..., None] * np.eye(
+                len(columns)
+            )
+            steps = np.linalg.solve(squares, slopes.transpose(0, 2, 1) @ residuals[..., None])[..., 0]
+            tried = best.copy()
+            tried[:, columns] += steps
+            errors = (actions - self._actor.act(tried, variant)) / self._std
+            is_better = np.square(errors).sum(axis=1) < np.square(residuals).sum(axis=1)
+            best[is_better], residuals[is_better] = tried[is_better], errors[is_better]
+            damping = np.where(is_better, damping / 4, damping * 4)
+        return best
+
+    def _slope(self, observations: Array, column: int, variant: Variant) -> Array:
+        """Return the change of the actions, in standard deviations, with an element, shape (rows, actions)."""
+        step = 1e-4 * max(1.0, abs(self._unknown[column]))
+        ends = []
+        for sign in (1, -1):
+            moved = observations.copy()
+            moved[:, column] += sign * step
+            ends.append(self._actor.act(moved, variant))
+        slope: Array = (ends[0] - ends[1]) / (2 * step) / self._std
+        return slope
 
     def match(self, *, pairs: bool = True) -> PolicyMatch:
         """Search single corrections, then pairs."""

@@ -25,6 +25,7 @@ _MOST_INPUTS = 3  # observations of a feature
 _STEEPNESS = (0.7, 2.0)  # of a feature
 STRIDE = 8  # rows to the first and the last row of a window: changes in so long a time are larger than noise
 STEPS = (-STRIDE, -1, 0, 1, STRIDE)  # the rows of a window
+_BLOCK = 24  # rows after which errors are independent of those before
 _ECHO = 1e-4  # median difference to the action before, of an observation that repeats it
 
 
@@ -226,9 +227,9 @@ class _Gram:
 
 
 def _count_samples(losses: Array, lengths: Sequence[int]) -> Array:
-    """Return how many independent rows a row counts for, from the variance of the means of episodes."""
-    parts = np.split(losses, np.cumsum(lengths)[:-1])
-    means = np.array([part.mean(axis=0) for part in parts])
-    usual = float(np.mean(lengths))
-    ratio = losses.var(axis=0) / np.maximum(usual * means.var(axis=0), 1e-12)
-    return np.clip(ratio, 1.0 / usual, 1.0)
+    """Return how many independent rows a row counts for, from the variance of the means of blocks of rows."""
+    episodes = np.split(losses, np.cumsum(lengths)[:-1])
+    blocks = [episode[begin : begin + _BLOCK] for episode in episodes for begin in range(0, len(episode), _BLOCK)]
+    means = np.array([block.mean(axis=0) for block in blocks if len(block) == _BLOCK])
+    ratio = losses.var(axis=0) / np.maximum(_BLOCK * means.var(axis=0), 1e-12)
+    return np.clip(ratio, 1.0 / _BLOCK, 1.0)

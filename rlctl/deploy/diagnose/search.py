@@ -13,9 +13,9 @@ from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, LoggedSignals
 
 _ROWS = 300  # of a log, in each half
 _STARTS = 3  # best single corrections that are tried as parts of pairs
-EVIDENCE = 12.0
+EVIDENCE = 6.0
 """Evidence in nats that a finding needs in the rows it was searched in, and half of it in the others."""
-LEAST_SHARE = 0.3
+LEAST_SHARE = 0.2
 """Part of the errors that it changes which a finding must explain."""
 _APART = 3.0  # nats that two explanations must differ by to be told apart
 _LEAST_FACTOR = 1.4  # smaller differences of a gain are between robots
