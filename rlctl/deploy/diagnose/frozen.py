@@ -7,10 +7,10 @@ import numpy as np
 
 from rlctl.deploy.diagnose.signals import Array, LoggedSignals
 
-_LONGER = 3.0  # than the longest time without a change in simulation
+_LONGER = 3.0  # than the longest motion of the others without a change in simulation
 _LONGER_AT_END = 10.0  # the same at an end of the range, where contacts and saturated actions stay
 _LEAST_ROWS = 20
-_LEAST_CHANGING = 0.25  # of the other elements, in a row in which something moves
+_MOST_MOTION = 2.0  # of an element in a row, in standard deviations: a wrong unit must not decide alone
 _LEAST_MOTION = 0.05  # of the standard deviations in simulation
 
 
@@ -39,20 +39,17 @@ def find_frozen(signals: LoggedSignals, references: Sequence[LoggedSignals]) -> 
     found = []
     ends = np.cumsum(signals.lengths).tolist()
     for name in signals.sizes:
-        moving = _find_moving(signals, references[0], name)
-        usual_moving = [_find_moving(one, references[0], name) for one in references]
-        runs = [_longest_run(column, signals.lengths, moving) for column in signals.term(name).T]
+        motion = _measure_motion(signals, references[0], name)
+        usual = [_measure_motion(one, references[0], name) for one in references]
+        runs = [_longest_run(column, signals.lengths, motion) for column in signals.term(name).T]
         stuck = [
             index
             for index, run in enumerate(runs)
             if run.first + run.rows in ends
+            and run.rows >= _LEAST_ROWS
             and _moves(signals, references[0], name, slice(run.first, run.first + run.rows))
             and not _repeats_constant_action(signals, name, index, slice(run.first, run.first + run.rows - 1))
-            and run.moving
-            >= max(
-                _LEAST_ROWS,
-                _count_least(references, usual_moving, name, index, signals.term(name)[run.first, index]),
-            )
+            and run.motion > _count_least(references, usual, name, index, signals.term(name)[run.first, index])
         ]
         if stuck:
             run = runs[stuck[0]]
@@ -63,14 +60,18 @@ def find_frozen(signals: LoggedSignals, references: Sequence[LoggedSignals]) -> 
     return found
 
 
-def _find_moving(signals: LoggedSignals, sound: LoggedSignals, name: str) -> Array:
-    """Return in which rows the other observations change: at rest, all sensors of a simulation keep their values."""
+def _measure_motion(signals: LoggedSignals, sound: LoggedSignals, name: str) -> Array:
+    """Return how far the other observations move from the row before, in standard deviations, shape (T,).
+
+    At rest all sensors of a simulation keep their values.
+    """
     others = np.delete(np.arange(signals.observations.shape[1]), np.r_[signals.slices[name]])
-    others = others[np.ptp(sound.observations[:, others], axis=0) > 0]
+    std = sound.observations[:, others].std(axis=0)
+    others, std = others[std > 0], std[std > 0]
     if not len(others):
-        return np.ones(len(signals.observations), bool)
-    changed = np.diff(signals.observations[:, others], axis=0) != 0
-    return np.append(True, changed.mean(axis=1) >= _LEAST_CHANGING)
+        return np.ones(len(signals.observations))
+    change = np.abs(np.diff(signals.observations[:, others], axis=0)) / std
+    return np.append(0.0, np.minimum(change, _MOST_MOTION).mean(axis=1))
 
 
 def _moves(signals: LoggedSignals, sound: LoggedSignals, name: str, rows: slice) -> bool:
@@ -91,15 +92,20 @@ def _repeats_constant_action(signals: LoggedSignals, name: str, index: int, rows
 
 
 def _count_least(
-    references: Sequence[LoggedSignals], moving: Sequence[Array], name: str, index: int, value: float
+    references: Sequence[LoggedSignals], motion: Sequence[Array], name: str, index: int, value: float
 ) -> float:
-    """Return for how many rows an element must keep a value: never, if it often does in simulation."""
+    """Return during which motion an element must keep a value: never, if it often does in simulation."""
     columns = [signals.term(name)[:, index] for signals in references]
     usual = max(
-        _longest_run(column, one.lengths, some).moving
-        for column, one, some in zip(columns, references, moving, strict=True)
+        _longest_run(column, one.lengths, some).motion
+        for column, one, some in zip(columns, references, motion, strict=True)
     )
-    if usual >= max(max(one.lengths) for one in references) / 2:
+    most = max(
+        part.sum()
+        for one, some in zip(references, motion, strict=True)
+        for part in np.split(some, np.cumsum(one.lengths)[:-1])
+    )
+    if usual >= most / 2:
         return np.inf
     low, high = min(column.min() for column in columns), max(column.max() for column in columns)
     is_inside = low + 1e-6 < value < high - 1e-6
@@ -110,14 +116,14 @@ def _count_least(
 class _Run:
     rows: int
     first: int
-    moving: int  # rows of these in which the other observations change
+    motion: float  # of the other observations in these rows
 
 
-def _longest_run(values: Array, lengths: tuple[int, ...], moving: Array) -> _Run:
-    """Return the rows of a segment that have the same value while the others change for the longest time."""
+def _longest_run(values: Array, lengths: tuple[int, ...], motion: Array) -> _Run:
+    """Return the rows of a segment that have the same value while the others move farthest."""
     begins = np.append(True, np.diff(values) != 0)
     begins[np.cumsum((0, *lengths[:-1]))] = True
     number = np.cumsum(begins) - 1
-    counts = np.bincount(number, weights=moving | begins)
-    longest = int(counts.argmax())
-    return _Run(int((number == longest).sum()), int(np.searchsorted(number, longest)), int(counts[longest]))
+    moved = np.bincount(number, weights=np.where(begins, 0.0, motion))
+    longest = int(moved.argmax())
+    return _Run(int((number == longest).sum()), int(np.searchsorted(number, longest)), float(moved[longest]))

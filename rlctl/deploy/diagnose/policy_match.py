@@ -12,6 +12,9 @@ from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSigna
 
 SAME = 0.02
 """Mean difference, in standard deviations of the action, below which actions are the same."""
+EXACT = 1e-3
+"""The same, below which they are equal but for the precision of a log."""
+_FAR_BETTER = 0.1  # of a difference between the two, which a correction must bring it to
 _BETTER = 0.25  # of the difference before, below which a correction that explains only a part must bring it
 _CLEARLY_BETTER = 0.5  # of the difference with one correction, which a pair must bring it to
 _ROWS = 100
@@ -32,7 +35,7 @@ class PolicyMatch:
     @property
     def is_same(self) -> bool:
         """Whether the policy produces the logged actions as they are."""
-        return self.difference < SAME
+        return self.difference < SAME and not (self.corrections or self.variant.text)
 
     @property
     def is_explained(self) -> bool:
@@ -129,18 +132,21 @@ class Matcher:
     def match(self, *, pairs: bool = True) -> PolicyMatch:
         """Search single corrections, then pairs."""
         begin = self.compare()
-        if begin < SAME:
+        if begin < EXACT:
             return PolicyMatch(begin, begin)
         singles = self._list_singles()
         best = singles[0]
-        if best.difference < SAME:
-            also = tuple(one.corrections for one in singles[1:4] if one.difference < SAME and one.corrections)
+        if begin < SAME and best.difference > _FAR_BETTER * begin:  # rounded numbers, or another machine
+            return PolicyMatch(begin, begin)
+        if best.difference < EXACT:
+            also = tuple(one.corrections for one in singles[1:4] if one.difference < EXACT and one.corrections)
             return PolicyMatch(begin, best.difference, best.corrections, best.variant, also)
+        better = _FAR_BETTER if best.difference < SAME else _CLEARLY_BETTER
         for first in singles[:_STARTS] if pairs else ():
             pair = min(self._list_pairs([first]), key=lambda guess: guess.difference)
-            if pair.difference < _CLEARLY_BETTER * best.difference:
+            if pair.difference < better * best.difference:
                 best = pair
-            if best.difference < SAME:
+            if best.difference < EXACT:
                 break
         found = PolicyMatch(begin, best.difference, best.corrections, best.variant)
         return found if found.is_explained else PolicyMatch(begin, best.difference)

@@ -25,7 +25,7 @@ _MOST_INPUTS = 3  # observations of a feature
 _STEEPNESS = (0.7, 2.0)  # of a feature
 STRIDE = 8  # rows to the first and the last row of a window: changes in so long a time are larger than noise
 STEPS = (-STRIDE, -1, 0, 1, STRIDE)  # the rows of a window
-_BLOCK = 24  # rows after which errors are independent of those before
+_BLOCK = 24  # rows after which errors of predictions are independent of those before
 _ECHO = 1e-4  # median difference to the action before, of an observation that repeats it
 
 
@@ -153,11 +153,10 @@ def fit_relations(reference: Recordings, windows: Windows) -> tuple[Relations, l
     usual = np.where(np.array(kinds) == "alone", np.maximum(usual, anywhere), usual)
     scale = _WIDER * np.maximum(usual, _SMALLEST_ERROR)
     losses = compute_losses(errors / scale)
-    samples = np.where(
-        np.isin(elements, _find_elements(windows, echoes)),
-        1.0,
-        _count_samples(losses, [length - 2 * STRIDE for length in held_out.lengths if length > 2 * STRIDE]),
-    )
+    episodes = np.split(losses, np.cumsum([length - 2 * STRIDE for length in held_out.lengths])[:-1])
+    blocks = [part[begin : begin + _BLOCK] for part in episodes for begin in range(0, len(part) - _BLOCK + 1, _BLOCK)]
+    samples = np.where(np.array(kinds) == "alone", _count_samples(losses, episodes), _count_samples(losses, blocks))
+    samples[np.isin(elements, _find_elements(windows, echoes))] = 1.0
     typical = np.average(losses, axis=0, weights=motion)
     return Relations(
         matrix / scale[:, None], constant / scale, np.array(elements), samples, typical, tuple(kinds)
@@ -226,10 +225,9 @@ class _Gram:
         return weights, solution[-1]
 
 
-def _count_samples(losses: Array, lengths: Sequence[int]) -> Array:
-    """Return how many independent rows a row counts for, from the variance of the means of blocks of rows."""
-    episodes = np.split(losses, np.cumsum(lengths)[:-1])
-    blocks = [episode[begin : begin + _BLOCK] for episode in episodes for begin in range(0, len(episode), _BLOCK)]
-    means = np.array([block.mean(axis=0) for block in blocks if len(block) == _BLOCK])
-    ratio = losses.var(axis=0) / np.maximum(_BLOCK * means.var(axis=0), 1e-12)
-    return np.clip(ratio, 1.0 / _BLOCK, 1.0)
+def _count_samples(losses: Array, parts: Sequence[Array]) -> Array:
+    """Return how many independent rows a row counts for, from the variance of the means of parts."""
+    means = np.array([part.mean(axis=0) for part in parts])
+    usual = float(np.mean([len(part) for part in parts]))
+    ratio = losses.var(axis=0) / np.maximum(usual * means.var(axis=0), 1e-12)
+    return np.clip(ratio, 1.0 / usual, 1.0)

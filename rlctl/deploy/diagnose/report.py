@@ -36,7 +36,8 @@ def show(result: Diagnosis, json: str | None) -> None:
 def describe_answers(result: Diagnosis) -> list[str]:
     """Return a line for each of the three questions."""
     answers = result.answers
-    same = "yes" if answers.policy_difference < SAME else "no"
+    is_corrected = answers.policy_difference_corrected < answers.policy_difference
+    same = "yes" if answers.policy_difference < SAME and not is_corrected else "no"
     first = f"1. does the policy produce the logged actions? {same}: they differ by {answers.policy_difference:.2g}"
     if same == "no":
         first += f" standard deviations on average, {answers.policy_difference_corrected:.2g} when corrected"

@@ -13,7 +13,7 @@ from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, LoggedSignals
 
 _ROWS = 300  # of a log, in each half
 _STARTS = 3  # best single corrections that are tried as parts of pairs
-EVIDENCE = 6.0
+EVIDENCE = 8.0
 """Evidence in nats that a finding needs in the rows it was searched in, and half of it in the others."""
 LEAST_SHARE = 0.2
 """Part of the errors that it changes which a finding must explain."""
