@@ -43,7 +43,8 @@ def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> Ro
     assigned = assign_columns(path, header.names, info, size, columns)
     table = recording or read_table(header, assigned.used)
     if len(table.rows) < 2:
-        raise ArtifactError(f"{path}: {len(table.rows)} row; diagnose needs a few seconds")
+        count = f"{len(table.rows)} row{'' if len(table.rows) == 1 else 's'}"
+        raise ArtifactError(f"{path}: {count} after the header; diagnose needs {_LEAST_ROWS} or more")
     lengths, notes = _split(table, assigned, info.control_dt)
     names = [name for columns_of in assigned.observations.values() for name in columns_of]
     observations = np.column_stack([table.columns[name] for name in names])
@@ -53,8 +54,9 @@ def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> Ro
     kept_lengths = tuple(length for length in lengths if length >= _LEAST_SEGMENT)
     signals = LoggedSignals(observations[keep], actions[keep], kept_lengths, sizes)
     if sum(kept_lengths) < _LEAST_ROWS:
+        gap = f", the first gap is before {table.row_word} {table.rows[lengths[0]]}" if len(lengths) > 1 else ""
         raise ArtifactError(
-            f"{path}: {sum(kept_lengths)} rows in parts without gaps; diagnose needs {_LEAST_ROWS} or more"
+            f"{path}: {sum(kept_lengths)} rows in parts without gaps{gap}; diagnose needs {_LEAST_ROWS} or more"
         )
     all_notes = [*([table.note] if table.note else []), *assigned.notes, *notes]
     return RobotLog(signals, table, tuple(all_notes), np.flatnonzero(keep))

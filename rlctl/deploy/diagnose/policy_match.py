@@ -1,7 +1,8 @@
 """Question 1: does the policy, given the logged observations, produce the logged actions? If not, what is wrong?"""
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -17,6 +18,7 @@ EXACT = 1e-3
 _FAR_BETTER = 0.1  # of a difference between the two, which a correction must bring it to
 _BETTER = 0.25  # of the difference before, below which a correction that explains only a part must bring it
 _CLEARLY_BETTER = 0.5  # of the difference with one correction, which a pair must bring it to
+_FITTED_COST = 2.0
 _ROWS = 100
 _STARTS = 6
 _ITERATIONS = 8
@@ -50,6 +52,12 @@ class _ExplainedActions:
     difference: float
     corrections: tuple[Correction, ...]
     variant: Variant = RIGHT
+
+    @property
+    def cost(self) -> float:
+        """The difference; more where every element of the actions was fitted by itself."""
+        is_fitted = any(one.term == ACTIONS and one.factor and one.offset for one in self.corrections)
+        return self.difference * (_FITTED_COST if is_fitted else 1.0)
 
 
 class Matcher:
@@ -143,7 +151,7 @@ class Matcher:
             return PolicyMatch(begin, best.difference, best.corrections, best.variant, also)
         better = _FAR_BETTER if best.difference < SAME else _CLEARLY_BETTER
         for first in singles[:_STARTS] if pairs else ():
-            pair = min(self._list_pairs([first]), key=lambda guess: guess.difference)
+            pair = min(self._list_pairs([first]), key=lambda guess: guess.cost)
             if pair.difference < better * best.difference:
                 best = pair
             if best.difference < EXACT:
@@ -155,7 +163,7 @@ class Matcher:
         guesses = [_ExplainedActions(self.compare([one]), (one,)) for one in self._candidates]
         guesses += [_ExplainedActions(self.compare([], variant), (), variant) for variant in self._actor.variants()]
         guesses += self._fit([])
-        return sorted(guesses, key=lambda guess: guess.difference)
+        return sorted(guesses, key=lambda guess: guess.cost)
 
     def _list_pairs(self, singles: Sequence[_ExplainedActions]) -> list[_ExplainedActions]:
         pairs = []
@@ -172,7 +180,8 @@ class Matcher:
     def _fit(self, before: Sequence[Correction], variant: Variant = RIGHT) -> list[_ExplainedActions]:
         """Return corrections with fitted numbers: a factor of a term, an offset or a factor of one of its elements."""
         guesses = [*self._fit_actions(before, variant)]
-        for name in self.signals.sizes:
+        # With unknown observations there is no regression of the actions.
+        for name in [*self.signals.sizes, *([ACTIONS] if self._unknown else [])]:
             guesses += self._fit_term(name, before, variant)
         return guesses
 
@@ -215,10 +224,11 @@ class Matcher:
         """Return the best factor of a whole term near the best of a coarse grid."""
         from scipy.optimize import minimize_scalar
 
-        size = self.signals.sizes[name]
+        size = self.signals.term(name).shape[1]
 
         def guess(factor: float) -> _ExplainedActions:
-            both = (*before, make_scale(name, size, range(size), factor))
+            scale = make_log_scale if name == ACTIONS else partial(make_scale, name)
+            both = (*before, scale(size, range(size), factor))
             return _ExplainedActions(self.compare(both, variant), both, variant)
 
         grid = [guess(factor) for factor in np.geomspace(0.15, 6.0, 9)]
@@ -233,7 +243,7 @@ class Matcher:
         return [guess(float(np.exp(found.x)))]
 
 
-def make_log_scale(size: int, elements: Collection[int], factor: float) -> Correction:
+def make_log_scale(size: int, elements: Sequence[int], factor: float) -> Correction:
     """Return the correction of logged actions that differ from the policy's by a factor."""
     one = make_scale(ACTIONS, size, list(elements), factor)
     some = "all elements are" if len(elements) == size else f"element {next(iter(elements))} is"
