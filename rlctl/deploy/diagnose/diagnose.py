@@ -15,9 +15,9 @@ from rlctl.deploy.diagnose.frozen import Frozen, find_frozen
 from rlctl.deploy.diagnose.log import RobotLog, read_robot_log
 from rlctl.deploy.diagnose.mapping import CorrectedMapping, build_mapping
 from rlctl.deploy.diagnose.policy_match import SAME, Matcher, PolicyMatch
-from rlctl.deploy.diagnose.reference import record_reference
+from rlctl.deploy.diagnose.reference import record_mistakes, record_reference
 from rlctl.deploy.diagnose.rows import ChosenRows, choose_rows
-from rlctl.deploy.diagnose.search import Search
+from rlctl.deploy.diagnose.search import Found, Search
 from rlctl.deploy.diagnose.signals import ACTIONS, LoggedSignals
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError
@@ -25,6 +25,7 @@ from rlctl.policy.file import PolicyFile
 
 MOST = 5  # findings that are listed
 _STEPS_PER_ELEMENT, _FEWEST_STEPS, _MOST_STEPS = 400, 16_000, 20_000  # of rollouts in simulation
+_GUESSES, _GUESS_STEPS = 4, 300  # mistakes with which the robot is simulated again, and for how many steps each
 _ROWS = 500  # of a log, for the answers in numbers
 _CERTAIN = 1e4  # evidence of what needs no statistics [nats]
 
@@ -94,7 +95,7 @@ class Doctor:
         steps: int | None = None,
     ) -> None:
         """`steps` of rollouts in simulation in total; by default as many as the observation needs."""
-        self.policy, self.spec, self._others = policy, spec, others
+        self.policy, self.spec, self._others, self._seed = policy, spec, others, seed
         self.actor = Actor(policy)
         width = int(np.prod(policy.info.env.spaces()[0].shape or ()))
         steps = steps or int(np.clip(_STEPS_PER_ELEMENT * width, _FEWEST_STEPS, _MOST_STEPS))
@@ -115,8 +116,7 @@ class Doctor:
         corrected = correct(signals, match.corrections)
         stuck = [(one.term, element) for one in frozen for element in one.elements]
         used = len(match.corrections) + bool(match.variant.text) + len(frozen)
-        search = Search(self.likelihood, corrected, self.candidates, stuck)
-        found = search.find(max(0, 2 - used))
+        found = self._search(corrected, stuck, max(0, 2 - used))
         for one in found:
             findings.append(
                 MappingFinding(
@@ -134,6 +134,23 @@ class Doctor:
         of_robot = [one.correction for one in found]
         answers = self._answer(signals, corrected, of_robot, match, stuck)
         return findings[:MOST], answers, build_mapping(match.corrections, of_robot, dict(signals.sizes))
+
+    def _search(self, signals: LoggedSignals, stuck: Sequence[tuple[str, int]], most: int) -> list[Found]:
+        """Return what the simulation says is wrong.
+
+        Where something is, the search is repeated with relations that are also those of robots with such mistakes: they
+        get where the other rollouts were not.
+        """
+        search = Search(self.likelihood, signals, self.candidates, stuck)
+        found = search.find(most)
+        if not found:
+            return []
+        first = [one.correction for one in found]
+        mistakes = [first, *search.list_guesses(_GUESSES)]
+        if len(first) < most:
+            mistakes += search.list_guesses(_GUESSES, first)
+        recordings = record_mistakes(self.spec, self.actor, mistakes, _GUESS_STEPS * len(mistakes), self._seed)
+        return Search(self.likelihood.learn_more(recordings), signals, self.candidates, stuck).find(most) or found
 
     def _match(self, signals: LoggedSignals, frozen: Sequence[Frozen]) -> PolicyMatch:
         std = self.likelihood.reference.statistics[ACTIONS].std

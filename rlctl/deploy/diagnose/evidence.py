@@ -61,6 +61,13 @@ class Likelihood:
                 for key in (one, _group(one)):
                     self._chances[key] = max(self._chances.get(key, 0.0), gain)
 
+    def learn_more(self, recordings: LoggedSignals) -> "Likelihood":
+        """Return the likelihood with relations that are also those of further recordings in simulation."""
+        varied = self.reference.varied.join(recordings)
+        more = Likelihood(dataclasses.replace(self.reference, varied=varied))
+        more._chances = self._chances
+        return more
+
     def chance(self, one: Correction) -> float:
         """Return the evidence to take off a correction: more than it had in simulation without any mistake [nats]."""
         return _CHANCE_FACTOR * self._chances.get(one, self._chances.get(_group(one), 0.0))

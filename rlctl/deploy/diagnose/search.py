@@ -1,7 +1,7 @@
 """Questions 2 and 3: which corrections, singly or in pairs, make a log plausible for the robot in simulation."""
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
@@ -68,6 +68,7 @@ class Search:
     def find(self, most: int = 2) -> list[Found]:
         """Return the corrections that the log needs, at most `most`, the one with the most evidence first."""
         base, chosen = self._choose(most) if most else ([], [])
+        chosen = self._refine(base, chosen)
         found = []
         for one in chosen:
             others = [other for other in chosen if other is not one]
@@ -79,6 +80,24 @@ class Search:
         if len(convincing) < len(found) == 2:
             return self.find(1)
         return sorted(convincing, key=lambda one: -one.evidence)
+
+    def list_guesses(self, most: int, chosen: Sequence[Correction] = ()) -> list[list[Correction]]:
+        """Return `chosen` with one correction more: the most plausible ones, of different observations or kinds."""
+        guesses = [guess for base in self._allowed for guess in self._guess(base, list(chosen))]
+        guesses.sort(key=lambda guess: guess.score, reverse=True)
+        different = {(guess.corrections[-1].term, guess.corrections[-1].kind): guess for guess in guesses}
+        best = sorted(different.values(), key=lambda guess: guess.score)[:most]
+        return [[*guess.base, *guess.corrections] for guess in best]
+
+    def _refine(self, base: list[Correction], chosen: list[Correction]) -> list[Correction]:
+        """Return the corrections with the factors that suit all rows best, beside the other corrections."""
+        refined = list(chosen)
+        for index, one in enumerate(chosen):
+            if one.kind == "scale" and not one.offset:
+                for scorer in (self._search, self._confirm):
+                    scorer.rebase([*base, *refined[:index], *refined[index + 1 :]])
+                refined[index] = _fit_factor(one, lambda scale: self._search.gain(scale) + self._confirm.gain(scale))
+        return [new if _is_large(new) else old for new, old in zip(refined, chosen, strict=True)]
 
     def _choose(self, most: int) -> tuple[list[Correction], list[Correction]]:
         """Return the allowed delay, and no, one or two corrections: two only with evidence beyond any single one."""
@@ -119,21 +138,11 @@ class Search:
 
     def _fit_scales(self, ranked: Sequence[tuple[float, Correction]]) -> list[tuple[float, Correction]]:
         """Return the best scales with the factor that suits the log best."""
-        from scipy.optimize import minimize_scalar
-
         fitted = []
         scales = [(gain, one) for gain, one in ranked[:20] if one.kind == "scale" and not one.offset][:3]
         for gain, one in scales:
-            elements = np.flatnonzero(np.array(one.factor) != 1.0).tolist()
-            begin = float(np.log(one.factor[elements[0]]))
-
-            def cost(log_factor: float, one: Correction = one, elements: list[int] = elements) -> float:
-                scale = make_scale(one.term, len(one.factor), elements, float(np.exp(log_factor)))
-                return -self._search.gain(scale)
-
-            best = minimize_scalar(cost, bounds=(begin - 0.8, begin + 0.8), method="bounded", options={"maxiter": 14})
-            scale = make_scale(one.term, len(one.factor), elements, float(np.exp(best.x)))
-            if (better := -float(best.fun) - self._likelihood.chance(scale)) > gain:
+            scale = _fit_factor(one, self._search.gain)
+            if (better := self._search.gain(scale) - self._likelihood.chance(scale)) > gain:
                 fitted.append((better, scale))
         return fitted
 
@@ -159,6 +168,25 @@ class Search:
             if not is_same and other.kind not in ("scale", "unit", "offset"):
                 alike += [other] if more + self._confirm.gain(other) > gain - _APART else []
         return tuple(alike[:2])
+
+
+def _fit_factor(one: Correction, score: Callable[[Correction], float]) -> Correction:
+    """Return a scale with the factor near its own that has the highest score."""
+    from scipy.optimize import minimize_scalar
+
+    elements = np.flatnonzero(np.array(one.factor) != 1.0).tolist()
+    begin = float(np.log(one.factor[elements[0]]))
+
+    def make(log_factor: float) -> Correction:
+        return make_scale(one.term, len(one.factor), elements, float(np.exp(log_factor)))
+
+    best = minimize_scalar(
+        lambda log_factor: -score(make(log_factor)),
+        bounds=(begin - 0.8, begin + 0.8),
+        method="bounded",
+        options={"maxiter": 14},
+    )
+    return make(float(best.x))
 
 
 def make_delay(steps: int) -> Correction:
