@@ -10,6 +10,9 @@ from rlctl.deploy.diagnose.signals import Array, LoggedSignals
 _LONGER = 3.0  # than the longest motion of the others without a change in simulation
 _LONGER_AT_END = 10.0  # the same at an end of the range, where contacts and saturated actions stay
 _LEAST_ROWS = 20
+_LEAST_ROWS_AT_END = 200  # of a value that an end stop or a top speed could be
+_NEAR_END = 0.02  # of the range of values: a joint goes a little beyond its end stop
+_ECHO = 1e-4  # median difference of the last action and the observation that repeats it
 _MOST_MOTION = 2.0  # of an element in a row, in standard deviations: a wrong unit must not decide alone
 _LEAST_MOTION = 0.05  # of the standard deviations in simulation
 
@@ -46,10 +49,12 @@ def find_frozen(signals: LoggedSignals, references: Sequence[LoggedSignals]) -> 
             index
             for index, run in enumerate(runs)
             if run.first + run.rows in ends
-            and run.rows >= _LEAST_ROWS
+            and run.rows >= (_LEAST_ROWS_AT_END if _reaches_end(signals, name, index, run.first) else _LEAST_ROWS)
             and _moves(signals, references[0], name, slice(run.first, run.first + run.rows))
-            and not _repeats_constant_action(signals, name, index, slice(run.first, run.first + run.rows - 1))
-            and run.motion > _count_least(references, usual, name, index, signals.term(name)[run.first, index])
+            and not _repeats_constant_action(
+                signals, references[0], name, index, slice(run.first, run.first + run.rows - 1)
+            )
+            and _is_longer(run, references, usual, name, index, signals.term(name)[run.first, index])
         ]
         if stuck:
             run = runs[stuck[0]]
@@ -83,33 +88,48 @@ def _moves(signals: LoggedSignals, sound: LoggedSignals, name: str, rows: slice)
     return not ratios or bool(np.median(np.concatenate(ratios)) > _LEAST_MOTION)
 
 
-def _repeats_constant_action(signals: LoggedSignals, name: str, index: int, rows: slice) -> bool:
+def _repeats_constant_action(signals: LoggedSignals, sound: LoggedSignals, name: str, index: int, rows: slice) -> bool:
     """Return whether an element is that of the last action, and the action itself does not change."""
     if signals.sizes[name] != signals.actions.shape[1]:
         return False
-    actions = signals.actions[rows, index]
-    return bool(np.ptp(actions) == 0 and signals.term(name)[rows.stop, index] == actions[-1])
+    later = sound.inner_rows(1)
+    is_last = np.median(np.abs(sound.term(name)[later, index] - sound.actions[later - 1, index])) < _ECHO
+    return bool(is_last and np.ptp(signals.actions[rows, index]) == 0)
 
 
-def _count_least(
-    references: Sequence[LoggedSignals], motion: Sequence[Array], name: str, index: int, value: float
-) -> float:
-    """Return during which motion an element must keep a value: never, if it often does in simulation."""
+def _reaches_end(signals: LoggedSignals, name: str, index: int, first: int) -> bool:
+    """Return whether an element moved to its least or greatest value of the segment: perhaps an end stop."""
+    segment = int(np.searchsorted(np.cumsum(signals.lengths), first, side="right"))
+    start = signals.starts[segment]
+    values = signals.term(name)[start : start + signals.lengths[segment], index]
+    near = _NEAR_END * np.ptp(values)
+    return first > start and not values.min() + near < values[first - start] < values.max() - near
+
+
+def _is_longer(
+    run: "_Run", references: Sequence[LoggedSignals], motion: Sequence[Array], name: str, index: int, value: float
+) -> bool:
+    """Return whether a value stays for more rows, and during more motion, than in simulation."""
     columns = [signals.term(name)[:, index] for signals in references]
-    usual = max(
-        _longest_run(column, one.lengths, some).motion
-        for column, one, some in zip(columns, references, motion, strict=True)
+    usual = [
+        _longest_run(column, one.lengths, some) for column, one, some in zip(columns, references, motion, strict=True)
+    ]
+    usual_rows = max(
+        _longest_run(column, one.lengths, np.ones(len(column))).rows
+        for column, one in zip(columns, references, strict=True)
     )
     most = max(
         part.sum()
         for one, some in zip(references, motion, strict=True)
         for part in np.split(some, np.cumsum(one.lengths)[:-1])
     )
-    if usual >= most / 2:
-        return np.inf
+    usual_motion = max(one.motion for one in usual)
+    if usual_motion >= most / 2:  # it often does not change at all
+        return False
     low, high = min(column.min() for column in columns), max(column.max() for column in columns)
     is_inside = low + 1e-6 < value < high - 1e-6
-    return (_LONGER if is_inside else _LONGER_AT_END) * usual
+    factor = _LONGER if is_inside else _LONGER_AT_END
+    return run.rows > factor * usual_rows and run.motion > factor * usual_motion
 
 
 @dataclasses.dataclass(frozen=True)

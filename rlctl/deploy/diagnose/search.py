@@ -22,6 +22,7 @@ _LEAST_FACTOR = 1.4  # smaller differences of a gain are between robots
 _LEAST_OFFSET = 0.5  # in standard deviations of the element in simulation
 _OFFSET_SHARE = 0.6  # of the errors that a fitted offset must explain
 _OFFSET_TRUST = 0.5  # of its evidence: an offset also imitates what linear relations miss far from the usual states
+_SOME_ELEMENTS = 3.0  # nats that a mistake of some of the elements costs
 _FITTED = 4.0  # nats that a fitted number costs
 
 
@@ -130,7 +131,9 @@ class Search:
             late = [_Guess(self._search.rebase([*chosen, one]), base, [*chosen, one]) for one in self._late]
         score = self._search.rebase([*base, *chosen])
         possible = [one for one in self._candidates if not any(_exclude(one, other) for other in chosen)]
-        ranked = [(gain - self._likelihood.chance(one), one) for gain, one in self._search.rank(possible)]
+        ranked = [
+            (gain - self._likelihood.chance(one) - _get_cost(one), one) for gain, one in self._search.rank(possible)
+        ]
         ranked += self._fit_scales(ranked)
         ranked += [pair for pair in self._fit_offsets() if not any(_exclude(pair[1], other) for other in chosen)]
         guesses = [_Guess(score - gain, base, [*chosen, one]) for gain, one in ranked if _is_large(one)]
@@ -200,6 +203,12 @@ def _exclude(one: Correction, other: Correction) -> bool:
     sizes = ("scale", "unit", "offset", "normalised")
     alike = (one.kind == other.kind and one.kind in ("delay", "frame")) or (one.kind in sizes and other.kind in sizes)
     return one.term == other.term and (alike or one == other)
+
+
+def _get_cost(one: Correction) -> float:
+    """Return what a mistake of some but not all elements costs: one of an element, or of all, is more common."""
+    changed = sum(factor != 1.0 for factor in one.factor)
+    return _SOME_ELEMENTS if one.kind == "sign" and 1 < changed < len(one.factor) else 0.0
 
 
 def _is_large(one: Correction) -> bool:
