@@ -44,7 +44,8 @@ def describe_answers(result: Diagnosis) -> list[str]:
     else:
         first += " standard deviations on average"
     odd = sorted(answers.term_errors.items(), key=lambda item: -item[1][0])
-    odd = [(name, errors) for name, errors in odd if errors[0] > _ODD]
+    found = {finding.term for finding in result.findings if finding.question == 2}
+    odd = [(name, errors) for name, errors in odd if errors[0] > _ODD or name in found]
     second = "2. are the observations those of the simulation? "
     if odd:
         named = ", ".join(f"{name} {before:.3g} -> {after:.3g}" for name, (before, after) in odd[:_FEW])
