@@ -270,11 +270,14 @@ def diagnose_log(
     Raises `ArtifactError` for a log that cannot be read or does not fit the policy, `UsageError` for a policy that
     cannot be diagnosed.
     """
+    from threadpoolctl import threadpool_limits
+
     log: RobotLog = read_robot_log(path, policy.info.env, columns)
     report(f"{len(log.signals.actions):,} rows; rollouts in simulation")
-    doctor = Doctor(policy, spec, seed, others)
-    report("comparing the log with the policy and the simulation")
-    findings, answers, mapping = doctor.diagnose(log.signals)
+    with threadpool_limits(1, "blas"):  # with other programs on the same cores, threads wait for each other
+        doctor = Doctor(policy, spec, seed, others)
+        report("comparing the log with the policy and the simulation")
+        findings, answers, mapping = doctor.diagnose(log.signals)
     rows = len(log.signals.actions)
     return Diagnosis(
         log=path,
