@@ -18,7 +18,7 @@ EVIDENCE = 8.0
 LEAST_SHARE = 0.2
 """Part of the errors that it changes which a finding must explain."""
 _APART = 3.0  # nats that two explanations must differ by to be told apart
-_LEAST_FACTOR = 1.4  # smaller differences of a gain are between robots
+_LEAST_FACTOR = 1.6  # smaller differences of a gain are between robots, such as how well they follow a command
 _LEAST_OFFSET = 0.5  # in standard deviations of the element in simulation
 _OFFSET_SHARE = 0.6  # of the errors that a fitted offset must explain
 _OFFSET_TRUST = 0.5  # of its evidence: an offset also imitates what linear relations miss far from the usual states
@@ -91,14 +91,14 @@ class Search:
         return [[*guess.base, *guess.corrections] for guess in best]
 
     def _refine(self, base: list[Correction], chosen: list[Correction]) -> list[Correction]:
-        """Return the corrections with the factors that suit all rows best, beside the other corrections."""
+        """Return the corrections with the factors that suit all rows best, without those that are small then."""
         refined = list(chosen)
         for index, one in enumerate(chosen):
             if one.kind == "scale" and not one.offset:
                 for scorer in (self._search, self._confirm):
                     scorer.rebase([*base, *refined[:index], *refined[index + 1 :]])
                 refined[index] = _fit_factor(one, lambda scale: self._search.gain(scale) + self._confirm.gain(scale))
-        return [new if _is_large(new) else old for new, old in zip(refined, chosen, strict=True)]
+        return [one for one in refined if _is_large(one)]
 
     def _choose(self, most: int) -> tuple[list[Correction], list[Correction]]:
         """Return the allowed delay, and no, one or two corrections: two only with evidence beyond any single one."""
