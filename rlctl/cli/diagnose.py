@@ -13,7 +13,8 @@ def diagnose(
     log: Annotated[
         Path,
         Argument(
-            "Recording of observations and actions (.csv, .npz): a row per action; columns NAME_0, .., action_0, ..",
+            "Observations and actions, a row per action: .csv or .npz with columns NAME_0, .., action_0, .., or what "
+            "`rlctl serve --rerun` wrote.",
             metavar="LOG",
         ),
     ],

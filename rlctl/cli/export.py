@@ -24,6 +24,10 @@ def export(
     limits: Annotated[
         Path | None, Option("Limits of the controller's commands, in its C file (limits.yaml).", metavar="FILE")
     ] = None,
+    mapping: Annotated[
+        Path | None,
+        Option("Mapping from the program's values to the controller's, as rlctl diagnose prints it.", metavar="FILE"),
+    ] = None,
     policy: Annotated[
         Path | None,
         Option(
@@ -50,7 +54,9 @@ def export(
         raise UsageError("--policy FILE writes only that file: leave out --output, --onnx, --c and --controller")
     both = onnx == c if controller else onnx and c
     formats: tuple[Format, ...] = ("onnx", "c") if both else ("c",) if c else ("onnx",)
-    request = ExportRequest(run, formats, checkpoint, output, policy, episodes, dataset, controller, limits, sim)
+    request = ExportRequest(
+        run, formats, checkpoint, output, policy, episodes, dataset, controller, limits, sim, mapping
+    )
     if dataset is not None:
         if onnx or c or controller or policy is not None:
             raise UsageError("--dataset writes only a dataset: leave out --onnx, --c, --controller and --policy")

@@ -26,10 +26,13 @@ class ExportRequest:
     controller: bool = False  # write the controller: from what a robot measures to joint targets within limits
     limits: Path | None = None  # of the controller
     sim: str | None = None  # engine of the episodes that are compared; default: that of the training
+    mapping: Path | None = None  # of the controller's inputs, as `rlctl diagnose` prints it
 
     def __post_init__(self) -> None:
         if self.limits is not None and not self.controller:
             raise UsageError("--limits: only a controller has limits; add --controller")
+        if self.mapping is not None and not self.controller:
+            raise UsageError("--mapping: only a controller reads a robot's values; add --controller")
         if self.policy is not None and self.policy.suffix != ".safetensors":
             raise UsageError(f"--policy {self.policy}: the name of a policy file ends in .safetensors")
         if self.output is None or self.dataset is not None:

@@ -14,6 +14,7 @@ from rlctl.policy.numpy_policy import NumpyPolicy
 from rlctl.policy.shipped import find_shipped_policy
 from rlctl.task.events import EventSettings, delay
 
+_EPSILON = 1e-8  # that policies add to the variance; it is most of the variance of an element that never changed
 MOVES = 1e-3  # standard deviation within an episode, below which an element tells nothing
 
 
@@ -98,7 +99,7 @@ class Robot:
         ends = np.cumsum(list(self.sizes.values())).tolist()
         self.slices = {name: slice(end - n, end) for (name, n), end in zip(self.sizes.items(), ends, strict=True)}
         tensors = self.policy_file.tensors
-        self.mean, self.std = tensors["normalize//mean"], np.sqrt(tensors["normalize//var"])
+        self.mean, self.std = tensors["normalize//mean"], np.sqrt(tensors["normalize//var"] + _EPSILON)
         self.low, self.high = self.env.action_space.low, self.env.action_space.high
 
     def log(

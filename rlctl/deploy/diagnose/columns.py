@@ -179,6 +179,7 @@ class _Finder:
             columns = next(iter(alike.values()))
             self.notes.append(f"{term}: columns {columns[0]} to {columns[-1]}, whose name is the closest")
             return columns
+        self._refuse_incomplete(term, count)
         known = ", ".join(self._names[:8]) + (", ..." if len(self._names) > 8 else "")
         if alike:
             raise ArtifactError(
@@ -188,3 +189,22 @@ class _Finder:
             f"{self._path}: no {count} columns for {term}, such as {term}_0 to {term}_{count - 1}; it has {known}\n"
             "give the columns' names: --columns FILE"
         )
+
+    def _refuse_incomplete(self, term: str, count: int) -> None:
+        """Raise `ArtifactError` if a log has some of the columns of a term."""
+        for text in (term, term.removesuffix("s"), *_SYNONYMS.get(term, ())):
+            present = [index for index in range(count + 1) if f"{text}_{index}" in self._by_text]
+            if len(present) < 2:
+                continue
+            wanted = range(count) if 0 in present else range(1, count + 1)
+            missing = [f"{text}_{index}" for index in wanted if index not in present]
+            if missing:
+                raise ArtifactError(
+                    f"{self._path}: {term} has {count} elements, and columns are missing: {', '.join(missing)}\n"
+                    "give the columns' names: --columns FILE"
+                )
+            extra = [name for name in self._names if re.fullmatch(rf"{text}_\d+", _simplify(name))]
+            raise ArtifactError(
+                f"{self._path}: {term} has {count} elements, and there are {len(extra)} columns, "
+                f"{extra[0]} to {extra[-1]}\ngive the columns' names: --columns FILE"
+            )

@@ -15,15 +15,18 @@ from rlctl.deploy.diagnose.frozen import Frozen, find_frozen
 from rlctl.deploy.diagnose.log import RobotLog, read_robot_log
 from rlctl.deploy.diagnose.mapping import CorrectedMapping, build_mapping
 from rlctl.deploy.diagnose.policy_match import SAME, Matcher, PolicyMatch
-from rlctl.deploy.diagnose.reference import record_reference
-from rlctl.deploy.diagnose.search import Search
+from rlctl.deploy.diagnose.reference import record_mistakes, record_reference
+from rlctl.deploy.diagnose.rows import ChosenRows, choose_rows
+from rlctl.deploy.diagnose.search import Found, Search
 from rlctl.deploy.diagnose.signals import ACTIONS, LoggedSignals
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError
 from rlctl.policy.file import PolicyFile
 
 MOST = 5  # findings that are listed
-_STEPS_PER_ELEMENT, _FEWEST_STEPS, _MOST_STEPS = 250, 8000, 14_000  # of rollouts in simulation
+_STEPS_PER_ELEMENT, _FEWEST_STEPS, _MOST_STEPS = 400, 16_000, 20_000  # of rollouts in simulation
+_GUESSES, _GUESS_STEPS = 4, 300  # mistakes with which the robot is simulated again, and for how many steps each
+_ROWS = 500  # of a log, for the answers in numbers
 _CERTAIN = 1e4  # evidence of what needs no statistics [nats]
 
 
@@ -92,7 +95,7 @@ class Doctor:
         steps: int | None = None,
     ) -> None:
         """`steps` of rollouts in simulation in total; by default as many as the observation needs."""
-        self.policy, self.spec, self._others = policy, spec, others
+        self.policy, self.spec, self._others, self._seed = policy, spec, others, seed
         self.actor = Actor(policy)
         width = int(np.prod(policy.info.env.spaces()[0].shape or ()))
         steps = steps or int(np.clip(_STEPS_PER_ELEMENT * width, _FEWEST_STEPS, _MOST_STEPS))
@@ -108,13 +111,12 @@ class Doctor:
             raise ArtifactError(f"the longest part without gaps has {longest} rows; diagnose needs {needed}")
         reference = self.likelihood.reference
         frozen = find_frozen(signals, (reference.sound, reference.varied))
-        match = self._match(signals, pairs=not frozen)
+        match = self._match(signals, frozen)
         findings = [*self._describe_frozen(frozen, signals), *self._describe_match(match, signals, bool(frozen))]
         corrected = correct(signals, match.corrections)
         stuck = [(one.term, element) for one in frozen for element in one.elements]
         used = len(match.corrections) + bool(match.variant.text) + len(frozen)
-        search = Search(self.likelihood, corrected, self.candidates, stuck)
-        found = search.find(max(0, 2 - used))
+        found = self._search(corrected, stuck, max(0, 2 - used))
         for one in found:
             findings.append(
                 MappingFinding(
@@ -133,14 +135,43 @@ class Doctor:
         answers = self._answer(signals, corrected, of_robot, match, stuck)
         return findings[:MOST], answers, build_mapping(match.corrections, of_robot, dict(signals.sizes))
 
-    def _match(self, signals: LoggedSignals, *, pairs: bool) -> PolicyMatch:
+    def _search(self, signals: LoggedSignals, stuck: Sequence[tuple[str, int]], most: int) -> list[Found]:
+        """Return what the simulation says is wrong.
+
+        Where something is, the search is repeated with relations that are also those of robots with such mistakes: they
+        get where the other rollouts were not.
+        """
+        search = Search(self.likelihood, signals, self.candidates, stuck)
+        found = search.find(most)
+        if not found:
+            return []
+        first = [one.correction for one in found]
+        mistakes = [first, *search.list_guesses(_GUESSES)]
+        if len(first) < most:
+            mistakes += search.list_guesses(_GUESSES, first)
+        recordings = record_mistakes(self.spec, self.actor, mistakes, _GUESS_STEPS * len(mistakes), self._seed)
+        return Search(self.likelihood.learn_more(recordings), signals, self.candidates, stuck).find(most) or found
+
+    def _match(self, signals: LoggedSignals, frozen: Sequence[Frozen]) -> PolicyMatch:
         std = self.likelihood.reference.statistics[ACTIONS].std
         if self.actor.in_rows:
-            return self._decide_normalisation(
-                Matcher(self.actor, signals, std, self.candidates).match(pairs=pairs), signals
-            )
+            match = Matcher(self.actor, signals, std, self.candidates).match(pairs=not frozen)
+            if frozen and not match.is_explained:  # the policy may have received what the log does not hold
+                unknown = self._list_unknown(frozen, signals)
+                if len(unknown) < len(std):
+                    match = Matcher(self.actor, signals, std, self.candidates, unknown).match(pairs=False)
+            return self._decide_normalisation(match, signals)
         difference = np.minimum(np.abs(signals.actions - self.actor.act_all(signals)) / std, 1.0)
         return PolicyMatch(float(difference.mean()), float(difference.mean()))
+
+    def _list_unknown(self, frozen: Sequence[Frozen], signals: LoggedSignals) -> dict[int, float]:
+        """Return the columns of frozen elements, with their usual values."""
+        statistics = self.likelihood.reference.statistics
+        return {
+            signals.slices[one.term].start + element: float(statistics[one.term].mean[element])
+            for one in frozen
+            for element in one.elements
+        }
 
     def _decide_normalisation(self, match: PolicyMatch, signals: LoggedSignals) -> PolicyMatch:
         """Tell logged values that are normalised already from a network that got none: the actions are the same."""
@@ -150,14 +181,17 @@ class Doctor:
         is_variant = match.variant.normalizes == 0
         if not is_variant and normalised not in match.corrections:
             return match
-        rows = signals.inner_rows(self.likelihood.margin)
-        scorer = Scorer(self.likelihood, signals, rows[:: max(1, len(rows) // 400)])
+        scorer = Scorer(self.likelihood, signals, self._choose_rows(signals))
         others = [one for one in match.corrections if one != normalised]
         scorer.rebase(others)
         if scorer.gain(normalised) > 0:
             return dataclasses.replace(match, corrections=(normalised, *others), variant=RIGHT, also=())
         variant = next(one for one in self.actor.variants() if one.normalizes == 0)
         return dataclasses.replace(match, corrections=tuple(others), variant=variant, also=())
+
+    def _choose_rows(self, signals: LoggedSignals) -> ChosenRows:
+        rows = signals.inner_rows(self.likelihood.margin)
+        return choose_rows(signals, rows, self.likelihood.reference.statistics, _ROWS)
 
     def _describe_frozen(self, frozen: Sequence[Frozen], signals: LoggedSignals) -> list[MappingFinding]:
         return [
@@ -204,8 +238,7 @@ class Doctor:
         match: PolicyMatch,
         stuck: Sequence[tuple[str, int]],
     ) -> Answers:
-        rows = signals.inner_rows(self.likelihood.margin)
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), 600)).astype(int)]
+        rows = self._choose_rows(signals)
         before, after = Scorer(self.likelihood, signals, rows, stuck), Scorer(self.likelihood, corrected, rows, stuck)
         after.rebase(of_robot)
         terms = {name: (before.times_usual(name), after.times_usual(name)) for name in signals.sizes}
@@ -237,11 +270,14 @@ def diagnose_log(
     Raises `ArtifactError` for a log that cannot be read or does not fit the policy, `UsageError` for a policy that
     cannot be diagnosed.
     """
+    from threadpoolctl import threadpool_limits
+
     log: RobotLog = read_robot_log(path, policy.info.env, columns)
     report(f"{len(log.signals.actions):,} rows; rollouts in simulation")
-    doctor = Doctor(policy, spec, seed, others)
-    report("comparing the log with the policy and the simulation")
-    findings, answers, mapping = doctor.diagnose(log.signals)
+    with threadpool_limits(1, "blas"):  # with other programs on the same cores, threads wait for each other
+        doctor = Doctor(policy, spec, seed, others)
+        report("comparing the log with the policy and the simulation")
+        findings, answers, mapping = doctor.diagnose(log.signals)
     rows = len(log.signals.actions)
     return Diagnosis(
         log=path,

@@ -7,14 +7,17 @@ import numpy as np
 
 from rlctl.deploy.diagnose.correction import EVERYTHING, Correction
 from rlctl.deploy.diagnose.reference import Recordings
-from rlctl.deploy.diagnose.relations import STEPS, STRIDE, Windows, compute_losses, fit_relations
+from rlctl.deploy.diagnose.relations import STRIDE, Windows, compute_losses, fit_relations
+from rlctl.deploy.diagnose.rows import ChosenRows, choose_rows
 from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
 
 _MOST_SAMPLES = 30.0
 """Independent rows that a relation counts for at most: a real robot differs a little, however long the log is."""
 
 _CHANCE_LOGS, _CHANCE_ROWS = 6, 1500  # logs of a sound robot in simulation, and for how many rows each counts
+_CHANCE_SAMPLE = 400  # rows of such a log that are scored
 _CHANCE_FACTOR = 1.5
+_SMALL_OFFSET = 0.3  # in standard deviations: the effect of an offset is measured with it
 
 
 class Likelihood:
@@ -26,7 +29,7 @@ class Likelihood:
         self.relations, self.echoes = fit_relations(reference, self.windows)
         matrix = self.relations.matrix[:, : self.windows.total]
         self.affected = {
-            name: np.flatnonzero(np.abs(matrix[:, columns]).max(axis=1) > 0)
+            name: np.flatnonzero(np.abs(matrix[:, columns]).max(axis=1) > 0)  # its features are of these relations too
             for name, columns in self.windows.columns.items()
         }
         self.margin = MAX_DELAY + reference.allowed_delay + STRIDE
@@ -51,11 +54,19 @@ class Likelihood:
             )
             if not len(inner := part.inner_rows(self.margin)):
                 continue
-            scorer = Scorer(self, part, inner, (), _CHANCE_ROWS)
+            chosen = choose_rows(part, inner, self.reference.statistics, _CHANCE_SAMPLE)
+            scorer = Scorer(self, part, dataclasses.replace(chosen, stands_for=_CHANCE_ROWS))
             for one in candidates:
                 gain = scorer.gain(one)
                 for key in (one, _group(one)):
                     self._chances[key] = max(self._chances.get(key, 0.0), gain)
+
+    def learn_more(self, recordings: LoggedSignals) -> "Likelihood":
+        """Return the likelihood with relations that are also those of further recordings in simulation."""
+        varied = self.reference.varied.join(recordings)
+        more = Likelihood(dataclasses.replace(self.reference, varied=varied))
+        more._chances = self._chances
+        return more
 
     def chance(self, one: Correction) -> float:
         """Return the evidence to take off a correction: more than it had in simulation without any mistake [nats]."""
@@ -74,14 +85,12 @@ class Scorer:
         self,
         likelihood: Likelihood,
         signals: LoggedSignals,
-        rows: Array,
+        chosen: ChosenRows,
         frozen: Collection[tuple[str, int]] = (),
-        stands_for: int | None = None,
     ) -> None:
-        """`rows` are a sample of `stands_for` rows."""
-        self._likelihood, self._signals, self._rows = likelihood, signals, rows
+        self._likelihood, self._signals, self._rows = likelihood, signals, chosen.rows
         relations, windows = likelihood.relations, likelihood.windows
-        weights = np.minimum(relations.samples * (stands_for or len(rows)), _MOST_SAMPLES)
+        weights = np.minimum(relations.samples * chosen.stands_for, _MOST_SAMPLES)
         self._keep = np.ones(windows.total)  # 0 for columns of frozen elements: their usual value is used
         for name, element in frozen:
             weights[relations.element == windows.slices[name].start + element] = 0.0
@@ -139,15 +148,22 @@ class Scorer:
                 axis=0
             )
             return everything
-        columns, affected = windows.columns[one.term], self._likelihood.affected[one.term]
-        block = windows.block(one.term, self._signals, self._rows, corrections) * self._keep[columns]
-        change = block - self._window[:, columns]
-        errors = self._errors[:, affected] + change @ relations.matrix[np.ix_(affected, columns)].T
-        features = np.tanh(self._before + change @ windows.projection[columns]) - self._features
-        errors += features @ relations.matrix[affected, windows.total :].T
+        block = windows.block(one.term, self._signals, self._rows, corrections) * self._keep[windows.columns[one.term]]
         losses = self._losses.copy()
-        losses[affected] = compute_losses(errors).mean(axis=0)
+        affected = self._likelihood.affected[one.term]
+        losses[affected] = compute_losses(self._errors_with(one.term, block)).mean(axis=0)
         return losses
+
+    def _errors_with(self, name: str, block: Array) -> Array:
+        """Return the errors of the affected relations with another part of the windows, shape (rows, affected)."""
+        windows, matrix = self._likelihood.windows, self._likelihood.relations.matrix
+        columns, affected, features = windows.columns[name], self._likelihood.affected[name], windows.features_of[name]
+        change = block - self._window[:, columns]
+        projected = self._before[:, features] + change @ windows.projection[np.ix_(columns, features)]
+        moved = np.tanh(projected) - self._features[:, features]
+        errors: Array = self._errors[:, affected] + change @ matrix[np.ix_(affected, columns)].T
+        errors += moved @ matrix[np.ix_(affected, windows.total + features)].T
+        return errors
 
     def share(self, one: Correction) -> float:
         """Return which part of the errors that it changes a correction explains, in [0, 1]."""
@@ -175,17 +191,18 @@ class Scorer:
 
     def fit_offset(self, name: str) -> Array:
         """Return the offset of each element alone that suits the log best, by reweighted least squares."""
-        windows, relations = self._likelihood.windows, self._likelihood.relations
+        windows = self._likelihood.windows
         columns, size = windows.columns[name], windows.sizes[name]
         affected = self._likelihood.affected[name]
-        matrix = relations.matrix[np.ix_(affected, columns)]
-        effect = matrix.reshape(len(affected), len(STEPS), size).sum(axis=1)
         errors, offset = self._errors[:, affected], np.zeros(size)
         for index in range(size):
+            moved = self._window[:, columns]
+            moved[:, index::size] += _SMALL_OFFSET
+            effect = (self._errors_with(name, moved) - errors) / _SMALL_OFFSET
             for _ in range(6):
-                now = errors + effect[:, index] * offset[index]
+                now = errors + effect * offset[index]
                 weights = self._weights[affected] / (1.0 + np.square(now))
-                slope = float((weights * effect[:, index] ** 2).mean(axis=0).sum())
-                offset[index] -= float((weights * now * effect[:, index]).mean(axis=0).sum()) / max(slope, 1e-9)
+                slope = float((weights * np.square(effect)).mean(axis=0).sum())
+                offset[index] -= float((weights * now * effect).mean(axis=0).sum()) / max(slope, 1e-9)
         found: Array = offset * windows.statistics[name].std
         return found

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from rlctl.deploy.diagnose.columns import ColumnAssignment, assign_columns
+from rlctl.deploy.diagnose.recording import read_recording
 from rlctl.deploy.diagnose.signals import Array, LoggedSignals
-from rlctl.deploy.diagnose.table import LogTable, read_header, read_table
+from rlctl.deploy.diagnose.table import LogTable, TableHeader, read_header, read_table
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError
 
@@ -36,12 +37,14 @@ class RobotLog:
 def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> RobotLog:
     """Read a log; raises `ArtifactError` that names the row and the column, and what to change."""
     shape = info.spaces()[0].shape or ()
-    header = read_header(path)
+    recording = read_recording(path) if path.suffix.lower() == ".rrd" else None
+    header = read_header(path) if recording is None else TableHeader(path, tuple(recording.columns))
     size = int(np.prod(shape))
     assigned = assign_columns(path, header.names, info, size, columns)
-    table = read_table(header, assigned.used)
+    table = recording or read_table(header, assigned.used)
     if len(table.rows) < 2:
-        raise ArtifactError(f"{path}: {len(table.rows)} row; diagnose needs a few seconds")
+        count = f"{len(table.rows)} row{'' if len(table.rows) == 1 else 's'}"
+        raise ArtifactError(f"{path}: {count} after the header; diagnose needs {_LEAST_ROWS} or more")
     lengths, notes = _split(table, assigned, info.control_dt)
     names = [name for columns_of in assigned.observations.values() for name in columns_of]
     observations = np.column_stack([table.columns[name] for name in names])
@@ -51,8 +54,9 @@ def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> Ro
     kept_lengths = tuple(length for length in lengths if length >= _LEAST_SEGMENT)
     signals = LoggedSignals(observations[keep], actions[keep], kept_lengths, sizes)
     if sum(kept_lengths) < _LEAST_ROWS:
+        gap = f", the first gap is before {table.row_word} {table.rows[lengths[0]]}" if len(lengths) > 1 else ""
         raise ArtifactError(
-            f"{path}: {sum(kept_lengths)} rows in parts without gaps; diagnose needs {_LEAST_ROWS} or more"
+            f"{path}: {sum(kept_lengths)} rows in parts without gaps{gap}; diagnose needs {_LEAST_ROWS} or more"
         )
     all_notes = [*([table.note] if table.note else []), *assigned.notes, *notes]
     return RobotLog(signals, table, tuple(all_notes), np.flatnonzero(keep))
@@ -67,6 +71,12 @@ def _split(table: LogTable, assigned: ColumnAssignment, control_dt: float | None
         breaks[1:] |= np.diff(table.columns[assigned.episode]) != 0
     if assigned.time is None:
         notes.append(f"{table.path}: no column with the time, so each row counts as a control step")
+    elif (
+        control_dt is not None and table.has_row_per_action and not _has_rate(table, assigned.time, breaks, control_dt)
+    ):
+        notes.append(
+            f"{table.path}: the client did not act every {control_dt:.4g} s; each row counts as a control step"
+        )
     elif control_dt is not None:
         gaps = _find_gaps(table, table.columns[assigned.time], breaks, control_dt)
         new = np.setdiff1d(gaps, np.flatnonzero(breaks))
@@ -76,6 +86,12 @@ def _split(table: LogTable, assigned: ColumnAssignment, control_dt: float | None
         breaks[new] = True
     starts = np.flatnonzero(breaks)
     return np.diff([*starts, len(breaks)]).tolist(), notes
+
+
+def _has_rate(table: LogTable, name: str, breaks: Array, control_dt: float) -> bool:
+    """Return whether the rows are as far apart as control steps: those of a simulated robot may be nearer."""
+    periods = np.diff(table.columns[name])[~breaks[1:]]
+    return not len(periods) or abs(float(np.median(periods)) - control_dt) <= _RATE_TOLERANCE * control_dt
 
 
 def _find_gaps(table: LogTable, time: Array, breaks: Array, control_dt: float) -> Array:
@@ -95,7 +111,7 @@ def _find_gaps(table: LogTable, time: Array, breaks: Array, control_dt: float) -
             "log a row per action"
         )
     short = np.flatnonzero((periods < _SHORT * control_dt) & inside)
-    if short.size > _SHORT_SHARE * len(periods):
+    if short.size > _SHORT_SHARE * len(periods) and not table.has_row_per_action:
         row = int(short[0]) + 1
         raise ArtifactError(
             f"{table.where(row)}: mixed rates: a row after {periods[row - 1]:.4g} s, most after {usual:.4g} s; "

@@ -26,38 +26,53 @@ class TermMapping(Section):
     """`to body` or `to world`: the vector must be turned into this frame."""
 
 
+class LogMapping(Section):
+    """What the log holds otherwise than the policy received and returned; a program needs no change for it."""
+
+    observations: dict[str, TermMapping] = {}
+    """From the logged value to what the policy received, per observation."""
+    actions: TermMapping | None = None
+    """From the logged action to what the policy returned."""
+
+
 class CorrectedMapping(Section):
     """What to change between a robot and a policy."""
 
     observations: dict[str, TermMapping] = {}
-    """From the program's value to the policy's, per observation."""
+    """From the program's value to the policy's, per observation; `rlctl export --controller --mapping` reads it."""
     actions: TermMapping | None = None
-    """From the policy's action to what the program must send; for `in_log`, from the logged action to the policy's."""
+    """From the policy's action to what the program must send."""
+    log: LogMapping | None = None
 
 
 def build_mapping(
     of_log: Sequence[Correction], of_robot: Sequence[Correction], sizes: dict[str, int]
 ) -> CorrectedMapping:
-    """Return the mapping that corrections of the log (first) and of the robot make together."""
-    terms = list(dict.fromkeys(one.term for one in (*of_log, *of_robot) if one.term != ACTIONS))
-    observations = {}
-    for name in terms:
-        if name == EVERYTHING and EVERYTHING not in sizes:
-            continue
-        observations[name] = compose([one for one in (*of_log, *of_robot) if one.term == name])
-    everything = [one for one in (*of_log, *of_robot) if one.term == EVERYTHING and EVERYTHING not in sizes]
-    for one in everything:
-        begin = 0
-        for name, size in sizes.items():
-            part = Correction(
-                name, "scale", "", factor=one.factor[begin : begin + size], offset=one.offset[begin : begin + size]
-            )
-            observations[name] = compose([part, *(other for other in (*of_log, *of_robot) if other.term == name)])
-            begin += size
+    """Return the mapping that corrections of the log alone and of the robot make."""
     sent = [one for one in of_robot if one.term == ACTIONS]
     logged = [one for one in of_log if one.term == ACTIONS]
-    actions = invert(sent) if sent else compose(logged) if logged else None
-    return CorrectedMapping(observations=observations, actions=actions)
+    observations, log_actions = _compose_terms(of_log, sizes), compose(logged) if logged else None
+    return CorrectedMapping(
+        observations=_compose_terms(of_robot, sizes),
+        actions=invert(sent) if sent else None,
+        log=LogMapping(observations=observations, actions=log_actions) if of_log else None,
+    )
+
+
+def _compose_terms(corrections: Sequence[Correction], sizes: dict[str, int]) -> dict[str, TermMapping]:
+    """Return the mapping of each observation; a correction of all together has a part for each."""
+    parts: dict[str, list[Correction]] = {}
+    for one in corrections:
+        if one.term == EVERYTHING and EVERYTHING not in sizes:
+            begin = 0
+            for name, size in sizes.items():
+                part = slice(begin, begin + size)
+                scale = Correction(name, "scale", "", factor=one.factor[part], offset=one.offset[part])
+                parts.setdefault(name, []).append(scale)
+                begin += size
+        elif one.term != ACTIONS:
+            parts.setdefault(one.term, []).append(one)
+    return {name: compose(some) for name, some in parts.items()}
 
 
 def compose(corrections: Iterable[Correction]) -> TermMapping:

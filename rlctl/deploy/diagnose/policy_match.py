@@ -1,7 +1,8 @@
 """Question 1: does the policy, given the logged observations, produce the logged actions? If not, what is wrong?"""
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -12,10 +13,15 @@ from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSigna
 
 SAME = 0.02
 """Mean difference, in standard deviations of the action, below which actions are the same."""
+EXACT = 1e-3
+"""The same, below which they are equal but for the precision of a log."""
+_FAR_BETTER = 0.1  # of a difference between the two, which a correction must bring it to
 _BETTER = 0.25  # of the difference before, below which a correction that explains only a part must bring it
 _CLEARLY_BETTER = 0.5  # of the difference with one correction, which a pair must bring it to
+_FITTED_COST = 2.0
 _ROWS = 100
 _STARTS = 6
+_ITERATIONS = 8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,7 +37,7 @@ class PolicyMatch:
     @property
     def is_same(self) -> bool:
         """Whether the policy produces the logged actions as they are."""
-        return self.difference < SAME
+        return self.difference < SAME and not (self.corrections or self.variant.text)
 
     @property
     def is_explained(self) -> bool:
@@ -47,12 +53,30 @@ class _ExplainedActions:
     corrections: tuple[Correction, ...]
     variant: Variant = RIGHT
 
+    @property
+    def cost(self) -> float:
+        """The difference; more where every element of the actions was fitted by itself."""
+        is_fitted = any(one.term == ACTIONS and one.factor and one.offset for one in self.corrections)
+        return self.difference * (_FITTED_COST if is_fitted else 1.0)
+
 
 class Matcher:
     """Compares logged actions with those of the policy under corrections of the log."""
 
-    def __init__(self, actor: Actor, signals: LoggedSignals, std: Array, candidates: Sequence[Correction]) -> None:
+    def __init__(
+        self,
+        actor: Actor,
+        signals: LoggedSignals,
+        std: Array,
+        candidates: Sequence[Correction],
+        unknown: Mapping[int, float] | None = None,
+    ) -> None:
+        """`unknown`: usual values of elements that the log does not hold, such as of a frozen sensor, by their column.
+
+        For each row the values are used with which the policy comes nearest to the logged action.
+        """
         self._actor, self._std = actor, np.maximum(std, 1e-6)
+        self._unknown = dict(unknown or {})
         self.signals = signals
         self._candidates = candidates
         rows = signals.inner_rows(MAX_DELAY + 1)
@@ -74,25 +98,63 @@ class Matcher:
 
     def _residuals(self, corrections: Sequence[Correction], variant: Variant = RIGHT) -> Array:
         corrected = correct(self._windows, corrections)
-        computed = self._actor.act(corrected.observations[self._middle], variant)
-        residuals: Array = (corrected.actions[self._middle] - computed) / self._std
+        observations, actions = corrected.observations[self._middle], corrected.actions[self._middle]
+        if self._unknown:
+            observations = self._complete(observations, actions, variant)
+        residuals: Array = (actions - self._actor.act(observations, variant)) / self._std
         return residuals
+
+    def _complete(self, observations: Array, actions: Array, variant: Variant) -> Array:
+        """Return the observations with the unknown elements that suit the actions, by Levenberg-Marquardt's method."""
+        columns = list(self._unknown)
+        best = observations.copy()
+        best[:, columns] = list(self._unknown.values())
+        residuals = (actions - self._actor.act(best, variant)) / self._std
+        damping = np.ones(len(best))
+        for _ in range(_ITERATIONS):
+            slopes = np.stack([self._slope(best, column, variant) for column in columns], axis=2)
+            squares = slopes.transpose(0, 2, 1) @ slopes
+            squares += (damping[:, None] * np.trace(squares, axis1=1, axis2=2)[:, None] + 1e-9)[..., None] * np.eye(
+                len(columns)
+            )
+            steps = np.linalg.solve(squares, slopes.transpose(0, 2, 1) @ residuals[..., None])[..., 0]
+            tried = best.copy()
+            tried[:, columns] += steps
+            errors = (actions - self._actor.act(tried, variant)) / self._std
+            is_better = np.square(errors).sum(axis=1) < np.square(residuals).sum(axis=1)
+            best[is_better], residuals[is_better] = tried[is_better], errors[is_better]
+            damping = np.where(is_better, damping / 4, damping * 4)
+        return best
+
+    def _slope(self, observations: Array, column: int, variant: Variant) -> Array:
+        """Return the change of the actions, in standard deviations, with an element, shape (rows, actions)."""
+        step = 1e-4 * max(1.0, abs(self._unknown[column]))
+        ends = []
+        for sign in (1, -1):
+            moved = observations.copy()
+            moved[:, column] += sign * step
+            ends.append(self._actor.act(moved, variant))
+        slope: Array = (ends[0] - ends[1]) / (2 * step) / self._std
+        return slope
 
     def match(self, *, pairs: bool = True) -> PolicyMatch:
         """Search single corrections, then pairs."""
         begin = self.compare()
-        if begin < SAME:
+        if begin < EXACT:
             return PolicyMatch(begin, begin)
         singles = self._list_singles()
         best = singles[0]
-        if best.difference < SAME:
-            also = tuple(one.corrections for one in singles[1:4] if one.difference < SAME and one.corrections)
+        if begin < SAME and best.difference > _FAR_BETTER * begin:  # rounded numbers, or another machine
+            return PolicyMatch(begin, begin)
+        if best.difference < EXACT:
+            also = tuple(one.corrections for one in singles[1:4] if one.difference < EXACT and one.corrections)
             return PolicyMatch(begin, best.difference, best.corrections, best.variant, also)
+        better = _FAR_BETTER if best.difference < SAME else _CLEARLY_BETTER
         for first in singles[:_STARTS] if pairs else ():
-            pair = min(self._list_pairs([first]), key=lambda guess: guess.difference)
-            if pair.difference < _CLEARLY_BETTER * best.difference:
+            pair = min(self._list_pairs([first]), key=lambda guess: guess.cost)
+            if pair.difference < better * best.difference:
                 best = pair
-            if best.difference < SAME:
+            if best.difference < EXACT:
                 break
         found = PolicyMatch(begin, best.difference, best.corrections, best.variant)
         return found if found.is_explained else PolicyMatch(begin, best.difference)
@@ -101,7 +163,7 @@ class Matcher:
         guesses = [_ExplainedActions(self.compare([one]), (one,)) for one in self._candidates]
         guesses += [_ExplainedActions(self.compare([], variant), (), variant) for variant in self._actor.variants()]
         guesses += self._fit([])
-        return sorted(guesses, key=lambda guess: guess.difference)
+        return sorted(guesses, key=lambda guess: guess.cost)
 
     def _list_pairs(self, singles: Sequence[_ExplainedActions]) -> list[_ExplainedActions]:
         pairs = []
@@ -118,7 +180,8 @@ class Matcher:
     def _fit(self, before: Sequence[Correction], variant: Variant = RIGHT) -> list[_ExplainedActions]:
         """Return corrections with fitted numbers: a factor of a term, an offset or a factor of one of its elements."""
         guesses = [*self._fit_actions(before, variant)]
-        for name in self.signals.sizes:
+        # With unknown observations there is no regression of the actions.
+        for name in [*self.signals.sizes, *([ACTIONS] if self._unknown else [])]:
             guesses += self._fit_term(name, before, variant)
         return guesses
 
@@ -161,10 +224,11 @@ class Matcher:
         """Return the best factor of a whole term near the best of a coarse grid."""
         from scipy.optimize import minimize_scalar
 
-        size = self.signals.sizes[name]
+        size = self.signals.term(name).shape[1]
 
         def guess(factor: float) -> _ExplainedActions:
-            both = (*before, make_scale(name, size, range(size), factor))
+            scale = make_log_scale if name == ACTIONS else partial(make_scale, name)
+            both = (*before, scale(size, range(size), factor))
             return _ExplainedActions(self.compare(both, variant), both, variant)
 
         grid = [guess(factor) for factor in np.geomspace(0.15, 6.0, 9)]
@@ -179,7 +243,7 @@ class Matcher:
         return [guess(float(np.exp(found.x)))]
 
 
-def make_log_scale(size: int, elements: Collection[int], factor: float) -> Correction:
+def make_log_scale(size: int, elements: Sequence[int], factor: float) -> Correction:
     """Return the correction of logged actions that differ from the policy's by a factor."""
     one = make_scale(ACTIONS, size, list(elements), factor)
     some = "all elements are" if len(elements) == size else f"element {next(iter(elements))} is"

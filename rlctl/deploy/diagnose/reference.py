@@ -2,8 +2,9 @@
 
 import contextlib
 import dataclasses
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,9 +21,10 @@ from rlctl.task.events import EventSettings, delay
 from rlctl.task.events.event import Widening
 
 _SOUND_SHARE, _HELD_OUT_SHARE = 0.4, 0.2  # of all steps; the others are with mistakes
-_LONGEST = 200  # steps of an episode, so that there are many different ones
-_SHORTEST = 12
+_SHORT, _LONG = 30, 160  # steps of an episode: short, so that there are many different ones
+_SHORTEST = 20  # steps of an episode that is used
 _NOISE = (0.0, 0.05, 0.2, 0.4)  # of half the range of an action
+_LITTLE_NOISE = (0.0, 0.05)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -50,8 +52,21 @@ def record_reference(spec: EnvSpec, actor: Actor, steps: int, seed: int = 0) -> 
         held_out = player.play(int(_HELD_OUT_SHARE * steps))
         statistics = measure_statistics(sound)
         candidates = list_candidates(actor.info.env, statistics)
-        varied = player.play(int((1 - _SOUND_SHARE - _HELD_OUT_SHARE) * steps), candidates, statistics)
+        possible = [one for one in candidates if one.kind in ("order", "sign", "scale", "offset")]
+        varied = player.play(
+            int((1 - _SOUND_SHARE - _HELD_OUT_SHARE) * steps), lambda: player.draw_mistakes(possible), _NOISE
+        )
         return Recordings(sound, held_out, varied, statistics, player.allowed_delay)
+
+
+def record_mistakes(
+    spec: EnvSpec, actor: Actor, mistakes: Sequence[Sequence[Correction]], steps: int, seed: int = 0
+) -> LoggedSignals:
+    """Play the policy in its task with each of the combinations of mistakes, for so many control steps in total."""
+    with contextlib.closing(spec.make()) as env:
+        player = _ReferencePlayer(env, actor, np.random.default_rng(seed))
+        following = itertools.cycle(mistakes)
+        return player.play(steps, lambda: list(next(following)), _LITTLE_NOISE)
 
 
 def measure_statistics(signals: LoggedSignals) -> dict[str, TermStatistics]:
@@ -85,18 +100,16 @@ class _ReferencePlayer:
                 self.allowed_delay += int(steps.end[1] if isinstance(steps, Widening) else steps)
 
     def play(
-        self, steps: int, candidates: Sequence[Correction] = (), statistics: Mapping[str, TermStatistics] = {}
+        self, steps: int, draw: Callable[[], list[Correction]] = list, noises: Sequence[float] = (0.0,)
     ) -> LoggedSignals:
-        """Record episodes: half of them of the nominal robot; with `candidates`, with mistakes of these kinds."""
+        """Record episodes, each with the mistakes that `draw` returns: half of them of the nominal robot."""
         parts: list[tuple[Array, Array]] = []
         count, episode = 0, 0
         while count < steps:
             if self._task_env is not None and episode % 2 == 0:
                 changes = {} if episode % 4 == 0 else self._events
                 self._task_env.set_events(EventSettings(False, changes))
-            mistakes = self._draw_mistakes(candidates) if candidates else []
-            noise = float(self._rng.choice(_NOISE)) if candidates else 0.0
-            part = self._play_episode(mistakes, noise)
+            part = self._play_episode(draw(), float(self._rng.choice(noises)))
             count += len(part[0])
             episode += 1
             if len(part[0]) >= _SHORTEST:
@@ -106,8 +119,8 @@ class _ReferencePlayer:
         observations, actions = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         return LoggedSignals(observations, actions, tuple(len(part[0]) for part in parts), self._sizes)
 
-    def _draw_mistakes(self, candidates: Sequence[Correction]) -> list[Correction]:
-        possible = [one for one in candidates if one.kind in ("order", "sign", "scale", "offset") and one.term]
+    def draw_mistakes(self, possible: Sequence[Correction]) -> list[Correction]:
+        """Return none, one or two mistakes."""
         count = int(self._rng.integers(0, 3))
         return [possible[int(index)] for index in self._rng.integers(0, len(possible), count)]
 
@@ -116,13 +129,18 @@ class _ReferencePlayer:
         slices = LoggedSignals(np.zeros((0, 0)), np.zeros((0, 0)), (), self._sizes).slices
         actor.reset()
         observation, _ = env.reset(seed=int(rng.integers(2**31)))
-        observations, actions = [], []
+        observations: list[Array] = []
+        sent: list[Array] = []
+        actions: list[Array] = []
+        late = sum(one.delay for one in mistakes if one.term == ACTIONS)
         disturbance = np.zeros(len(actor.low))
-        for _ in range(_LONGEST):
-            seen = np.array(observation, np.float64)
+        for step in range(int(rng.integers(_SHORT, _LONG))):
+            observations.append(np.array(observation, np.float64))
+            seen = observations[-1].copy()
             for one in mistakes:
                 if one.term in slices:
-                    seen[slices[one.term]] = one.undo(seen[slices[one.term]])
+                    part = slices[one.term]
+                    seen[part] = one.undo(observations[max(0, step - one.delay)][part] if one.delay else seen[part])
             action = actor.act_step(seen)
             for one in mistakes:
                 if one.term == ACTIONS:
@@ -130,8 +148,8 @@ class _ReferencePlayer:
             if noise:
                 disturbance = 0.8 * disturbance + 0.6 * noise * self._range * rng.standard_normal(len(action))
                 action = action + disturbance
-            executed = np.clip(action, actor.low, actor.high)
-            observations.append(np.array(observation, np.float64))
+            sent.append(np.clip(action, actor.low, actor.high))
+            executed = sent[max(0, step - late)]
             actions.append(executed)
             observation, _, terminated, truncated, _ = env.step(executed.astype(np.float32))
             if terminated or truncated:

@@ -3,7 +3,8 @@
 Each relation predicts one element of an observation: from the other observations (`across`), its change from the other
 observations (`moves`), from the rows before and the actions (`ahead`), or from nothing, its usual value (`alone`). A
 `window` holds the standardised observations of five rows, two actions that the robot executed, and a logged action.
-All are linear, except that `ahead` also uses random tanh features of the row: gravity and inertia change with the pose.
+All are linear in the window and in random tanh features of a few observations of the row: positions of links are no
+linear functions of angles, and gravity and inertia change with the pose.
 """
 
 import dataclasses
@@ -13,14 +14,18 @@ import numpy as np
 
 from rlctl.deploy.diagnose.correction import EVERYTHING, Correction, turn
 from rlctl.deploy.diagnose.reference import Recordings
+from rlctl.deploy.diagnose.rows import measure_motion
 from rlctl.deploy.diagnose.signals import ACTIONS, Array, LoggedSignals
 
-_RIDGE = 1e-4
+_RIDGE = 1e-3  # about the variance of a sensor's noise: what only differences below the noise tell is not used
 _SMALLEST_ERROR = 0.01  # of an element's standard deviation: sensors are no better
 _WIDER = 1.5  # errors are counted in units of so many usual errors
-_FEATURES = 100
+_FEATURES = 400
+_MOST_INPUTS = 3  # observations of a feature
+_STEEPNESS = (0.7, 2.0)  # of a feature
 STRIDE = 8  # rows to the first and the last row of a window: changes in so long a time are larger than noise
 STEPS = (-STRIDE, -1, 0, 1, STRIDE)  # the rows of a window
+_BLOCK = 24  # rows after which errors of predictions are independent of those before
 _ECHO = 1e-4  # median difference to the action before, of an observation that repeats it
 
 
@@ -43,13 +48,23 @@ class Windows:
         self._draw_features()
 
     def _draw_features(self) -> None:
-        """Draw features of the observations and of the executed action of the middle row."""
+        """Draw features, each of a few of the observations and of the executed action of the middle row."""
         rng = np.random.default_rng(0)
         middle = STEPS.index(0)
-        used = [self.columns[name][middle * n : (middle + 1) * n] for name, n in self.sizes.items()]
-        inputs = np.concatenate([*used, self.columns[ACTIONS][self.actions :]])
+        inputs = {name: self.columns[name][middle * n : (middle + 1) * n] for name, n in self.sizes.items()}
+        inputs[ACTIONS] = self.columns[ACTIONS][self.actions :]
+        names = list(inputs)
         self.projection = np.zeros((self.total, self.features))
-        self.projection[inputs] = rng.standard_normal((len(inputs), self.features)) / np.sqrt(len(inputs))
+        uses: dict[str, list[int]] = {name: [] for name in names}
+        for index in range(self.features):
+            count = min(int(rng.integers(1, _MOST_INPUTS + 1)), len(names))
+            some = [names[number] for number in rng.choice(len(names), count, replace=False)]
+            columns = np.concatenate([inputs[name] for name in some])
+            steepness = rng.uniform(*_STEEPNESS) / np.sqrt(len(columns))
+            self.projection[columns, index] = steepness * rng.standard_normal(len(columns))
+            for name in some:
+                uses[name].append(index)
+        self.features_of = {name: np.array(some, np.int64) for name, some in uses.items()}
         self.bias = rng.uniform(-1.0, 1.0, self.features)
 
     def extend(self, window: Array) -> Array:
@@ -119,6 +134,7 @@ def fit_relations(reference: Recordings, windows: Windows) -> tuple[Relations, l
         for some in ((reference.sound, reference.varied), (reference.held_out,))
     )
     held_out = reference.held_out
+    motion = measure_motion(held_out, held_out.inner_rows(STRIDE), windows.statistics)
     echoes = [name for name in windows.sizes if _repeats_action(reference.sound, windows, name)]
     rows, constants, kinds, elements = [], [], [], []
     for kind, name, targets, weights, bias in _list_fits(train, windows, echoes):
@@ -131,18 +147,17 @@ def fit_relations(reference: Recordings, windows: Windows) -> tuple[Relations, l
             elements.append(windows.slices[name].start + index)
     matrix, constant = np.array(rows), np.array(constants)
     errors, all_errors = (rows @ matrix.T + constant for rows in (held, train))
-    usual = np.sqrt(np.mean(np.square(errors), axis=0))
+    usual = np.sqrt(np.average(np.square(errors), axis=0, weights=motion))
     # `alone` also where a wrong mapping gets: a robot that has fallen is no mistake of each of its sensors.
     anywhere = np.sqrt(np.mean(np.square(all_errors), axis=0))
     usual = np.where(np.array(kinds) == "alone", np.maximum(usual, anywhere), usual)
     scale = _WIDER * np.maximum(usual, _SMALLEST_ERROR)
     losses = compute_losses(errors / scale)
-    samples = np.where(
-        np.isin(elements, _find_elements(windows, echoes)),
-        1.0,
-        _count_samples(losses, [length - 2 * STRIDE for length in held_out.lengths if length > 2 * STRIDE]),
-    )
-    typical = losses.mean(axis=0)
+    episodes = np.split(losses, np.cumsum([length - 2 * STRIDE for length in held_out.lengths])[:-1])
+    blocks = [part[begin : begin + _BLOCK] for part in episodes for begin in range(0, len(part) - _BLOCK + 1, _BLOCK)]
+    samples = np.where(np.array(kinds) == "alone", _count_samples(losses, episodes), _count_samples(losses, blocks))
+    samples[np.isin(elements, _find_elements(windows, echoes))] = 1.0
+    typical = np.average(losses, axis=0, weights=motion)
     return Relations(
         matrix / scale[:, None], constant / scale, np.array(elements), samples, typical, tuple(kinds)
     ), echoes
@@ -166,13 +181,15 @@ def _list_fits(train: Array, windows: Windows, echoes: Sequence[str]) -> Iterato
     features = np.arange(windows.total, total)
     gram = _Gram(train)
     plain = [name for name in sizes if name not in echoes]
+    of_echoes = np.concatenate([np.zeros(0, np.int64), *(windows.features_of[name] for name in echoes)])
     nothing = np.zeros(0, np.int64)
     for name in plain:
         size, own = sizes[name], columns[name]
         first, _, now, after, last = (own[step * size : (step + 1) * size] for step in range(len(STEPS)))
         others = np.concatenate([*(columns[other] for other in plain if other != name), columns[ACTIONS]])
+        others = np.concatenate([others, np.delete(features, np.union1d(windows.features_of[name], of_echoes))])
         past = np.concatenate([*(columns[other][sizes[other] : 3 * sizes[other]] for other in plain), columns[ACTIONS]])
-        past = np.concatenate([past, features])
+        past = np.concatenate([past, np.delete(features, of_echoes)])
         eye = np.eye(total)
         for kind, targets, inputs in (
             ("across", eye[now], others),
@@ -208,10 +225,9 @@ class _Gram:
         return weights, solution[-1]
 
 
-def _count_samples(losses: Array, lengths: Sequence[int]) -> Array:
-    """Return how many independent rows a row counts for, from the variance of the means of episodes."""
-    parts = np.split(losses, np.cumsum(lengths)[:-1])
+def _count_samples(losses: Array, parts: Sequence[Array]) -> Array:
+    """Return how many independent rows a row counts for, from the variance of the means of parts."""
     means = np.array([part.mean(axis=0) for part in parts])
-    usual = float(np.mean(lengths))
+    usual = float(np.mean([len(part) for part in parts]))
     ratio = losses.var(axis=0) / np.maximum(usual * means.var(axis=0), 1e-12)
     return np.clip(ratio, 1.0 / usual, 1.0)

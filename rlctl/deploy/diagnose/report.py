@@ -36,14 +36,16 @@ def show(result: Diagnosis, json: str | None) -> None:
 def describe_answers(result: Diagnosis) -> list[str]:
     """Return a line for each of the three questions."""
     answers = result.answers
-    same = "yes" if answers.policy_difference < SAME else "no"
+    is_corrected = answers.policy_difference_corrected < answers.policy_difference
+    same = "yes" if answers.policy_difference < SAME and not is_corrected else "no"
     first = f"1. does the policy produce the logged actions? {same}: they differ by {answers.policy_difference:.2g}"
     if same == "no":
         first += f" standard deviations on average, {answers.policy_difference_corrected:.2g} when corrected"
     else:
         first += " standard deviations on average"
     odd = sorted(answers.term_errors.items(), key=lambda item: -item[1][0])
-    odd = [(name, errors) for name, errors in odd if errors[0] > _ODD]
+    found = {finding.term for finding in result.findings if finding.question == 2}
+    odd = [(name, errors) for name, errors in odd if errors[0] > _ODD or name in found]
     second = "2. are the observations those of the simulation? "
     if odd:
         named = ", ".join(f"{name} {before:.3g} -> {after:.3g}" for name, (before, after) in odd[:_FEW])

@@ -1,26 +1,28 @@
 """Questions 2 and 3: which corrections, singly or in pairs, make a log plausible for the robot in simulation."""
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
 from rlctl.deploy.diagnose.candidates import make_offset, make_scale
 from rlctl.deploy.diagnose.correction import Correction
 from rlctl.deploy.diagnose.evidence import Likelihood, Scorer
-from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
+from rlctl.deploy.diagnose.rows import choose_rows
+from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, LoggedSignals
 
 _ROWS = 300  # of a log, in each half
 _STARTS = 3  # best single corrections that are tried as parts of pairs
-EVIDENCE = 12.0
+EVIDENCE = 8.0
 """Evidence in nats that a finding needs in the rows it was searched in, and half of it in the others."""
-LEAST_SHARE = 0.3
+LEAST_SHARE = 0.2
 """Part of the errors that it changes which a finding must explain."""
 _APART = 3.0  # nats that two explanations must differ by to be told apart
-_LEAST_FACTOR = 1.4  # smaller differences of a gain are between robots
+_LEAST_FACTOR = 1.6  # smaller differences of a gain are between robots, such as how well they follow a command
 _LEAST_OFFSET = 0.5  # in standard deviations of the element in simulation
 _OFFSET_SHARE = 0.6  # of the errors that a fitted offset must explain
 _OFFSET_TRUST = 0.5  # of its evidence: an offset also imitates what linear relations miss far from the usual states
+_SOME_ELEMENTS = 3.0  # nats that a mistake of some of the elements costs
 _FITTED = 4.0  # nats that a fitted number costs
 
 
@@ -55,7 +57,8 @@ class Search:
         block = max(10, min(50, len(rows) // 10))
         is_second = (np.arange(len(rows)) // block) % 2 == 1
         self._search, self._confirm = (
-            Scorer(likelihood, signals, _thin(part), frozen, len(part)) for part in (rows[~is_second], rows[is_second])
+            Scorer(likelihood, signals, choose_rows(signals, part, likelihood.reference.statistics, _ROWS), frozen)
+            for part in (rows[~is_second], rows[is_second])
         )
         self._likelihood = likelihood
         allowed = likelihood.reference.allowed_delay
@@ -66,6 +69,7 @@ class Search:
     def find(self, most: int = 2) -> list[Found]:
         """Return the corrections that the log needs, at most `most`, the one with the most evidence first."""
         base, chosen = self._choose(most) if most else ([], [])
+        chosen = self._refine(base, chosen)
         found = []
         for one in chosen:
             others = [other for other in chosen if other is not one]
@@ -77,6 +81,24 @@ class Search:
         if len(convincing) < len(found) == 2:
             return self.find(1)
         return sorted(convincing, key=lambda one: -one.evidence)
+
+    def list_guesses(self, most: int, chosen: Sequence[Correction] = ()) -> list[list[Correction]]:
+        """Return `chosen` with one correction more: the most plausible ones, of different observations or kinds."""
+        guesses = [guess for base in self._allowed for guess in self._guess(base, list(chosen))]
+        guesses.sort(key=lambda guess: guess.score, reverse=True)
+        different = {(guess.corrections[-1].term, guess.corrections[-1].kind): guess for guess in guesses}
+        best = sorted(different.values(), key=lambda guess: guess.score)[:most]
+        return [[*guess.base, *guess.corrections] for guess in best]
+
+    def _refine(self, base: list[Correction], chosen: list[Correction]) -> list[Correction]:
+        """Return the corrections with the factors that suit all rows best, without those that are small then."""
+        refined = list(chosen)
+        for index, one in enumerate(chosen):
+            if one.kind == "scale" and not one.offset:
+                for scorer in (self._search, self._confirm):
+                    scorer.rebase([*base, *refined[:index], *refined[index + 1 :]])
+                refined[index] = _fit_factor(one, lambda scale: self._search.gain(scale) + self._confirm.gain(scale))
+        return [one for one in refined if _is_large(one)]
 
     def _choose(self, most: int) -> tuple[list[Correction], list[Correction]]:
         """Return the allowed delay, and no, one or two corrections: two only with evidence beyond any single one."""
@@ -109,7 +131,9 @@ class Search:
             late = [_Guess(self._search.rebase([*chosen, one]), base, [*chosen, one]) for one in self._late]
         score = self._search.rebase([*base, *chosen])
         possible = [one for one in self._candidates if not any(_exclude(one, other) for other in chosen)]
-        ranked = [(gain - self._likelihood.chance(one), one) for gain, one in self._search.rank(possible)]
+        ranked = [
+            (gain - self._likelihood.chance(one) - _get_cost(one), one) for gain, one in self._search.rank(possible)
+        ]
         ranked += self._fit_scales(ranked)
         ranked += [pair for pair in self._fit_offsets() if not any(_exclude(pair[1], other) for other in chosen)]
         guesses = [_Guess(score - gain, base, [*chosen, one]) for gain, one in ranked if _is_large(one)]
@@ -117,21 +141,11 @@ class Search:
 
     def _fit_scales(self, ranked: Sequence[tuple[float, Correction]]) -> list[tuple[float, Correction]]:
         """Return the best scales with the factor that suits the log best."""
-        from scipy.optimize import minimize_scalar
-
         fitted = []
         scales = [(gain, one) for gain, one in ranked[:20] if one.kind == "scale" and not one.offset][:3]
         for gain, one in scales:
-            elements = np.flatnonzero(np.array(one.factor) != 1.0).tolist()
-            begin = float(np.log(one.factor[elements[0]]))
-
-            def cost(log_factor: float, one: Correction = one, elements: list[int] = elements) -> float:
-                scale = make_scale(one.term, len(one.factor), elements, float(np.exp(log_factor)))
-                return -self._search.gain(scale)
-
-            best = minimize_scalar(cost, bounds=(begin - 0.8, begin + 0.8), method="bounded", options={"maxiter": 14})
-            scale = make_scale(one.term, len(one.factor), elements, float(np.exp(best.x)))
-            if (better := -float(best.fun) - self._likelihood.chance(scale)) > gain:
+            scale = _fit_factor(one, self._search.gain)
+            if (better := self._search.gain(scale) - self._likelihood.chance(scale)) > gain:
                 fitted.append((better, scale))
         return fitted
 
@@ -159,6 +173,25 @@ class Search:
         return tuple(alike[:2])
 
 
+def _fit_factor(one: Correction, score: Callable[[Correction], float]) -> Correction:
+    """Return a scale with the factor near its own that has the highest score."""
+    from scipy.optimize import minimize_scalar
+
+    elements = np.flatnonzero(np.array(one.factor) != 1.0).tolist()
+    begin = float(np.log(one.factor[elements[0]]))
+
+    def make(log_factor: float) -> Correction:
+        return make_scale(one.term, len(one.factor), elements, float(np.exp(log_factor)))
+
+    best = minimize_scalar(
+        lambda log_factor: -score(make(log_factor)),
+        bounds=(begin - 0.8, begin + 0.8),
+        method="bounded",
+        options={"maxiter": 14},
+    )
+    return make(float(best.x))
+
+
 def make_delay(steps: int) -> Correction:
     """Return the correction of actions that take effect late."""
     plural = "s" if steps > 1 else ""
@@ -172,12 +205,14 @@ def _exclude(one: Correction, other: Correction) -> bool:
     return one.term == other.term and (alike or one == other)
 
 
+def _get_cost(one: Correction) -> float:
+    """Return what a mistake of some but not all elements costs: one of an element, or of all, is more common."""
+    changed = sum(factor != 1.0 for factor in one.factor)
+    return _SOME_ELEMENTS if one.kind == "sign" and 1 < changed < len(one.factor) else 0.0
+
+
 def _is_large(one: Correction) -> bool:
     if one.kind != "scale" or one.offset:
         return True
     factors = np.array(one.factor)
     return bool((np.abs(np.log(factors[factors != 1.0])) > np.log(_LEAST_FACTOR)).all())
-
-
-def _thin(rows: Array) -> Array:
-    return rows if len(rows) <= _ROWS else rows[np.linspace(0, len(rows) - 1, _ROWS).astype(int)]

@@ -38,6 +38,15 @@ class LoggedSignals:
         """Return the columns of an observation, or the actions."""
         return self.actions if name == ACTIONS else self.observations[:, self.slices[name]]
 
+    def join(self, other: "LoggedSignals") -> "LoggedSignals":
+        """Return these segments and those of another log of the same observations."""
+        return LoggedSignals(
+            np.concatenate([self.observations, other.observations]),
+            np.concatenate([self.actions, other.actions]),
+            (*self.lengths, *other.lengths),
+            self.sizes,
+        )
+
     def inner_rows(self, margin: int) -> Array:
         """Return the rows with at least `margin` rows of the same segment on both sides."""
         parts = [

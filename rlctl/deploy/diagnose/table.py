@@ -34,6 +34,7 @@ class LogTable:
     windows: tuple[int, ...]  # rows of each part of the file that was read
     row_word: str  # `line` or `row`
     note: str = ""
+    has_row_per_action: bool = False  # whatever the time between them is
 
     def where(self, index: int) -> str:
         """Return `FILE, line 12` for a row of the table."""
@@ -63,7 +64,7 @@ def read_header(path: Path) -> TableHeader:
         if twice := [name for name in names if names.count(name) > 1]:
             raise ArtifactError(f"{path}, line 1: column {twice[0]!r} is given twice")
     else:
-        raise ArtifactError(f"{path}: not a log that diagnose reads: give a .csv or .npz file")
+        raise ArtifactError(f"{path}: not a log that diagnose reads: give a .csv, .npz or .rrd file")
     if not names:
         raise ArtifactError(f"{path}: it has no columns")
     if len(names) > _MOST_COLUMNS:

@@ -187,9 +187,9 @@ class RerunLog:
             reason = getattr(error, "strerror", None) or error
             raise ArtifactError(f"{file}: the recording cannot be written: {reason}") from None
 
-    def add(self, entity: str, values: Any) -> None:
-        """Add numbers at the present time; the oldest are dropped if too many rows wait for `flush`."""
-        self._rows.append((entity, time.time(), values))
+    def add(self, entity: str, values: Any, time_s: float) -> None:
+        """Add numbers at a time [s since 1970]; the oldest are dropped if too many rows wait for `flush`."""
+        self._rows.append((entity, time_s, values))
 
     def flush(self) -> None:
         """Write the collected rows; any thread may call this."""

@@ -179,13 +179,14 @@ class PolicyServer:
             self._write_fault(session, "deadline", seconds, dt)
 
     def _record(self, recording: RerunLog, session: Session, infer_ms: float) -> None:
-        root, layout = f"client_{session.number}", session.safety.layout
-        recording.add(f"{root}/action", session.action)
-        recording.add(f"{root}/infer_ms", infer_ms)
+        root, layout, now = f"client_{session.number}", session.safety.layout, time.time()
+        recording.add(f"{root}/action", session.action, now)
+        recording.add(f"{root}/infer_ms", infer_ms, now)
+        recording.add(f"{root}/episode", float(session.episode), now)
         if session.observation is not None:
             flat = layout.flatten(session.observation)
             for name, part in layout.slices.items():
-                recording.add(f"{root}/observation/{name}", flat[part].copy())
+                recording.add(f"{root}/observation/{name}", flat[part].copy(), now)
 
     def give_order(self, order: str) -> int:
         """Give an order to all present and later clients; return their number. Raises `UsageError` without a home."""

@@ -82,6 +82,7 @@ class Session:
         self._watchdog_s = periods * dt if periods and dt else None
         self._last_s: float | None = None
         self._by_watchdog = False
+        self.episode = 0  # how many episodes the client has begun with `reset`
         self.action: NDArray[Any] | None = None  # the last action
         self.observation: Any = None  # the last observation, in the policy's form
 
@@ -156,6 +157,7 @@ class Session:
         if self._by_watchdog and self.safety.state == "stopped":
             self.safety.resume()
         self._by_watchdog = False
+        self.episode += 1
         self._actor.reset()
         self.safety.reset()
 

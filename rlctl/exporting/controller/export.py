@@ -18,8 +18,15 @@ from rlctl.errors import TaskError, UsageError
 from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
 from rlctl.exporting.controller.graph import build_graph
+from rlctl.exporting.controller.input_mapping import InputMaps, read_mapping
 from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
-from rlctl.exporting.controller.players import CController, Controller, OnnxController, compile_controller
+from rlctl.exporting.controller.players import (
+    CController,
+    Controller,
+    MappedController,
+    OnnxController,
+    compile_controller,
+)
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.exporting.export import (
     ExportReport,
@@ -49,6 +56,7 @@ class ControllerReport(ExportReport):
         """Return the lines of the report: pairs of a word and a text."""
         details, rows = self.details, super().list_rows()
         target = [("target", text)] if (text := details["target"]) else []
+        target += [("mapping", f"{name}: {text}") for name, text in details["mapping"].items()]
         if "opset" in details:  # for a robot's program, not for `rlctl eval`
             rows = rows[:-1]
         else:
@@ -77,8 +85,9 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
         check_environment(source.file, torch_policy.info, built)
         # Policies that were trained before their task declared its terms do not contain them.
         policy = torch_policy.file.with_info(env=built)
-        player = verify.TaskPlayer(ControllerLayout(policy.info), env, spec.task)
-        export = _Export(torch_policy, policy, player, limits)
+        layout = ControllerLayout(policy.info)
+        maps = {} if request.mapping is None else read_mapping(request.mapping, layout)
+        export = _Export(torch_policy, policy, verify.TaskPlayer(layout, env, spec.task), limits, maps)
         write = {"onnx": export.write_onnx, "c": export.write_c}
         return [write[form](target.with_suffix(f".{form}")) for form in request.formats]
     finally:
@@ -98,10 +107,11 @@ class _Export:
     policy: PolicyFile
     player: verify.TaskPlayer
     limits: Limits | None
+    maps: InputMaps
 
     def write_onnx(self, path: Path) -> ControllerReport:
         """Write and verify the ONNX file, which has no limits."""
-        model = build_graph(self.policy)
+        model = build_graph(self.policy, self.maps)
         content = encode(model)
         controller = OnnxController(content)
         target = ControllerLayout(self.policy.info).find_target(None, None)
@@ -121,7 +131,7 @@ class _Export:
 
     def write_c(self, path: Path) -> ControllerReport:
         """Write and verify the C file and its header, with the limits."""
-        source = ControllerSource(self.policy, path.stem, self.limits)
+        source = ControllerSource(self.policy, path.stem, self.limits, self.maps)
         compiler, median = find_compiler(), None
         command = os.environ.get("CC") or "cc"
         fields: dict[str, Any] = {"not_verified": f"there is no C compiler {command!r}; set CC to one"}
@@ -163,7 +173,7 @@ class _Export:
     ) -> tuple[dict[str, Any], list[verify.Recorded]]:
         """Return how a controller was verified, as fields of its report; raises `AnswerIsNo` if it acts differently."""
         recorded = self._record(is_limited)
-        result = verify.verify_controller(self.player, recorded, controller, target)
+        result = verify.verify_controller(self.player, recorded, MappedController(controller, self.maps), target)
         agreement, loop = result.agreement, result.closed_loop
         if agreement.agrees and not loop.agrees:
             repeats, magnified = self._check_conclusive(is_limited)
@@ -182,7 +192,9 @@ class _Export:
         fields: dict[str, Any],
     ) -> ControllerReport:
         sizes = {part.name: part.size for part in ControllerLayout(self.policy.info).quantities}
-        details = {**details, "input_sizes": sizes, "target": "" if target is None else target.formula}
+        mapping = {name: one.describe() for name, one in self.maps.items()}
+        details = {**details, "input_sizes": sizes, "mapping": mapping}
+        details["target"] = "" if target is None else target.formula
         if median is not None:
             fields["latency"] = Latency(median, measure_sb3(self.torch_policy))
         return ControllerReport(**describe_policy(self.torch_policy, path), **fields, size=size, details=details)

@@ -7,6 +7,7 @@ import onnx
 
 from rlctl.errors import UsageError
 from rlctl.exporting.actor import emit_actor, make_metadata
+from rlctl.exporting.controller.input_mapping import InputMap, InputMaps
 from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Stack
 from rlctl.exporting.controller.symbols import GraphSymbol
 from rlctl.exporting.layers import BATCH, Graph, concatenate
@@ -20,16 +21,17 @@ _TAKEN = {onnx_policy.ACTION, TARGET, *onnx_policy.STATE_INPUTS, OBSERVATION, LA
 _ZEROS = "zeros when an episode begins, then the output of the step before"
 
 
-def build_graph(policy: PolicyFile) -> onnx.ModelProto:
+def build_graph(policy: PolicyFile, maps: InputMaps | None = None) -> onnx.ModelProto:
     """Write a policy's controller, without limits, as ONNX. Raises `UsageError` for one that cannot be written."""
-    return _Writer(policy).write()
+    return _Writer(policy, maps or {}).write()
 
 
 class _Writer:
-    def __init__(self, policy: PolicyFile) -> None:
+    def __init__(self, policy: PolicyFile, maps: InputMaps) -> None:
         self._policy, self._layout, self._graph = policy, ControllerLayout(policy.info), Graph()
         self._target = self._layout.find_target(None, None)
         self._inputs = {part.name: self._add_input(part.name, part.size, part.unit) for part in self._layout.quantities}
+        self._inputs |= {name: self._map_input(name, one) for name, one in maps.items()}
         self._states: list[str] = []
         self._steps = ""
         layout = self._layout
@@ -40,6 +42,14 @@ class _Writer:
         if name.startswith("/") or name in _TAKEN or name.endswith("_out"):
             raise UsageError(f"export --controller: an input named {name!r} cannot be written as ONNX; rename it")
         return self._graph.input(name, self._layout.dtype, (BATCH, size), f"[{unit}]" if unit else "")
+
+    def _map_input(self, name: str, one: InputMap) -> str:
+        """Add the mapping from the program's values of an input to the policy's."""
+        graph = self._graph
+        value = graph.add("Gather", self._inputs[name], graph.constant(f"mapping/{name}/order", one.order), axis=1)
+        value = graph.add("Mul", self._read(value), graph.constant(f"mapping/{name}/factor", one.factor))
+        value = graph.add("Add", value, graph.constant(f"mapping/{name}/offset", one.offset))
+        return graph.cast(value, self._layout.dtype)
 
     def write(self) -> onnx.ModelProto:
         graph, layout, info = self._graph, self._layout, self._policy.info

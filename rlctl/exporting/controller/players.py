@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rlctl.errors import AnswerIsNo, short_repr
 from rlctl.exporting.c_source import FLAGS, CSource
 from rlctl.exporting.controller.graph import LAST_ACTION, TARGET
+from rlctl.exporting.controller.input_mapping import InputMaps
 from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type
 from rlctl.policy.onnx_policy import ACTION, open_session
@@ -131,6 +132,26 @@ class OnnxController(Controller):
         """Replace the last action, if it is part of the state."""
         if LAST_ACTION in self._state:
             self._state[LAST_ACTION] = action.reshape(1, -1).astype(self._dtypes[LAST_ACTION])
+
+
+class MappedController(Controller):
+    """A controller with a mapping, which a program with the wrong mapping gives its values."""
+
+    def __init__(self, controller: Controller, maps: InputMaps) -> None:
+        self._controller, self._maps = controller, maps
+
+    def begin(self) -> None:
+        """Begin an episode."""
+        self._controller.begin()
+
+    def step(self, inputs: Inputs) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
+        """Return the action and the targets for the robot's quantities, as the policy expects them."""
+        wrong = {name: self._maps[name].undo(value) if name in self._maps else value for name, value in inputs.items()}
+        return self._controller.step(wrong)
+
+    def set_last_action(self, action: NDArray[Any]) -> None:
+        """Replace the last action."""
+        self._controller.set_last_action(action)
 
 
 _DTYPES: dict[str, np.dtype[Any]] = {

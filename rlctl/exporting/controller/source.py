@@ -11,7 +11,8 @@ from rlctl.deploy.filter.limits import Limits
 from rlctl.exporting import c_source
 from rlctl.exporting.c_layers import CWriter, write_number
 from rlctl.exporting.c_source import CSource, Layout
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed
+from rlctl.exporting.controller.input_mapping import InputMaps
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Quantity
 from rlctl.exporting.controller.limits_source import LimitsSource
 from rlctl.exporting.controller.symbols import CSymbol
 from rlctl.policy.file import PolicyFile
@@ -44,10 +45,12 @@ class ControllerSource:
     Raises `UsageError` for a policy that cannot be written as C, `RecipeError` for limits that do not fit it.
     """
 
-    def __init__(self, policy: PolicyFile, file_name: str, limits: Limits | None) -> None:
+    def __init__(
+        self, policy: PolicyFile, file_name: str, limits: Limits | None, maps: InputMaps | None = None
+    ) -> None:
         c_source.check_can_be_written(policy)
         self.layout = layout = ControllerLayout(policy.info)
-        self.limits = limits or Limits()
+        self.limits, self._maps = limits or Limits(), maps or {}
         fitted = fit_limits(self.limits, layout.inputs_info)
         assert fitted.bounds is not None  # the actions are in a Box
         self._limits_source = LimitsSource(self.limits, fitted, fitted.bounds)
@@ -86,6 +89,8 @@ class ControllerSource:
             "lstm_size": hidden,
             "arrays": self._list_arrays(described),
             "target": None if self.target is None else self._describe_target(self.target),
+            "read_lines": [line for quantity in layout.quantities for line in self._write_reading(quantity)],
+            "mapped": [f"{name}: {one.describe()}" for name, one in self._maps.items()],
             "term_lines": [line for part in layout.observed for line in self._write_term(part, described.type)],
             "constants": writer.constants,
             "functions": writer.find_functions(),
@@ -99,6 +104,19 @@ class ControllerSource:
         used = set(re.findall(r"\w+", code))
         arrays = [text for name, text in self._limits_source.list_arrays().items() if name in used]
         return c_source.render("limits.c", {**values, "constants_of_limits": arrays})
+
+    def _write_reading(self, quantity: Quantity) -> list[str]:
+        """Return statements that read an input; with a mapping from the program's values to the policy's."""
+        name, start = quantity.identifier, quantity.start
+        if (one := self._maps.get(quantity.name)) is None:
+            loop = f"for (int i = 0; i < {quantity.size}; ++i) {{"
+            return [loop, f"    values[{start} + i] = inputs->{name}[i];", "}"]
+        rows = zip(one.order.tolist(), one.factor, one.offset, strict=True)
+        return [
+            f"values[{start + index}] = {write_number(factor, 'double')} * (double)inputs->{name}[{element}] + "
+            f"{write_number(offset, 'double')};"
+            for index, (element, factor, offset) in enumerate(rows)
+        ]
 
     def _write_term(self, part: Observed, kind: str) -> list[str]:
         """Return statements that compute the newest values of a part of the observation."""

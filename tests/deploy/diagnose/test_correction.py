@@ -64,8 +64,17 @@ def test_what_is_sent_to_a_robot_is_the_inverse_of_what_it_does():
 
 
 def test_the_mapping_of_a_swap_has_only_its_order():
-    mapping = build_mapping([SWAP], [], {"q": 3}).model_dump(exclude_defaults=True)
+    mapping = build_mapping([], [SWAP], {"q": 3}).model_dump(exclude_defaults=True)
     assert mapping == {"observations": {"q": {"order": [1, 0, 2]}}}
+
+
+def test_mistakes_of_the_log_alone_do_not_change_what_a_program_must_do():
+    everything = Correction("observation", "normalised", "", factor=(2.0, 2.0, 2.0, 3.0), offset=(0.0, 0.0, 0.0, 1.0))
+    mapping = build_mapping([everything], [SWAP], {"q": 3, "v": 1}).model_dump(exclude_defaults=True)
+    assert mapping == {
+        "observations": {"q": {"order": [1, 0, 2]}},
+        "log": {"observations": {"q": {"scale": [2.0, 2.0, 2.0]}, "v": {"scale": [3.0], "offset": [1.0]}}},
+    }
 
 
 def test_orders_of_legs_joints_and_names_are_tried():

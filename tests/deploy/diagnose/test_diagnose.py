@@ -36,6 +36,7 @@ def test_a_sound_log_has_no_finding(doctor, robot, randomized):
     assert mapping.model_dump(exclude_defaults=True) == {}
 
 
+@pytest.mark.slow
 def test_a_swap_in_the_closed_loop(doctor, robot):
     findings, answers, mapping = diagnose(doctor, robot, Wrong("joint_velocities", "swap", order=SWAPPED))
     assert findings[0].text == "joint_velocities: elements 3 and 4 are swapped"
@@ -44,10 +45,12 @@ def test_a_swap_in_the_closed_loop(doctor, robot):
 
 
 def test_a_swap_in_the_log_alone_is_found_with_the_policy(doctor, robot):
-    findings, answers, _ = diagnose(doctor, robot, Wrong("joint_velocities", "swap", order=SWAPPED, in_log=True))
+    findings, answers, mapping = diagnose(doctor, robot, Wrong("joint_velocities", "swap", order=SWAPPED, in_log=True))
     assert findings[0].text.startswith("joint_velocities: elements 3 and 4 are swapped (in the log")
     assert findings[0].question == 1
     assert answers.policy_difference > 0.1 > 1e-4 > answers.policy_difference_corrected
+    assert mapping.log.observations["joint_velocities"].order == list(SWAPPED)
+    assert mapping.observations == {}  # the policy received the right values
 
 
 @pytest.mark.slow
@@ -66,6 +69,17 @@ def test_degrees_and_a_frozen_sensor_in_one_log(doctor, robot):
     findings, _, _ = diagnose(doctor, robot, degrees, Wrong("hand", "stuck", stuck=(2,)))
     assert findings[0].text.startswith("hand: element 2 is frozen at")
     assert "joint_velocities: is in degrees, the policy expects radians" in [finding.text for finding in findings]
+
+
+@pytest.mark.slow
+def test_late_actions_in_a_log_that_also_misses_a_sensor(doctor, robot):
+    """The policy received what the log does not hold: its actions are matched with the values that suit them best."""
+    late = Wrong("actions", "late", late=2, in_log=True)
+    findings, _, mapping = diagnose(doctor, robot, Wrong("hand", "stuck", stuck=(2,), in_log=True), late)
+    assert findings[0].text.startswith("hand: element 2 is frozen at")
+    assert "actions: the log holds each action 2 control steps late" in [finding.text for finding in findings]
+    assert mapping.log.actions.delay == 2
+    assert mapping.actions is None
 
 
 @pytest.mark.slow

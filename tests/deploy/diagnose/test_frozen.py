@@ -42,3 +42,21 @@ def test_a_robot_that_lies_still_has_no_frozen_sensor():
     reference = make_pair(sound, sound, (200, 200))
     assert find_frozen(make_pair(fallen, fallen, (100,)), [reference]) == []
     assert len(find_frozen(make_pair(fallen, np.sin(np.arange(100.0)), (100,)), [reference])) == 1
+
+
+def test_an_end_stop_is_not_frozen():
+    values = np.sin(np.arange(150.0) / 10)
+    values[60:] = -1.2  # beyond all that the joint measured before
+    assert find_frozen(make_signals(values, (150,)), [MOVING]) == []
+
+
+def test_rest_in_simulation_does_not_hide_a_frozen_sensor():
+    """At rest all sensors of a simulation keep their values, which is no reason to expect it while others move."""
+
+    def make_pair(first, second, lengths):
+        return LoggedSignals(np.column_stack([first, second]), np.zeros((len(first), 1)), lengths, {"q": 1, "v": 1})
+
+    at_rest = np.where(np.arange(400) < 370, np.sin(np.arange(400.0)), 0.5)
+    frozen = np.where(np.arange(200) < 40, np.sin(np.arange(200.0)), 0.25)
+    (one,) = find_frozen(make_pair(frozen, np.sin(np.arange(200.0)), (200,)), [make_pair(at_rest, at_rest, (400,))])
+    assert (one.term, one.first_row, one.rows) == ("q", 40, 160)
