@@ -18,14 +18,17 @@ from rlctl.checking.families.speed import format_speed
 from rlctl.checking.junit import to_junit
 from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, find_rule
 from rlctl.checking.tool_formats import Row, action_rows, observation_rows, to_annotations, to_json, to_sarif
+from rlctl.environments import registry
 from rlctl.environments.info import describe_randomization
 from rlctl.environments.places import format_place
 from rlctl.errors import UsageError
+from rlctl.recipe import sources
 from rlctl.storage import files
 
 STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO: "cyan"}
 SHOWN_LINES = 3  # of what a dying process printed
 SHOWN_ITEMS = 4  # How much of a list in the evidence is shown; JSON has it whole
+_WITH_EVENTS = "; those of the recipe act with --set randomize=true"
 SHOWN_ROWS = 16  # How many parts of the observation are shown
 
 
@@ -132,7 +135,8 @@ def _facts(report: CheckReport) -> Iterator[str]:
             yield f"MuJoCo model {built.model}"
         yield f"speed {format_speed(report.records) or 'not measured'}"
         if built.events:
-            yield f"events: {describe_randomization(built.events)}"
+            unchecked = "" if any(built.events.values()) or not _randomizes(report.task) else _WITH_EVENTS
+            yield f"events: {describe_randomization(built.events)}{unchecked}"
     if verdict.crashed:
         yield f"crashed: {', '.join(verdict.crashed)}; their findings are unknown"
     if built is None:
@@ -144,6 +148,14 @@ def _facts(report: CheckReport) -> Iterator[str]:
     for reason in dict.fromkeys(verdict.not_judged.values()):
         names = [name for name, why in verdict.not_judged.items() if why == reason]
         yield f"not judged: {_list_rules(names)}: {reason}"
+
+
+def _randomizes(task: str) -> bool:
+    """Return whether the recipe that comes with a task lets events act."""
+    if registry.find_recipe_file(task) is None:
+        return False
+    recipe = sources.resolve(task, None, {})
+    return recipe.randomize or bool(recipe.events)
 
 
 def _list_rules(names: list[str]) -> str:
