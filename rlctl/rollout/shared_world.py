@@ -70,7 +70,7 @@ def make_watched(spec: EnvSpec) -> tuple[Any, SharedWorld | None]:
     """
     constructor = spec.constructor()
     if is_task(constructor):
-        return spec.make(), None
+        return spec.make(visuals=False), None
     before = _find_clients()
     with record_calls(with_results=()) as calls:
         env = spec.make()

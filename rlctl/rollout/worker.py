@@ -92,13 +92,13 @@ class Worker:
         if self._job.count > 1 and not spec.is_batch:
             first, shared_world = make_watched(spec)
         else:
-            first = spec.make()
+            first = spec.make(visuals=False)
         envs = [first]
         self._privileged = {} if privileged is None else show_critic(spec, first, privileged)
         if (batch := spec.make_batch(first, self._job.count)) is not None:
             self._batch = BatchEpisodes(batch, self._job.first)
         elif shared_world is None:
-            envs += [spec.make() for _ in range(self._job.count - 1)]
+            envs += [spec.make(visuals=False) for _ in range(self._job.count - 1)]
             for env in envs[1:] if privileged is not None else ():
                 show_critic(spec, env, privileged or {})
         self._info = describe(envs[0])
