@@ -19,7 +19,7 @@ _CURVE = 200  # points of a curve
 _WIDE = 100  # columns of a terminal
 _LINE_EVERY_S = 5.0
 _LINE_OF_SEGMENT_EVERY_S = 10.0
-_LONG_START_S = 5.0  # a phase before the first step that takes longer gets a line
+_LONG_START_S = 10.0  # a phase before the first step that takes longer gets a line
 
 
 def sparkline(values: list[float], low: float | None = None, high: float | None = None) -> str:
