@@ -173,9 +173,13 @@ def _is_plugin_file(file: str) -> bool:
     return not any(Path(file).is_relative_to(folder) for folder in (_OURS, _IMPORTLIB))
 
 
-def did_you_mean(word: str, options: Iterable[str]) -> str:
-    """Return " Did you mean 'reach'?" for the option closest to `word`, else an empty string."""
-    close = difflib.get_close_matches(word, list(options), n=1, cutoff=0.5)
+def did_you_mean(word: str, options: Iterable[str], otherwise: str = "") -> str:
+    """Return " Did you mean 'reach'?" for the option closest to `word`, else an empty string.
+
+    With `otherwise`, what is meant where no option is nearly the same.
+    """
+    close = difflib.get_close_matches(word, list(options), n=1, cutoff=0.7 if otherwise else 0.5)
+    close = close or [otherwise] * bool(otherwise)
     return f" Did you mean {close[0]!r}?" if close else ""
 
 

@@ -12,6 +12,8 @@ from rlctl.checking.bullet_worlds import ClientCalls, find_clients, read_world
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rules import NotJudged
 from rlctl.checking.worlds import WorldBody
+from rlctl.task.env import TaskEnv
+from rlctl.task.mujoco.sim import MujocoSim
 
 FEWEST_JOINTS, MOST_JOINTS = 2, 12
 SAMPLES, SWEEPS, VALUES = 200, 3, 9  # random joint positions; then each joint in turn at so many positions
@@ -40,6 +42,7 @@ class Reach:
     centre: Sequence[float]  # [m]
     distance: float  # [m]
     how: str  # this was found out, as a sentence
+    unit: str = ""
 
 
 def find_chains(env: Any) -> Iterator[Chain]:
@@ -48,10 +51,18 @@ def find_chains(env: Any) -> Iterator[Chain]:
         for body in read_world(client).bodies:
             if not body.is_free and FEWEST_JOINTS <= len(body.joints) <= MOST_JOINTS:
                 yield _bullet_chain(ClientCalls(client), body)
-    model, data = (getattr(getattr(env, "unwrapped", env), name, None) for name in ("model", "data"))
-    mujoco = sys.modules.get("mujoco")
+    inner, mujoco = getattr(env, "unwrapped", env), sys.modules.get("mujoco")
+    if isinstance(inner, TaskEnv) and isinstance(inner.sim, MujocoSim):
+        for robot in inner.sim.bodies.values():
+            if robot.fixed and FEWEST_JOINTS <= len(robot.joint_names) <= MOST_JOINTS:
+                yield _mujoco_chain(mujoco, inner.sim.model, inner.sim.data, robot.parts.joints)
+        return
+    model, data = (getattr(inner, name, None) for name in ("model", "data"))
     if mujoco is not None and isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
-        yield from _mujoco_chains(mujoco, model, data)
+        single = [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)]
+        joints = [j for j in range(model.njnt) if model.jnt_type[j] in single]
+        if len(joints) == model.njnt and FEWEST_JOINTS <= len(joints) <= MOST_JOINTS:  # else the robot may be free
+            yield _mujoco_chain(mujoco, model, data, joints)
 
 
 def _bullet_chain(p: ClientCalls, body: WorldBody) -> Chain:
@@ -70,13 +81,9 @@ def _bullet_chain(p: ClientCalls, body: WorldBody) -> Chain:
     return Chain(ranges, np.array(p.getBasePositionAndOrientation(body.id)[0]), set_joints, read, names)
 
 
-def _mujoco_chains(mujoco: Any, model: Any, data: Any) -> Iterator[Chain]:
+def _mujoco_chain(mujoco: Any, model: Any, data: Any, joints: Sequence[int]) -> Chain:
     copy = mujoco.MjData(model)
     copy.qpos[:] = data.qpos
-    single = [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)]
-    joints = [j for j in range(model.njnt) if model.jnt_type[j] in single]
-    if len(joints) != model.njnt or not FEWEST_JOINTS <= len(joints) <= MOST_JOINTS:
-        return  # something is free, and may be the robot
     mujoco.mj_kinematics(model, copy)
 
     def set_joints(values: Numbers) -> None:
@@ -88,7 +95,7 @@ def _mujoco_chains(mujoco: Any, model: Any, data: Any) -> Iterator[Chain]:
 
     limits = [tuple(model.jnt_range[j].tolist()) if model.jnt_limited[j] else (-np.pi, np.pi) for j in joints]
     names = [model.body(i).name for i in range(model.nbody)] + [model.site(i).name for i in range(model.nsite)]
-    yield Chain(limits, copy.xpos[model.jnt_bodyid[joints[0]]].copy(), set_joints, read, names)
+    return Chain(limits, copy.xpos[model.jnt_bodyid[joints[0]]].copy(), set_joints, read, names)
 
 
 def measure_reach(chain: Chain, link: int, size: int) -> Reach:
@@ -107,8 +114,10 @@ def measure_reach(chain: Chain, link: int, size: int) -> Reach:
             others[1:, joint] = np.linspace(low[joint], high[joint], VALUES)
             best = max(others, key=distance)
     reach = distance(best)
-    how = f"with all joints anywhere within their limits, {chain.names[link]} gets {reach:.4g} away from there at most"
-    return Reach(chain.base[:size].tolist(), reach, how)
+    how = (
+        f"with all joints anywhere within their limits, {chain.names[link]} gets {reach:.4g} m away from there at most"
+    )
+    return Reach(chain.base[:size].tolist(), reach, how, " m")
 
 
 def find_reach(places: Numbers, episodes: NDArray[np.int64]) -> Reach:

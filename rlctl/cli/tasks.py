@@ -117,12 +117,17 @@ def show_task(task: TaskName, json: Json = None) -> None:
 @app.command("new")
 @command
 def new_task(
-    name: Annotated[str, Argument("Name of the task: letters, digits, - and _.", metavar="NAME")], json: Json = None
+    name: Annotated[str, Argument("Name of the task: letters, digits, - and _.", metavar="NAME")],
+    model: Annotated[
+        str | None, Option("Your robot: a URDF or MJCF file, copied with its meshes.", metavar="FILE")
+    ] = None,
+    link: Annotated[str | None, Option("Link of --model that is to reach the goal.", metavar="LINK")] = None,
+    json: Json = None,
 ) -> None:
-    """Create a starter plugin in a folder NAME: a task that trains in seconds, its recipe and tests."""
+    """Create a starter plugin in a folder NAME: a reach task that trains as it is, its recipe and tests."""
     from rlctl.tasks.new import create, show
 
-    show(create(name), json)
+    show(create(name, model=model, link=link), json)
 
 
 @command

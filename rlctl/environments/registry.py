@@ -50,6 +50,8 @@ def load(task: str) -> Callable[..., Any]:
     if task and Path(task).is_dir():
         forms = f"pip install -e {task} installs a plugin; or name a class: {task}/FILE.py:CLASS"
         raise UsageError(f"{task} is a folder, not a task: {forms}")
+    if model := suggestions.explain_model_file(task):
+        raise UsageError(model)
     names = [entry.name for entry in installed.list_installed()]
     listed, close = ", ".join(dict.fromkeys(names)) or "none", suggestions.suggest(task)
     close, forms = close or f".{did_you_mean(task, names)}", "package.module:Class, path/to/file.py:Class, Pendulum-v1."

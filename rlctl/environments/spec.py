@@ -63,18 +63,23 @@ class EnvSpec:
         return named_task.load(self.task, self.named_by) if self.named_by else load(self.task)
 
     def make(
-        self, render_mode: Literal["human", "rgb_array", "ansi"] | None = None, *, teacher: EnvSpec | None = None
+        self,
+        render_mode: Literal["human", "rgb_array", "ansi"] | None = None,
+        *,
+        teacher: EnvSpec | None = None,
+        visuals: bool = True,
     ) -> gymnasium.Env[Any, Any]:
         """Build the environment; raises `UsageError` for wrong names or parameters, `TaskError` if it fails.
 
         With a `teacher` it also observes what a policy of that spec sees; see `rlctl.environments.teacher_view`.
+        Without `visuals` a task that draws nothing needs less memory: see `TaskEnv`.
         """
         if render_mode == "rgb_array" and not os.environ.get("DISPLAY"):
             os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it at import; its default needs a display
         constructor = self.constructor()
         print_mujoco_warnings()
         if is_task(constructor):
-            env = self._make_task_env(constructor, render_mode)
+            env = self._make_task_env(constructor, render_mode, visuals=visuals)
         else:
             for key in ("reward_weights", "randomize", "events", "level", "sim", "observation_history"):
                 # Files of plain environments that were written before engines could be chosen name PyBullet.
@@ -174,7 +179,7 @@ class EnvSpec:
         batch: BatchEnv = call_plugin(self.task, lambda: BatchEnv(constructor(**parameters), worlds, described, sim))
         return batch
 
-    def _make_task_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
+    def _make_task_env(self, constructor: Any, render_mode: Any, *, visuals: bool) -> gymnasium.Env[Any, Any]:
         from rlctl.task.env import TaskEnv
         from rlctl.task.events import EventSettings
         from rlctl.task.task import check_parameters
@@ -187,7 +192,13 @@ class EnvSpec:
         def build() -> TaskEnv:
             task = constructor(**parameters)
             return TaskEnv(
-                task, render_mode=render_mode, reward_weights=weights, events=events, sim=sim, observing=observing
+                task,
+                render_mode=render_mode,
+                reward_weights=weights,
+                events=events,
+                sim=sim,
+                visuals=visuals,
+                observing=observing,
             )
 
         env: TaskEnv = call_plugin(self.task, build)

@@ -15,6 +15,13 @@ def suggest(task: str) -> str:
     return f". Did you mean {meant!r}?" if meant else ""
 
 
+def explain_model_file(name: str) -> str:
+    """Return why a robot's model file is not a task, and what to do; empty for any other name."""
+    if not name.endswith((".urdf", ".xml")) or not Path(name).is_file():
+        return ""
+    return f"{name}: a model file, not a task: `rlctl tasks new NAME --model {name}` makes a task of it"
+
+
 def _list_forms(task: str) -> Iterator[str]:
     """Yield existing files and modules with the class of a task that is written in another form, or misspelt."""
     parts = [part for part in re.split(r":+|\s+", task) if part]

@@ -297,7 +297,8 @@ def _explain(problem: Any, path: Sequence[str | int], schema: validation.Schema,
         where, shown = f"stage {int(path[1]) + 1}: ", path[2:]
     key = ".".join(short_repr(str(part)) for part in shown)
     of = f" for {values.get('algo', 'ppo')}" if path and path[0] in ("algo_kwargs", "policy_kwargs") else ""
-    return where + validation.explain(problem, path, schema, values, key=key, of=of)
+    parameter = f"task.{key}" if len(path) == 1 else ""  # users forget the section of a task's parameters
+    return where + validation.explain(problem, path, schema, values, key=key, of=of, otherwise=parameter)
 
 
 def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:

@@ -151,7 +151,8 @@ def check_changes(values: Mapping[str, Any], source: str) -> EnvChanges:
     for key in values:
         if key not in _OF_THE_ENVIRONMENT:
             can = "task.NAME, reward_weights.NAME, randomize, events.NAME and sim can be set here"
-            raise RecipeError(f"{source} {key}: only {can}.{did_you_mean(key, _OF_THE_ENVIRONMENT)}")
+            parameter = "" if key in Recipe.model_fields else f"task.{key}"
+            raise RecipeError(f"{source} {key}: only {can}.{did_you_mean(key, _OF_THE_ENVIRONMENT, parameter)}")
     recipe = validate(values, source)
     randomize = recipe.randomize if "randomize" in values else None
     return EnvChanges(recipe.task, recipe.reward_weights, randomize, recipe.events, recipe.sim or "")

@@ -131,7 +131,11 @@ def find_mujoco_bounds(sim: MujocoSim, bodies: Sequence[Body], markers: Sequence
         for geom in range(sim.model.ngeom)
         if int(sim.model.geom_bodyid[geom]) in wanted and 0 < sim.model.geom_rbound[geom] < _GROUND_SIZE / 2
     ]
-    corners = [*markers, *(_find_box(sim.model, geoms, sim.data.geom_xpos) if geoms else ())]
+    turns = sim.data.geom_xmat[geoms].reshape(-1, 3, 3)
+    boxes = sim.model.geom_aabb[geoms]  # centre and half sides in the frame of the geom
+    centers = sim.data.geom_xpos[geoms] + np.einsum("gij,gj->gi", turns, boxes[:, :3])
+    halves = np.einsum("gij,gj->gi", np.abs(turns), boxes[:, 3:])
+    corners = [*markers, *(centers - halves), *(centers + halves)]
     return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
 
 

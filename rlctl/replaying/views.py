@@ -6,7 +6,7 @@ from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, describe_exception
 from rlctl.replaying.bullet_bodies import read_body
-from rlctl.replaying.bullet_camera import EYE_DIRECTION, BulletCamera, Picture, find_world
+from rlctl.replaying.bullet_camera import EYE_DIRECTION, BulletCamera, Picture, find_distance, find_world
 from rlctl.replaying.drawable import DrawableEnv, make_drawable
 from rlctl.replaying.mujoco_scene import find_mujoco_bounds
 from rlctl.replaying.scene import Env
@@ -95,7 +95,7 @@ class _MujocoTaskView:
         markers = [np.asarray(position) for position in self._env.task.markers().values()]
         low, high = find_mujoco_bounds(sim, shown, markers)
         self._target = (low + high) / 2
-        distance = max(1.0, 1.6 * float(np.linalg.norm(high - low)))
+        distance = find_distance(low, high, self._size)
         self._offset = distance * EYE_DIRECTION / np.linalg.norm(EYE_DIRECTION)
 
     def draw(self) -> Picture:

@@ -32,9 +32,10 @@ def make_world_reader(env: Env, other_clients: Collection[int] = ()) -> WorldRea
 
     `other_clients` are PyBullet clients that existed before the environment.
     """
-    if (simulation := find_mujoco(env)) is not None:
-        return MujocoWorldReader(*simulation)
     inner = env.unwrapped
+    if (simulation := find_mujoco(env)) is not None:
+        bodies = inner.sim.bodies if isinstance(inner, TaskEnv) else {}
+        return MujocoWorldReader(*simulation, bodies)
     if isinstance(inner, TaskEnv):
         return BulletWorldReader({name: _read_task_body(body) for name, body in inner.sim.bodies.items()})
     clients = [client for client in find_clients() if client not in other_clients]
@@ -130,10 +131,13 @@ def _read_points(client: int) -> Any:
 
 
 class MujocoWorldReader:
-    """Reads a MuJoCo model: a body is a tree of MuJoCo's bodies that begins at the world."""
+    """Reads a MuJoCo model: a body is a tree of MuJoCo's bodies that begins at the world.
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        self._model, self._data = model, data
+    `bodies` are those of a task, which know the limits of their files.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, bodies: Mapping[str, Body]) -> None:
+        self._model, self._data, self._bodies = model, data, bodies
         self._roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
         named = {root: (model.body(root).name or f"body {root}").partition("/")[0] for root in self._roots}
         repeated = {root: name for root, name in named.items() if list(named.values()).count(name) > 1}
@@ -176,11 +180,22 @@ class MujocoWorldReader:
             if kind < int(mujoco.mjtJoint.mjJNT_SLIDE):  # free, or a ball
                 continue
             low, high = model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (None, None)
-            force = float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else None
+            name, force, speed = self._read_limits(root, joint)
             unit: Literal["rad", "m"] = "m" if kind == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
             start = float(self._data.qpos[model.jnt_qposadr[joint]])
-            joints.append(JointSummary(joint_name(model, joint), unit, low, high, start, force))
+            joints.append(JointSummary(name, unit, low, high, start, force, speed))
         return joints
+
+    def _read_limits(self, root: int, joint: int) -> tuple[str, float | None, float | None]:
+        """Return the name of a joint, of a task's body as `joint_names` has it, and its limits of force and speed."""
+        model, full_name = self._model, joint_name(self._model, joint)
+        body = self._bodies.get(self._names[root])
+        name = full_name.partition("/")[2]
+        if body is None or name not in body.joint_names:
+            force = float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else None
+            return full_name, force, None
+        index = body.joint_names.index(name)
+        return name, _strength(float(body.joint_max_force[index])), _strength(float(body.joint_max_speed[index]))
 
     def read_poses(self) -> Mapping[str, Pose]:
         """Return the poses of the bodies that are not fixed, by name."""

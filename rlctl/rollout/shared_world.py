@@ -70,7 +70,7 @@ def make_watched(spec: EnvSpec, teacher: EnvSpec | None = None) -> tuple[Any, Sh
     """
     constructor = spec.constructor()
     if is_task(constructor):
-        return spec.make(teacher=teacher), None
+        return spec.make(teacher=teacher, visuals=False), None
     before = _find_clients()
     with record_calls(with_results=()) as calls:
         env = spec.make(teacher=teacher)

@@ -95,7 +95,7 @@ class Worker:
         if self._job.count > 1 and not spec.is_batch:
             first, shared_world = make_watched(spec, taught_by)
         else:
-            first = spec.make(teacher=taught_by)
+            first = spec.make(teacher=taught_by, visuals=False)
         envs = [first]
         if teacher is not None:
             check_teacher(teacher, first)
@@ -104,7 +104,7 @@ class Worker:
             self._batch = BatchEpisodes(batch, self._job.first)
             self._batch.teacher = None if teacher is None else BatchTeacher(teacher, batch)
         elif shared_world is None:
-            envs += [spec.make(teacher=taught_by) for _ in range(self._job.count - 1)]
+            envs += [spec.make(teacher=taught_by, visuals=False) for _ in range(self._job.count - 1)]
             for env in envs[1:] if privileged is not None else ():
                 show_critic(spec, env, privileged or {})
         self._info = describe(envs[0])

@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rlctl.environments import installed, registry
+from rlctl.environments import installed, registry, suggestions
 from rlctl.environments.registry import describe_task_changes
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError, did_you_mean
@@ -68,6 +68,8 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
         inside = next((file.parent for pattern in patterns for file in Path(text).glob(pattern)), None)
         hint = f"; in it is {inside}" if inside else ""
         raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json{hint}")
+    if model := suggestions.explain_model_file(text):
+        raise UsageError(model)
     if Path(text).is_file() and Path(text).suffix != ".zip":
         hint = f"; its run: {Path(text).parent}" if (Path(text).parent / "run.json").is_file() else ""
         raise ArtifactError(f"{text}: neither a run nor a policy (.safetensors, .onnx){hint}")

@@ -138,14 +138,25 @@ def _locate(problem: Any, root: Schema) -> Place:
 
 
 def explain(
-    problem: Any, path: Sequence[str | int], root: Schema, values: Any, *, key: str, of: str = "", unit: str = ""
+    problem: Any,
+    path: Sequence[str | int],
+    root: Schema,
+    values: Any,
+    *,
+    key: str,
+    of: str = "",
+    unit: str = "",
+    otherwise: str = "",
 ) -> str:
-    """Explain what is wrong with the value at `path`, which the message calls `key`."""
+    """Explain what is wrong with the value at `path`, which the message calls `key`.
+
+    `otherwise` is the key that is meant if this one is unknown and none is nearly the same.
+    """
     if problem["type"] == "extra_forbidden":
         keys = list_keys(root, find_schema(root, path[:-1]))
         name, outer = path[-1], (find_schema(root, [*path[:-1], key_here]) for key_here in keys)
         inner = [f"{parent}.{name}" for parent, node in zip(keys, outer, strict=True) if name in list_keys(root, node)]
-        hint = f" Did you mean {inner[0]!r}?" if inner else did_you_mean(str(name), keys)
+        hint = f" Did you mean {inner[0]!r}?" if inner else did_you_mean(str(name), keys, otherwise)
         return f"no key {key!r}{of}.{hint} Keys here: {', '.join(keys)}."
     label = f"{key}: " if key else ""
     if problem["type"] == "value_error":  # raised by a validator of rlctl

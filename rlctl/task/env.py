@@ -35,7 +35,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
 
     `info` holds `reward_terms` (weighted; they add up to the reward), `metrics` (every raw term), `is_success`
     where the task defines it, and, in steps with events, `events` (the drawn values). `sim` is the engine:
-    `pybullet`, `mujoco`, `mujoco:SOLREF`; by default that of `choose_engine`. `observing` is what the policy sees.
+    `pybullet`, `mujoco`, `mujoco:SOLREF`; by default that of `choose_engine`. Without `visuals` MuJoCo loads visual
+    shapes only when the task takes its first picture. `observing` is what the policy sees.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         reward_weights: Mapping[str, float] | None = None,
         events: EventSettings | None = None,
         sim: str = "",
+        visuals: bool = True,
         observing: Observing = Observing(),  # noqa: B008 (it cannot change)
     ) -> None:
         check_parameters(type(task))
@@ -71,7 +73,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self.level = self._episode_level = 1.0
         self.measured: dict[str, Any] = {}
         """What the last observation's terms were computed from, by the name of the term."""
-        self.sim = _make_world(task, sim, render_mode)
+        self.sim = _make_world(task, sim, render_mode, visuals=visuals)
         self._step = 0
         self._running = self._closed = False
         self._streams: Streams = {}
@@ -314,19 +316,22 @@ def choose_engine(task: type) -> str:
     return "mujoco" if issubclass(task, BatchTask | OneWorld) or not is_installed() else "pybullet"
 
 
-def _make_world(task: Task, sim: str, render_mode: str | None) -> Sim:
+def _make_world(task: Task, sim: str, render_mode: str | None, *, visuals: bool) -> Sim:
     solref, iterations = read_solref(sim or choose_engine(type(task))), task.solver_iterations
+    dt, substeps = task.control_dt, task.substeps
     if isinstance(task, OneWorld):
         if solref is None:
             raise UsageError(f"{type(task).__name__} simulates its worlds in MuJoCo: sim: mujoco, or --sim mujoco")
-        dt, substeps = task.control_dt, task.substeps
-        return MujocoSim(control_dt=dt, substeps=substeps, solref=solref, iterations=iterations, worlds=1).one(0)
+        many = MujocoSim(
+            control_dt=dt, substeps=substeps, solref=solref, iterations=iterations, worlds=1, visuals=visuals
+        )
+        return many.one(0)
     if solref is None:
         gui = render_mode == "human"
-        return PybulletSim(control_dt=task.control_dt, substeps=task.substeps, solver_iterations=iterations, gui=gui)
+        return PybulletSim(control_dt=dt, substeps=substeps, solver_iterations=iterations, gui=gui)
     if render_mode == "human":
         raise UsageError("sim mujoco opens no window; record the episode to see it in 3-D")
-    return MujocoSim(control_dt=task.control_dt, substeps=task.substeps, solref=solref, iterations=iterations)
+    return MujocoSim(control_dt=dt, substeps=substeps, solref=solref, iterations=iterations, visuals=visuals)
 
 
 def _merge_weights(task: Task, changes: Mapping[str, float]) -> dict[str, float]:

@@ -29,10 +29,10 @@ class Joints:
     high: Sequence[float] = ()
     max_speed: Sequence[float] = ()  # [rad/s or m/s]
     max_torque: Sequence[float] = ()
-    action_step: Sequence[float] = ()  # only if the target is the joint's measured position plus `action_step * action`
+    action_step: Sequence[float] = ()  # only if the target is what `measured` has, plus `action_step * action`
     action_speed: Sequence[float] = ()  # only if the target is a speed, `action_speed * action` [rad/s or m/s]
     action_torque: Sequence[float] = ()  # only if the target is a torque or force, `action_torque * action`
-    measured: str = ""  # the observation, or quantity of a term, that has the positions of these joints in this order
+    measured: str = ""  # observation, or quantity of a term, with the positions or last targets of these joints
     clips_target: bool = False  # whether a position that an action commands is clipped to `low` and `high`
 
     def __post_init__(self) -> None:
@@ -54,7 +54,7 @@ class Joints:
             raise TaskError(f"joints: {' and '.join(given)} exclude each other: an action commands one thing")
         if self.action_step and not self.measured:
             raise TaskError(
-                "joints: action_step needs measured: the name of the observation with the joints' positions"
+                "joints: action_step needs measured: the observation with the joints' positions or last targets"
             )
         if self.clips_target and not (self.low and self.high):
             raise TaskError("joints: clips_target needs low and high")

@@ -28,11 +28,11 @@ def convert_mesh(file: Path) -> bytes | None:
     suffix = file.suffix.lower()
     try:
         if suffix == ".dae":
-            return _write_msh(*read_collada(file))
+            return write_msh(*read_collada(file))
         if suffix == ".stl" and not _is_binary_stl(file):
-            return _write_msh(*_read_stl_text(file))
+            return write_msh(*_read_stl_text(file))
         if suffix == ".stl" and file.stat().st_size > _STL_HEAD + _STL_TRIANGLE * _MOST_STL_TRIANGLES:
-            return _write_msh(*_read_stl(file))
+            return write_msh(*_read_stl(file))
     except (OSError, IndexError, KeyError, StopIteration, ElementTree.ParseError) as error:
         raise ValueError(f"{file}: {error}") from error
     return None
@@ -80,7 +80,8 @@ def count_vertices(file: Path) -> int:
     raise ValueError(f"{file}: not an STL, OBJ or DAE file")
 
 
-def _write_msh(points: Array, triangles: Triangles) -> bytes:
+def write_msh(points: Array, triangles: Triangles) -> bytes:
+    """Return a mesh in MuJoCo's MSH format; without triangles MuJoCo takes those of the convex hull."""
     counts = struct.pack("<4i", len(points), 0, 0, len(triangles))
     return counts + points.astype("<f4").tobytes() + triangles.astype("<i4").tobytes()
 

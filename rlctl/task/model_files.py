@@ -1,5 +1,6 @@
 """Finds model files: a path, or the name of a model of rlctl or of `pybullet_data`. Needs no PyBullet."""
 
+import difflib
 import importlib
 from pathlib import Path
 
@@ -8,6 +9,8 @@ from rlctl.task.pybullet.library import INSTALL_PYBULLET
 
 MODELS = Path(__file__).parent / "models"
 """rlctl's own models."""
+_SUFFIXES = (".urdf", ".xml")
+_MOST_NAMES = 4
 
 
 def find_model_file(file: str | Path) -> Path:
@@ -20,6 +23,8 @@ def find_model_file(file: str | Path) -> Path:
     for folder in folders:
         if (folder / path).is_file():  # PyBullet crashes on a folder
             return folder / path
+    if path.is_absolute() or (path.parent != Path() and path.parent.is_dir()):
+        raise TaskError(_explain_missing(path))
     own = ", ".join(sorted(model.name for model in MODELS.glob("*.urdf")))
     hint = f"for a file next to your module: Path(__file__).with_name({path.name!r})"
     if other_models is None:
@@ -28,6 +33,16 @@ def find_model_file(file: str | Path) -> Path:
         f"model file {str(file)!r} not found: neither under {Path.cwd()}, nor among rlctl's models ({own}), "
         f"nor in pybullet_data; {hint}"
     )
+
+
+def _explain_missing(path: Path) -> str:
+    """Return what to say of a file in a folder: the closest model files there."""
+    if not path.parent.is_dir():
+        return f"model file {str(path)!r} not found: there is no folder {path.parent}"
+    names = sorted(file.name for file in path.parent.iterdir() if file.suffix in _SUFFIXES)
+    close = difflib.get_close_matches(path.name, names, n=_MOST_NAMES, cutoff=0.0)
+    listed = ", ".join(close) or f"no file that ends in {' or '.join(_SUFFIXES)}"
+    return f"model file {str(path)!r} not found. That folder has: {listed}"
 
 
 def _find_pybullet_models() -> Path | None:

@@ -24,6 +24,7 @@ Moments = NDArray[np.float64]
 FRAME_MASS, FRAME_MOMENT = 1e-6, 1e-9  # [kg], [kg m^2], of a link without <inertial> on a body that has mass
 GUESSED_MASS, GUESSED_MOMENT = 1.0, 1.0  # [kg], [kg m^2]: PyBullet's, of any other link without <inertial>
 _SMALLEST_RADIUS = 1e-3  # [m], of gyration: for moments that are not above 0
+_SMALLEST_MOMENT = FRAME_MASS * _SMALLEST_RADIUS**2  # [kg m^2]; MuJoCo refuses less than 1e-14
 _MOST_NAMES = 4
 _ROUNDING = 1e-12
 _MARGIN = 1e-9
@@ -219,14 +220,14 @@ def _raise_moments(urdf: Urdf, root: Element) -> None:
 def find_possible_moments(moments: Moments, mass: float) -> Moments | None:
     """Return principal moments that a body of `mass` [kg] can have; None if it can have `moments`.
 
-    Moments that are not above 0 become those of a radius of gyration of 1 mm. Then, if the largest exceeds the sum of
-    the others, both of these are raised by the same amount until it does not. PyBullet sets all three to 0, MuJoCo
-    refuses the file.
+    Moments that are not above 0 become those of a radius of gyration of 1 mm; for a frame link of less than 1 mg, as
+    generators of URDF write them, those of 1 mg. Then, if the largest exceeds the sum of the others, both of these
+    are raised by the same amount until it does not. PyBullet sets all three to 0, MuJoCo refuses the file.
     """
     low, middle, high = (float(moment) for moment in moments)
-    if low > 0 and high <= (low + middle) * (1 + _ROUNDING):
+    if low >= _SMALLEST_MOMENT and high <= (low + middle) * (1 + _ROUNDING):
         return None
-    possible = np.sort(np.where(moments > 0, moments, mass * _SMALLEST_RADIUS**2))
+    possible = np.maximum(np.sort(np.where(moments > 0, moments, mass * _SMALLEST_RADIUS**2)), _SMALLEST_MOMENT)
     lack = possible[2] * (1 + _MARGIN) - possible[0] - possible[1]
     if lack > 0:
         possible[:2] += lack / 2

@@ -12,9 +12,10 @@ from rlctl.environments import installed
 from rlctl.errors import UsageError
 from rlctl.recipe.recipe import SCHEMA_FILE
 from rlctl.storage import files as storage_files
+from rlctl.tasks.starter_robot import make_planar_arm, read_robot
 
 TEMPLATE = Path(__file__).with_name("template")
-"""Templates of the files. `$name`, `$package` and `$cls` are substituted; `package/` is renamed to the package."""
+"""Templates of the files: `$name`, `$package`, `$cls` and the values of a `StarterRobot`; `package/` gets its name."""
 _SUFFIX = ".tmpl"
 _NAME = re.compile(r"[A-Za-z](?:[A-Za-z0-9_-]*[A-Za-z0-9])?")
 _TAKEN = {
@@ -32,6 +33,7 @@ class NewPlugin:
     package: str
     cls: str
     files: list[Path]  # relative to `folder`
+    summary: str
 
     @property
     def target(self) -> str:
@@ -39,29 +41,38 @@ class NewPlugin:
         return f"{self.folder / self.package / 'task.py'}:{self.cls}"
 
 
-def create(name: str) -> NewPlugin:
-    """Write the plugin `name` atomically into the current folder; raises `UsageError` for a name in use."""
+def create(name: str, *, model: str | None = None, link: str | None = None) -> NewPlugin:
+    """Write the plugin `name` atomically into the current folder.
+
+    `model` is the user's own robot, of which `link` is to reach. Raises `UsageError` for a name in use, and for a model
+    that is missing or no arm.
+    """
+    if link is not None and model is None:
+        raise UsageError("--link needs --model")
     package = name.replace("-", "_").lower()
     _check(name, package)
     folder = Path(name)
     if os.path.lexists(folder):
         raise UsageError(f"{folder} already exists; choose another name or another folder")
+    robot = make_planar_arm() if model is None else read_robot(model, link)
     templates = sorted(TEMPLATE.rglob(f"*{_SUFFIX}"))
     sources = {file.relative_to(TEMPLATE).with_suffix(""): file.read_text(encoding="utf-8") for file in templates}
     cls = _make_class_name(name, "".join(sources.values()))
+    values = {**robot.values, "name": name, "package": package, "cls": cls}
     content = {
-        Path(*(package if part == "package" else part for part in path.parts)): string.Template(text).substitute(
-            name=name, package=package, cls=cls
-        )
+        Path(*(package if part == "package" else part for part in path.parts)): string.Template(text)
+        .substitute(values)
+        .encode()
         for path, text in sources.items()
     }
+    content |= {package / path: data for path, data in robot.files.items()}
     # The recipe's schema is copied next to it, since a path to this machine's packages is wrong on other machines.
-    content[Path(package, SCHEMA_FILE.name)] = SCHEMA_FILE.read_text(encoding="utf-8")
+    content[Path(package, SCHEMA_FILE.name)] = SCHEMA_FILE.read_bytes()
     with storage_files.whole_folder(folder) as temporary:
-        for path, text in content.items():
+        for path, data in content.items():
             (temporary / path).parent.mkdir(parents=True, exist_ok=True)
-            storage_files.write_new(temporary / path, text.encode())
-    return NewPlugin(name, folder, package, cls, list(content))
+            storage_files.write_new(temporary / path, data)
+    return NewPlugin(name, folder, package, cls, sorted(content), robot.summary)
 
 
 def show(plugin: NewPlugin, json: str | None) -> None:
@@ -75,9 +86,7 @@ def show(plugin: NewPlugin, json: str | None) -> None:
     out = output.out()
     for file in plugin.files:
         out.print(f"wrote {plugin.folder / file}")
-    out.print(
-        "A planar arm moves its tip to a goal. Comments with CHANGE in task.py mark what to replace by your own task."
-    )
+    out.print(f"{plugin.summary}.")
     out.print("next:")
     for command in (
         f"rlctl replay {plugin.target} --policy zero",

@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -18,6 +19,7 @@ _CURVE = 200  # points of a curve
 _WIDE = 100  # columns of a terminal
 _LINE_EVERY_S = 5.0
 _LINE_OF_SEGMENT_EVERY_S = 10.0
+_LONG_START_S = 10.0  # a phase before the first step that takes longer gets a line
 
 
 def sparkline(values: list[float], low: float | None = None, high: float | None = None) -> str:
@@ -58,22 +60,34 @@ class Display:
         self._first: tuple[float, int] | None = None  # time and steps of the first segment
         self._began = time.monotonic()
         self._steps, self._stage, self._last_line = 0, "", 0.0
+        self._long_phase: threading.Timer | None = None
 
     def __enter__(self) -> Self:
         self.message(self.title)
         return self
 
     def __exit__(self, *details: Any) -> None:
-        return
+        self._end_phase()
 
     def phase(self, text: str) -> None:
-        """A phase such as evaluating begins; a log does not show it."""
+        """A phase such as building begins; a log shows those before the first step that take some seconds."""
+        self._end_phase()
+        if self._first is None:
+            self._long_phase = threading.Timer(_LONG_START_S, self.message, (text,))
+            self._long_phase.daemon = True
+            self._long_phase.start()
+
+    def _end_phase(self) -> None:
+        if self._long_phase is not None:
+            self._long_phase.cancel()
+            self._long_phase = None
 
     def run_folder(self, run: RunDirectory) -> None:
         """The run's folder is known; the tables of a resumed run hold its earlier rows."""
 
     def steps(self, steps: int) -> None:
         """`steps` environment steps are done; called after each segment."""
+        self._end_phase()
         if self._first is None:
             self._first = (time.monotonic(), steps)
         self._steps = steps
@@ -81,6 +95,7 @@ class Display:
     def playing(self, steps: int) -> None:
         """A segment is being played, and `steps` environment steps have begun; called several times a second."""
         now = time.monotonic()
+        self._end_phase()
         if self._first is None:
             self._first = now, steps
         began, first_steps = self._first

@@ -71,3 +71,8 @@ class Arm(Robot):
 
 class ArmFarGoals(Arm):
     farthest = 1.4
+
+
+class ArmGoalsInMillimetres(Arm):
+    def draw_goal(self):
+        return 1000 * super().draw_goal()

@@ -1,5 +1,6 @@
 """Numbers that do not mean what they should: each mistake is found in two robots, and nothing in their twins."""
 
+import contextlib
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,8 @@ from rlctl.checking.families.units import find_rates
 from rlctl.checking.rules import NotJudged
 from rlctl.checking.transitions import Transitions
 from rlctl.checking.values import read_attributes
-from rlctl.checking.workspaces import find_reach
+from rlctl.checking.workspaces import find_chains, find_reach, measure_reach
+from rlctl.environments.spec import EnvSpec
 from tests.checking.judging import case, check_case, findings, mark_slow
 
 MEANING, REACH = "broken_meaning.py", "broken_reach.py"
@@ -42,6 +44,22 @@ CASES = [
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
+
+
+@pytest.mark.slow
+def test_goals_that_are_all_out_of_reach_are_an_error():
+    others = ("RL603", "warning"), ("RL118", "info"), ("RL611", "info")
+    check_case(case(f"{REACH}:ArmGoalsInMillimetres", ("RL619", "error"), *others))
+
+
+def test_the_reach_of_a_task_in_mujoco_is_measured_by_its_joints():
+    with contextlib.closing(EnvSpec("reach", sim="mujoco").make()) as env:
+        env.reset(seed=0)
+        *_, chain = find_chains(env)  # other tests may have left PyBullet's
+        reach = measure_reach(chain, chain.names.index("arm/lbr_iiwa_link_7"), 3)
+    # The stretched arm: 0.9 m from the shoulder, which is 0.2 m above the first joint.
+    assert reach.distance == pytest.approx(1.1, abs=0.01)
+    assert reach.centre == pytest.approx([0, 0, 0.16], abs=0.01)
 
 
 def test_attributes_of_mixed_shapes_are_left_out():

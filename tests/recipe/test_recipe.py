@@ -100,6 +100,7 @@ def test_a_resolved_recipe_is_a_config(packaged, config):
     ("values", "message"),
     [
         ({"alog": "ppo"}, "no key 'alog'. Did you mean 'algo'? Keys here: task, reward_weights, "),
+        ({"tolerance": 0.02}, "no key 'tolerance'. Did you mean 'task.tolerance'? Keys here: task, "),
         ({"gamma": 0.9}, "no key 'gamma'. Did you mean 'algo_kwargs.gamma'? Keys here: task, "),
         (
             {"eval": {"episode": 3}},

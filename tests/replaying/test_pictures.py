@@ -9,6 +9,7 @@ from PIL import Image
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
+from rlctl.replaying.bullet_camera import find_distance
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.report import ReplayResult, show
 from rlctl.replaying.request import ReplayRequest
@@ -102,3 +103,11 @@ def test_closing_the_window_ends_it_well():
 def test_a_window_that_was_closed_at_once_is_no_error(tmp_path):
     show(ReplayResult("reach", "best.safetensors", []), str(tmp_path / "result.json"))
     assert '"episodes": []' in (tmp_path / "result.json").read_text()
+
+
+def test_a_small_robot_fills_the_picture_as_a_large_one_does():
+    low, high = np.array([-0.1, -0.1, 0.0]), np.array([0.2, 0.1, 0.3])
+    small, large = (find_distance(scale * low, scale * high, (400, 300)) for scale in (1.0, 3.0))
+    assert large == pytest.approx(3 * small)
+    assert 0.4 < small < 0.8  # 0.45 m from corner to corner, seen at 45 degrees
+    assert find_distance(low, high, (150, 300)) > small  # a narrow picture

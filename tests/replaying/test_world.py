@@ -215,6 +215,9 @@ def test_a_task_in_mujoco():
     assert (ground.name, ground.base) == ("ground", "fixed")
     assert (robot.name, robot.base, len(robot.joints)) == ("robot", "free", 12)
     assert robot.mass == pytest.approx(12.46, abs=0.01)
+    hip = robot.joints[0]
+    # As code names it, with the limits of the URDF.
+    assert (hip.name, hip.max_force, hip.max_speed) == ("FR_hip_joint", 20.0, hip.max_speed)
 
 
 def test_nothing_to_read():

@@ -49,6 +49,12 @@ def test_steps_and_torques_have_no_scale():
     assert "default_joint_pos" not in write_metadata("hopper")
 
 
+def test_limits_of_the_motors_replace_those_of_the_model_file():
+    body = describe_task("reach")[1].task.arm
+    joints = body.describe_joints(body.joint_names, max_torque=[3.35] * 7)
+    assert (joints.max_torque, joints.max_speed) == ((3.35,) * 7, (10.0,) * 7)
+
+
 def test_a_task_without_joints_says_nothing():
     assert describe_task("kuka-grasp")[0].joints is None
     assert "joint_names" not in write_metadata("kuka-grasp")

@@ -57,6 +57,16 @@ def test_without_pybullet_data_the_error_says_how_to_install_it(monkeypatch):
     assert str(caught.value).endswith("; for a file next to your module: Path(__file__).with_name('model.urdf')")
 
 
+def test_a_file_that_is_missing_in_a_folder_names_the_closest_ones(tmp_path):
+    for name in ("so100.urdf", "so101_new_calib.urdf", "notes.txt"):
+        (tmp_path / name).touch()
+    with pytest.raises(TaskError) as caught:
+        find_model_file(tmp_path / "so101.urdf")
+    assert str(caught.value).endswith("so101.urdf' not found. That folder has: so100.urdf, so101_new_calib.urdf")
+    with pytest.raises(TaskError, match=r"arm\.urdf' not found: there is no folder .*nowhere$"):
+        find_model_file(tmp_path / "nowhere" / "arm.urdf")
+
+
 @pytest.mark.pybullet
 @pytest.mark.parametrize("model", THEIRS)
 def test_numbers_are_those_of_the_model_in_pybullet_data(sim, model):

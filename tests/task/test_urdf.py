@@ -122,6 +122,22 @@ def test_replaced_moments_keep_their_axes(tmp_path):
     assert values == pytest.approx([0.225, 0.225, 0.15, 0.075, 0.0, 0.0], abs=1e-8)
 
 
+@pytest.mark.parametrize("mass", [1e-16, 1e-9, 1e-5])
+def test_frames_of_generators_load_in_both_engines(sim, tmp_path, mass):
+    # onshape-to-robot writes frames with hardly any mass and no inertia.
+    zeros = " ".join(f'{name}="0"' for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+    frame = f'<link name="tip"><inertial><mass value="{mass}"/><inertia {zeros}/></inertial></link>'
+    parts = models.link("base", 1.0), models.link("arm", 0.5), models.joint("turn", "base", "arm"), frame
+    robot = sim.load(
+        "robot", models.urdf(tmp_path, *parts, models.joint("end", "arm", "tip", kind="fixed")), fixed=True
+    )
+    # Mass times (1 mm)^2, and at least that of 1 mg.
+    assert read_dynamics(robot, "tip")[1] == pytest.approx([max(mass, 1e-6) * 1e-6] * 3)
+    assert find_model_faults(robot) == []
+    sim.step()
+    assert np.isfinite(robot.link_position("tip")).all()
+
+
 @pytest.mark.parametrize("fixed", [True, False])
 def test_frames_weigh_a_milligram_in_both_engines(sim, tmp_path, fixed):
     file = models.urdf(

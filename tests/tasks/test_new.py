@@ -1,16 +1,21 @@
 """`rlctl tasks new`: the plugin it writes works as it is, installed or not."""
 
+import contextlib
 import json
 import os
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rlctl.environments import registry
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
+from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.tasks import new
 from tests import fork_server
+from tests.task import mesh_files
 
 ROOT = Path(__file__).parents[2]
 FILES = {
@@ -134,6 +139,120 @@ def test_names_made_from_the_name(tmp_path, monkeypatch, name, package, cls):
     assert (plugin.package, plugin.cls) == (package, cls)
     for file in tmp_path.rglob("*.py"):
         compile(file.read_text(), file, "exec")
+
+
+ROBOT = """<?xml version="1.0"?>
+<robot name="two arms"><link name="base"/>{links}{joints}
+<gazebo><plugin filename="libplugin.so"/></gazebo></robot>"""
+
+
+@pytest.fixture
+def model(tmp_path, monkeypatch):
+    """An arm on a slide, with a gripper, a frame at its tip and a mesh elsewhere: its last three joints have no limits
+    of force."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "given" / "stl").mkdir(parents=True)
+    mesh_files.write_stl(tmp_path / "given" / "stl" / "part.stl")
+    part = '<geometry><mesh filename="stl/part.stl" scale="0.1 0.1 0.1"/></geometry>'
+    inertial = (
+        '<inertial><mass value="0.1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>'
+    )
+    names = ["sled", "upper_arm", "forearm", "finger"]
+    links = "".join(f'<link name="{name}">{inertial}<collision>{part}</collision></link>' for name in names)
+    chain = [("rail", "base", "sled"), ("lift", "sled", "upper_arm"), ("bend", "upper_arm", "forearm")]
+    chain += [("grip", "forearm", "finger"), ("mount", "forearm", "tool_frame")]
+    joints = ""
+    for name, parent, child in chain:
+        kind = {"rail": "prismatic", "mount": "fixed"}.get(name, "revolute")
+        effort = {"rail": 20}.get(name, 0)
+        joints += (
+            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="0.2 0 0.1"/><axis xyz="0 1 0"/><limit lower="0.1" upper="1.1" '
+            f'effort="{effort}" velocity="1"/></joint>'
+        )
+    file = tmp_path / "given" / "arm.urdf"
+    file.write_text(ROBOT.format(links=links + '<link name="tool_frame"/>', joints=joints))
+    return file
+
+
+def test_a_plugin_of_a_users_own_model(model, tmp_path):
+    plugin = new.create("two-arms", model="given/arm.urdf")
+    package = plugin.folder / "two_arms"
+    assert (package / "meshes" / "part.stl").read_bytes() == (model.parent / "stl" / "part.stl").read_bytes()
+    copy = model.read_text().replace("stl/part.stl", "meshes/part.stl")
+    assert (package / "arm.urdf").read_text() == copy
+    code = (package / "task.py").read_text()
+    assert 'TIP = "tool_frame"' in code
+    assert 'JOINTS = ["rail", "lift", "bend"]' in code
+    # The slide 0.5 m/s of 1; no limit of force except the first.
+    assert "MAX_SPEED = [0.5, 1.0, 1.0, 1.0]" in code
+    assert "MAX_FORCE = [20.0, 10.0, 10.0, 10.0]" in code
+    assert "START = np.array([0.2, 0.2, 0.2, 0.2])" in code  # 0 is below the limits: a tenth of the range inside
+    with contextlib.closing(EnvSpec("two-arms/two_arms/task.py:TwoArms", sim="mujoco").make()) as env:
+        env.reset(seed=0)
+        task = env.unwrapped.task
+        before = task.target
+        for _ in range(5):
+            env.step(np.full(3, -1.0))
+        # Whole steps of the targets, 0.5 m/s and 1 rad/s for 5/30 s, up to the limits; the gripper stays.
+        assert task.target == pytest.approx(np.maximum(before - np.array([0.5, 1, 1]) / 6, 0.1))
+        assert task.arm.joint_positions[3] == pytest.approx(0.2, abs=0.02)
+    plugin = new.create("finger", model="given/arm.urdf", link="finger")
+    assert 'JOINTS = ["rail", "lift", "bend", "grip"]' in (plugin.folder / "finger" / "task.py").read_text()
+
+
+def test_an_mjcf_model_becomes_one_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "given" / "assets").mkdir(parents=True)
+    mesh_files.write_stl(tmp_path / "given" / "assets" / "part.stl")
+    parts = '<mujoco><asset><mesh file="part.stl"/></asset></mujoco>'
+    (tmp_path / "given" / "parts.xml").write_text(parts)
+    (tmp_path / "given" / "arm.xml").write_text(
+        """<mujoco model="arm"><compiler meshdir="assets" angle="radian"/><include file="parts.xml"/><worldbody>
+        <body name="base"><geom size="0.1"/><body name="arm" pos="0 0 0.3"><joint name="lift" axis="0 1 0" range="-1 1"
+        actuatorfrcrange="-5 5"/><geom type="mesh" mesh="part"/></body></body></worldbody></mujoco>"""
+    )
+    plugin = new.create("lifter", model="given/arm.xml", link="arm")
+    (tmp_path / "given").rename(tmp_path / "gone")
+    with contextlib.closing(MujocoSim(control_dt=0.02, substeps=2)) as sim:
+        arm = sim.load("arm", plugin.folder / "lifter" / "arm.xml", fixed=True)
+        assert (arm.joint_names, arm.joint_max_force.tolist(), arm.joint_low.tolist()) == (["lift"], [5.0], [-1.0])
+        assert sim.model.nmesh == 1
+
+
+@pytest.mark.slow
+def test_the_plugin_of_a_model_reads_well_and_passes_its_tests(model, tmp_path):
+    plugin = new.create("slow-arm", model="given/arm.urdf")
+    test_it_reads_like_the_rest(plugin)
+    assert "4 passed" in run("pytest", "-q", "-p", "no:cacheprovider", "slow-arm", cwd=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"model": "arm.urdf"}, "--model: model file 'arm.urdf' not found"),
+        ({"model": "plane.urdf"}, "--model plane.urdf: it has no joints; this makes a task for an arm"),
+        (
+            {"model": "given/arm.urdf", "link": "tool"},
+            "--link: arm.urdf has no link 'tool'. Did you mean 'tool_frame'?",
+        ),
+        ({"model": "given/arm.urdf", "link": "base"}, "--link 'base': no joint moves it; choose another of: sled"),
+        ({"link": "tip"}, "--link needs --model"),
+    ],
+)
+def test_models_that_cannot_be(model, given, message):
+    with pytest.raises(UsageError) as caught:
+        new.create("my-arm", **given)
+    assert message in str(caught.value)
+    assert not Path("my-arm").exists()
+
+
+@pytest.mark.parametrize("command", ["check-env", "replay"])
+def test_a_model_file_is_no_task(rlctl, model, command):
+    result = rlctl(command, "given/arm.urdf")
+    assert result.returncode == 2
+    hint = "`rlctl tasks new NAME --model given/arm.urdf` makes a task of it"
+    assert result.stderr == f"error: given/arm.urdf: a model file, not a task: {hint}\n"
 
 
 def test_an_existing_folder_is_left_alone(rlctl, tmp_path):

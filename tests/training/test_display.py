@@ -2,12 +2,14 @@
 
 import io
 import re
+import time
 
 import pytest
 from rich.console import Console
 
 from rlctl.run.directory import RunDirectory
-from rlctl.training.display import LiveDisplay
+from rlctl.training import display as display_module
+from rlctl.training.display import Display, LiveDisplay
 
 ROW = {"steps": 640, "fps": 1234.0, "return": 5.5, "success": 0.25, "term/distance": -3.5, "term/effort": None}
 
@@ -31,6 +33,18 @@ def test_a_phase_is_named_until_the_first_step(display):
     assert "first steps ... 0:00" in draw(display, 80)
     display.steps(64)
     assert "first steps" not in draw(display, 80)
+
+
+def test_a_log_names_a_phase_before_the_first_step_that_takes_long(monkeypatch, capsys):
+    monkeypatch.setattr(display_module, "_LONG_START_S", 0.05)
+    with Display("train reach (ppo)", 1000) as log:
+        for text in ("short", "building 64 environments"):
+            log.phase(text)
+        time.sleep(0.2)
+        log.steps(64)
+        log.phase("evaluating")
+        time.sleep(0.1)
+    assert capsys.readouterr().err.splitlines() == ["train reach (ppo)", "building 64 environments"]
 
 
 def test_an_evaluation_is_named_until_it_ends(display):

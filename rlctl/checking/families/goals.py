@@ -15,7 +15,7 @@ from rlctl.checking.families.lateness import sample_ordinary_steps
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact, Records
 from rlctl.checking.regression import action_terms, fit_terms
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, check, experiment
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
 from rlctl.checking.transitions import Transitions, collect_transitions, find_float_leaves
 from rlctl.checking.values import Attribute, pick, read_attributes
 from rlctl.checking.workspaces import Reach, find_chains, find_reach, measure_reach
@@ -24,11 +24,12 @@ SIZES = (1, 2, 3)  # of a place [numbers]
 MOST_CANDIDATES = 6
 STEPS = 3  # in which a goal does not change
 SHIFT = np.array([0.013, -0.021, 0.034])  # of a goal, to see what of the observation follows it
-ROUNDING = 1e-5  # of observations to float32
+ROUNDING, PART = 1e-5, 5e-7  # of observations to float32, and of large ones
 COMPARED = 4  # resets after which the places of links are compared with the observation
 NEAR = 2e-3  # how near they are [m]
 MARGIN = 0.02  # part of the reach that the robot may get further
 UNKNOWN_TOLERANCE = 0.1  # part of the reach
+VERY_FAR = 2.0  # times the reach
 FEWEST_FAR, FEWEST_SUCCESSES = 2, 3
 Numbers = NDArray[np.float64]
 Source = tuple[int, int]
@@ -83,8 +84,9 @@ def _find_copies(instance: Instance, name: str) -> list[tuple[int, int]]:
         return []
     change, shift = shifted - plain, SHIFT[: read_attributes(instance.env)[name].numbers.size]
     parts = [change[element : element + len(shift)] for element in range(len(change) - len(shift) + 1)]
+    rounding = [ROUNDING + PART * np.abs(plain[i : i + len(shift)]).max() for i in range(len(parts))]
     return [
-        (i, sign) for i, part in enumerate(parts) for sign in (1, -1) if np.abs(part - sign * shift).max() < ROUNDING
+        (i, sign) for i, part in enumerate(parts) for sign in (1, -1) if np.abs(part - sign * shift).max() < rounding[i]
     ]
 
 
@@ -152,21 +154,33 @@ def _find_goals_out_of_reach(records: Records) -> Iterator[RuleFinding]:
     steps = collect_transitions(records, with_constants=True)
     steps = steps.select(np.isin(steps.seeds, list(drawn.goals)))
     goals = np.array([drawn.goals[seed] for seed in steps.seeds.tolist()])
-    places, of, tolerance = _find_robot(steps, goals, drawn)
-    reach = drawn.reaches.get(of) or find_reach(places, steps.episodes)
+    try:
+        places, of, tolerance = _find_robot(steps, goals, drawn)
+        reach = drawn.reaches.get(of) or find_reach(places, steps.episodes)
+    except NotJudged:
+        # Rewards may not tell where the robot is; that a link is observed relative to goals far away tells enough.
+        known, tolerance = [reach for (_, sign), reach in drawn.reaches.items() if sign], None
+        if not known or _measure_distances(drawn, known[0]).min() < VERY_FAR * known[0].distance:
+            raise
+        reach = known[0]
     if tolerance is None:
         tolerance = UNKNOWN_TOLERANCE * reach.distance
-    distances = np.linalg.norm(np.array(list(drawn.goals.values())) - np.array(reach.centre), axis=1)
+    distances = _measure_distances(drawn, reach)
     far = distances > (1 + MARGIN) * reach.distance + tolerance
     if far.sum() >= FEWEST_FAR:
         seed, farthest = list(drawn.goals)[int(distances.argmax())], float(distances.max())
-        where = f"up to {farthest:.4g} from {np.round(reach.centre, 3).tolist()}"
+        centre = (np.round(reach.centre, 3) + 0.0).tolist()  # no -0.0
+        where = f"up to {farthest:.4g}{reach.unit} from {centre}"
         goals_far = f"{int(far.sum())} of {len(far)} goals ({drawn.name}) are out of reach"
         message = f"{goals_far}: they are {where}; {reach.how}"
         expected = f"up to {reach.distance + tolerance:.4g}"
-        yield RuleFinding(
-            "RL619", message, {"element": drawn.name, "seed": seed, "value": farthest, "expected": expected}
-        )
+        evidence = {"element": drawn.name, "seed": seed, "value": farthest, "expected": expected}
+        yield RuleFinding("RL619", message, evidence, Severity.ERROR if far.all() else None)
+
+
+def _measure_distances(drawn: DrawnGoal, reach: Reach) -> Numbers:
+    """Return how far the goals are from the centre of a reach. Shape (goals,)."""
+    return np.linalg.norm(np.array(list(drawn.goals.values())) - np.array(reach.centre), axis=1)
 
 
 def _find_robot(steps: Transitions, goals: Numbers, drawn: DrawnGoal) -> tuple[Numbers, Source, float | None]:

@@ -296,3 +296,4 @@ class MujocoBody(MujocoMotors):
         numbers, bodies = self._find_links(links), self._sim.model.geom_bodyid
         geoms = np.flatnonzero(np.isin(bodies, numbers))
         self._fields.model("geom_rgba")[..., geoms, :3] = rgb
+        self._fields.model("color")[..., numbers, :] = rgb

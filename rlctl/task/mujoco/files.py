@@ -13,6 +13,7 @@ import numpy as np
 
 from rlctl.errors import TaskError
 from rlctl.task.meshes import convert_mesh, count_vertices
+from rlctl.task.mujoco.hulls import delete_unused_meshes, use_hulls
 from rlctl.task.mujoco.world import import_mujoco
 from rlctl.task.urdf import Urdf, read_urdf
 
@@ -40,12 +41,17 @@ def read_model_file(
     """Read a URDF or MJCF file; raises `TaskError` with MuJoCo's message for one that it refuses.
 
     With `visuals` the geoms include the visual shapes of a URDF, in group 1; its collision shapes are in group 0.
+    Without it those of an MJCF file are left out, too, as far as nothing refers to them.
     """
     if path.suffix not in (".urdf", ".xml"):
         raise TaskError(f"{path}: MuJoCo reads URDF and MJCF (.xml) files")
     if path.suffix == ".xml":
         spec = _call_reader(path, lambda: import_mujoco().MjSpec.from_file(str(path)))
-        return _describe_mjcf(path, _prepare_mjcf(spec))
+        described = _describe_mjcf(path, _prepare_mjcf(spec))
+        if not visuals:
+            _delete_visuals(spec)
+        _call_reader(path, lambda: use_hulls(spec, _list_mesh_files(path, spec)))
+        return described
     urdf = read_urdf(path, fixed=fixed, inertia_from_file=inertia == "file")
     if urdf.root is None:
         raise TaskError(f"MuJoCo cannot load {path}: {urdf.problem}")
@@ -84,10 +90,24 @@ def _prepare_mjcf(spec: Any) -> Any:
     return spec
 
 
+def _delete_visuals(spec: Any) -> None:
+    """Delete shapes that are only seen; those with names, which others may refer to, and with mass are kept."""
+    seen = [geom for geom in spec.geoms if not is_colliding(geom) and not geom.name and geom.parent.explicitinertial]
+    meshes = {geom.meshname for geom in seen}
+    for geom in seen:
+        spec.delete(geom)
+    delete_unused_meshes(spec, meshes)
+
+
+def _list_mesh_files(path: Path, spec: Any) -> dict[str, Path]:
+    return {mesh.name: path.parent / spec.meshdir / mesh.file for mesh in spec.meshes if mesh.file}
+
+
 def _parse_urdf(urdf: Urdf, *, visuals: bool) -> Any:
     """Return the `MjSpec` of a URDF; a mesh that MuJoCo does not read is converted, or left out if it is visual."""
     mujoco, root = import_mujoco(), ElementTree.fromstring(urdf.text)
     assets: dict[str, bytes] = {}
+    converted_from: dict[str, Path] = {}  # by name in `assets`
     for link in root.findall("link"):
         for shape in link.findall("visual"):
             if not visuals or not all(_can_be_drawn(mesh) for mesh in shape.iterfind(".//mesh[@filename]")):
@@ -97,7 +117,7 @@ def _parse_urdf(urdf: Urdf, *, visuals: bool) -> Any:
         if (converted := convert_mesh(file)) is not None:
             # MuJoCo keeps meshes in memory, by name.
             name = f"{file.with_suffix('')}-{hashlib.sha256(converted).hexdigest()[:16]}.msh"
-            assets[name] = converted
+            assets[name], converted_from[name] = converted, file
             mesh.set("filename", name)
     extension = root.find("mujoco")
     extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
@@ -110,11 +130,12 @@ def _parse_urdf(urdf: Urdf, *, visuals: bool) -> Any:
     except ValueError:
         mujoco.MjSpec.from_file(str(urdf.path))  # it has the file's numbers of lines in its message
         raise
-    kinds, colliding = mujoco.mjtMeshInertia, {geom.meshname for geom in spec.geoms if is_colliding(geom)}
     for mesh in spec.meshes:
-        # What is only drawn may be flat.
-        is_solid = mesh.name in colliding
-        mesh.inertia = kinds.mjMESH_INERTIA_CONVEX if is_solid else kinds.mjMESH_INERTIA_SHELL
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    use_hulls(spec, {mesh.name: converted_from.get(mesh.file, Path(mesh.file)) for mesh in spec.meshes})
+    colliding = {geom.meshname for geom in spec.geoms if is_colliding(geom)}
+    for mesh in [mesh for mesh in spec.meshes if mesh.name not in colliding]:
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # what is only drawn may be flat
     return spec
 
 

@@ -24,7 +24,7 @@ _HIDDEN = 3  # group of geoms that neither pictures nor recordings show
 _GROUND_THICKNESS = 0.5  # [m], of rough ground
 
 
-class SceneSpec:
+class MujocoScene:
     """The `MjSpec` of a world, and the parts of its bodies by name.
 
     A single world is solved more exactly than one of many (`single=False`), and has shapes that are only looked at
@@ -87,7 +87,7 @@ class SceneSpec:
         for option in dir(self.spec.option):  # the file's are not used, and MuJoCo warns of them
             if not option.startswith("_"):
                 setattr(child.option, option, getattr(self.spec.option, option))
-        self.spec.attach(child, prefix=f"{name}/", frame=frame)
+        self._attach(child, name, frame)
         if not fixed and is_urdf:
             self.spec.body(f"{name}/{parts.base_name}").add_freejoint(name=f"{name}/free")
         self._add_motors(parts)
@@ -145,14 +145,25 @@ class SceneSpec:
         Raises `TaskError` naming the newest file if MuJoCo refuses.
         """
         try:
-            new_model, new_data = self.spec.recompile(model, data)  # keeps the state
+            # Of a copy: a spec keeps all meshes that it has compiled.
+            new_model = self.spec.copy().compile()
         except ValueError as error:
             newest = list(self.parts.values())[-1]  # those before it have been compiled
             raise TaskError(f"MuJoCo cannot load {newest.file.path}: {' '.join(str(error).split())}") from None
+        new_data = self.mujoco.MjData(new_model)
         _keep_changes(model, new_model)
+        _keep_state(model, data, new_model, new_data)
         for parts in self.parts.values():
             parts.bind(new_model)
         return new_model, new_data
+
+    def _attach(self, child: Any, name: str, frame: Any) -> None:
+        # Where a model has files in memory, `attach` puts the prefix before the names of all other files.
+        in_memory = {**self.spec.assets, **child.assets}
+        for spec in (self.spec, child):
+            spec.assets.clear()
+        self.spec.attach(child, prefix=f"{name}/", frame=frame)
+        self.spec.assets.update(in_memory)
 
     def _flatten_ground(self, child: Any) -> None:
         """Make a wide box that is fixed, such as the ground of `plane.urdf`, a plane: faster, and exact."""
@@ -220,3 +231,14 @@ def _keep_changes(before: Any, after: Any) -> None:
         number = after.actuator(before.actuator(actuator).name).id
         for name in ("actuator_biasprm", "actuator_forcerange"):
             getattr(after, name)[number] = getattr(before, name)[actuator]
+
+
+def _keep_state(model: Any, data: Any, new_model: Any, new_data: Any) -> None:
+    for number in range(model.njnt):
+        name = model.joint(number).name
+        before, after = data.joint(name), new_data.joint(name)
+        after.qpos[:], after.qvel[:] = before.qpos, before.qvel
+    for number in range(model.nu):
+        name = model.actuator(number).name
+        new_data.actuator(name).ctrl[:] = data.actuator(name).ctrl
+    new_data.time = data.time

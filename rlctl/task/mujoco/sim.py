@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from rlctl.errors import UsageError
 from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.mujoco.body import MujocoBody
+from rlctl.task.mujoco.drawn_world import DrawnWorld
 from rlctl.task.mujoco.parts import WORLD, Parts
 from rlctl.task.mujoco.pictures import Marker, draw
-from rlctl.task.mujoco.scene import SceneSpec
+from rlctl.task.mujoco.scene import MujocoScene
 from rlctl.task.mujoco.world import Array, Fields, MujocoWorld, Rows
 from rlctl.task.sim import Sim
 
@@ -53,11 +54,19 @@ class MujocoSim(Sim):
     bodies: dict[str, MujocoBody]
 
     def __init__(
-        self, *, control_dt: float, substeps: int, solref: float = 0.02, iterations: int = 50, worlds: int | None = None
+        self,
+        *,
+        control_dt: float,
+        substeps: int,
+        solref: float = 0.02,
+        iterations: int = 50,
+        worlds: int | None = None,
+        visuals: bool = True,
     ) -> None:
         self.world = MujocoWorld(substeps, worlds)
         self.mujoco = self.world.mujoco
         self._control_dt, self._solref, self._iterations = control_dt, solref, iterations
+        self._visuals = visuals and worlds in (None, 1)  # nobody sees one world of many
         self.fields = Fields(self.world)
         self._views: dict[int, OneWorldSim] = {}
         self.clear()
@@ -66,18 +75,23 @@ class MujocoSim(Sim):
         self.bodies = {}
         self._pushes: list[_MujocoPush] = []
         self._markers: list[Marker] = []
-        self._scene = SceneSpec(
+        self._added: list[Callable[[MujocoScene], Parts]] = []  # what has added each body
+        self._drawn: list[DrawnWorld] = []  # one, after the first picture of a world without visual shapes
+        self._scene = self._make_scene(visuals=self._visuals)
+        model = self._scene.spec.compile()
+        self.world.extra.clear()
+        self.world.set_model(model, self.mujoco.MjData(model))
+        self._look_up()
+
+    def _make_scene(self, *, visuals: bool) -> MujocoScene:
+        return MujocoScene(
             self.mujoco,
             timestep=self._control_dt / self.world.substeps,
             iterations=self._iterations,
             solref=self._solref,
             single=self.world.count is None,
-            visuals=self.world.count in (None, 1),  # nobody sees one world of many
+            visuals=visuals,
         )
-        model = self._scene.spec.compile()
-        self.world.extra.clear()
-        self.world.set_model(model, self.mujoco.MjData(model))
-        self._look_up()
 
     @property
     def model(self) -> Any:
@@ -116,7 +130,7 @@ class MujocoSim(Sim):
     ) -> MujocoBody:
         self._check_new(name)
         return self._add_body(
-            self._scene.add_file(
+            lambda scene: scene.add_file(
                 name,
                 file,
                 position=position,
@@ -127,7 +141,9 @@ class MujocoSim(Sim):
             )
         )
 
-    def _add_body(self, parts: Parts) -> MujocoBody:
+    def _add_body(self, add: Callable[[MujocoScene], Parts]) -> MujocoBody:
+        parts = add(self._scene)
+        self._added.append(add)
         body = self.bodies[parts.name] = MujocoBody(self, parts)
         self._compile()
         return body
@@ -144,7 +160,7 @@ class MujocoSim(Sim):
         self, name: str, heights: Array, *, cell: float, color: Sequence[float] = (0.55, 0.6, 0.5)
     ) -> MujocoBody:
         self._check_new(name)
-        return self._add_body(self._scene.add_height_field(name, heights, cell, color))
+        return self._add_body(lambda scene: scene.add_height_field(name, heights, cell, color))
 
     def connect_gear(
         self, body: Any, driver: str, driven: str, *, ratio: float, max_force: float = 0, stiffness: float = 0
@@ -186,6 +202,7 @@ class MujocoSim(Sim):
                     friction[number] = parts.built_friction.get(link, value)
                     spin[number] = parts.file.spin[link]
         self.world.extra |= {"friction": friction, "spin": spin, "strength": np.ones(model.nu)}
+        self.world.extra["color"] = np.full((model.nbody, 3), np.nan)  # of links, where it was changed
         numbers = [[model.body(end).id for end in pair] for pair in self._scene.pairs]
         self._pair_links = np.array(numbers, int).reshape(-1, 2)
 
@@ -266,8 +283,21 @@ class MujocoSim(Sim):
         if self.world.batch is not None:
             self._refuse("pictures of many worlds")
         self.world.refresh()
+        model, data = self._see()
         size = width, height
-        return draw(self.model, self.data, size, self._markers, eye=eye, target=target, field_of_view=field_of_view)
+        return draw(model, data, size, self._markers, eye=eye, target=target, field_of_view=field_of_view)
+
+    def _see(self) -> tuple[Any, Any]:
+        """Return the model and the data that pictures show."""
+        if self._visuals:
+            return self.model, self.data
+        if not self._drawn:
+            scene = self._make_scene(visuals=True)
+            for add in self._added:
+                add(scene)
+            self._drawn.append(DrawnWorld(scene))
+        self._drawn[0].follow(self.model, self.data, self.fields.model("color"))
+        return self._drawn[0].model, self._drawn[0].data
 
     def close(self) -> None:
         with contextlib.suppress(AttributeError):

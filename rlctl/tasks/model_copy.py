@@ -1,0 +1,68 @@
+"""Copies a robot model with its meshes into one folder."""
+
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from rlctl.errors import UsageError
+
+_MESHES = Path("meshes")
+_FILENAME = re.compile(r"""(\bfilename\s*=\s*)(["'])(.*?)\2""")
+
+
+def copy_model(model: Path) -> dict[Path, bytes]:
+    """Return the files of a model by their path in the copy: URDF or MJCF, and its meshes in `meshes/`.
+
+    A URDF keeps its text except for the paths of meshes; an MJCF file and what it includes become one file.
+    """
+    files: dict[Path, bytes] = {}
+    text = _copy_urdf(model, files) if model.suffix == ".urdf" else _copy_mjcf(model, files)
+    files[Path(model.name)] = text
+    return files
+
+
+def _copy_urdf(model: Path, files: dict[Path, bytes]) -> bytes:
+    from rlctl.task.mesh_paths import resolve_mesh
+
+    copies: dict[Path, str] = {}
+
+    def rename(match: re.Match[str]) -> str:
+        before, quote, name = match.groups()
+        source = resolve_mesh(name, model)
+        if source is None:  # such as the library of a Gazebo plugin
+            return match[0]
+        if source not in copies:
+            copies[source] = _add(files, source)
+        return f"{before}{quote}{copies[source]}{quote}"
+
+    # Byte for byte in Latin-1, whatever the encoding is.
+    return _FILENAME.sub(rename, model.read_bytes().decode("latin-1")).encode("latin-1")
+
+
+def _copy_mjcf(model: Path, files: dict[Path, bytes]) -> bytes:
+    import mujoco
+
+    spec = mujoco.MjSpec.from_file(str(model))
+    folders = {"mesh": spec.meshdir, "hfield": spec.meshdir, "skin": spec.meshdir, "texture": spec.texturedir}
+    root = ElementTree.fromstring(spec.to_xml())
+    for asset in root.iterfind("asset/*[@file]"):
+        name = asset.get("file", "")
+        asset.set("name", asset.get("name", Path(name).stem))
+        asset.set("file", Path(_add(files, model.parent / folders.get(asset.tag, "") / name)).name)
+    for compiler in root.iterfind("compiler"):
+        compiler.attrib.pop("assetdir", None)
+        compiler.attrib |= {"meshdir": _MESHES.as_posix(), "texturedir": _MESHES.as_posix()}
+    return ElementTree.tostring(root)
+
+
+def _add(files: dict[Path, bytes], source: Path) -> str:
+    """Add a file under a name of its own and return its path in the copy."""
+    path, number = _MESHES / source.name, 1
+    while path in files:
+        number += 1
+        path = _MESHES / f"{source.stem}-{number}{source.suffix}"
+    try:
+        files[path] = source.read_bytes()
+    except OSError as error:
+        raise UsageError(f"--model: {source}: {error.strerror or error}") from None
+    return path.as_posix()
