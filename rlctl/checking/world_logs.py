@@ -29,7 +29,6 @@ from rlctl.checking.worlds import (
     StateReader,
     World,
     WorldBody,
-    WrittenCommand,
 )
 from rlctl.environments.bullet_calls import BulletCalls
 from rlctl.environments.info import find_mujoco
@@ -58,7 +57,7 @@ class WorldLog:
     before: list[tuple[list[Array], Poses] | None] = dataclasses.field(default_factory=list)
     """What the reader has of the moment before the last call that advanced the physics."""
     targets: list[dict[JointKey, MotorTarget]] = dataclasses.field(default_factory=list)
-    commands: list[WrittenCommand | None] = dataclasses.field(default_factory=list)
+    commands: list[Array | None] = dataclasses.field(default_factory=list)
     weights: dict[JointKey, float] = dataclasses.field(default_factory=dict)  # at reset
     failure: str = ""  # What the engine itself reported
 

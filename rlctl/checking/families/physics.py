@@ -58,8 +58,9 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
                 yield describe_failure(error, context.progress)
         bounds = [leaf.flat_bounds for leaf in instance.action_leaves if leaf.supported]
         low, high = (np.concatenate([pair[end] for pair in bounds] or [np.zeros(0)]) for end in (0, 1))
-        yield from find_misuses(logger.worlds, calls, low, high)
-        yield from find_wrong_reads(instance, mujoco_calls, logger.worlds)
+        misuses = list(find_misuses(logger.worlds, calls, low, high))
+        yield from misuses
+        yield from find_wrong_reads(instance, mujoco_calls, logger.worlds, {finding.rule for finding in misuses})
         if logger.worlds and not context.budget.is_over():
             with contextlib.suppress(EnvironmentRaised):  # its resets were logged by now
                 logger.simulate_alone(len(EPISODES))
