@@ -236,6 +236,10 @@ class BulletStateReader:
         """See `StateReader`."""
         return read_physics(self.world.client)
 
+    def read_time(self) -> float:
+        """See `StateReader`."""
+        return math.nan
+
     def read_failure(self) -> str:
         """See `StateReader`; PyBullet reports nothing."""
         return ""

@@ -243,6 +243,10 @@ class MujocoStateReader:
         """See `StateReader`."""
         return self.model.opt.gravity.tolist(), float(self.model.opt.timestep)
 
+    def read_time(self) -> float:
+        """See `StateReader`."""
+        return float(self.data.time)
+
     def read_failure(self) -> str:
         """See `StateReader`: MuJoCo found the simulation unstable and set it back to the model's first position."""
         mujoco, warnings = library(), self.data.warning

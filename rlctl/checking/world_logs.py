@@ -48,6 +48,7 @@ class WorldLog:
     world: World
     actions: str  # The kind of the episode's actions
     places: list[Place] = dataclasses.field(default_factory=list)
+    times: list[float] = dataclasses.field(default_factory=list)  # simulated [s]; NaN in PyBullet
     states: list[list[Array]] = dataclasses.field(default_factory=list)  # by look and body
     deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)  # depth and limit [m]
     touching: list[set[Pair]] = dataclasses.field(default_factory=list)  # Links that touch
@@ -74,6 +75,7 @@ class WorldLog:
         except reader.errors:
             return False
         self.places.append(place)
+        self.times.append(reader.read_time())
         self.states.append(states)
         self.touching.append(set(contacts))
         self.poses.append(poses)

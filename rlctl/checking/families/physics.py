@@ -35,7 +35,7 @@ FASTEST_JUMP = 1.0  # above falling, 0.1 s after a reset: ten times gravity [m/s
 LONGEST_TIME_STEP = 0.02  # PyBullet's own is 1/240 [s]
 
 
-@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, *range(9, 19))), share=4.0)
+@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, *range(9, 21))), share=4.0)
 def watch_worlds(context: Context) -> Iterator[ChildMessage]:
     """Log the worlds of an instance through a few episodes, then let them fall alone, which may change them."""
     if not ENGINES & sys.modules.keys():
