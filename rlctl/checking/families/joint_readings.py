@@ -138,7 +138,7 @@ def _find_wrong_time(time_step: float, logs: Sequence[WorldLog]) -> Iterator[Rul
     if wrong:
         column, name = next(iter(wrong.items()))
         others = [f"observation[{other}]" for other in list(wrong)[1:]]
-        more = f" (and so on: {list_names(others, 4)})" if others else ""
+        more = f" (likewise {list_names(others, 4)})" if others else ""
         what = f"observation[{column}] is the change of {name} in a step, divided by {time_step:.4g} s{more}"
         taken = f"the step takes {time_step * substeps:.4g} s, {substeps} steps of the physics"
         evidence = {"element": f"observation[{column}]", "value": time_step, "expected": time_step * substeps}
@@ -164,15 +164,16 @@ def _read_changes(logs: Sequence[WorldLog], time_step: float) -> tuple[Array, Ar
 
 
 def _find_equal(values: Array, features: Array) -> int | None:
-    """Return the feature that values equal in nearly all steps, also in those in which they are not small."""
+    """Return the feature that values equal, up to its sign, in nearly all steps, also where they are not small."""
     allowed = CLOSE * values.std()
     moving = np.flatnonzero(np.abs(values) > MOVING * values.std())
     if len(moving) < FEWEST_STEPS // 2:
         return None
-    first = moving[: len(moving) : max(1, len(moving) // FIRST_STEPS)]
-    few = (np.abs(values[first, None] - features[first]) <= allowed).mean(axis=0)
-    for feature in np.flatnonzero(few >= 1 - 1.5 / len(first)).tolist():
-        near = np.abs(values - features[:, feature]) <= allowed
-        if min(near.mean(), near[moving].mean()) >= NEARLY_ALL:
-            return int(feature)
+    few = moving[:: max(1, len(moving) // FIRST_STEPS)]
+    for sign in (1.0, -1.0):
+        part = (np.abs(values[few, None] - sign * features[few]) <= allowed).mean(axis=0)
+        for feature in np.flatnonzero(part >= 1 - 1.5 / len(few)).tolist():
+            near = np.abs(values - sign * features[:, feature]) <= allowed
+            if min(near.mean(), near[moving].mean()) >= NEARLY_ALL:
+                return int(feature)
     return None
