@@ -37,7 +37,7 @@ def find_wrong_answers(
 
     `known` are the rules that have findings about the motors: one mistake is reported once.
     """
-    trial = _Trial(instance, calls, reader.world.motors)
+    trial = _MotorTrial(instance, calls, reader.world.motors)
     if not trial.motors or {"RL810", "RL811"} & set(known):
         return
     orders = list(_find_other_starts(trial)) or list(_find_other_feedback(trial))
@@ -60,7 +60,7 @@ class _Played:
         return self.controls[self.calls[step - 1]] if has_called else None
 
 
-class _Trial:
+class _MotorTrial:
     """Plays episodes in which joints are moved."""
 
     def __init__(self, instance: Instance, calls: MujocoCalls, motors: Sequence[Motor]) -> None:
@@ -131,7 +131,7 @@ class _Trial:
         return f"; {list_names(pairs[1:])}"
 
 
-def _find_other_starts(trial: _Trial) -> Iterator[RuleFinding]:
+def _find_other_starts(trial: _MotorTrial) -> Iterator[RuleFinding]:
     """Yield motors whose first target after a zero action is exactly where another joint starts, in all resets."""
     zero = zero_action(trial.instance.env.action_space)
     episodes = [trial.play(FIRST_SEED + number, [zero]) for number in range(SEEDS) if not trial.is_over()]
@@ -152,7 +152,7 @@ def _find_other_starts(trial: _Trial) -> Iterator[RuleFinding]:
         yield RuleFinding("RL811", message, evidence)
 
 
-def _find_other_feedback(trial: _Trial) -> Iterator[RuleFinding]:
+def _find_other_feedback(trial: _MotorTrial) -> Iterator[RuleFinding]:
     """Yield motors whose command changes when another joint is moved, as that of a position controller does."""
     plain = trial.play(FIRST_SEED, steps=MOMENTS[-1] + 1)
     positions, speeds, size = trial.find_places()
@@ -169,7 +169,9 @@ def _find_other_feedback(trial: _Trial) -> Iterator[RuleFinding]:
             return
 
 
-def _measure_answer(trial: _Trial, plain: _Played, places: NDArray[np.intp], size: int, *, is_whole: bool) -> Array:
+def _measure_answer(
+    trial: _MotorTrial, plain: _Played, places: NDArray[np.intp], size: int, *, is_whole: bool
+) -> Array:
     """Return how the first commands after some joints were moved change, per unit; 0 where they never do. Shape
     (motors,). Stops after the first answer unless `is_whole`."""
     answers = np.zeros(len(trial.motors))
@@ -192,7 +194,7 @@ def _is_feedback(motors: Sequence[Motor], answers: Array, exchanged: Mapping[int
     return all(sign * answers[pair] > 0 for sign, pair in zip(signs, exchanged.items(), strict=True))
 
 
-def _describe_feedback(trial: _Trial, exchanged: Mapping[int, int], what: str) -> RuleFinding:
+def _describe_feedback(trial: _MotorTrial, exchanged: Mapping[int, int], what: str) -> RuleFinding:
     motor, joint = next(iter(exchanged.items()))
     own, other = trial.motors[motor].joint.name, trial.joints[joint].name
     follows = f"ctrl[{motor}], of the actuator of joint {own}, follows the {what} of joint {other}"
@@ -201,7 +203,7 @@ def _describe_feedback(trial: _Trial, exchanged: Mapping[int, int], what: str) -
     return RuleFinding("RL811", message, evidence)
 
 
-def _find_kept_targets(trial: _Trial) -> Iterator[RuleFinding]:
+def _find_kept_targets(trial: _MotorTrial) -> Iterator[RuleFinding]:
     """Yield a position target that a held action brings beyond its motor's range, and that stays there for some steps
     when the action turns round."""
     space = trial.instance.env.action_space
