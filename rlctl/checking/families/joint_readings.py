@@ -90,7 +90,9 @@ def _find_degrees(copies: Sequence[JointCopy]) -> Iterator[RuleFinding]:
     large, plain = ([copy for copy in copies if copy.is_scaled(factor)] for factor in (DEGREES, 1.0))
     if large and plain:
         name, unit = f"observation[{large[0].column}]", "rad/s" if plain[0].is_speed else "rad"
-        more = f" (so are {list_names([f'observation[{copy.column}]' for copy in large[1:]], 4)})" if large[1:] else ""
+        more = (
+            f" (likewise {list_names([f'observation[{copy.column}]' for copy in large[1:]], 4)})" if large[1:] else ""
+        )
         other = f"observation[{plain[0].column}], {plain[0].name}, is in {unit}"
         message = f"{name} is {large[0].name} in degrees{more}, and {other}"
         yield RuleFinding("RL119", message, {"element": name, "value": large[0].factor, "expected": 1.0})
