@@ -40,9 +40,11 @@ def find_wrong_answers(
     trial = _MotorTrial(instance, calls, reader.world.motors)
     if not trial.motors or {"RL810", "RL811"} & set(known):
         return
-    orders = list(_find_other_starts(trial)) or list(_find_other_feedback(trial))
+    holds_position = any(motor.holds_position for motor in trial.motors)
+    orders = list(_find_other_starts(trial)) if holds_position else []
+    orders = orders or list(_find_other_feedback(trial))
     yield from orders
-    if not orders and "RL816" not in known:
+    if not orders and holds_position and "RL816" not in known:
         yield from _find_kept_targets(trial)
 
 
