@@ -71,7 +71,7 @@ def measure_order(env: gymnasium.Env[Any, Any]) -> list[int] | None:
     as it is. None also for an environment that cannot be copied or raises, and one that draws windows.
     """
     space = env.action_space
-    if not isinstance(space, spaces.Box) or env.render_mode == "human":
+    if not isinstance(space, spaces.Box) or getattr(env, "render_mode", None) == "human":
         return None
     low, high = (np.ravel(np.clip(bound, -1e3, 1e3)) for bound in (space.low, space.high))
     zero = np.clip(0.0, low, high)
