@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 
 _STEPS = 3  # an action may act some steps later
 _PER_JOINT = ("names", "low", "high", "max_torque")
+_DRAWING = (
+    *("gymnasium.envs.mujoco.mujoco_rendering", "mujoco.renderer", "mujoco.viewer", "mujoco.gl_context"),
+    *("mujoco.egl", "mujoco.glfw", "mujoco.osmesa", "glfw", "pygame"),
+)
+"""Modules of renderers and windows."""
 Array = NDArray[np.float64]
 
 
@@ -91,10 +96,16 @@ def measure_order(env: gymnasium.Env[Any, Any]) -> list[int] | None:
 
 
 def _copy(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
-    """Copy an environment by its attributes: Gymnasium's `EzPickle` would build it again, and load its model."""
+    """Copy an environment by its attributes: Gymnasium's `EzPickle` would build it again, and load its model.
+
+    What draws is shared: it holds contexts of OpenGL, which an incomplete copy would free.
+    """
     inner = env.unwrapped
     clone = object.__new__(type(inner))
-    memo: dict[int, Any] = {id(inner): clone}
+    values = list(vars(inner).values())
+    parts = [*values, *(part for value in values for part in getattr(value, "__dict__", {}).values())]
+    memo: dict[int, Any] = {id(part): part for part in parts if type(part).__module__.startswith(_DRAWING)}
+    memo[id(inner)] = clone
     vars(clone).update(copy.deepcopy(vars(inner), memo))
     return copy.deepcopy(env, memo)
 

@@ -108,6 +108,23 @@ def test_measuring_the_order_leaves_the_environment_alone():
     assert mujoco.get_mjcb_control() is None
 
 
+class Drawing:
+    """A renderer: a copy would free the context of OpenGL that it shares."""
+
+    __module__ = "mujoco.renderer"
+
+    def __deepcopy__(self, memo):
+        raise TypeError("cannot be copied")
+
+
+def test_what_draws_is_not_copied_to_measure_the_order():
+    env = Arm()
+    env.viewer = SimpleNamespace(renderer=Drawing())
+    assert describe(env).joints.names == ("yaw", "elbow")
+    env.other = (line for line in ())  # a generator cannot be copied
+    assert describe(env).joints is None
+
+
 def make_model(bodies: int):
     balls = "".join("<body><freejoint/><geom size='.1'/></body>" for _ in range(bodies))
     return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{balls}</worldbody></mujoco>")
