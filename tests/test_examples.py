@@ -58,8 +58,8 @@ def test_bare_env_is_clean(tmp_path: Path) -> None:
 
 def test_reacher_of_mujoco_trains(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
-    recipe = EXAMPLES / "mujoco/reacher.yaml"
-    rlctl("train", "Reacher-v5", "--config", str(recipe), "-n", "1600", "--set", "eval.episodes=2", cwd=tmp_path)
+    preset = "presets/reacher-v5"
+    rlctl("train", "Reacher-v5", "--config", preset, "-n", "1600", "--set", "eval.episodes=2", cwd=tmp_path)
 
 
 def test_bare_env_trains_by_path(tmp_path: Path) -> None:

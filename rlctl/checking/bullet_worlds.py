@@ -30,7 +30,6 @@ from rlctl.checking.worlds import (
     Poses,
     World,
     WorldBody,
-    WrittenCommand,
 )
 from rlctl.environments.bullet_calls import BulletCalls
 
@@ -185,7 +184,7 @@ class BulletStateReader:
     def update(self) -> None:
         """See `StateReader`; every value is read when it is asked for."""
 
-    def read_command(self) -> WrittenCommand | None:
+    def read_command(self) -> Array | None:
         """See `StateReader`; not known for PyBullet."""
         return None
 
@@ -236,6 +235,10 @@ class BulletStateReader:
     def read_physics(self) -> tuple[list[float], float]:
         """See `StateReader`."""
         return read_physics(self.world.client)
+
+    def read_time(self) -> float:
+        """See `StateReader`."""
+        return math.nan
 
     def read_failure(self) -> str:
         """See `StateReader`; PyBullet reports nothing."""

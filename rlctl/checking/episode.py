@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.instance import Instance
 from rlctl.checking.progress import read_clock
-from rlctl.checking.values import Leaf, Path, find_leaves, name_type, read_flag
+from rlctl.checking.values import Leaf, Path, find_leaves, flatten_action, name_type, read_flag
 
 HOLD_STEPS, RARE = 10, 0.1  # How long an extreme action is held; how often a rare action is not zero
 
@@ -29,6 +29,7 @@ class Moment:
     info: Any = dataclasses.field(default_factory=dict)
     form: str = ""  # of a wrong return value: `tuple of 4`, `NoneType`
     is_readable: bool = True  # False if step returned something that cannot be unpacked
+    changes_action: bool = False  # Whether step wrote into the action that it was given
 
     @property
     def flags(self) -> tuple[bool, bool]:
@@ -78,7 +79,10 @@ class EpisodePlayer:
         self.steps += 1
         call, env = self.instance.call, self.instance.env
         action = call("sample", next, self._next, step=self.steps)
-        moment = self._read(action, call("step", env.step, action, step=self.steps))
+        given = copy.deepcopy(action)
+        moment = self._read(action, call("step", env.step, given, step=self.steps))
+        if _is_changed(self.instance.action_leaves, action, given):
+            moment = dataclasses.replace(moment, changes_action=True)
         terminated, truncated = moment.flags
         if not moment.is_readable:
             self.ended = "raised"
@@ -98,6 +102,13 @@ class EpisodePlayer:
             observation, reward, done, info = returned
             return Moment(self.steps, action, observation, reward, done, False, info, form)
         return Moment(self.steps, action, None, form=form, is_readable=False)
+
+
+def _is_changed(leaves: list[Leaf], action: Any, given: Any) -> bool:
+    try:
+        return not np.array_equal(flatten_action(leaves, action), flatten_action(leaves, given), equal_nan=True)
+    except LookupError:  # step took a part of it out
+        return True
 
 
 def _form(returned: Any) -> str:

@@ -33,6 +33,8 @@ NO_DISPLAY = re.compile(
     re.IGNORECASE,
 )
 """What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
+_NO_FILE = re.compile(r"Error opening file '([^']+)'|^File (.+) does not exist$")
+"""What MuJoCo's ValueError says, and the OSError of Gymnasium's MujocoEnv."""
 _MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
 
 
@@ -78,8 +80,8 @@ def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
         if isinstance(cause, FileNotFoundError):
             path = re.search(r"[^\s'\"]*[/\\][^\s'\":]*", str(cause))
             name = str(cause.filename or (path[0] if path else cause))
-        elif match := re.search(r"Error opening file '([^']+)'", str(cause)):  # MuJoCo's ValueError
-            name = match[1]
+        elif match := _NO_FILE.search(str(cause)):
+            name = match[1] or match[2]
         elif type(cause).__module__ == "pybullet" and "load" in str(cause).lower():
             name, data = _find_model(cause.__traceback__), sys.modules.get("pybullet_data")
             folders += [data.getDataPath()] if data else []

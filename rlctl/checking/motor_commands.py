@@ -1,17 +1,13 @@
-"""What an environment writes for the motors of a world, as a function of its actions and of the joints' state."""
+"""What an environment writes for the motors of a world, as a function of its actions."""
 
 import dataclasses
-import math
-from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlctl.checking.world_logs import LoggedWorld
-from rlctl.checking.worlds import Array, Motor, WrittenCommand
+from rlctl.checking.worlds import Array, Motor
 
 FEWEST_ROWS = 40
-MORE_ROWS = 15  # than a fit has parameters, so that it proves something
 SAME = 1e-5  # relative; a command is a function of something if it differs by no more
 
 
@@ -33,8 +29,6 @@ class MotorCommands:
     motors: tuple[Motor, ...]
     values: Array  # Shape (n, motors)
     actions: Array  # Shape (n, k)
-    states: tuple[tuple[Array, Array], ...]  # positions and speeds that the environment may have read, (n, motors) each
-    starts: Array  # A column per episode, 1 in its rows. Shape (n, episodes)
     low: Array  # Of the action. Shape (k,)
     high: Array
 
@@ -42,30 +36,15 @@ class MotorCommands:
     def read(cls, world: LoggedWorld, low: Array, high: Array) -> "MotorCommands | None":
         """Return what the logs have; None if they have too little."""
         rows = [
-            (number, log.given[i], command)
-            for number, log in enumerate(world.logs)
+            (log.given[i], command)
+            for log in world.logs
             for i, command in enumerate(log.commands)
             if command is not None and log.actions in ("random", "zero") and log.given[i].size == low.size
         ]
         if len(rows) < FEWEST_ROWS or not low.size:
             return None
-        episodes, actions, commands = zip(*rows, strict=True)
-        starts = (np.array(episodes)[:, None] == np.unique(episodes)).astype(float)
-
-        def stack(read: Callable[[WrittenCommand], Array]) -> Array:
-            return np.nan_to_num(np.stack([read(command) for command in commands]))
-
-        last = stack(lambda c: c.positions), stack(lambda c: c.speeds)
-        first = stack(lambda c: c.first_positions), stack(lambda c: c.first_speeds)
-        return cls(world.world.motors, stack(lambda c: c.values), np.stack(actions), (last, first), starts, low, high)
-
-    def _free_rows(self, motor: int) -> NDArray[np.bool_]:
-        """Return the rows in which a command is not at an end where it is clipped."""
-        values = self.values[:, motor]
-        free = np.ones(len(values), np.bool_)
-        for end in (values.min(), values.max()):
-            free &= (values != end) | ((values == end).sum() < 3)
-        return free
+        actions, commands = zip(*rows, strict=True)
+        return cls(world.world.motors, np.nan_to_num(np.stack(commands)), np.stack(actions), low, high)
 
     def find_spans(self) -> list[CommandSpan]:
         """Return the spans of motors whose command is a linear function of one element of the action, and of nothing
@@ -83,19 +62,3 @@ class MotorCommands:
                 ends = (fitted[-1, number] + fitted[element, number] * bounds).tolist()
                 spans.append(CommandSpan(motor, number, element, min(ends), max(ends)))
         return spans
-
-    def find_rest(self, motor: int, position: int | None, *speeds_of: int) -> float:
-        """Return the part of a command that the action, the position of one motor's joint, and the speeds of some, do
-        not explain."""
-        free = self._free_rows(motor)
-        values, rests = self.values[free, motor], []
-        is_few = len(values) < MORE_ROWS + self.actions.shape[1] + self.starts.shape[1] + 3
-        design = np.column_stack([self.actions, np.ones(len(free)) if is_few else self.starts])[free]
-        for positions, speeds in self.states:
-            own = [] if position is None else [positions[free, position]]
-            columns = np.column_stack([design, *own, speeds[free][:, list(speeds_of)]])
-            if len(values) < MORE_ROWS + columns.shape[1] or values.std() == 0:
-                return math.nan
-            fitted = np.linalg.lstsq(columns, values, rcond=None)[0]
-            rests.append(float(np.abs(values - columns @ fitted).max() / values.std()))
-        return min(rests)

@@ -28,7 +28,6 @@ from rlctl.checking.worlds import (
     Poses,
     World,
     WorldBody,
-    WrittenCommand,
 )
 from rlctl.environments.info import find_mujoco
 
@@ -122,13 +121,11 @@ class MujocoStateReader:
         self.world = read_world(model)
         self._now, self._other = library().MjData(model), library().MjData(model)
         self._before: tuple[Array, Array] | None = None  # qpos and qvel before the last call that advanced the physics
-        self._first: tuple[Array, Array] | None = None  # The same before the first call of a control step
         self.touched: list[set[int]] = []  # The geoms that touch another one, at each update
         self._calls = 0
         """Calls since the last update that advanced the physics by one substep each; -1 if one took several."""
         self._links = {body.id: _links(model, body.id) for body in self.world.bodies if body.id}
         self._link_of = {body: (root, i - 1) for root, links in self._links.items() for i, body in enumerate(links)}
-        self._joints = np.array([motor.joint.index for motor in self.world.motors], np.intp)
 
     def update(self) -> None:
         """See `StateReader`."""
@@ -140,12 +137,11 @@ class MujocoStateReader:
     def remember(self, nstep: int) -> None:
         """Keep positions and velocities as those before the next step of the physics."""
         self._before = self.data.qpos.copy(), self.data.qvel.copy()
-        self._first = self._first or self._before
         self._calls = -1 if nstep > 1 or self._calls < 0 else self._calls + 1
 
     def forget(self) -> None:
         """Begin another control step."""
-        self._before, self._first, self._calls = None, None, 0
+        self._before, self._calls = None, 0
 
     def _read_state(self, body: WorldBody, qpos: Array, qvel: Array, xpos: Array) -> Array:
         joints = [joint.index for joint in body.joints]
@@ -224,14 +220,9 @@ class MujocoStateReader:
                 targets[motor.body, motor.joint.index] = MotorTarget(value, force, f"actuator {motor.name}")
         return targets
 
-    def read_command(self) -> WrittenCommand | None:
+    def read_command(self) -> Array | None:
         """See `StateReader`."""
-        if self._before is None or self._first is None or not len(self._joints):
-            return None
-        positions, speeds = self.model.jnt_qposadr[self._joints], self.model.jnt_dofadr[self._joints]
-        (qpos, qvel), (first_qpos, first_qvel) = self._before, self._first
-        first = first_qpos[positions], first_qvel[speeds]
-        return WrittenCommand(self.data.ctrl.copy(), qpos[positions], qvel[speeds], *first)
+        return self.data.ctrl.copy() if self._before is not None and self.world.motors else None
 
     def read_weights(self) -> dict[JointKey, float]:
         """See `StateReader`; empty for robots that stand on something, or are bound by an equality."""
@@ -251,6 +242,10 @@ class MujocoStateReader:
     def read_physics(self) -> tuple[list[float], float]:
         """See `StateReader`."""
         return self.model.opt.gravity.tolist(), float(self.model.opt.timestep)
+
+    def read_time(self) -> float:
+        """See `StateReader`."""
+        return float(self.data.time)
 
     def read_failure(self) -> str:
         """See `StateReader`: MuJoCo found the simulation unstable and set it back to the model's first position."""

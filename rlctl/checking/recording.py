@@ -58,6 +58,8 @@ class Recording:
         self._step = moment.step
         if moment.form:
             self._count_form("step" if moment.step else "reset", moment.form)
+        if moment.changes_action:
+            self._count_form("action", "changed")
         if not moment.is_readable:
             return
         if moment.step:

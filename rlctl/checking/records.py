@@ -33,6 +33,7 @@ class Built:
     nondeterministic: bool = False  # its registration says that it is not repeatable
     truncation: str = "unknown"  # `truncated` in the code of step: `never`, `computed`, `unknown`
     counter: str = ""  # comparison in step that sets terminated by a counter
+    counter_place: tuple[str, int] | None = None  # file and line of that comparison
     places: Mapping[str, tuple[str, int]] = dataclasses.field(default_factory=dict)  # of a method or a space
     accepts_seed: bool = True
     accepts_options: bool = True
@@ -76,7 +77,7 @@ class Series:
 class Form:
     """A type that something had: where it came first, and how often."""
 
-    what: str  # `observation`, `memory`, `keys`, `info`, a flag, `reward`, `reset` or `step`
+    what: str  # `observation`, `memory`, `keys`, `info`, a flag, `reward`, `action`, `reset` or `step`
     type: str
     step: int
     count: int

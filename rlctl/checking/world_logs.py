@@ -29,7 +29,6 @@ from rlctl.checking.worlds import (
     StateReader,
     World,
     WorldBody,
-    WrittenCommand,
 )
 from rlctl.environments.bullet_calls import BulletCalls
 from rlctl.environments.info import find_mujoco
@@ -49,6 +48,7 @@ class WorldLog:
     world: World
     actions: str  # The kind of the episode's actions
     places: list[Place] = dataclasses.field(default_factory=list)
+    times: list[float] = dataclasses.field(default_factory=list)  # simulated [s]; NaN in PyBullet
     states: list[list[Array]] = dataclasses.field(default_factory=list)  # by look and body
     deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)  # depth and limit [m]
     touching: list[set[Pair]] = dataclasses.field(default_factory=list)  # Links that touch
@@ -58,7 +58,7 @@ class WorldLog:
     before: list[tuple[list[Array], Poses] | None] = dataclasses.field(default_factory=list)
     """What the reader has of the moment before the last call that advanced the physics."""
     targets: list[dict[JointKey, MotorTarget]] = dataclasses.field(default_factory=list)
-    commands: list[WrittenCommand | None] = dataclasses.field(default_factory=list)
+    commands: list[Array | None] = dataclasses.field(default_factory=list)
     weights: dict[JointKey, float] = dataclasses.field(default_factory=dict)  # at reset
     failure: str = ""  # What the engine itself reported
 
@@ -75,6 +75,7 @@ class WorldLog:
         except reader.errors:
             return False
         self.places.append(place)
+        self.times.append(reader.read_time())
         self.states.append(states)
         self.touching.append(set(contacts))
         self.poses.append(poses)

@@ -111,16 +111,6 @@ class MotorTarget(NamedTuple):
     where: tuple[str, int] | None = None  # File and line of the call, where they are known
 
 
-class WrittenCommand(NamedTuple):
-    """What an environment last wrote for all motors of `World.motors`, and what it could know then."""
-
-    values: Array  # Shape (motors,)
-    positions: Array  # Of the joint of each motor, before the last call that advanced the physics. Shape (motors,)
-    speeds: Array  # Shape (motors,)
-    first_positions: Array  # The same before the first such call of the control step
-    first_speeds: Array
-
-
 class StateReader(Protocol):
     """What the rules need from an engine: the values of one world at the last `update`."""
 
@@ -152,14 +142,17 @@ class StateReader(Protocol):
     def read_targets(self) -> dict[JointKey, MotorTarget]:
         """Return the present target of each motor that has one."""
 
-    def read_command(self) -> WrittenCommand | None:
-        """Return what was last written for the motors; None where that is not known."""
+    def read_command(self) -> Array | None:
+        """Return what was last written for all motors of `World.motors`; None where that is not known."""
 
     def read_weights(self) -> dict[JointKey, float]:
         """Return the force that holds each joint of the robots with a fixed base still [N m], [N]."""
 
     def read_physics(self) -> tuple[list[float], float]:
         """Return the gravity [m/s^2], and how long one step of the physics is [s]."""
+
+    def read_time(self) -> float:
+        """Return how long was simulated [s]; NaN where the engine does not tell."""
 
     def read_failure(self) -> str:
         """Return what the engine itself says is wrong with the simulation; empty for nothing."""

@@ -126,10 +126,11 @@ def import_run(
     json: Json = None,
 ) -> None:
     """Convert a model of Stable-Baselines3 to a policy file. Nothing in the model is unpickled."""
-    from rlctl.importing.import_model import import_model, show
+    from rlctl.importing.import_model import find_normalizations, import_model, show
 
     changes = parse_changes(settings)
-    show(import_model(model, task, normalization=vecnormalize, algo=algo, output=output, changes=changes), json)
+    policy = import_model(model, task, normalization=vecnormalize, algo=algo, output=output, changes=changes)
+    show(policy, json, find_normalizations(model) if vecnormalize is None else [])
 
 
 @app.command("rm")

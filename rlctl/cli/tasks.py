@@ -51,14 +51,15 @@ def check_env(
     ] = None,
 ) -> None:
     """Find mistakes in an environment before hours of training are lost."""
+    from rlctl import output as streams
     from rlctl.checking import formats
     from rlctl.checking.check import check
     from rlctl.checking.rules import choose_rules
     from rlctl.checking.tool_formats import read_baseline
     from rlctl.environments.spec import EnvSpec
+    from rlctl.environments.suggestions import find_only_class
 
     if explain is not None and explain.upper().startswith("Q"):
-        from rlctl import output as streams
         from rlctl.runs.diagnosis import findings
 
         streams.out().print("\n".join(findings.explain(explain)))
@@ -72,6 +73,9 @@ def check_env(
         raise UsageError("--json - prints only JSON: leave out --format and -o, or give --json a file")
     targets = formats.pair_targets(form, output)
     known = set() if baseline is None else read_baseline(Path(baseline))
+    if only := find_only_class(task):
+        streams.print_notes([f"{task} has one environment class: {only}"])
+        task = only
     spec = parse_changes(settings, sim).apply(EnvSpec(task))
     rules = choose_rules(select, ignore)
     report = check(spec, rules=rules, strict=strict, env_timeout_s=env_timeout, budget_s=budget)

@@ -14,6 +14,7 @@ import pydantic
 from gymnasium import spaces
 
 from rlctl.environments.dict_spaces import LARGEST_SPACE, format_space
+from rlctl.environments.driven_joints import describe_driven_joints, joint_name
 from rlctl.errors import ArtifactError, OldGymError, TaskError, UsageError, short_repr
 from rlctl.storage import validation
 from rlctl.task.history import Start
@@ -165,8 +166,7 @@ def describe_model(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
         return {}
     dt = getattr(env.unwrapped, "dt", None)  # not from the frame rate, which is rounded: 67 for a step of 0.015 s
     step = {"control_dt": float(dt)} if isinstance(dt, float | int) and dt > 0 else {}
-    size = int(np.prod(env.action_space.shape or ()))
-    return {**step, "joints": _describe_joints(simulation[0]) if size == simulation[0].nu else None}
+    return {**step, "joints": describe_driven_joints(env, simulation[0])}
 
 
 def describe_mujoco_model(env: gymnasium.Env[Any, Any]) -> str:
@@ -181,31 +181,6 @@ def describe_mujoco_model(env: gymnasium.Env[Any, Any]) -> str:
         joints.append(f"{joint_name(model, int(joint))}{limits}")
     more = f" and {len(joints) - _SHOWN_JOINTS} more" if len(joints) > _SHOWN_JOINTS else ""
     return f"{model.body_mass.sum():.4g} kg; joints: {', '.join(joints[:_SHOWN_JOINTS])}{more}"
-
-
-def _describe_joints(model: mujoco.MjModel) -> Joints | None:
-    """Describe the joints that the actuators move, in their order; None if one moves something else."""
-    import mujoco
-
-    joint_kind, no_bias = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtBias.mjBIAS_NONE)
-    if not model.nu or any(int(kind) != joint_kind for kind in model.actuator_trntype):
-        return None
-    moved = model.actuator_trnid[:, 0]
-    ranges, limited = model.jnt_range[moved], model.jnt_limited[moved].astype(bool).all()
-    gains = np.abs(model.actuator_gainprm[:, 0] * model.actuator_gear[:, 0])
-    strengths = gains * np.abs(model.actuator_ctrlrange).max(axis=1)
-    motors = all(int(kind) == no_bias for kind in model.actuator_biastype) and model.actuator_ctrllimited.all()
-    return Joints(
-        names=[joint_name(model, joint) for joint in moved],
-        low=ranges[:, 0].tolist() if limited else (),
-        high=ranges[:, 1].tolist() if limited else (),
-        max_torque=strengths.tolist() if motors else (),
-    )
-
-
-def joint_name(model: mujoco.MjModel, joint: int) -> str:
-    """Return a joint's name, or its number if it has no name."""
-    return model.joint(int(joint)).name or f"joint {joint}"
 
 
 def describe_randomization(events: Mapping[str, bool]) -> str:

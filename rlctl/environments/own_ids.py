@@ -24,12 +24,23 @@ def _list_modules(name: str) -> Iterator[str]:
     here = Path()
     depths = (here.glob("/".join(["*"] * depth + ["*.py"])) for depth in range(_DEEPEST))
     for file in itertools.islice(itertools.chain.from_iterable(depths), _MOST_FILES):
-        module = ".".join(file.parent.parts if file.name == "__init__.py" else file.with_suffix("").parts)
-        if module and _has(file, quoted) and installed.find_module_file(module, in_current_folder=True) is not None:
+        if _has(file, quoted) and (module := _name_module(file)):
             yield module
     for package, folder in _list_packages():
         if any(_has(file, quoted) for file in itertools.islice(folder.rglob("*.py"), _MOST_FILES)):
             yield package
+
+
+def _name_module(file: Path) -> str:
+    """Return the name by which Python finds a file below the current folder: that of an installed package, whose folder
+    may be `src`, before the path from here; empty if there is none."""
+    parts = file.parent.parts if file.name == "__init__.py" else file.with_suffix("").parts
+    for start in range(len(parts)):
+        name = ".".join(parts[start:])
+        if (found := installed.find_module_file(name)) is not None and found.resolve() == file.resolve():
+            return name
+    name = ".".join(parts)
+    return name if parts and installed.find_module_file(name, in_current_folder=True) is not None else ""
 
 
 def _has(file: Path, quoted: re.Pattern[bytes]) -> bool:

@@ -22,6 +22,7 @@ from rlctl.environments.places import describe_exception_place
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError, did_you_mean
 from rlctl.storage import files
 
+_MOST_NAMED = 4  # classes of a file
 _GYMNASIUM_ID = re.compile(r"^(?:[\w.]+:)?(?:[\w.-]+/)?[\w.-]+-v\d+$")
 
 
@@ -45,7 +46,8 @@ def load(task: str) -> Callable[..., Any]:
         return _load_target(task, task)
     for file in (Path(os.path.expanduser(task.rstrip(":"))), Path(f"{task}.py"), Path(f"{task.lower()}.py")):
         if file.suffix == ".py" and file.is_file():
-            forms = " or ".join(f"{file}:{name}" for name in suggestions.list_classes(file)) or f"{file}:CLASS"
+            classes = suggestions.list_classes(file)
+            forms = " or ".join(f"{file}:{name}" for name in classes[:_MOST_NAMED]) or f"{file}:CLASS"
             raise UsageError(f"no task {task!r} is installed; to name a class in {file}: {forms}")
     if task and Path(task).is_dir():
         forms = f"pip install -e {task} installs a plugin; or name a class: {task}/FILE.py:CLASS"
@@ -54,7 +56,10 @@ def load(task: str) -> Callable[..., Any]:
         raise UsageError(model)
     names = [entry.name for entry in installed.list_installed()]
     listed, close = ", ".join(dict.fromkeys(names)) or "none", suggestions.suggest(task)
-    close, forms = close or f".{did_you_mean(task, names)}", "package.module:Class, path/to/file.py:Class, Pendulum-v1."
+    close, forms = (
+        close or suggestions.suggest_name(task, names) or ".",
+        "package.module:Class, path/to/file.py:Class, Pendulum-v1.",
+    )
     raise UsageError(f"no task {task!r}{close} Installed: {listed}. Other forms: {forms}")
 
 

@@ -2,17 +2,46 @@
 
 import ast
 import difflib
+import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rlctl.environments import installed
 
+_MOST_NAMED = 4
+
 
 def suggest(task: str) -> str:
     """Return ". Did you mean 'walk.py:Walker'?" for a file or module that exists; empty if there is none."""
-    meant = next(_list_forms(task.strip()), None)
-    return f". Did you mean {meant!r}?" if meant else ""
+    meant = _list_in_module(task) or list(itertools.islice(_list_forms(task.strip()), 1))
+    return f". Did you mean {' or '.join(map(repr, meant[:_MOST_NAMED]))}?" if meant else ""
+
+
+def suggest_name(task: str, installed_names: Sequence[str]) -> str:
+    """Return ". Did you mean 'half-cheetah' or 'HalfCheetah-v5'?" for the closest installed name, and the newest id of
+    Gymnasium that only lacks its version; empty if there is none."""
+    import gymnasium
+
+    specs = sorted(gymnasium.registry.values(), key=lambda spec: spec.version or 0)
+    versions = {spec.name.lower(): spec.id for spec in specs if spec.namespace is None}
+    names = difflib.get_close_matches(task, installed_names, n=1, cutoff=0.5)
+    names += [versions[task.lower()]] if task.lower() in versions else []
+    return f". Did you mean {' or '.join(map(repr, names))}?" if names else ""
+
+
+def _list_in_module(task: str) -> list[str]:
+    """Return the classes of a module that is named without a class."""
+    is_module = re.fullmatch(r"\w+(\.\w+)+", task) is not None
+    file = installed.find_module_file(task, in_current_folder=True) if is_module else None
+    return [f"{task}:{name}" for name in list_classes(file)] if file is not None and file.suffix == ".py" else []
+
+
+def find_only_class(task: str) -> str:
+    """Return `file.py:Class` for a file with one environment class; empty for anything else."""
+    file = Path(task)
+    classes = _list_public(file)[0] if file.suffix == ".py" and file.is_file() else []
+    return f"{task}:{classes[0]}" if len(classes) == 1 else ""
 
 
 def explain_model_file(name: str) -> str:
@@ -45,10 +74,20 @@ def _list_forms(task: str) -> Iterator[str]:
 
 def list_classes(file: Path) -> list[str]:
     """Return the public classes in a file, without importing it: those that look like tasks, else all."""
+    tasks, classes = _list_public(file)
+    return tasks or classes
+
+
+def _list_public(file: Path) -> tuple[list[str], list[str]]:
+    """Return the public classes in a file that look like tasks, and all."""
     try:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError, RecursionError):
-        return []
-    classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and not node.name.startswith("_")]
-    bases = {node.name: " ".join(map(ast.unparse, node.bases)) for node in classes}
-    return [name for name, base in bases.items() if "Task" in base or "Env" in base] or list(bases)
+        return [], []
+    bases = {node.name: list(map(ast.unparse, node.bases)) for node in tree.body if isinstance(node, ast.ClassDef)}
+    tasks: set[str] = set()
+    for name, names in bases.items():  # a base class comes before what is derived from it
+        if tasks & set(names) or any("Task" in base or "Env" in base for base in names):
+            tasks.add(name)
+    public = [name for name in bases if not name.startswith("_")]
+    return [name for name in public if name in tasks], public

@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,8 @@ from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.storage import files
 from rlctl.version import collect_versions
+
+_MOST_PICKLES = 20  # near a model that are read
 
 
 def import_model(
@@ -135,8 +139,18 @@ def _write_checked(target: Path, source: str, policy: PolicyFile) -> None:
     files.write_with(target, write)
 
 
-def show(policy: PolicyFile, json: str | None) -> None:
-    """Print what was imported and the next commands, or only JSON for `-`."""
+def find_normalizations(file: Path) -> list[Path]:
+    """Return the files in a model's folder, and in those below it, that are a VecNormalize of observations."""
+    found = []
+    for path in sorted([*file.parent.glob("*.pkl"), *file.parent.glob("*/*.pkl")])[:_MOST_PICKLES]:
+        with contextlib.suppress(ArtifactError):  # something else: it is read, never unpickled
+            if read_normalization(path) is not None:
+                found.append(path)
+    return found
+
+
+def show(policy: PolicyFile, json: str | None, unused: Sequence[Path] = ()) -> None:
+    """Print what was imported and the next commands, or only JSON for `-`; `unused` are normalisations near it."""
     file, info, normalizes = policy.path, policy.info, policy.info.clip_observation is not None
     content = {
         "policy": file,
@@ -152,6 +166,9 @@ def show(policy: PolicyFile, json: str | None) -> None:
     out = output.out()
     normalization = "with" if normalizes else "without"
     out.print(f"{file}: {info.algo}, step {info.training_steps:,}, {normalization} observation normalisation")
+    if unused and not normalizes:
+        options = " or ".join(f"--vecnormalize {shlex.quote(str(path))}" for path in unused)
+        out.print(f"if it was trained with normalised observations, import it again with {options}", soft_wrap=True)
     if info.spec.time_feature:
         out.print("it also observes the remaining fraction of the episode, rl-zoo3's time feature")
     out.print(f"next:\n  rlctl eval {file}\n  rlctl export {file} --onnx\n  rlctl replay {file}")

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.environments.info import find_mujoco, joint_name
+from rlctl.environments.driven_joints import joint_name
+from rlctl.environments.info import find_mujoco
 from rlctl.replaying.mjcf import Mesh, Shape, ShapeKind
 from rlctl.replaying.scene import BodyMotion, Env, Scene
 from rlctl.task.env import TaskEnv

@@ -1,6 +1,7 @@
 """Where the episodes of a replay come from: a recorded episode, the policy of a run, or a task and a named policy."""
 
 import dataclasses
+import math
 from contextlib import closing
 from pathlib import Path
 
@@ -37,6 +38,7 @@ from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
 from rlctl.run.lookup import find_owner, find_policy, locate_task
 
 _EPISODES_TO_CHOOSE_FROM = 100
+_ROUNDING = 1e-9  # relative; sums of equal rewards in another order
 _LONGEST = 1000  # [steps], of an episode without a known time limit
 
 
@@ -115,8 +117,9 @@ class _NewEpisodes:
         """Return the result; print a warning for an episode whose return has changed since it was chosen."""
         for episode in episodes:
             before = self._chosen.get(episode.seed, episode.total_reward)
-            if before != episode.total_reward:
-                returns = f"the return is {episode.total_reward:.6g}, but was {before:.6g} when the episode was chosen"
+            if not math.isclose(before, episode.total_reward, rel_tol=_ROUNDING, abs_tol=_ROUNDING):
+                off = f"{episode.total_reward - before:+.3g} off"
+                returns = f"the return is {episode.total_reward:.6g}, {off} from when the episode was chosen"
                 advice = f"the environment may not be deterministic: rlctl check-env {self.spec.task}"
                 print_warning(f"warning: seed {episode.seed}: {returns}; {advice}")
         return ReplayResult(self.spec.task, self.name, episodes, policy_file=self.described, choice=self._choice)

@@ -11,7 +11,8 @@ import numpy as np
 
 from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.worlds import MOST_BODIES, WIDEST_RANGE
-from rlctl.environments.info import find_mujoco, joint_name
+from rlctl.environments.driven_joints import joint_name
+from rlctl.environments.info import find_mujoco
 from rlctl.replaying.bullet_bodies import BulletBody, name_bodies, read_bodies, read_body, read_pose, read_state
 from rlctl.replaying.mujoco_scene import find_trunk_joint
 from rlctl.replaying.scene import Env

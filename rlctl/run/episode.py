@@ -15,6 +15,7 @@ from rlctl.errors import ArtifactError
 from rlctl.storage import files, untrusted
 
 FORMAT = 2
+STEP_LABEL = "training step "  # start of `policy` of an episode of an evaluation in training; its number follows
 """In version 2 each event has its own random stream."""
 
 
@@ -32,6 +33,12 @@ class EpisodeInfo(pydantic.BaseModel, extra="forbid"):
     """Whether a person changed commands or the world while it was played: then seed and actions do not reproduce it."""
     failure: str = ""  # the error with which the environment failed; then only the actions are known
     versions: dict[str, str] = {}
+
+    @property
+    def evaluated_at(self) -> int | None:
+        """The training step of the evaluation that played it; None if something else did, such as a replay."""
+        number = self.policy.removeprefix(STEP_LABEL)
+        return int(number) if number != self.policy and number.isdecimal() else None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,7 +20,6 @@ from rlctl.training.checkpoint import Checkpoint, ReplaySegments
 from rlctl.training.learner import Learner, begin_next_episodes
 from rlctl.training.snapshot import check_finite
 
-STEP_LABEL = "training step "  # start of the `policy` text of a saved episode; the step's number follows
 CHECKPOINT_TIME_SHARE = 0.02  # share of the training time that checkpoints may take
 
 
@@ -200,7 +199,6 @@ class Checkpoints:
 def _is_later(file: Path, step: int) -> bool:
     """Return whether a file is an episode of an evaluation after a training step: a resumed run repeats it."""
     try:
-        _, label, number = load_episode(file).info.policy.rpartition(STEP_LABEL)
+        return (load_episode(file).info.evaluated_at or 0) > step
     except ArtifactError:
         return False  # damaged
-    return label != "" and number.isdigit() and int(number) > step

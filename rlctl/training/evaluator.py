@@ -15,11 +15,11 @@ from rlctl.policy.players.player import Exploration
 from rlctl.rollout.collect import Episode, play_episodes
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.rollout.workers import Workers
-from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
+from rlctl.run.episode import STEP_LABEL, EpisodeInfo, RecordedEpisode, save_episode
 from rlctl.runs.diagnosis.findings import Grade, diagnose
 from rlctl.runs.summary import is_better, read_table
 from rlctl.training import measurements
-from rlctl.training.checkpoints import STEP_LABEL, Checkpoints
+from rlctl.training.checkpoints import Checkpoints
 from rlctl.training.display import Display, format_score
 from rlctl.training.learner import Learner
 from rlctl.version import collect_versions

@@ -57,6 +57,25 @@ class CostlyAction(OneAxis):
         return super().reward() - self.cost
 
 
+class ChangesAction(Clean):
+    def step(self, action):
+        action *= 0.5
+        return super().step(action)
+
+
+class ChangesPartOfAction(Clean):
+    """Takes a part out of the action, a dictionary."""
+
+    rlctl_ignore = {"RL109": "this is about its actions"}
+
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Dict({"push": self.action_space})
+
+    def step(self, action):
+        return super().step(action.pop("push"))
+
+
 class Watched(CostlyAction):
     """Actions are rewarded, and change nothing else: a series that is watched."""
 

@@ -67,3 +67,10 @@ class NoMujocoModel(Clean):
         import mujoco  # optional
 
         self.model = mujoco.MjModel.from_xml_path("finger.xml")
+
+
+class NoMujocoEnvModel(Clean):
+    def __init__(self):
+        from gymnasium.envs.mujoco import MujocoEnv  # optional
+
+        MujocoEnv("/nowhere/arm.xml", 5, None)

@@ -17,6 +17,8 @@ CASES = [
     case(f"{FILE}:CopiedAction", ("RL701", "info")),
     case(f"{FILE}:OnlyCosts", ("RL701", "error"), twin=f"{FILE}:Switch"),
     case(f"{FILE}:OnlyCopies", ("RL701", "error"), twin=f"{FILE}:Switch"),
+    case(f"{FILE}:ChangesAction", ("RL705", "warning")),
+    case(f"{FILE}:ChangesPartOfAction", ("RL705", "warning")),
     case("broken_robots.py:ArmPullsOnly", ("RL701", "info"), twin="robots.py:Arm"),
     case("broken_robots.py:BoatForwardOnly", ("RL701", "info"), twin="robots.py:Boat"),
 ]

@@ -55,6 +55,8 @@ def test_a_missing_model_of_mujoco_is_named():
     pytest.importorskip("mujoco")
     (finding,) = findings("broken_loading.py:NoMujocoModel", "RL007")
     assert finding.evidence["file"] == "finger.xml"
+    (finding,) = findings("broken_loading.py:NoMujocoEnvModel", "RL007")
+    assert finding.evidence["file"] == "/nowhere/arm.xml"
 
 
 def test_a_missing_file_is_named_without_the_words_around_it():

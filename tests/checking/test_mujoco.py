@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.checking.judging import case, check_case, findings, mark_slow
+from tests.checking.judging import case, check_case, findings, found, mark_slow, rules_of
 
 pytest.importorskip("mujoco")
 
@@ -10,6 +10,10 @@ pytest.importorskip("mujoco")
 def broken(name, rule, severity="warning", twin=None):
     base = "mujoco_robots.py:MujocoArm" if name.startswith("Arm") else "mujoco_robots.py:MujocoHopper"
     return case(f"broken_mujoco.py:{name}", (rule, severity), twin=f"broken_mujoco.py:{twin}" if twin else base)
+
+
+def broken_joints(name, rule, twin, severity="warning"):
+    return case(f"broken_mujoco_joints.py:{name}", (rule, severity), twin=f"broken_mujoco_joints.py:{twin}")
 
 
 CASES = [
@@ -45,6 +49,16 @@ CASES = [
     broken("HopperKeepsTime", "RL301", "error", "HopperResets"),
     broken("HopperForces", "RL818", twin="HopperRightForces"),
     broken("ArmInverse", "RL818", twin="ArmActuator"),
+    case("broken_mujoco_joints.py:ArmLimitsInRadians", ("RL804", "warning"), twin="mujoco_robots.py:MujocoArm"),
+    broken_joints("ArmIncrementsInOtherOrder", "RL811", "ArmIncrements", "error"),
+    broken_joints("HopperIncrementsInOtherOrder", "RL811", "HopperIncrements", "error"),
+    broken_joints("ArmIncrementsTooFar", "RL816", "ArmIncrements"),
+    broken_joints("HopperInDegrees", "RL119", "HopperObserves"),
+    broken_joints("HopperSpeedsInOtherOrder", "RL819", "HopperObserves"),
+    broken_joints("ArmVelocityOfSubsteps", "RL820", "ArmVelocity"),
+]
+CLEAN = [
+    f"broken_mujoco_joints.py:{name}" for name in ("ArmFollowsMeasured", "ArmResolvesMotion", "HopperAllInDegrees")
 ]
 
 
@@ -54,9 +68,22 @@ def test_finds_the_mistake_and_only_that(case):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("task", CLEAN)
+def test_clean_is_clean(task):
+    assert found(task, "RL119", *rules_of("RL8")) == set()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "rule", "words"),
     [
+        ("joints.py:ArmLimitsInRadians", "RL804", ("in radians, and was read in degrees",)),
+        ("joints.py:ArmIncrementsInOtherOrder", "RL811", ("of joint wrist", "the start of joint shoulder")),
+        ("joints.py:HopperIncrementsInOtherOrder", "RL811", ("left_hip, follows the position of joint left_knee",)),
+        ("joints.py:ArmIncrementsTooFar", "RL816", ("ctrl[2] (bend)", "opposite action then changes nothing")),
+        ("joints.py:HopperInDegrees", "RL119", ("joint left_hip in degrees", "is in rad/s")),
+        ("joints.py:HopperSpeedsInOtherOrder", "RL819", ("the speeds of left_hip, right_hip",)),
+        ("joints.py:ArmVelocityOfSubsteps", "RL820", ("divided by 0.004 s", "5 times too large")),
         ("HopperQuaternion", "RL116", ("of body", "(w, x, y, z) read as x, y, z, w")),
         ("ArmOrder", "RL811", ("another order", "shoulder")),
         ("HopperOrder", "RL811", ("right_knee", "left_knee", "not of its own joint")),
@@ -72,5 +99,6 @@ def test_finds_the_mistake_and_only_that(case):
     ],
 )
 def test_finding_names_what_is_wrong(name, rule, words):
-    messages = " ".join(finding.message for finding in findings(f"broken_mujoco.py:{name}", rule))
+    task = f"broken_mujoco_{name}" if name.startswith("joints.py") else f"broken_mujoco.py:{name}"
+    messages = " ".join(finding.message for finding in findings(task, rule))
     assert [word for word in words if word not in messages] == []

@@ -11,6 +11,7 @@ import pytest
 import rlctl
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
+from rlctl.environments.suggestions import find_only_class
 from rlctl.errors import NoDisplayError, RecipeError, TaskError, UsageError
 
 ENV = """
@@ -216,6 +217,36 @@ def test_a_task_in_another_form(my_env, write_module, task, meant):
     write_module("package/__init__.py", "")
     write_module("package/envs.py", ENV)
     assert f". Did you mean {meant!r}?" in error(UsageError, task)
+
+
+def test_a_module_without_its_class(my_env, write_module):
+    write_module("package/__init__.py", "")
+    write_module("package/envs.py", f"{ENV}\n    class Derived(MyEnv):\n        pass\n")
+    assert ". Did you mean 'package.envs:MyEnv' or 'package.envs:Derived'?" in error(UsageError, "package.envs")
+
+
+def test_an_id_without_its_version():
+    assert ". Did you mean 'half-cheetah' or 'HalfCheetah-v5'?" in error(UsageError, "HalfCheetah")
+
+
+@pytest.mark.parametrize(
+    ("source", "only"),
+    [
+        (ENV, "one.py:MyEnv"),
+        (f"{ENV}\n    class _Private(MyEnv):\n        pass\n", "one.py:MyEnv"),
+        (f"{ENV}\n    class Derived(MyEnv):\n        pass\n", ""),
+        ("class Helper:\n    pass\n", ""),
+    ],
+)
+def test_the_only_environment_class_of_a_file(my_env, write_module, source, only):
+    write_module("one.py", source)
+    assert find_only_class("one.py") == only
+
+
+def test_an_id_is_named_by_the_installed_package_not_its_folder(my_env, write_module, monkeypatch, tmp_path):
+    write_module("src/in_src/__init__.py", "import gymnasium\n\ngymnasium.register('InSrc-v0', 'in_src.env:Env')\n")
+    monkeypatch.syspath_prepend(str(tmp_path / "src"))
+    assert error(UsageError, "InSrc-v0").endswith(": write in_src:InSrc-v0")
 
 
 def test_a_name_without_its_class(my_env):

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from rlctl import load_policy
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.importing.import_model import import_model
+from rlctl.importing.import_model import find_normalizations, import_model
 from rlctl.importing.sb3_model import read_model, read_normalization
 from rlctl.policy.torch_policy import ALGORITHMS, policy_name
 
@@ -226,3 +226,11 @@ def test_other_spaces_are_refused(save):
     PPO("MlpPolicy", "Pendulum-v1", device="cpu").save(request["file"])
     with pytest.raises(ArtifactError, match=r"model\.zip with .*vecnormalize\.pkl: "):
         import_model(request["file"], "Pendulum-v1", normalization=request["normalization"], output=request["output"])
+
+
+def test_a_normalisation_near_the_model_is_found(save):
+    _, _, request = save("ppo")
+    folder = request["file"].parent
+    (folder / "other.pkl").write_bytes(pickle.dumps([1, 2]))
+    (folder / "damaged.pkl").write_bytes(b"no pickle")
+    assert find_normalizations(request["file"]) == [folder / "vecnormalize.pkl"]

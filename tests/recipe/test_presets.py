@@ -25,12 +25,17 @@ def test_sac():
     assert sources.resolve("reach", Path("presets/sac"), {}).algo == "sac"
 
 
+def test_the_example_of_the_page_about_mujoco():
+    made = sources.resolve("Reacher-v5", Path("presets/reacher-v5"), {})
+    assert (made.algo, made.total_timesteps) == ("ppo", 400_000)
+
+
 def test_a_preset_that_is_not_there():
     with pytest.raises(ArtifactError) as caught:
         sources.resolve("reach", Path("presets/pppo"), {})
     assert str(caught.value) == (
         "no preset 'presets/pppo'. Did you mean 'presets/ppo'? "
-        "Presets: presets/biped-ladder, presets/gear-arm-ladder, presets/ppo, presets/sac."
+        "Presets: presets/biped-ladder, presets/gear-arm-ladder, presets/ppo, presets/reacher-v5, presets/sac."
     )
 
 

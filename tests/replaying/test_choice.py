@@ -1,5 +1,7 @@
 """`rlctl replay --worst`, `--best`, `--failures`: episodes by outcome."""
 
+import dataclasses
+
 import pytest
 import typer
 
@@ -7,7 +9,8 @@ from rlctl.cli import build_app
 from rlctl.errors import UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
-from rlctl.replaying.choice import select
+from rlctl.replaying import sources
+from rlctl.replaying.choice import choose_episodes, select
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.request import Choice, ReplayRequest
 from rlctl.rollout.messages import EpisodeResult
@@ -42,6 +45,17 @@ def test_they_are_episodes_of_the_evaluation_bit_for_bit(run, tmp_path, capsys):
     assert all(each.recording.is_file() for each in result.episodes)
     assert result.choice.startswith("the 2 worst of 5 episodes, of which ")
     assert "warning" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("off", "warns"), [(5e-15, False), (0.25, True)])
+def test_a_return_that_has_changed_since_the_choice_is_reported(run, tmp_path, monkeypatch, capsys, off, warns):
+    def choose(*arguments):
+        chosen, text = choose_episodes(*arguments)
+        return [dataclasses.replace(result, total_reward=result.total_reward - off) for result in chosen], text
+
+    monkeypatch.setattr(sources, "choose_episodes", choose)
+    run_replay(ReplayRequest(str(run.run.path), episodes=1, output=tmp_path, worst=1))
+    assert (", +0.25 off from when the episode was chosen" in capsys.readouterr().err) is warns
 
 
 def test_no_failures_is_an_answer(replay, run, tmp_path):

@@ -107,3 +107,11 @@ def test_of_an_episode_that_failed_there_are_the_actions_alone(path):
     save_episode(path, RecordedEpisode(actions, nothing, nothing, nothing.reshape(0, 0), whole))
     with pytest.raises(ArtifactError, match=r"actions: float32 of shape \(3, 2\), not numbers of shape \(0, 2\)"):
         load_episode(path)
+
+
+@pytest.mark.parametrize(
+    ("policy", "step"),
+    [("training step 300", 300), ("training", None), ("best.safetensors, ppo, step 300", None), ("", None)],
+)
+def test_an_episode_knows_the_evaluation_that_played_it(policy, step):
+    assert INFO.model_copy(update={"policy": policy}).evaluated_at == step

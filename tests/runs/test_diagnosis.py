@@ -89,7 +89,9 @@ def make_episode(actions, observations=None, terms=None):
     terms = np.column_stack([np.ones(steps), np.sin(np.arange(steps))]) if terms is None else terms
     observations = np.zeros((steps + 1, 3), np.float32) if observations is None else observations
     names = ["alive", "progress"]
-    info = EpisodeInfo(spec=EnvSpec("reach"), seed=1, total_reward=float(terms.sum()), term_names=names)
+    info = EpisodeInfo(
+        spec=EnvSpec("reach"), seed=1, policy="training step 1", total_reward=float(terms.sum()), term_names=names
+    )
     return RecordedEpisode(actions.astype(np.float32), observations, terms.sum(axis=1), terms, info)
 
 
@@ -260,7 +262,9 @@ GOALS = ENV.model_copy(
 def reward_goals(rewards):
     """Return an episode of a goal environment with these rewards."""
     observations = {name: np.zeros((101, 2), np.float32) for name in ("observation", "achieved_goal", "desired_goal")}
-    info = EpisodeInfo(spec=EnvSpec("reach"), seed=1, total_reward=float(rewards.sum()), term_names=[])
+    info = EpisodeInfo(
+        spec=EnvSpec("reach"), seed=1, policy="training step 1", total_reward=float(rewards.sum()), term_names=[]
+    )
     return RecordedEpisode(SMOOTH.astype(np.float32), observations, rewards, np.zeros((100, 0)), info)
 
 

@@ -8,12 +8,15 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
 from rlctl.recipe.sources import parse_settings, resolve
 from rlctl.run.directory import RunDirectory
+from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
 from rlctl.runs.report import content
 from rlctl.runs.report.write import write_report
 from rlctl.storage import files
@@ -70,6 +73,19 @@ def test_page_has_everything_and_needs_nothing_else(group):
     assert "<b>&" not in page  # what a run says is text
     assert not re.search(r"""(src|href)\s*=\s*["']?(https?:)?//|@import|url\(\s*["']?http|<script|<link""", page)
     assert len(page) < LARGEST
+
+
+def test_a_replayed_episode_is_not_one_of_the_evaluation(group):
+    policies = ["training step 2000", "training step 2000", "best.safetensors, ppo, step 2000"]
+    for number, (policy, total) in enumerate(zip(policies, (3.0, 5.0, 9.0), strict=True)):
+        info = EpisodeInfo(spec=EnvSpec("reach"), seed=number, policy=policy, total_reward=total)
+        episode = RecordedEpisode(np.zeros((1, 7)), np.zeros((2, 3)), np.array([total]), np.zeros((1, 0)), info)
+        save_episode(RunDirectory(group[2]).episode_file(number), episode)
+    captions = [caption for caption, _ in content.choose_episodes(content.collect([str(run) for run in group]))]
+    assert captions == [
+        "The best recorded episode of the last evaluation: return 5, 1 steps",
+        "The worst recorded episode of the last evaluation: return 3, 1 steps",
+    ]
 
 
 def test_command_for_another_algorithm_trains_the_same_recipe(write_run):

@@ -11,8 +11,17 @@ from numpy.typing import NDArray
 from rlctl.checking import action_trials
 from rlctl.checking.action_trials import REWARD, ActionNumber, Frame, Trials
 from rlctl.checking.instance import Context, EnvironmentRaised
-from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact
-from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFinding, Severity, experiment, list_names
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact, Records
+from rlctl.checking.rules import (
+    NotApplicable,
+    NotJudged,
+    OutOfTime,
+    RuleFinding,
+    Severity,
+    check,
+    experiment,
+    list_names,
+)
 
 MOST_DIMENSIONS = 64
 STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows
@@ -70,6 +79,15 @@ def give_nan(context: Context) -> Iterator[ChildMessage]:
                 until = "also in later episodes" if lasts else "until the next reset"
                 message = f"step accepts an action of NaN: {nan_in} NaN {until}"
                 yield RuleFinding("RL704", message, evidence, Severity.WARNING if lasts else None)
+
+
+@check("RL705")
+def _find_changed_actions(records: Records) -> Iterator[RuleFinding]:
+    for episode, form in records.forms("action")[:1]:
+        message = (
+            f"step {form.step} wrote into the action that it was given, as did {form.count} of {episode.steps} steps"
+        )
+        yield RuleFinding("RL705", message, episode.at(form.step, steps=form.count))
 
 
 def _play_nan(trials: Trials) -> tuple[str, bool]:

@@ -6,7 +6,7 @@ computed from it.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.families.model_parts import find_drift, find_untouched_parts
+from rlctl.checking.families.motor_trials import find_wrong_answers
 from rlctl.checking.instance import EnvironmentRaised, Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_trials import STEPS, Look, are_equal, name_columns, pair_rows, play
@@ -43,8 +44,11 @@ FEWEST_LOOKS, LEAST_MOTION = 4, 1e-4
 EXACT = 2e-6  # relative; the last bits of float32
 
 
-def find_wrong_reads(instance: Instance, calls: MujocoCalls, worlds: Sequence[LoggedWorld]) -> Iterator[RuleFinding]:
-    """Yield what is wrong with how an environment reads MuJoCo's data and changes its model."""
+def find_wrong_reads(
+    instance: Instance, calls: MujocoCalls, worlds: Sequence[LoggedWorld], known: Collection[str]
+) -> Iterator[RuleFinding]:
+    """Yield what is wrong with how an environment reads MuJoCo's data, changes its model, and moves its motors; `known`
+    are the rules that have findings about the motors."""
     readers = [world.reader for world in worlds if isinstance(world.reader, MujocoStateReader)]
     if not readers or not instance.accepts_seed or instance.context.budget.is_over():
         return
@@ -58,6 +62,7 @@ def find_wrong_reads(instance: Instance, calls: MujocoCalls, worlds: Sequence[Lo
         yield from _find_unforwarded(instance, calls, plain)
         yield from _find_never_computed(instance, calls, plain)
         yield from find_untouched_parts(instance, calls, readers[0])
+        yield from find_wrong_answers(instance, calls, readers[0], known)
 
 
 class _Refresh:

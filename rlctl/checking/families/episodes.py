@@ -86,9 +86,10 @@ def _find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
         return
     ended = [episode for episode in episodes if episode.ended == "terminated"]
     limit = max((episode.steps for episode in ended), default=0)
-    if counter := records.require_built().counter:
+    if counter := (built := records.require_built()).counter:
         message = f"step sets terminated by a counter ({counter}), and truncated is always False"
-        yield RuleFinding("RL501", message, {"value": "terminated", "expected": "truncated"})
+        flags = {"value": "terminated", "expected": "truncated"}
+        yield RuleFinding("RL501", message, flags, where=built.counter_place)
         return
     records.require_whole("episodes", "search")
     longer = [episode for episode in episodes if episode.ended not in ENDS] + records.role("search")

@@ -1,12 +1,10 @@
 """RL0: from the name on the command line to an environment, and to the variants of a task that a recipe switches on."""
 
-import ast
 import contextlib
 import dataclasses
 import difflib
 import inspect
 import re
-import textwrap
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -28,6 +26,7 @@ from rlctl.checking.instance import (
 )
 from rlctl.checking.records import FIRST_SEED, Built, ChildMessage, Records, Skipped
 from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, check, experiment
+from rlctl.checking.step_source import read_flags
 from rlctl.checking.values import find_assignment, find_author, flatten, is_task
 from rlctl.environments import registry
 from rlctl.environments.dict_spaces import format_space
@@ -165,7 +164,7 @@ def _describe_built(instance: Instance) -> Built:
         events={name: name in inner.events for name in inner.task.events} if is_task(env) else {},
         max_steps=instance.max_steps,
         nondeterministic=bool(getattr(spec, "nondeterministic", False)),
-        **_read_flags(inner),
+        **read_flags(inner),
         places=_find_places(env, author, file),
         accepts_seed=instance.accepts_seed,
         accepts_options=instance.accepts_options,
@@ -192,31 +191,6 @@ def _find_places(env: Any, author: type, file: str | None) -> dict[str, tuple[st
         places[name] = (code.co_filename, code.co_firstlineno) if code is not None else None
     found = {name: place for name, place in places.items() if place is not None}
     return {name: place for name, place in found.items() if place[0] == file or is_own_file(place[0])}
-
-
-def _read_flags(env: Any) -> dict[str, str]:
-    try:
-        nodes = list(ast.walk(ast.parse(textwrap.dedent(inspect.getsource(type(env).step)))))
-    except (AttributeError, OSError, TypeError, SyntaxError):
-        return {}
-    returned = [node.value for node in nodes if isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple)]
-    flags = [[ast.unparse(element) for element in values.elts[2:4]] for values in returned if len(values.elts) == 5]
-    assigned: dict[str, set[str]] = {}
-    counters = set()
-    for node in nodes:
-        if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign) and node.value is not None:
-            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
-                assigned.setdefault(ast.unparse(target), set()).add(ast.unparse(node.value))
-        if isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add) and ast.unparse(node.value) == "1":
-            counters.add(ast.unparse(node.target))
-    if not flags:
-        return {}
-    if any(assigned.get(truncated, {truncated}) != {"False"} for _, truncated in flags):
-        return {"truncation": "computed"}
-    texts = {text for terminated, _ in flags for text in assigned.get(terminated, {terminated})}
-    names = "|".join(map(re.escape, counters))
-    limits = [re.search(rf"\(?(?:{names})\s*(?:>=|>|==)\s*[\w.]+\)?", text) for text in texts if counters]
-    return {"truncation": "never", "counter": next((limit[0] for limit in limits if limit), "")}
 
 
 STEPS = 60  # Of each variant: an event at an interval of a second acts in them

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rlctl.checking.motor_commands import SAME, CommandSpan, MotorCommands
+from rlctl.checking.motor_commands import CommandSpan, MotorCommands
 from rlctl.checking.rules import RuleFinding, Severity, list_names
 from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import JOINTS, Array, JointKey, Motor, MotorTarget
@@ -16,8 +16,7 @@ FAR_RANGES = 3.0  # a target farther outside the limits is not just out of reach
 FEWEST_JOINTS = 3
 NEAR, APART = 0.05, 0.2  # of sorted targets and positions; of a target and its own joint's position [rad], [m]
 DEGREE = math.pi / 180
-UNLIKE = 1e-2  # relative; a command is no function of what leaves so much unexplained
-ROUNDED = 1e-3  # the same; for what people round
+ROUNDED = 1e-3  # relative; for what people round
 BEYOND = 0.05  # part of a motor's range
 
 
@@ -31,7 +30,7 @@ def find_wrong_motors(world: LoggedWorld, calls: BulletCalls, low: Array, high: 
         spans = commands.find_spans()
         in_degrees = list(_find_ranges_in_degrees(spans))
         yield from in_degrees
-        orders = orders or [*_find_other_state(commands), *_find_other_ranges(spans)][:1]
+        orders = orders or list(_find_other_ranges(spans))
         if not in_degrees and not orders:
             yield from _find_clamped(spans)
     yield from orders
@@ -147,29 +146,6 @@ def _find_weak_motors(world: LoggedWorld) -> Iterator[RuleFinding]:
             evidence = {"element": joint.name, "value": target.force, "expected": needed}
             yield RuleFinding("RL814", message, evidence, where=target.where)
             return
-
-
-def _find_other_state(commands: MotorCommands) -> Iterator[RuleFinding]:
-    """Yield a motor whose command follows the state of another joint than its own."""
-    for number, motor in enumerate(commands.motors):
-        if not commands.find_rest(number, None) > UNLIKE or not commands.find_rest(number, number, number) > UNLIKE:
-            continue
-        for other, another in enumerate(commands.motors):
-            is_other = another.joint.index != motor.joint.index
-            if is_other and commands.find_rest(number, other, other, number) < SAME and _is_missing(commands, other):
-                follows = f"follows the position of joint {another.joint.name}"
-                message = (
-                    f"ctrl[{number}], of the actuator of joint {motor.joint.name}, {follows}, not of its own joint"
-                )
-                evidence = {"element": motor.name, "value": another.joint.name, "expected": motor.joint.name}
-                yield RuleFinding("RL811", message, evidence)
-                return
-
-
-def _is_missing(commands: MotorCommands, motor: int) -> bool:
-    """Say whether a motor's command does not follow its own joint, or nothing but the action: a finger that follows the
-    other one is meant."""
-    return not min(commands.find_rest(motor, None), commands.find_rest(motor, motor, motor)) <= UNLIKE
 
 
 def _find_other_ranges(spans: Sequence[CommandSpan]) -> Iterator[RuleFinding]:

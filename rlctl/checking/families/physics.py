@@ -19,7 +19,7 @@ from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.values import is_task
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
 from rlctl.checking.worlds import ANGULAR, JOINTS, VELOCITY, Array, Joint, Jump, Pair, WorldBody
-from rlctl.environments.bullet_calls import record_calls
+from rlctl.environments.bullet_calls import FULL_TURN, record_calls
 
 ENGINES = {"pybullet", "mujoco"}
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60)) + (("random", 2),) * 16
@@ -32,10 +32,11 @@ FASTEST_BASE = 50.0  # [m/s]; PyBullet stops at 100 per axis, and no robot is fa
 FASTEST_JOINT, FASTEST_SLIDE = 90.0, 50.0  # [rad/s], [m/s]; PyBullet stops at 100; arms and legs stay below 30
 FASTEST_MEANT, NONSENSE = 100.5, 5_000.0  # between them the author raised the limit, for example for wheels
 FASTEST_JUMP = 1.0  # above falling, 0.1 s after a reset: ten times gravity [m/s]
+RADIANS = 'Write <compiler angle="radian"/> into the model file: angles in MJCF are degrees unless it says so.'
 LONGEST_TIME_STEP = 0.02  # PyBullet's own is 1/240 [s]
 
 
-@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, *range(9, 19))), share=4.0)
+@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, *range(9, 21))), share=4.0)
 def watch_worlds(context: Context) -> Iterator[ChildMessage]:
     """Log the worlds of an instance through a few episodes, then let them fall alone, which may change them."""
     if not ENGINES & sys.modules.keys():
@@ -58,8 +59,9 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
                 yield describe_failure(error, context.progress)
         bounds = [leaf.flat_bounds for leaf in instance.action_leaves if leaf.supported]
         low, high = (np.concatenate([pair[end] for pair in bounds] or [np.zeros(0)]) for end in (0, 1))
-        yield from find_misuses(logger.worlds, calls, low, high)
-        yield from find_wrong_reads(instance, mujoco_calls, logger.worlds)
+        misuses = list(find_misuses(logger.worlds, calls, low, high))
+        yield from misuses
+        yield from find_wrong_reads(instance, mujoco_calls, logger.worlds, {finding.rule for finding in misuses})
         if logger.worlds and not context.budget.is_over():
             with contextlib.suppress(EnvironmentRaised):  # its resets were logged by now
                 logger.simulate_alone(len(EPISODES))
@@ -156,14 +158,27 @@ def _joint_limits(world: LoggedWorld) -> Iterator[RuleFinding]:
                     joints.append((float(outside[row]), name, joint, steps, place, float(positions[row])))
     joints.sort(key=lambda record: -record[0])
     names = list(dict.fromkeys(record[1] for record in joints))
-    for _, name, joint, steps, place, value in joints[:1]:
+    for widths, name, joint, steps, place, value in joints[:1]:
         unit = "rad" if joint.is_angle else "m"
         more = f"; outside of theirs are {list_names(names[1:])}" if names[1:] else ""
         limits = f"its limits are [{joint.low:.3g}, {joint.high:.3g}] {unit}"
         lasts = f"it is far outside them in {steps} steps{more}"
         message = f"{name} is at {value:.3g} {unit} {_when(place)}; {limits}; {lasts}"
         evidence = {**place, "joint": name, "value": value, "expected": [joint.low, joint.high]}
-        yield RuleFinding("RL804", message, {**evidence, "other_joints": names[1:]})
+        fix = ""
+        if _is_read_as_degrees(world, joint, widths):
+            low, high = np.degrees([joint.low, joint.high])
+            message += f". The model file may have meant {low:.4g} to {high:.4g} in radians, and was read in degrees"
+            fix = RADIANS
+        yield RuleFinding("RL804", message, {**evidence, "other_joints": names[1:]}, fix=fix)
+
+
+def _is_read_as_degrees(world: LoggedWorld, joint: Joint, widths: float) -> bool:
+    """Say whether limits look like radians that MuJoCo's compiler took for degrees, as it does unless it is told: no
+    hinge has wider ones than a full turn of such degrees, and this one is outside by more than their width."""
+    limited = [j for body in world.world.bodies for j in body.joints if j.is_angle and j.has_limits]
+    is_small = all(max(abs(j.low), abs(j.high)) <= math.radians(FULL_TURN) for j in limited)
+    return world.world.engine == "MuJoCo" and joint in limited and is_small and widths > 1
 
 
 def _is_kept_there(log: WorldLog, outside: Array) -> bool:

@@ -15,7 +15,6 @@ FEWEST_LOOKS = 30
 SAME = 5e-5  # An element is equal to a value if it differs by no more [rad], [m], [m/s], and relative to the value
 NEARLY_ALL = 0.98  # in so many of all looks: angles near a pole have larger errors
 MOVED, FEWEST_MOVED = 20, 15  # in so many looks a value is away from its median by so many times that, or it is calm
-LEAST_TURN = 0.02  # standard deviation; calmer positions may be equal by chance [rad]
 FIRST_LOOKS = 5  # Values that differ in these are not compared further
 MOST_ELEMENTS = 400
 READ, CONVERTED, REVERSED = (1, 2, 3, 0), (3, 0, 1, 2), (2, 1, 0, 3)
@@ -38,7 +37,8 @@ EXACT = 2e-6  # relative; the last bits of float32 and of sums
 OLD = 1e-4  # An old value differs from the present one by more, in most looks [m], [rad], [m/s]
 
 
-def _join_logs(world: LoggedWorld) -> tuple[list[WorldLog], Array] | None:
+def join_logs(world: LoggedWorld) -> tuple[list[WorldLog], Array] | None:
+    """Return the logs of a world and the observations of all their looks, shape (looks, elements); None for few."""
     logs = [log for log in world.logs if log.observed and len({row.size for row in log.observed}) == 1]
     if sum(len(log.observed) for log in logs) < FEWEST_LOOKS or len({log.observed[0].size for log in logs}) != 1:
         return None
@@ -48,7 +48,7 @@ def _join_logs(world: LoggedWorld) -> tuple[list[WorldLog], Array] | None:
 
 def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
     """Yield an element of the observation that follows from a quaternion in a wrong order, and from no right one."""
-    if (joined := _join_logs(world)) is None:
+    if (joined := join_logs(world)) is None:
         return
     logs, observed = joined
     moving = np.flatnonzero(_find_moved(observed).sum(axis=0) >= FEWEST_MOVED)
@@ -191,24 +191,6 @@ def _find_moved(values: Array) -> NDArray[np.bool_]:
     return moved
 
 
-def find_shrunk_angles(world: LoggedWorld) -> Iterator[RuleFinding]:
-    """Yield an element of the observation that is a joint's position taken for degrees, and converted to radians."""
-    if (joined := _join_logs(world)) is None:
-        return
-    logs, observed = joined
-    for i, body in enumerate(world.world.bodies):
-        states = np.array([state[i] for log in logs for state in log.states])
-        for j, joint in enumerate(body.joints):
-            positions = states[:, JOINTS + j] if joint.is_angle else np.zeros(len(states))
-            shrunk = np.radians(positions)[:, None]
-            is_shrunk = (np.abs(observed - shrunk) <= EXACT * np.abs(positions).max()).mean(axis=0) >= NEARLY_ALL
-            if positions.std() > LEAST_TURN and is_shrunk.any():
-                name = f"observation[{int(is_shrunk.argmax())}]"
-                message = f"{name} is the position of joint {joint.name} times pi / 180: it was in radians already"
-                yield RuleFinding("RL810", message, {"element": name, "value": joint.name, "expected": "radians"})
-                return
-
-
 def find_old_elements(world: LoggedWorld) -> Iterator[RuleFinding]:
     """Yield the elements of the observation that equal the state before the last step of the physics, not the present
     one; an element may have its episode's constant added, such as a goal."""
@@ -216,7 +198,7 @@ def find_old_elements(world: LoggedWorld) -> Iterator[RuleFinding]:
     if not logs or len({row.size for log in logs for row in log.observed}) != 1:
         return
     observed, now, before = ([_center(part) for part in parts] for parts in zip(*map(_read_log, logs), strict=True))
-    names = _name_features(logs[0])
+    names = name_features(logs[0])
     old: dict[int, str] = {}
     for column in range(min(MOST_ELEMENTS, observed[0].shape[1])):
         values = np.concatenate([part[:, column] for part in observed])
@@ -239,11 +221,12 @@ def _read_log(log: WorldLog) -> tuple[Array, Array, Array]:
     observed = np.stack([log.observed[i] for i in looks]).astype(np.float64)
     now = [(log.states[i], log.poses[i]) for i in looks]
     before = [entry for entry in (log.before[i] for i in looks) if entry is not None]
-    present, earlier = (np.stack([_features(log, *entry) for entry in entries]) for entries in (now, before))
+    present, earlier = (np.stack([read_features(log, *entry) for entry in entries]) for entries in (now, before))
     return np.nan_to_num(observed), present, earlier
 
 
-def _features(log: WorldLog, states: Sequence[Array], poses: Poses) -> Array:
+def read_features(log: WorldLog, states: Sequence[Array], poses: Poses) -> Array:
+    """Return what an observation may have of a look: states, attitudes of free bodies, and positions of links."""
     parts = []
     for body, state in zip(log.world.bodies, states, strict=True):
         parts += [state] if body.joints or body.is_free else []
@@ -253,7 +236,8 @@ def _features(log: WorldLog, states: Sequence[Array], poses: Poses) -> Array:
     return np.nan_to_num(np.concatenate(parts)) if parts else np.zeros(0)
 
 
-def _name_features(log: WorldLog) -> list[str]:
+def name_features(log: WorldLog) -> list[str]:
+    """Name the numbers of `read_features`."""
     names = []
     for body in log.world.bodies:
         if body.joints or body.is_free:

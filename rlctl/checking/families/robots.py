@@ -4,8 +4,9 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 from rlctl.checking.bullet_worlds import ClientCalls
+from rlctl.checking.families.joint_readings import find_misread_joints
 from rlctl.checking.families.motors import find_wrong_motors
-from rlctl.checking.families.readings import find_misread_quaternions, find_old_elements, find_shrunk_angles
+from rlctl.checking.families.readings import find_misread_quaternions, find_old_elements
 from rlctl.checking.rules import RuleFinding, Severity, list_names
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import Array
@@ -122,5 +123,5 @@ def find_misuses(worlds: Sequence[LoggedWorld], calls: BulletCalls, low: Array, 
         yield from find_wrong_motors(world, calls, low, high)
         yield from find_misread_quaternions(world)
         yield from find_old_elements(world)
-        yield from find_shrunk_angles(world)
+        yield from find_misread_joints(world)
         yield from _find_empty_queries(world, calls) if world.world.engine == "PyBullet" else ()

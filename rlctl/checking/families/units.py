@@ -32,7 +32,7 @@ class Rate:
     size: float  # of the quantity, root mean square
 
 
-@check("RL119", *rewards.WITH_SEARCH)
+@check("RL119", *rewards.WITH_SEARCH, "worlds")  # which compares joints with those of the engine
 def _find_mixed_units(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     steps = collect_transitions(records)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -118,8 +119,9 @@ class History:
     def episodes(self) -> list[RecordedEpisode]:
         """The newest recorded episodes of evaluations, at most `EPISODES`."""
         files = sorted((file for file in self.run.episodes.glob("*.npz") if file.stem.isdecimal()), reverse=True)
-        episodes = [_read(load_episode, file) for file in files[:EPISODES]]
-        return [episode for episode in episodes if episode is not None and len(episode.rewards)]
+        read = (_read(load_episode, file) for file in files)
+        evaluated = (episode for episode in read if episode is not None and episode.info.evaluated_at is not None)
+        return list(itertools.islice((episode for episode in evaluated if len(episode.rewards)), EPISODES))
 
 
 def _read_recipe(path: Path) -> dict[str, Any]:

@@ -211,9 +211,9 @@ def choose_episodes(report: RunReport) -> list[tuple[str, RecordedEpisode]]:
     """Return the best and the worst recorded episode of the best run's last evaluation, with captions."""
     pairs = ((recipe, run) for recipe in report.recipes for run in recipe.runs)
     recipe, best = max(pairs, key=lambda pair: pair[1].summary.score)
-    episodes, of_recipe = best.episodes, f" of {recipe.name}" if recipe.name else ""
-    steps = max((_trained_steps(episode) for episode in episodes), default=-1)
-    last = [episode for episode in episodes if _trained_steps(episode) == steps]
+    of_recipe = f" of {recipe.name}" if recipe.name else ""
+    steps = [episode.info.evaluated_at or 0 for episode in best.episodes]  # those of evaluations only, no replays
+    last = [episode for episode, step in zip(best.episodes, steps, strict=True) if step == max(steps)]
     if not last:
         return []
     ordered = sorted(last, key=lambda episode: (episode.info.success is True, episode.info.total_reward))
@@ -222,11 +222,6 @@ def choose_episodes(report: RunReport) -> list[tuple[str, RecordedEpisode]]:
         (f"The {name} recorded episode of the last evaluation{of_recipe}: {_outcome(episode)}", episode)
         for name, episode in named
     ]
-
-
-def _trained_steps(episode: RecordedEpisode) -> int:
-    step = episode.info.policy.rpartition(" ")[2]
-    return int(step) if step.isdecimal() else -1
 
 
 def _outcome(episode: RecordedEpisode) -> str:
