@@ -89,12 +89,16 @@ def _mujoco_chain(mujoco: Any, model: Any, data: Any, joints: Sequence[int]) -> 
     def set_joints(values: Numbers) -> None:
         copy.qpos[model.jnt_qposadr[joints]] = values
 
+    # What is welded to the world gets nowhere.
+    bodies = [i for i in range(model.nbody) if model.body_weldid[i]]
+    sites = [i for i in range(model.nsite) if model.body_weldid[model.site_bodyid[i]]]
+
     def read() -> Numbers:
         mujoco.mj_kinematics(model, copy)
-        return np.vstack([copy.xpos, copy.site_xpos]).copy()
+        return np.vstack([copy.xpos[bodies], copy.site_xpos[sites]])
 
     limits = [tuple(model.jnt_range[j].tolist()) if model.jnt_limited[j] else (-np.pi, np.pi) for j in joints]
-    names = [model.body(i).name for i in range(model.nbody)] + [model.site(i).name for i in range(model.nsite)]
+    names = [model.body(i).name for i in bodies] + [model.site(i).name for i in sites]
     return Chain(limits, copy.xpos[model.jnt_bodyid[joints[0]]].copy(), set_joints, read, names)
 
 
