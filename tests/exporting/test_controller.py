@@ -7,14 +7,13 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.deploy import Limits
+from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.graph import build_graph
-from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.exporting.controller.players import OnnxController
 from rlctl.exporting.controller.source import ControllerSource
-from rlctl.exporting.controller.verify import find_targets
 from rlctl.policy.numpy_policy import NumpyPolicy
 from rlctl.policy.onnx_policy import OnnxPolicy, encode
 from rlctl.policy.torch_policy import TorchPolicy
@@ -158,7 +157,7 @@ def test_targets_by_hand(command, expected, tmp_path):
         action, target = controller.step({name: inputs[name] for name in source_names(source)})
         assert action.tolist() == [1.0, -0.25]
         assert target == pytest.approx(expected, abs=1e-7)
-    assert find_targets(source.target, {name: inputs[name] for name in source_names(source)}, action) == pytest.approx(
+    assert source.target.find_targets({name: inputs[name] for name in source_names(source)}, action) == pytest.approx(
         expected, abs=1e-7
     )
 
@@ -253,7 +252,7 @@ def test_what_cannot_be_a_controller():
         (inner, "nothing"),
     ):
         with pytest.raises(UsageError, match=message):
-            ControllerLayout(make_policy(make_arm()).info.model_copy(update={"env": env}))
+            ControllerLayout(env)
     with pytest.raises(UsageError, match="no input has the joints' positions: 'last' is computed inside"):
         ControllerSource(commanding(action_step=[1.0, 1.0], measured="last"), "c", None)
     wrong = Limits.model_validate({"command": "position", "scale": 0.3})

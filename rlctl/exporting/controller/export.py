@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rlctl.deploy.controller_layout import ControllerLayout, JointTarget
 from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
@@ -18,7 +19,6 @@ from rlctl.errors import TaskError, UsageError
 from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
 from rlctl.exporting.controller.graph import build_graph
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
 from rlctl.exporting.controller.players import CController, Controller, OnnxController, compile_controller
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.exporting.export import (
@@ -77,12 +77,16 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
         check_environment(source.file, torch_policy.info, built)
         # Policies that were trained before their task declared its terms do not contain them.
         policy = torch_policy.file.with_info(env=built)
-        player = verify.TaskPlayer(ControllerLayout(policy.info), env, spec.task)
+        player = verify.TaskPlayer(_describe_controller(policy), env, spec.task)
         export = _Export(torch_policy, policy, player, limits)
         write = {"onnx": export.write_onnx, "c": export.write_c}
         return [write[form](target.with_suffix(f".{form}")) for form in request.formats]
     finally:
         env.close()
+
+
+def _describe_controller(policy: PolicyFile) -> ControllerLayout:
+    return ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
 
 
 def _choose_spec(spec: EnvSpec, sim: str | None) -> EnvSpec:
@@ -104,7 +108,7 @@ class _Export:
         model = build_graph(self.policy)
         content = encode(model)
         controller = OnnxController(content)
-        target = ControllerLayout(self.policy.info).find_target(None, None)
+        target = _describe_controller(self.policy).find_target(None, None)
         fields, recorded = self._verify(path, controller, target, is_limited=False)
         inputs = recorded[0].inputs[0]
         median = float(np.median(timeit.repeat(lambda: controller.step(inputs), number=1, repeat=330)[30:])) * 1e6
@@ -145,7 +149,7 @@ class _Export:
         return self._report(path, size, details, source.target, median, fields)
 
     def _make_reference(self, policy: Policy, is_limited: bool) -> verify.LimitedPolicy:
-        return verify.LimitedPolicy(ControllerLayout(self.policy.info), policy, self.limits if is_limited else None)
+        return verify.LimitedPolicy(_describe_controller(self.policy), policy, self.limits if is_limited else None)
 
     @functools.lru_cache(maxsize=2)  # noqa: B019 (for one export)
     def _record(self, is_limited: bool) -> list[verify.Recorded]:
@@ -181,7 +185,7 @@ class _Export:
         median: float | None,
         fields: dict[str, Any],
     ) -> ControllerReport:
-        sizes = {part.name: part.size for part in ControllerLayout(self.policy.info).quantities}
+        sizes = {part.name: part.size for part in _describe_controller(self.policy).quantities}
         details = {**details, "input_sizes": sizes, "target": "" if target is None else target.formula}
         if median is not None:
             fields["latency"] = Latency(median, measure_sb3(self.torch_policy))

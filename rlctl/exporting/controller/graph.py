@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import onnx
 
+from rlctl.deploy.controller_layout import ControllerLayout, JointTarget, Observed, Stack
 from rlctl.errors import UsageError
 from rlctl.exporting.actor import emit_actor, make_metadata
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Stack
 from rlctl.exporting.controller.symbols import GraphSymbol
 from rlctl.exporting.layers import BATCH, Graph, concatenate
 from rlctl.policy import onnx_policy
@@ -27,7 +27,11 @@ def build_graph(policy: PolicyFile) -> onnx.ModelProto:
 
 class _Writer:
     def __init__(self, policy: PolicyFile) -> None:
-        self._policy, self._layout, self._graph = policy, ControllerLayout(policy.info), Graph()
+        self._policy, self._layout, self._graph = (
+            policy,
+            ControllerLayout(policy.info.env, policy.info.spec.frame_stack),
+            Graph(),
+        )
         self._target = self._layout.find_target(None, None)
         self._inputs = {part.name: self._add_input(part.name, part.size, part.unit) for part in self._layout.quantities}
         self._states: list[str] = []
@@ -38,7 +42,7 @@ class _Writer:
 
     def _add_input(self, name: str, size: int, unit: str) -> str:
         if name.startswith("/") or name in _TAKEN or name.endswith("_out"):
-            raise UsageError(f"export --controller: an input named {name!r} cannot be written as ONNX; rename it")
+            raise UsageError(f"--controller: an input named {name!r} cannot be written as ONNX; rename it")
         return self._graph.input(name, self._layout.dtype, (BATCH, size), f"[{unit}]" if unit else "")
 
     def write(self) -> onnx.ModelProto:
@@ -87,7 +91,7 @@ class _Writer:
         if term.internal == "last_action":
             symbols = [GraphSymbol(graph, self._read(self._last_action), part.size)]
         elif term.internal == "time":
-            dt = graph.constant("controller/control_dt", np.float64(self._layout.info.env.control_dt))
+            dt = graph.constant("controller/control_dt", np.float64(self._layout.env.control_dt))
             symbols = [GraphSymbol(graph, graph.add("Mul", self._read(self._steps), dt), 1)]
         parts: list[GraphSymbol] = term.compute(*symbols)
         joined = concatenate(graph, [symbol.value for symbol in parts])

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.errors import AnswerIsNo, short_repr
 from rlctl.exporting.c_source import FLAGS, CSource
 from rlctl.exporting.controller.graph import LAST_ACTION, TARGET
-from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type
 from rlctl.policy.onnx_policy import ACTION, open_session
 
@@ -52,7 +52,7 @@ class CController(Controller):
         self._memory = np.zeros(-(-self.library.rlctl_state_size() // 8), np.float64)
         self.state = self._memory.ctypes.data_as(ctypes.c_void_p)
         self._layout, self._has_target = layout, has_target
-        self.action = np.zeros(layout.action_size, action_type(layout.info))
+        self.action = np.zeros(layout.action_size, action_type(layout.env))
         self._target = np.zeros(layout.action_size)
         self._status = np.zeros(2, np.intc)
         self._outputs = [array.ctypes.data_as(ctypes.c_void_p) for array in (self.action, self._target, self._status)]

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from rlctl.deploy.controller_layout import ControllerLayout, JointTarget, Observed
 from rlctl.deploy.filter.fitting import fit_limits
 from rlctl.deploy.filter.limits import Limits
 from rlctl.exporting import c_source
 from rlctl.exporting.c_layers import CWriter, write_number
 from rlctl.exporting.c_source import CSource, Layout
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed
 from rlctl.exporting.controller.limits_source import LimitsSource
 from rlctl.exporting.controller.symbols import CSymbol
 from rlctl.policy.file import PolicyFile
@@ -46,7 +46,7 @@ class ControllerSource:
 
     def __init__(self, policy: PolicyFile, file_name: str, limits: Limits | None) -> None:
         c_source.check_can_be_written(policy)
-        self.layout = layout = ControllerLayout(policy.info)
+        self.layout = layout = ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
         self.limits = limits or Limits()
         fitted = fit_limits(self.limits, layout.inputs_info)
         assert fitted.bounds is not None  # the actions are in a Box
@@ -111,7 +111,7 @@ class ControllerSource:
         if part.term.internal == "last_action":
             symbols = [CSymbol([f"(double)state->last_action[{index}]" for index in range(part.size)])]
         elif part.term.internal == "time":
-            symbols = [CSymbol([f"((double)state->steps * {self.layout.info.env.control_dt!r})"])]
+            symbols = [CSymbol([f"((double)state->steps * {self.layout.env.control_dt!r})"])]
         parts: list[CSymbol] = part.term.compute(*symbols)
         expressions = [element for symbol in parts for element in symbol.elements]
         return [f"newest[{part.newest + i}] = ({kind}){text};" for i, text in enumerate(expressions)]
@@ -135,7 +135,7 @@ class ControllerSource:
 
     def _list_arrays(self, described: Layout) -> list[tuple[str, str, str, list[str]]]:
         """Return the header's constant arrays: type, name, the macro of the length, and the values as C."""
-        quote, target, env = c_source.quote, self.target, self.layout.info.env
+        quote, target, env = c_source.quote, self.target, self.layout.env
         quantities = self.layout.quantities
         arrays: list[tuple[str, str, str, list[str]]] = [
             ("char *const", "input_names", "INPUTS", [quote(quantity.name) for quantity in quantities]),

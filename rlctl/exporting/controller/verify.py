@@ -9,12 +9,11 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.deploy.controller_layout import ControllerLayout, JointTarget
 from rlctl.deploy.filter.limits import Limits
 from rlctl.deploy.filter.safety_filter import SafetyFilter
-from rlctl.environments.dict_spaces import SINGLE, split
 from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
 from rlctl.exporting.controller.players import CController, Controller, Inputs
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, compare_episodes
 from rlctl.policy.policy import Policy
@@ -73,7 +72,7 @@ class TaskPlayer:
         while not ended:
             if len(actions) == MOST_STEPS:
                 raise TaskError(f"{self._task}: the episode of seed {seed} has not ended after {MOST_STEPS:,} steps")
-            inputs = self._measure(observation)
+            inputs = self._layout.measure(observation, getattr(self._env.unwrapped, "measured", {}))
             action = np.array(act(observation, inputs))
             measured.append(inputs)
             actions.append(action)
@@ -83,24 +82,6 @@ class TaskPlayer:
         success = info.get("is_success")
         result = EpisodeResult(0, seed, total, len(actions), None if success is None else bool(success), {}, None)
         return Recorded(measured, actions, Episode(result))
-
-    def _measure(self, observation: Any) -> Inputs:
-        """Return the quantities of the last observation, in the order of the inputs."""
-        flat = split(observation)
-        values: dict[str, NDArray[Any]] = {}
-        for part in self._layout.observed:
-            if part.term is None:
-                source = np.ravel(flat[part.key])
-                start = part.start if part.key == SINGLE else 0
-                if self._layout.frames > 1:
-                    start = len(source) - self._layout.newest_size + part.newest
-                newest = start + part.size * (part.frames - 1)
-                values[part.name] = source[newest : newest + part.size]
-                continue
-            measured = self._env.unwrapped.measured[part.name]  # type: ignore[attr-defined]  # only tasks have terms
-            quantities = measured if isinstance(measured, tuple) else (measured,)
-            values |= {name: np.ravel(value) for name, value in zip(part.term.inputs, quantities, strict=False)}
-        return {quantity.name: np.array(values[quantity.name]) for quantity in self._layout.quantities}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +115,7 @@ def verify_controller(
             _compare(agreement, expected, action)
             controller.set_last_action(expected)
             if target is not None and targets is not None:
-                worst = max(worst, _compare(agreement, find_targets(target, inputs, expected), targets))
+                worst = max(worst, _compare(agreement, target.find_targets(inputs, expected), targets))
     agreement.observations = sum(len(episode.actions) for episode in recorded)
 
     def act(observation: Any, inputs: Inputs) -> NDArray[Any]:
@@ -164,21 +145,6 @@ def check_conclusive(
         loops.append(compare_episodes([episode.episode for episode in recorded[:EPISODES]], again))
     repeats = loops[0].agrees and loops[0].max_return_difference == 0.0
     return repeats, repeats and not loops[1].agrees
-
-
-def find_targets(target: JointTarget, inputs: Inputs, action: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the joints' targets for an action, from their definition."""
-    base = target.default
-    if target.kind == "step":
-        values = np.concatenate([np.ravel(value) for value in inputs.values()])
-        base = values[target.measured : target.measured + len(target.factor)]
-    targets = np.asarray(base + target.factor * action.ravel(), np.float64)
-    if not target.clips:
-        return targets
-    low, high = target.low, target.high
-    if target.clips == "towards":
-        low, high = np.minimum(low, base), np.maximum(high, base)
-    return np.clip(targets, low, high)
 
 
 def _compare(agreement: Agreement, expected: NDArray[Any], actual: NDArray[Any]) -> float:

@@ -1,9 +1,9 @@
-"""What a controller takes, computes and returns: quantities, terms, histories and joint targets of one policy."""
+"""What a controller takes, computes and returns: quantities, terms, histories and joint targets of one environment."""
 
 import dataclasses
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from rlctl.deploy.filter.bounds import Bounds
 from rlctl.deploy.filter.limits import Limits
-from rlctl.environments.dict_spaces import SINGLE, split_space
+from rlctl.environments.dict_spaces import SINGLE, split, split_space
 from rlctl.environments.info import AnyTerm, EnvInfo, space_to_json
 from rlctl.errors import RecipeError, UsageError
 from rlctl.policy.c_policy import observation_type
-from rlctl.policy.file import PolicyInfo
 from rlctl.task.joints import Command
 from rlctl.task.terms import Internal
 
@@ -90,6 +89,27 @@ class JointTarget:
         """What it commands, as ros2_control calls it."""
         return {"speed": "velocity", "torque": "effort"}.get(self.kind, "position")
 
+    def find_targets(self, inputs: Mapping[str, NDArray[Any]], action: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the joints' targets for an action and the quantities that were measured before it."""
+        base = self._find_base(inputs)
+        targets = np.asarray(base + self.factor * action.ravel(), np.float64)
+        if not self.clips:
+            return targets
+        low, high = self.low, self.high
+        if self.clips == "towards":
+            low, high = np.minimum(low, base), np.maximum(high, base)
+        return np.clip(targets, low, high)
+
+    def find_action(self, inputs: Mapping[str, NDArray[Any]], targets: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the action with which joints that are where `inputs` has them go to targets; it has no bounds."""
+        return np.asarray((targets.ravel() - self._find_base(inputs)) / self.factor, np.float64)
+
+    def _find_base(self, inputs: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        if self.kind != "step":
+            return self.default
+        values = np.concatenate([np.ravel(value) for value in inputs.values()])
+        return np.asarray(values[self.measured : self.measured + len(self.factor)])
+
     @property
     def formula(self) -> str:
         """How it follows from the action, for people."""
@@ -100,30 +120,33 @@ class JointTarget:
 
 
 class ControllerLayout:
-    """The interface of a policy's controller. Raises `UsageError` for a policy that cannot have one."""
+    """The interface of a controller for an environment; `frames` are the stacked observations of its policy.
 
-    def __init__(self, info: PolicyInfo) -> None:
-        self.info, env = info, info.env
+    Raises `UsageError` for an environment that cannot have one.
+    """
+
+    def __init__(self, env: EnvInfo, frames: int = 1) -> None:
+        self.env = env
         space, action_space = env.spaces()
         self.parts = split_space(space)
         if not isinstance(action_space, spaces.Box) or action_space.dtype.kind != "f" or len(action_space.shape) != 1:
-            raise UsageError(f"export --controller: actions must be a vector of real numbers, not {action_space}")
+            raise UsageError(f"--controller: actions must be a vector of real numbers, not {action_space}")
         if any(not isinstance(part, spaces.Box) or len(part.shape) != 1 for part in self.parts.values()):
-            raise UsageError("export --controller: observations must be vectors; images and choices are not supported")
-        self.action_space, self.dtype = action_space, observation_type(info)
+            raise UsageError("--controller: observations must be vectors; images and choices are not supported")
+        self.action_space, self.dtype = action_space, observation_type(env)
         self.action_size = math.prod(action_space.shape)
         self.repeats_first = env.history_start == "first"
-        self.frames = info.spec.frame_stack
+        self.frames = frames
         self.observed = self._list_observed()
         self.newest_size = sum(part.size for part in self.observed)
         self.size = sum(part.size * part.frames for part in self.observed) * self.frames
         self.quantities = self._list_quantities()
         self.input_size = sum(quantity.size for quantity in self.quantities)
         if not self.quantities:
-            raise UsageError("export --controller: this policy observes nothing that a robot measures")
+            raise UsageError("--controller: the policy observes nothing that a robot measures")
 
     def _list_observed(self) -> list[Observed]:
-        env, sizes = self.info.env, self.info.env.observation_sizes
+        env, sizes = self.env, self.env.observation_sizes
         if SINGLE not in self.parts:
             sizes = {key: math.prod(part.shape or ()) for key, part in self.parts.items()}
         total = sum(math.prod(part.shape or ()) for part in self.parts.values()) // self.frames
@@ -138,14 +161,14 @@ class ControllerLayout:
         return observed
 
     def _list_quantities(self) -> list[Quantity]:
-        env, sizes = self.info.env, dict[str, int]()
+        env, sizes = self.env, dict[str, int]()
         for part in self.observed:
             term = part.term
             names = [part.name] if term is None else [] if term.internal else term.inputs
             for name in names:
                 size = part.size if term is None else env.quantity_sizes[name]
                 if sizes.setdefault(name, size) != size:
-                    raise UsageError(f"export --controller: two quantities are named {name!r}, of different sizes")
+                    raise UsageError(f"--controller: two quantities are named {name!r}, of different sizes")
         quantities: list[Quantity] = []
         for name, size in sizes.items():
             identifier = _make_identifier(name, {quantity.identifier for quantity in quantities})
@@ -174,21 +197,42 @@ class ControllerLayout:
         sizes = {quantity.name: quantity.size for quantity in self.quantities}
         no_terms: dict[str, Any] = {"observation_history": {}, "observation_terms": {}, "quantity_sizes": {}}
         changes = {"observation_space": space_to_json(box), "observation_sizes": sizes, **no_terms}
-        return self.info.env.model_copy(update=changes)
+        return self.env.model_copy(update=changes)
+
+    def measure(self, observation: Any, terms: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Return the quantities behind an observation, in the order of the inputs.
+
+        `terms` is what the terms were computed from: `TaskEnv.measured`.
+        """
+        flat = split(observation)
+        values: dict[str, NDArray[Any]] = {}
+        for part in self.observed:
+            if part.term is None:
+                source = np.ravel(flat[part.key])
+                start = part.start if part.key == SINGLE else 0
+                if self.frames > 1:
+                    start = len(source) - self.newest_size + part.newest
+                newest = start + part.size * (part.frames - 1)
+                values[part.name] = source[newest : newest + part.size]
+                continue
+            measured = terms[part.name]
+            quantities = measured if isinstance(measured, tuple) else (measured,)
+            values |= {name: np.ravel(value) for name, value in zip(part.term.inputs, quantities, strict=False)}
+        return {quantity.name: np.array(values[quantity.name]) for quantity in self.quantities}
 
     def find_quantity(self, name: str) -> Quantity:
         """Return an input by its name; raises `UsageError` if there is none."""
         for quantity in self.quantities:
             if quantity.name == name:
                 return quantity
-        raise UsageError(f"export --controller: no input has the joints' positions: {name!r} is computed inside")
+        raise UsageError(f"--controller: no input has the joints' positions: {name!r} is computed inside")
 
     def find_target(self, limits: Limits | None, bounds: Bounds | None) -> JointTarget | None:
         """Return what an action commands, if the task describes it; `bounds` are those of the limits.
 
         Raises `RecipeError` for limits with other units than the task has.
         """
-        joints = self.info.env.joints
+        joints = self.env.joints
         if joints is None or not joints.command[0]:
             return None
         kind, per_action = joints.command
