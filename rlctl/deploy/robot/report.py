@@ -35,7 +35,7 @@ def show(report: RobotReport, json: str | None, gates: Gates) -> None:
     for score in report.scores:
         if score.commands.refused:
             out.print(
-                f"{_name(score)}: {score.commands.refused:,} messages were no action, the first: "
+                f"{_name(score)}: {score.commands.refused:,} messages were no command, the first: "
                 f"{score.commands.first_problem}"
             )
 
@@ -88,7 +88,7 @@ def _show_differences(report: RobotReport) -> None:
         worst = max(score.commands.differences, key=lambda difference: difference.largest)
         mean = float(np.mean([difference.mean for difference in score.commands.differences]))
         out.print(
-            f"{_name(score)}: {score.commands.compared:,} commands differ from the policy's actions by "
+            f"{_name(score)}: {score.commands.compared:,} commands differ from the policy's ({report.command}) by "
             f"{mean:.3g} on average, at most {worst.largest:.3g} ({worst.name}, episode {worst.episode}, "
             f"step {worst.step})"
         )
@@ -101,6 +101,7 @@ def as_json(report: RobotReport) -> dict[str, Any]:
             {
                 "task": {"name": report.spec.task, "parameters": report.spec.parameters},
                 "controller": report.controller,
+                "command": report.command,
                 "policy": report.policy,
                 "versions": collect_versions(),
                 "events": report.info.events,
