@@ -157,10 +157,12 @@ class _Export:
 
     @functools.lru_cache(maxsize=2)  # noqa: B019
     def _check_conclusive(self, is_limited: bool) -> tuple[bool, bool]:
-        changed = dataclasses.replace(self.policy, tensors=change_last_bits(self.policy.tensors))
-        policies: tuple[Policy, Policy] = self.torch_policy, NumpyPolicy(changed)
-        references = [self._make_reference(policy, is_limited) for policy in policies]
-        return verify.check_conclusive(self.player, (references[0], references[1]), self._record(is_limited))
+        changed = (
+            dataclasses.replace(self.policy, tensors=tensors) for tensors in change_last_bits(self.policy.tensors)
+        )
+        others = (self._make_reference(NumpyPolicy(policy), is_limited) for policy in changed)
+        original = self._make_reference(self.torch_policy, is_limited)
+        return verify.check_conclusive(self.player, original, others, self._record(is_limited))
 
     def _verify(
         self, path: Path, controller: Controller, target: JointTarget | None, *, is_limited: bool

@@ -38,8 +38,14 @@ class Controller(abc.ABC):
         """Return the action and, where the task says what it commands, the targets."""
 
     @abc.abstractmethod
-    def set_last_action(self, action: NDArray[Any]) -> None:
-        """Replace the last action: a feedback may magnify its last bits, so recorded episodes are followed."""
+    def follow(
+        self, inputs: Inputs, requested: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.float64] | None]:
+        """Take a step of a recorded episode: return the policy's action, and the action and targets for `requested`.
+
+        The recorded action replaces the policy's own because the feedback of the last action and limits of acceleration
+        magnify last bits from step to step.
+        """
 
 
 class CController(Controller):
@@ -76,18 +82,24 @@ class CController(Controller):
 
     def step(self, inputs: Inputs | None, age_s: float = 0.0) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
         """Return copies of action and targets."""
-        pointer = None
-        if inputs is not None:
-            self._values[:] = np.concatenate([np.ravel(inputs[part.name]) for part in self._layout.quantities])
-            pointer = self._values.ctypes.data_as(ctypes.c_void_p)
+        pointer = None if inputs is None else self._point_to(inputs)
         self.may_send = bool(self.library.rlctl_step(self.state, pointer, ctypes.c_double(age_s), *self._outputs))
         action = self.action.reshape(self._layout.action_space.shape).copy()
         return action, self._target.copy() if self._has_target else None
 
-    def set_last_action(self, action: NDArray[Any]) -> None:
-        """Replace the last action."""
-        self.action[:] = action.ravel()
-        self.library.rlctl_set_last_action(self.state, self._outputs[0])
+    def follow(
+        self, inputs: Inputs, requested: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.float64] | None]:
+        """Take a step of a recorded episode."""
+        own = requested.ravel().astype(self.action.dtype)
+        pointers = self._point_to(inputs), own.ctypes.data_as(ctypes.c_void_p)
+        self.library.rlctl_follow(self.state, *pointers, *self._outputs)
+        target = self._target.copy() if self._has_target else None
+        return own.reshape(self._layout.action_space.shape), self.action.copy(), target
+
+    def _point_to(self, inputs: Inputs) -> ctypes.c_void_p:
+        self._values[:] = np.concatenate([np.ravel(inputs[part.name]) for part in self._layout.quantities])
+        return self._values.ctypes.data_as(ctypes.c_void_p)
 
     def limit(self, values: NDArray[np.float64] | None, age_s: float, requested: NDArray[Any] | None) -> NDArray[Any]:
         """Return the action of the limits alone, for a policy's action."""
@@ -127,10 +139,14 @@ class OnnxController(Controller):
         target = results.get(TARGET)
         return results[ACTION][0], None if target is None else target[0]
 
-    def set_last_action(self, action: NDArray[Any]) -> None:
-        """Replace the last action, if it is part of the state."""
+    def follow(
+        self, inputs: Inputs, requested: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.float64] | None]:
+        """Take a step of a recorded episode."""
+        action, target = self.step(inputs)
         if LAST_ACTION in self._state:
-            self._state[LAST_ACTION] = action.reshape(1, -1).astype(self._dtypes[LAST_ACTION])
+            self._state[LAST_ACTION] = requested.reshape(1, -1).astype(self._dtypes[LAST_ACTION])
+        return action, action, target
 
 
 _DTYPES: dict[str, np.dtype[Any]] = {

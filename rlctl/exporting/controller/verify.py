@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import gymnasium
@@ -28,6 +28,9 @@ _TIMED_STEPS, _MEAN_OF = 3000, 10
 class LimitedPolicy:
     """The policy in Python, within the limits: what a controller is compared with."""
 
+    requested: NDArray[Any]
+    """The policy's last action, before the limits; zeros where it could not act."""
+
     def __init__(self, layout: ControllerLayout, policy: Policy, limits: Limits | None) -> None:
         self._layout, self._policy = layout, policy
         self._safety = None if limits is None else SafetyFilter(layout.inputs_info, limits)
@@ -42,10 +45,12 @@ class LimitedPolicy:
     def act(self, observation: Any, inputs: Inputs) -> NDArray[Any]:
         """Return the action for what the policy observes and what the robot measures."""
         if self._safety is None:
-            return self._policy.predict(observation)
+            self.requested = self._policy.predict(observation)
+            return self.requested
         values = np.concatenate([np.ravel(value) for value in inputs.values()]).astype(self._layout.dtype)
         is_sound = self._safety.observe(values)
-        return np.asarray(self._safety.limit(self._policy.predict(observation) if is_sound else None))
+        self.requested = self._policy.predict(observation) if is_sound else np.zeros(self._layout.action_size)
+        return np.asarray(self._safety.limit(self.requested if is_sound else None))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +60,7 @@ class Recorded:
     inputs: list[Inputs]
     actions: list[NDArray[Any]]
     episode: Episode
+    requested: list[NDArray[Any]] = dataclasses.field(default_factory=list)  # the policy's actions, before the limits
 
 
 class TaskPlayer:
@@ -99,21 +105,31 @@ def record(player: TaskPlayer, reference: LimitedPolicy) -> list[Recorded]:
     while len(recorded) < EPISODES or sum(len(episode.actions) for episode in recorded) < _MIN_OBSERVATIONS:
         seed = episode_seeds(0, Stream.VERIFY, len(recorded) + 1)[-1]
         reference.begin()
-        recorded.append(player.play(seed, reference.act))
+        requested: list[NDArray[Any]] = []
+
+        def act(observation: Any, inputs: Inputs, requested: list[NDArray[Any]] = requested) -> NDArray[Any]:
+            action = reference.act(observation, inputs)
+            requested.append(reference.requested)
+            return action
+
+        recorded.append(dataclasses.replace(player.play(seed, act), requested=requested))
     return recorded
 
 
 def verify_controller(
     player: TaskPlayer, recorded: Sequence[Recorded], controller: Controller, target: JointTarget | None
 ) -> ControllerAgreement:
-    """Compare a controller with recorded episodes, step by step; then let it act in the first of them."""
+    """Compare a controller with recorded episodes, step by step; then let it act in the first of them.
+
+    In each step the policy's action is compared, and what the limits make of the recorded one.
+    """
     agreement, worst = Agreement(), 0.0
     for episode in recorded:
         controller.begin()
-        for inputs, expected in zip(episode.inputs, episode.actions, strict=True):
-            action, targets = controller.step(inputs)
+        for inputs, requested, expected in zip(episode.inputs, episode.requested, episode.actions, strict=True):
+            own, action, targets = controller.follow(inputs, requested)
+            _compare(agreement, requested, own)
             _compare(agreement, expected, action)
-            controller.set_last_action(expected)
             if target is not None and targets is not None:
                 worst = max(worst, _compare(agreement, target.find_targets(inputs, expected), targets))
     agreement.observations = sum(len(episode.actions) for episode in recorded)
@@ -130,21 +146,24 @@ def verify_controller(
 
 
 def check_conclusive(
-    player: TaskPlayer, references: tuple[LimitedPolicy, LimitedPolicy], recorded: Sequence[Recorded]
+    player: TaskPlayer, reference: LimitedPolicy, changed: Iterable[LimitedPolicy], recorded: Sequence[Recorded]
 ) -> tuple[bool, bool]:
     """Return whether a policy repeats its recorded episodes, and whether they change with the last bits of its weights.
 
-    The references are the policy and one with other last bits.
+    `changed` are the policy with other last bits, within the same limits.
     """
-    loops = []
-    for reference in references:
+    episodes = [episode.episode for episode in recorded[:EPISODES]]
+
+    def play_again(reference: LimitedPolicy) -> ClosedLoop:
         again = []
-        for episode in recorded[:EPISODES]:
+        for episode in episodes:
             reference.begin()
-            again.append(player.play(episode.episode.result.seed, reference.act).episode)
-        loops.append(compare_episodes([episode.episode for episode in recorded[:EPISODES]], again))
-    repeats = loops[0].agrees and loops[0].max_return_difference == 0.0
-    return repeats, repeats and not loops[1].agrees
+            again.append(player.play(episode.result.seed, reference.act).episode)
+        return compare_episodes(episodes, again)
+
+    loop = play_again(reference)
+    repeats = loop.agrees and loop.max_return_difference == 0.0
+    return repeats, repeats and any(not play_again(other).agrees for other in changed)
 
 
 def _compare(agreement: Agreement, expected: NDArray[Any], actual: NDArray[Any]) -> float:
