@@ -40,7 +40,7 @@ def test_a_policy_of_pybullet_says_how_to_install_it_or_to_do_without(rlctl_with
     *_, missing, instead = done.stderr.splitlines()
     assert missing.startswith("error: PyBullet is not installed: pip install ")
     assert missing.endswith("pybullet")
-    assert instead == "or simulate in MuJoCo, unless the task needs models of PyBullet: --set sim=mujoco"
+    assert instead == "or simulate in MuJoCo, unless the task needs models of PyBullet: --sim mujoco"
 
 
 @pytest.mark.slow
