@@ -12,7 +12,6 @@ from rlctl.deploy.filter.bounds import Bounds
 from rlctl.deploy.filter.command import Command
 from rlctl.deploy.filter.fitting import FittedLimits
 from rlctl.deploy.filter.limits import Limits
-from rlctl.deploy.filter.observation import SensorChecks
 from rlctl.exporting.c_layers import write_array, write_number
 
 
@@ -108,28 +107,24 @@ class LimitsSource:
         """Where the quantities have the joints' positions; None if they are not measured."""
         return None if self.fitted.measured is None else self.fitted.measured.part.start
 
-    @functools.cached_property
-    def _sensors(self) -> SensorChecks:
-        return SensorChecks(self.limits, self.fitted.layout, self.fitted.control_dt)
-
     @property
     def has_range(self) -> bool:
         """Whether a sensor has a range."""
-        return self._sensors.has_range
+        return self.fitted.sensors.has_range
 
     @property
     def oldest(self) -> str:
         """Largest age of a measurement [s]."""
-        return write_number(np.float64(self._sensors.oldest), "double")
+        return write_number(np.float64(self.fitted.sensors.oldest), "double")
 
     @property
     def frozen(self) -> list[tuple[str, slice, int]]:
         """Name, place and largest number of equal steps of the quantities that must not freeze."""
-        return self._sensors.frozen
+        return self.fitted.sensors.frozen
 
     def list_arrays(self) -> dict[str, str]:
         """Return the definitions of all constant arrays by name."""
-        fitted, sensors, space = self.fitted, self._sensors, self.fitted.space
+        fitted, sensors, space = self.fitted, self.fitted.sensors, self.fitted.space
         assert isinstance(space, spaces.Box)
         numbers: dict[str, Any] = {
             **self.bounds.list_constants(),

@@ -8,7 +8,7 @@ import numpy as np
 
 from rlctl.deploy.controller_layout import ControllerLayout, JointTarget, Observed
 from rlctl.deploy.filter.fitting import fit_limits
-from rlctl.deploy.filter.limits import Limits
+from rlctl.deploy.filter.limits import NO_LIMITS, Limits
 from rlctl.exporting import c_source
 from rlctl.exporting.c_layers import CWriter, write_number
 from rlctl.exporting.c_source import CSource, Layout
@@ -47,11 +47,11 @@ class ControllerSource:
     def __init__(self, policy: PolicyFile, file_name: str, limits: Limits | None) -> None:
         c_source.check_can_be_written(policy)
         self.layout = layout = ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
-        self.limits = limits or Limits()
-        fitted = fit_limits(self.limits, layout.inputs_info)
+        fitted = fit_limits(limits or NO_LIMITS, layout.inputs_info)
+        self.limits = fitted.limits
         assert fitted.bounds is not None  # the actions are in a Box
         self._limits_source = LimitsSource(self.limits, fitted, fitted.bounds)
-        self.target = layout.find_target(limits, fitted.bounds)
+        self.target = layout.find_target(limits and fitted.limits, fitted.bounds)
         self.name = c_source.make_identifier(file_name)
         self._values = self._describe(policy)
 
