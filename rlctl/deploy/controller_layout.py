@@ -17,7 +17,7 @@ from rlctl.environments.info import AnyTerm, EnvInfo, space_to_json
 from rlctl.errors import RecipeError, UsageError
 from rlctl.policy.c_policy import observation_type
 from rlctl.task.joints import Command
-from rlctl.task.terms import Internal
+from rlctl.task.terms import Internal, Scaled
 
 _UNITS = {"position": "rad or m", "step": "rad or m", "speed": "rad/s or m/s", "torque": "N m or N"}
 Clips = Literal["", "exact", "towards"]
@@ -74,6 +74,7 @@ class JointTarget:
     factor: NDArray[np.float64]
     default: NDArray[np.float64]  # of positions; zeros for the other kinds
     measured: int  # where the inputs have the joints' positions, for steps
+    input: str  # name of that input
     clips: Clips
     """Whether a position is clipped to the joints' range; `towards`: a joint outside it is not sent back at once."""
     low: NDArray[np.float64]
@@ -113,7 +114,7 @@ class JointTarget:
     @property
     def formula(self) -> str:
         """How it follows from the action, for people."""
-        base = {"position": "default_positions + ", "step": "measured position + "}.get(self.kind, "")
+        base = {"position": "default_positions + ", "step": f"{self.input} + "}.get(self.kind, "")
         clipped = "" if not self.clips else ", within target_low and target_high"
         kind = "position" if self.kind == "step" else self.kind
         return f"joint {kind} [{self.unit}] = {base}target_factor * action{clipped}"
@@ -244,25 +245,35 @@ class ControllerLayout:
             scale = bounds.factor / (bounds.dt if kind == "speed" else 1.0)
             if not (np.allclose(scale, factor) and np.allclose(bounds.offset, default)):
                 raise RecipeError(f"limits: scale and offset differ from the task's {factor.tolist()}; leave them out")
-        measured = self.find_quantity(joints.measured).start if kind == "step" else 0
+        source = self.find_quantity(joints.measured) if kind == "step" else None
+        measured, name = (0, "") if source is None else (source.start, source.identifier)
         clips: Clips = "" if not joints.clips_target else "towards" if limits and kind == "step" else "exact"
         low, high = (np.array(ends or [0.0] * count) for ends in (joints.low, joints.high))
-        return JointTarget(kind, factor, default, measured, clips, low, high)
+        return JointTarget(kind, factor, default, measured, name, clips, low, high)
 
     def describe_inputs(self) -> list[str]:
         """Return a line per input: its name, size and unit."""
-        return [
-            f"  {quantity.identifier}[{quantity.size}]{f' [{quantity.unit}]' if quantity.unit else ''}"
-            + ("" if quantity.name == quantity.identifier else f": {quantity.name}")
-            for quantity in self.quantities
-        ]
+        lines = []
+        for part in self.quantities:
+            unit = f" [{part.unit}]" if part.unit else ", no unit declared"
+            lines.append(f"  {part.identifier}[{part.size}]{unit}")
+            lines[-1] += "" if part.name == part.identifier else f": {part.name}"
+        return lines
 
     def describe_internal(self) -> list[str]:
         """Return what the controller computes from the inputs, for people."""
-        computed = [f"{part.name} ({part.term.kind.replace('_', ' ')})" for part in self.observed if part.term]
+        computed = [f"{part.name} ({_describe_term(part.term)})" for part in self.observed if part.term]
         histories = [f"the last {part.frames} of {part.name}" for part in self.observed if part.frames > 1]
         stacked = [f"a stack of {self.frames} observations"] if self.frames > 1 else []
         return [*computed, *histories, *stacked]
+
+
+def _describe_term(term: AnyTerm) -> str:
+    if not isinstance(term, Scaled):
+        return " ".join([term.kind.replace("_", " "), *(["of"] if term.inputs else []), ", ".join(term.inputs)]).strip()
+    offset, scale = (", ".join(f"{number:.6g}" for number in numbers) for numbers in (term.offset, term.scale))
+    shifted = f"{term.quantity} - [{offset}]" if offset else term.quantity
+    return f"({shifted}) * [{scale}]" if scale else shifted
 
 
 def _make_identifier(name: str, taken: Iterable[str]) -> str:

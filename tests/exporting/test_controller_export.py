@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from rlctl.environments.info import describe
@@ -63,6 +64,11 @@ def test_both_files_are_verified_within_limits(policy_of, tmp_path):
     words = [word for word, _ in in_c.list_rows()]
     assert words == ["exported", "policy", "inputs", "target", "limits", "function", *words[6:]]
     assert (tmp_path / "cart.onnx").exists()
+    examples = [(tmp_path / name).read_text().splitlines() for name in ("cart.c.csv", "cart.onnx.csv")]
+    assert examples[0][0] == "places_0,places_1,goal_0,goal_1,action_0,action_1,target_0,target_1"
+    first = np.array(examples[1][1].split(","), float)
+    assert first[6:] == pytest.approx(first[:2] + 0.05 * first[4:6], abs=1e-7)  # a step, without limits
+    assert [len(lines) for lines in examples] == [101, 101]
 
 
 @pytest.mark.slow

@@ -28,7 +28,15 @@ def show(report: RobotReport, json: str | None, gates: Gates) -> None:
     settings = f"seed {report.seed}", report.spec.engine, describe_randomization(report.info.events)
     out.print(", ".join(filter(None, [episodes, *settings])))
     has_success = report.scores[0].outcome.success_rate is not None
-    columns = ("", *(("success", "95 % interval") if has_success else ()), "return", "steps", "steps/s", "held", "lost")
+    columns = (
+        "",
+        *(("success", "95 % interval") if has_success else ()),
+        "return",
+        "steps",
+        "steps/s",
+        "held",
+        "dropped",
+    )
     output.print_table(columns, [_list_scores(score) for score in report.scores], left=("",))
     _show_times(report)
     _show_differences(report)

@@ -18,6 +18,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
 from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
+from rlctl.exporting.controller.example import ROWS, write_example
 from rlctl.exporting.controller.graph import build_graph
 from rlctl.exporting.controller.players import CController, Controller, OnnxController, compile_controller
 from rlctl.exporting.controller.source import ControllerSource
@@ -54,7 +55,8 @@ class ControllerReport(ExportReport):
         else:
             sizes = ", ".join(f"{name}[{size}]" for name, size in details["input_sizes"].items())
             rows = [*rows[:2], ("inputs", sizes), *rows[2:]]
-        return [*rows[:3], *target, ("limits", details["limits"]), *rows[3:]]
+        example = [("example", f"{path}: inputs and outputs of {ROWS} steps")] if (path := details["example"]) else []
+        return [*rows[:3], *target, ("limits", details["limits"]), *rows[3:-1], *example, *rows[-1:]]
 
 
 def export_controller(request: ExportRequest) -> list[ExportReport]:
@@ -113,6 +115,7 @@ class _Export:
         inputs = recorded[0].inputs[0]
         median = float(np.median(timeit.repeat(lambda: controller.step(inputs), number=1, repeat=330)[30:])) * 1e6
         files.write_bytes(path, content)
+        example = self._write_example(path, controller, recorded)
         ports = {
             kind: [{"name": port.name, "dtype": port.type[len("tensor(") : -1], "shape": port.shape} for port in some]
             for kind, some in (
@@ -120,13 +123,18 @@ class _Export:
                 ("outputs", controller.session.get_outputs()),
             )
         }
-        details = {"opset": model.opset_import[0].version, **ports, "limits": "none: the limits are in the C file"}
+        details = {
+            "opset": model.opset_import[0].version,
+            **ports,
+            "example": example,
+            "limits": "none: the limits are in the C file",
+        }
         return self._report(path, len(content), details, target, median, fields)
 
     def write_c(self, path: Path) -> ControllerReport:
         """Write and verify the C file and its header, with the limits."""
         source = ControllerSource(self.policy, path.stem, self.limits)
-        compiler, median = find_compiler(), None
+        compiler, median, example = find_compiler(), None, None
         command = os.environ.get("CC") or "cc"
         fields: dict[str, Any] = {"not_verified": f"there is no C compiler {command!r}; set CC to one"}
         code = source.write()
@@ -136,6 +144,7 @@ class _Export:
                 controller = CController(source.layout, library, has_target=source.target is not None)
                 fields, recorded = self._verify(path, controller, source.target, is_limited=self.limits is not None)
                 median, longest = verify.measure_step(controller, recorded)
+                example = self._write_example(path, controller, recorded)
             code = source.write(
                 f"A step took {median:.1f} us (median; {longest:.1f} us were enough for 99 % of the steps) "
                 f"on {platform.machine()} with {Path(compiler[0]).name} {FLAGS[1]}."
@@ -145,8 +154,14 @@ class _Export:
         files.write_text(path, code.source)
         size = len(code.source.encode()) + len(code.header.encode())
         limits = "the bounds of the action; --limits FILE adds others" if self.limits is None else str(self.limits.file)
-        details = {"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0], "limits": limits}
+        details = {"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0]}
+        details |= {"example": example, "limits": limits}
         return self._report(path, size, details, source.target, median, fields)
+
+    def _write_example(self, path: Path, controller: Controller, recorded: list[verify.Recorded]) -> Path:
+        example = path.with_name(f"{path.name}.csv")
+        files.write_text(example, write_example(controller, recorded[0].inputs))
+        return example
 
     def _make_reference(self, policy: Policy, is_limited: bool) -> verify.LimitedPolicy:
         return verify.LimitedPolicy(_describe_controller(self.policy), policy, self.limits if is_limited else None)

@@ -6,7 +6,6 @@ import numpy as np
 import onnx
 
 from rlctl.deploy.controller_layout import ControllerLayout, JointTarget, Observed, Stack
-from rlctl.errors import UsageError
 from rlctl.exporting.actor import emit_actor, make_metadata
 from rlctl.exporting.controller.symbols import GraphSymbol
 from rlctl.exporting.layers import BATCH, Graph, concatenate
@@ -25,6 +24,12 @@ def build_graph(policy: PolicyFile) -> onnx.ModelProto:
     return _Writer(policy).write()
 
 
+def name_input(quantity: str) -> str:
+    """Return the name of a quantity's input: its own, or with `_input` where the graph itself uses that name."""
+    is_taken = quantity.startswith("/") or quantity in _TAKEN or quantity.endswith("_out")
+    return f"{quantity.lstrip('/')}_input" if is_taken else quantity
+
+
 class _Writer:
     def __init__(self, policy: PolicyFile) -> None:
         self._policy, self._layout, self._graph = (
@@ -41,9 +46,8 @@ class _Writer:
             self._steps = self._graph.input(STEPS, np.int64, (BATCH, 1), f"steps of the episode; {_ZEROS}")
 
     def _add_input(self, name: str, size: int, unit: str) -> str:
-        if name.startswith("/") or name in _TAKEN or name.endswith("_out"):
-            raise UsageError(f"--controller: an input named {name!r} cannot be written as ONNX; rename it")
-        return self._graph.input(name, self._layout.dtype, (BATCH, size), f"[{unit}]" if unit else "")
+        graph, shape = self._graph, (BATCH, size)
+        return graph.input(name_input(name), self._layout.dtype, shape, f"[{unit}]" if unit else "")
 
     def write(self) -> onnx.ModelProto:
         graph, layout, info = self._graph, self._layout, self._policy.info
@@ -74,7 +78,7 @@ class _Writer:
         target = self._target
         return metadata | {
             onnx_policy.CONTROLLER_KEY: "1",
-            "input_names": ",".join(part.name for part in quantities),
+            "input_names": ",".join(name_input(part.name) for part in quantities),
             "input_sizes": ",".join(str(part.size) for part in quantities),
             "input_units": ",".join(part.unit.replace(",", ";") for part in quantities),
             **({"target": target.formula} if target is not None else {}),

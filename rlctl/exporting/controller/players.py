@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.errors import AnswerIsNo, short_repr
 from rlctl.exporting.c_source import FLAGS, CSource
-from rlctl.exporting.controller.graph import LAST_ACTION, TARGET
+from rlctl.exporting.controller.graph import LAST_ACTION, TARGET, name_input
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type
 from rlctl.policy.onnx_policy import ACTION, open_session
 
@@ -133,7 +133,8 @@ class OnnxController(Controller):
 
     def step(self, inputs: Inputs) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
         """Return action and targets."""
-        feed = {name: np.asarray(value, self._dtypes[name]).reshape(1, -1) for name, value in inputs.items()}
+        named = {name_input(name): value for name, value in inputs.items()}
+        feed = {name: np.asarray(value, self._dtypes[name]).reshape(1, -1) for name, value in named.items()}
         results = dict(zip(self._outputs, self.session.run(self._outputs, feed | self._state), strict=True))
         self._state = {name: results[f"{name}_out"] for name in self._states}
         target = results.get(TARGET)

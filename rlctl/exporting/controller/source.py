@@ -152,6 +152,8 @@ class ControllerSource:
                 numbers |= {"target_low": target.low, "target_high": target.high}
         if env.joints is not None and env.joints.default_positions:
             numbers.setdefault("default_positions", np.array(env.joints.default_positions))
+        if env.joints is not None and env.joints.low and env.joints.high:
+            numbers |= {"joint_low": np.array(env.joints.low), "joint_high": np.array(env.joints.high)}
         for name, array in numbers.items():
             arrays.append(("double", name, "ACTION_SIZE", [write_number(value, "double") for value in array]))
         return arrays
