@@ -10,8 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.deploy.filter.bounds import Bounds
-from rlctl.deploy.filter.limits import Limits
+from rlctl.deploy.filter.fitting import FittedLimits
 from rlctl.environments.dict_spaces import SINGLE, split, split_space
 from rlctl.environments.info import AnyTerm, EnvInfo, space_to_json
 from rlctl.errors import RecipeError, UsageError
@@ -79,6 +78,7 @@ class JointTarget:
     """Whether a position is clipped to the joints' range; `towards`: a joint outside it is not sent back at once."""
     low: NDArray[np.float64]
     high: NDArray[np.float64]
+    tracks: bool = False  # whether limits bound the targets themselves, from one to the next
 
     @property
     def unit(self) -> str:
@@ -116,6 +116,7 @@ class JointTarget:
         """How it follows from the action, for people."""
         base = {"position": "default_positions + ", "step": f"{self.input} + "}.get(self.kind, "")
         clipped = "" if not self.clips else ", within target_low and target_high"
+        clipped = ", which the limits bound from one target to the next" if self.tracks else clipped
         kind = "position" if self.kind == "step" else self.kind
         return f"joint {kind} [{self.unit}] = {base}target_factor * action{clipped}"
 
@@ -228,8 +229,8 @@ class ControllerLayout:
                 return quantity
         raise UsageError(f"--controller: no input has the joints' positions: {name!r} is computed inside")
 
-    def find_target(self, limits: Limits | None, bounds: Bounds | None) -> JointTarget | None:
-        """Return what an action commands, if the task describes it; `bounds` are those of the limits.
+    def find_target(self, fitted: FittedLimits | None) -> JointTarget | None:
+        """Return what an action commands within limits, if the task describes it.
 
         Raises `RecipeError` for limits with other units than the task has.
         """
@@ -241,15 +242,18 @@ class ControllerLayout:
         default = np.array(
             joints.default_positions if kind == "position" and joints.default_positions else [0.0] * count
         )
-        if limits is not None and bounds is not None and limits.command == kind:
-            scale = bounds.factor / (bounds.dt if kind == "speed" else 1.0)
+        steps = None if fitted is None else fitted.steps
+        if fitted is not None and (bounds := fitted.bounds) is not None and fitted.limits.command == kind:
+            scale = (steps or bounds).factor / (bounds.dt if kind == "speed" else 1.0)
             if not (np.allclose(scale, factor) and np.allclose(bounds.offset, default)):
                 raise RecipeError(f"limits: scale and offset differ from the task's {factor.tolist()}; leave them out")
         source = self.find_quantity(joints.measured) if kind == "step" else None
         measured, name = (0, "") if source is None else (source.start, source.identifier)
-        clips: Clips = "" if not joints.clips_target else "towards" if limits and kind == "step" else "exact"
+        clips: Clips = (
+            "" if not joints.clips_target else "towards" if fitted is not None and kind == "step" else "exact"
+        )
         low, high = (np.array(ends or [0.0] * count) for ends in (joints.low, joints.high))
-        return JointTarget(kind, factor, default, measured, name, clips, low, high)
+        return JointTarget(kind, factor, default, measured, name, clips, low, high, tracks=steps is not None)
 
     def describe_inputs(self) -> list[str]:
         """Return a line per input: its name, size and unit."""

@@ -12,6 +12,7 @@ from rlctl.deploy.filter.bounds import Bounds
 from rlctl.deploy.filter.defaults import fill_in, find_positions
 from rlctl.deploy.filter.limits import JointLimits, Limits
 from rlctl.deploy.filter.observation import MeasuredPositions, ObservationLayout, SensorChecks
+from rlctl.deploy.filter.steps import Steps, bound_targets
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RecipeError, UsageError, check_name
 from rlctl.task.joints import Joints
@@ -37,6 +38,7 @@ class FittedLimits:
     layout: ObservationLayout
     space: spaces.Space[Any]  # the action space
     control_dt: float | None
+    steps: Steps | None  # steps that are bounded as targets
     bounds: Bounds | None  # None where actions are choices
     measured: MeasuredPositions | None
     sensors: SensorChecks
@@ -64,6 +66,8 @@ def _fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     _, space = info.spaces()
     count = math.prod(space.shape or ())
     bounds: Bounds | None = None
+    steps = None
+    measured = _find_measured(limits.measured.position, layout, info, count)
     if isinstance(space, spaces.Box):
         known = info.joints if info.joints is not None and len(info.joints.names) == count else None
         if limits.joints is not None and known is not None and limits.joints != list(known.names):
@@ -74,21 +78,20 @@ def _fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
         if len(names) != count or len(set(names)) != count:
             raise RecipeError(f"limits: joints: {len(set(names))} different names, the action has {count} elements")
         bounds = _make_bounds(limits, space, names, control_dt, known)
+        bounds, steps = bound_targets(bounds, space) if measured and limits.kind == "step" else (bounds, None)
     elif limits.limits or limits.lowpass_hz:
         raise UsageError(
             "limits: the actions of this policy are discrete choices; only continuous actions can be limited"
         )
-    measured = _find_measured(limits.measured.position, layout, info, count)
     home = _read_list(limits, "home", count)
     if (limits.lowpass_hz or limits.blend_in_s) and control_dt is None:
         raise RecipeError(_NO_CONTROL_DT)
     _check_home(limits, bounds, home)
     _check_measured(limits, bounds, measured, layout)
     safe = _make_safe_command(limits, bounds, count)
-    joints = info.joints if info.joints is not None and len(info.joints.names) == count else None
     positions = measured or _find_measured(find_positions(info, layout), layout, info, count)
-    sensors = SensorChecks(limits, layout, control_dt, positions, joints)
-    return FittedLimits(limits, layout, space, control_dt, bounds, measured, sensors, home, safe)
+    sensors = SensorChecks(limits, layout, control_dt, positions, info.joints)
+    return FittedLimits(limits, layout, space, control_dt, steps, bounds, measured, sensors, home, safe)
 
 
 def _make_bounds(

@@ -110,7 +110,7 @@ class _Export:
         model = build_graph(self.policy)
         content = encode(model)
         controller = OnnxController(content)
-        target = _describe_controller(self.policy).find_target(None, None)
+        target = _describe_controller(self.policy).find_target(None)
         fields, recorded = self._verify(path, controller, target, is_limited=False)
         inputs = recorded[0].inputs[0]
         median = float(np.median(timeit.repeat(lambda: controller.step(inputs), number=1, repeat=330)[30:])) * 1e6

@@ -37,7 +37,7 @@ class _Writer:
             ControllerLayout(policy.info.env, policy.info.spec.frame_stack),
             Graph(),
         )
-        self._target = self._layout.find_target(None, None)
+        self._target = self._layout.find_target(None)
         self._inputs = {part.name: self._add_input(part.name, part.size, part.unit) for part in self._layout.quantities}
         self._states: list[str] = []
         self._steps = ""

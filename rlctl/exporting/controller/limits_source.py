@@ -45,7 +45,12 @@ class LimitsSource:
     @property
     def is_position(self) -> bool:
         """Whether a command is a position."""
-        return self.limits.command == "position"
+        return self.limits.command == "position" or self.tracks
+
+    @property
+    def tracks(self) -> bool:
+        """Whether steps are bounded as targets: a command is the target of a joint, of type double."""
+        return self.fitted.steps is not None
 
     @property
     def is_action(self) -> bool:
@@ -129,6 +134,9 @@ class LimitsSource:
         numbers: dict[str, Any] = {
             **self.bounds.list_constants(),
             "safe_command": fitted.safe,
+            "step_factor": None if fitted.steps is None else fitted.steps.factor,
+            "step_low": None if fitted.steps is None else fitted.steps.low,
+            "step_high": None if fitted.steps is None else fitted.steps.high,
             "home": fitted.home,
             "action_low": space.low.ravel().astype(np.float64),
             "action_high": space.high.ravel().astype(np.float64),
@@ -162,7 +170,7 @@ class LimitsSource:
         """What a fault leads to, for the header."""
         if self.on_fault != "hold":
             return f"A fault of the inputs or the policy: {self.on_fault}."
-        still = "no motion" if not self.is_value else "the present position"
+        still = "no motion" if not self.is_value else "the present target, after braking"
         if self.is_value and not self.is_position:
             still = f"action {_shorten(self.limits.safe_action or 0.0)}"
         return f"A fault of the inputs or the policy: {still}, until the fault ends."

@@ -51,7 +51,7 @@ class ControllerSource:
         self.limits = fitted.limits
         assert fitted.bounds is not None  # the actions are in a Box
         self._limits_source = LimitsSource(self.limits, fitted, fitted.bounds)
-        self.target = layout.find_target(limits and fitted.limits, fitted.bounds)
+        self.target = layout.find_target(None if limits is None else fitted)
         self.name = c_source.make_identifier(file_name)
         self._values = self._describe(policy)
 

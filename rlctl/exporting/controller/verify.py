@@ -35,6 +35,12 @@ class LimitedPolicy:
         self._layout, self._policy = layout, policy
         self._safety = None if limits is None else SafetyFilter(layout.inputs_info, limits)
 
+    @property
+    def target(self) -> NDArray[Any] | None:
+        """A copy of the last target, where the limits bound targets."""
+        command = None if self._safety is None else self._safety.command
+        return None if command is None or command.target is None else command.target.copy()
+
     def begin(self) -> None:
         """Begin an episode, and end what the limits hold."""
         self._policy.reset()
@@ -61,6 +67,7 @@ class Recorded:
     actions: list[NDArray[Any]]
     episode: Episode
     requested: list[NDArray[Any]] = dataclasses.field(default_factory=list)  # the policy's actions, before the limits
+    targets: list[NDArray[Any] | None] = dataclasses.field(default_factory=list)  # those that the limits bound
 
 
 class TaskPlayer:
@@ -105,14 +112,16 @@ def record(player: TaskPlayer, reference: LimitedPolicy) -> list[Recorded]:
     while len(recorded) < EPISODES or sum(len(episode.actions) for episode in recorded) < _MIN_OBSERVATIONS:
         seed = episode_seeds(0, Stream.VERIFY, len(recorded) + 1)[-1]
         reference.begin()
-        requested: list[NDArray[Any]] = []
+        between: list[tuple[NDArray[Any], NDArray[Any] | None]] = []
 
-        def act(observation: Any, inputs: Inputs, requested: list[NDArray[Any]] = requested) -> NDArray[Any]:
+        def act(observation: Any, inputs: Inputs, between: list[Any] = between) -> NDArray[Any]:
             action = reference.act(observation, inputs)
-            requested.append(reference.requested)
+            between.append((reference.requested, reference.target))
             return action
 
-        recorded.append(dataclasses.replace(player.play(seed, act), requested=requested))
+        played = player.play(seed, act)
+        requested, targets = map(list, zip(*between, strict=True))
+        recorded.append(dataclasses.replace(played, requested=requested, targets=targets))
     return recorded
 
 
@@ -126,12 +135,14 @@ def verify_controller(
     agreement, worst = Agreement(), 0.0
     for episode in recorded:
         controller.begin()
-        for inputs, requested, expected in zip(episode.inputs, episode.requested, episode.actions, strict=True):
+        steps = zip(episode.inputs, episode.requested, episode.actions, episode.targets, strict=True)
+        for inputs, requested, expected, bounded in steps:
             own, action, targets = controller.follow(inputs, requested)
             _compare(agreement, requested, own)
             _compare(agreement, expected, action)
             if target is not None and targets is not None:
-                worst = max(worst, _compare(agreement, target.find_targets(inputs, expected), targets))
+                wanted = target.find_targets(inputs, expected) if bounded is None else bounded
+                worst = max(worst, _compare(agreement, wanted, targets))
     agreement.observations = sum(len(episode.actions) for episode in recorded)
 
     def act(observation: Any, inputs: Inputs) -> NDArray[Any]:
