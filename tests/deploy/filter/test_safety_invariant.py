@@ -89,7 +89,7 @@ class Oracle:
         unit = 1.0 if limits.scale is None else np.broadcast_to(limits.scale, 2)
         self.factor = unit * np.ones(2) * (dt if limits.command == "speed" else 1.0)
         self.offset = np.broadcast_to(0.0 if limits.offset is None else limits.offset, 2)
-        moves = np.isfinite([self.read("speed", np.inf), self.read("acceleration", np.inf)]).any()
+        moves = np.isfinite([self.read("speed", np.inf) * dt, self.read("acceleration", np.inf) * dt**2]).any()
         self.tracks = limits.command == "step" and space.dtype.kind == "f" and bool(moves)
         self.eps = np.finfo(space.dtype).eps if space.dtype.kind == "f" else np.finfo(np.float64).eps
         self.quantum = 1.0 if space.dtype.kind == "i" else self.eps
@@ -125,7 +125,8 @@ class Oracle:
         if target is None or position is None:
             return "" if (action == np.clip(0.0, self.space.low, self.space.high)).all() else "no target"
         low, high = self.find_range()
-        step = np.clip(target - position, low, high)
+        largest = self.factor * min(float(np.finfo(self.space.dtype).max), 1e30)  # actions without bounds end there
+        step = np.clip(target - position, np.maximum(low, -largest), np.minimum(high, largest))
         slack = 20 * self.eps * np.abs(step) + 2 * self.eps * self.factor + 1e-300
         if not (np.abs(action.astype(np.float64) * self.factor - step) <= slack).all():
             return "action"
