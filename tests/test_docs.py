@@ -131,7 +131,7 @@ def test_python_is_python(block):
 
 
 def is_limits(block) -> bool:
-    return block.text.startswith("command:")
+    return block.text.startswith(("command:", "limits:"))
 
 
 @pytest.mark.parametrize("block", [each for each in find_blocks("yaml") if not is_limits(each)], ids=str)
@@ -141,13 +141,16 @@ def test_recipes_are_recipes(block):
 
 def test_limits_are_limits_of_reach():
     from rlctl.deploy import Limits, SafetyFilter
+    from rlctl.exporting.controller.source import ControllerSource
     from rlctl.policy.file import PolicyFile
     from rlctl.policy.shipped import PRETRAINED
     from rlctl.run.lookup import find_policy
 
-    info = PolicyFile.read_info(find_policy("reach", PRETRAINED).file)
+    policy = PolicyFile.read(find_policy("reach", PRETRAINED).file)
     (block,) = [each for each in find_blocks("yaml") if is_limits(each) and "shoulder" not in each.text]
-    SafetyFilter(info.env, Limits.model_validate(yaml_text.load(block.text, str(block))))
+    limits = Limits.model_validate(yaml_text.load(block.text, str(block)))
+    SafetyFilter(policy.info.env, limits)
+    ControllerSource(policy, "reach", limits)
 
 
 def test_other_files_can_be_read():

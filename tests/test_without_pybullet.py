@@ -47,7 +47,7 @@ def test_pybullet_that_was_asked_for_is_an_error_that_says_how_to_install_it(rlc
     *_, missing, instead = done.stderr.splitlines()
     assert missing.startswith("error: PyBullet is not installed: pip install ")
     assert missing.endswith("pybullet")
-    assert instead == "or simulate in MuJoCo, unless the task needs models of PyBullet: --set sim=mujoco"
+    assert instead == "or simulate in MuJoCo, unless the task needs models of PyBullet: --sim mujoco"
 
 
 @pytest.mark.slow

@@ -1,10 +1,9 @@
-/* robot_client [PORT [HOST]]: runs the policy of policy.c (`rlctl export --c`) against `rlctl robot`, by UDP.
+/* robot_client [PORT [HOST]]: runs controller.c (`rlctl export --controller`) against `rlctl robot --controller`, by UDP.
  *
- * Replace policy_act by your own program. With a key: RLCTL_API_KEY in the environment.
+ * The loop of a robot: measurements in, controller_step, targets out. With a key: RLCTL_API_KEY in the environment.
  */
 #define _POSIX_C_SOURCE 200112L
 
-#include <math.h>
 #include <netdb.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -13,7 +12,7 @@
 #include <sys/time.h>
 #include <unistd.h>
 
-#include "policy.h"
+#include "controller.h"
 #include "rlctl_robot.h"
 
 enum { PATIENCE = 300 }; /* tenths of a second without a packet until the robot is given up */
@@ -39,7 +38,7 @@ static int connect_to_robot(const char *host, const char *port)
 
 static void say_hello(int robot)
 {
-    rlctl_robot_packet hello = {RLCTL_ROBOT_MAGIC, RLCTL_ROBOT_VERSION, RLCTL_ROBOT_HELLO, 0, 0, 0, 0, 0, 0, {0}};
+    rlctl_robot_packet hello = {RLCTL_ROBOT_MAGIC, RLCTL_ROBOT_VERSION, RLCTL_ROBOT_HELLO, 0, 0, 0, 0, 0, 0, 0, 0, {0}};
     const char *key = getenv("RLCTL_API_KEY");
     size_t length = key == NULL ? 0 : strlen(key);
     if (length > sizeof hello.values) {
@@ -72,6 +71,41 @@ static int receive(int robot, rlctl_robot_packet *packet, int greeting)
     return 0;
 }
 
+/* The measurement as the controller takes it, and its targets; where the task has none, its actions. */
+static int control(controller_state *state, const rlctl_robot_packet *packet, float *command)
+{
+    controller_inputs inputs;
+    controller_outputs outputs;
+    CONTROLLER_NUMBER *numbers = (CONTROLLER_NUMBER *)&inputs; /* its members, one after the other */
+    for (int i = 0; i < CONTROLLER_INPUT_SIZE; ++i) {
+        numbers[i] = packet->values[i];
+    }
+    const int may_send = controller_step(state, &inputs, packet->age_s, &outputs);
+    for (int i = 0; i < CONTROLLER_ACTION_SIZE; ++i) {
+#ifdef CONTROLLER_TARGET
+        command[i] = (float)outputs.target[i];
+#else
+        command[i] = (float)outputs.action[i];
+#endif
+    }
+    return may_send;
+}
+
+/* Returns 0 and prints a line for a robot that does not fit the controller. */
+static int fits(const rlctl_robot_packet *packet)
+{
+    if (packet->kind != RLCTL_ROBOT_MEASUREMENT) {
+        fprintf(stderr, "robot_client: the robot sends observations: start it with --controller\n");
+        return 0;
+    }
+    if (packet->measured_size != CONTROLLER_INPUT_SIZE || packet->command_size != CONTROLLER_ACTION_SIZE) {
+        fprintf(stderr, "robot_client: the robot sends %d numbers and takes %d, the controller has %d and %d\n",
+                packet->measured_size, packet->command_size, CONTROLLER_INPUT_SIZE, CONTROLLER_ACTION_SIZE);
+        return 0;
+    }
+    return 1;
+}
+
 int main(int count, char **arguments)
 {
     const int robot = connect_to_robot(count > 2 ? arguments[2] : "127.0.0.1", count > 1 ? arguments[1] : "8001");
@@ -79,9 +113,12 @@ int main(int count, char **arguments)
         perror("robot_client");
         return 1;
     }
+    controller_state state;
     rlctl_robot_packet packet;
-    uint32_t last = 0;                              /* sequence of the observation that was answered last */
-    float observation[POLICY_OBSERVATION_SIZE], action[POLICY_ACTION_SIZE] = {0};
+    uint32_t last = 0, episode = 0, step = 0; /* of the measurement that was answered last */
+    float command[CONTROLLER_ACTION_SIZE];
+    int may_send = 0;
+    controller_init(&state);
     say_hello(robot);
     for (;;) {
         if (!receive(robot, &packet, last == 0)) {
@@ -91,32 +128,26 @@ int main(int count, char **arguments)
         if (packet.kind == RLCTL_ROBOT_END) {
             break;
         }
-        if (packet.kind != RLCTL_ROBOT_OBSERVATION) {
-            continue;
-        }
-        if (packet.observation_size != POLICY_OBSERVATION_SIZE || packet.action_size != POLICY_ACTION_SIZE) {
-            fprintf(stderr, "robot_client: the robot has %d observations and %d actions, the policy %d and %d\n",
-                    packet.observation_size, packet.action_size, POLICY_OBSERVATION_SIZE, POLICY_ACTION_SIZE);
+        if (!fits(&packet)) {
             return 1;
         }
         if (packet.sequence != last) { /* else the robot has not received the answer: it gets the same again */
-            int is_finite = 1;
-            memcpy(observation, packet.values, sizeof observation);
-            for (int i = 0; i < POLICY_OBSERVATION_SIZE; ++i) {
-                is_finite = is_finite && isfinite(observation[i]);
+            if (packet.episode != episode || packet.step < step) {
+                controller_resume(&state); /* a new episode ends a stop: on a robot of your own, a person does that */
+                controller_reset(&state);
             }
-            if (is_finite) { /* else the last action is held; a robot of your own may need another answer */
-                policy_act(observation, action);
-            }
+            may_send = control(&state, &packet, command);
             last = packet.sequence;
+            episode = packet.episode;
+            step = packet.step;
         }
-        packet.kind = RLCTL_ROBOT_COMMAND;
-        memcpy(packet.values, action, sizeof action);
-        if (send(robot, &packet, RLCTL_ROBOT_HEADER_SIZE + sizeof action, 0) < 0) {
+        packet.kind = may_send ? RLCTL_ROBOT_COMMAND : RLCTL_ROBOT_NO_COMMAND;
+        memcpy(packet.values, command, sizeof command);
+        if (send(robot, &packet, RLCTL_ROBOT_HEADER_SIZE + (may_send ? sizeof command : 0), 0) < 0) {
             perror("robot_client");
         }
     }
     close(robot);
-    printf("%u observations answered\n", (unsigned)last);
+    printf("%u measurements answered\n", (unsigned)last);
     return 0;
 }

@@ -57,7 +57,7 @@ def serve(
 
 @command_in_panels(
     {
-        "Options": ["policy", "pretrained", "episodes", "seed", "realtime", "fault", "settings", "sim"],
+        "Options": ["policy", "pretrained", "controller", "episodes", "seed", "realtime", "fault", "settings", "sim"],
         "Gates": ["min_success", "min_success_lower", "min_return"],
         "Where": ["host", "port", "key_file", "timeout_s"],
         "Output": ["json"],

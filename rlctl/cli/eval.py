@@ -62,8 +62,9 @@ def evaluate(
 
     gates = Gates(min_success, min_success_lower, min_return)
     chosen = dataclasses.replace(options, checkpoint=choose_checkpoint(options.checkpoint, pretrained))
-    # Another engine than MuJoCo, and a policy without a file, have no range of contacts: they are played only there.
-    only = sim if sim == "pybullet" or options.baseline is not None else None
+    # PyBullet has no range of contacts, and what a robustness map cannot be combined with is played in one engine.
+    is_single = options.baseline is not None or options.limits is not None or options.record is not None
+    only = sim if sim == "pybullet" or is_single or options.decide_early else None
     sim = None if only is not None else sim
     request = EvalRequest(**vars(chosen), changes=parse_changes(settings, only))
     if on is not None and not vary and sim is None:

@@ -61,8 +61,8 @@ class Layout:
         self.parts = split_space(space)
         self.sizes = {key: math.prod(part.shape or ()) for key, part in self.parts.items()}
         self.size = sum(self.sizes.values()) // self.frames
-        self.type = _NUMBERS[observation_type(info).name]
-        self.action_type = _NUMBERS.get(action_type(info).name, "int")
+        self.type = _NUMBERS[observation_type(info.env).name]
+        self.action_type = _NUMBERS.get(action_type(info.env).name, "int")
         self.action_size = math.prod(self.action_space.shape or ())
         self.observed = self._list_observed()
         self.actions = self._list_actions()

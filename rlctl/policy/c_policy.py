@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import split, split_space
+from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.policy import Policy
@@ -18,15 +19,15 @@ from rlctl.storage import untrusted
 LIBRARY_SUFFIX = ".so"
 
 
-def observation_type(info: PolicyInfo) -> np.dtype[Any]:
+def observation_type(env: EnvInfo) -> np.dtype[Any]:
     """Return the type of the C function's observation: double if a part of the observation is float64, else float."""
-    types = [part.dtype for part in split_space(info.env.spaces()[0]).values()]
+    types = [part.dtype for part in split_space(env.spaces()[0]).values()]
     return np.dtype(np.float64 if np.float64 in types else np.float32)
 
 
-def action_type(info: PolicyInfo) -> np.dtype[Any]:
+def action_type(env: EnvInfo) -> np.dtype[Any]:
     """Return the type of the C function's action: the environment's, or int for discrete actions."""
-    space = info.env.spaces()[1]
+    space = env.spaces()[1]
     return np.result_type(np.float32, space.dtype) if isinstance(space, spaces.Box) else np.dtype(np.intc)
 
 
@@ -42,8 +43,8 @@ class CPolicy(Policy):
         library.rlctl_state_size.restype = ctypes.c_size_t
         self._keys = list(split_space(self.observation_space))
         size = sum(math.prod(part.shape or ()) for part in split_space(self.observation_space).values())
-        self._observation = np.zeros(size // info.spec.frame_stack, observation_type(info))
-        self._action = np.zeros(math.prod(self.action_space.shape or ()), action_type(info))
+        self._observation = np.zeros(size // info.spec.frame_stack, observation_type(info.env))
+        self._action = np.zeros(math.prod(self.action_space.shape or ()), action_type(info.env))
         # The C struct of the state; its size is a multiple of four bytes.
         self._memory = np.zeros(library.rlctl_state_size() // 4, np.float32)
         self._pointers = tuple(array.ctypes.data for array in (self._observation, self._memory, self._action))

@@ -7,14 +7,13 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.deploy import Limits
+from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.graph import build_graph
-from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.exporting.controller.players import OnnxController
 from rlctl.exporting.controller.source import ControllerSource
-from rlctl.exporting.controller.verify import find_targets
 from rlctl.policy.numpy_policy import NumpyPolicy
 from rlctl.policy.onnx_policy import OnnxPolicy, encode
 from rlctl.policy.torch_policy import TorchPolicy
@@ -158,7 +157,7 @@ def test_targets_by_hand(command, expected, tmp_path):
         action, target = controller.step({name: inputs[name] for name in source_names(source)})
         assert action.tolist() == [1.0, -0.25]
         assert target == pytest.approx(expected, abs=1e-7)
-    assert find_targets(source.target, {name: inputs[name] for name in source_names(source)}, action) == pytest.approx(
+    assert source.target.find_targets({name: inputs[name] for name in source_names(source)}, action) == pytest.approx(
         expected, abs=1e-7
     )
 
@@ -217,6 +216,19 @@ def test_the_last_action_is_the_limited_one(tmp_path):
     assert source.target is None
 
 
+def test_a_quantity_with_the_name_of_an_output():
+    env = make_arm(observation_units={"target": "m"}).model_copy(
+        update={"observation_sizes": {"positions": 2, "target": 3}}
+    )
+    policy = make_policy(env)
+    model = build_graph(policy)
+    assert [port.name for port in model.graph.input] == ["positions", "target_input"]
+    assert {entry.key: entry.value for entry in model.metadata_props}["input_names"] == "positions,target_input"
+    inputs = {"positions": np.ones(2), "target": np.zeros(3)}
+    action, _ = OnnxController(encode(model)).step(inputs)
+    assert action == pytest.approx(NumpyPolicy(policy).predict(np.array([1, 1, 0, 0, 0], np.float32)), abs=1e-6)
+
+
 def test_the_header_and_the_metadata_name_everything(tmp_path):
     policy = commanding(action_scale=[0.5, 0.5])
     code = ControllerSource(policy, "arm-1.c", None).write("A step took 1.0 us.")
@@ -224,7 +236,8 @@ def test_the_header_and_the_metadata_name_everything(tmp_path):
         "A step took 1.0 us.",
         "float input_int[1];",
         "orientation[4]",
-        "computed inside: gravity (gravity), angles (scaled), ",
+        "goal[3], no unit declared",
+        "computed inside:\n *   gravity (gravity of orientation)\n *   angles ((angles - [0.1, -0.2]) * [2])\n",
         "#define ARM_1_C_CONTROL_DT 0.1",
         "double target[ARM_1_C_ACTION_SIZE]; /* rad or m, of the joints arm_1_c_action_names */",
     ):
@@ -253,7 +266,7 @@ def test_what_cannot_be_a_controller():
         (inner, "nothing"),
     ):
         with pytest.raises(UsageError, match=message):
-            ControllerLayout(make_policy(make_arm()).info.model_copy(update={"env": env}))
+            ControllerLayout(env)
     with pytest.raises(UsageError, match="no input has the joints' positions: 'last' is computed inside"):
         ControllerSource(commanding(action_step=[1.0, 1.0], measured="last"), "c", None)
     wrong = Limits.model_validate({"command": "position", "scale": 0.3})

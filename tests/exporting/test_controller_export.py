@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from rlctl.environments.info import describe
@@ -32,11 +33,11 @@ sensors: {goal: {range: [-3, 3]}}
 def policy_of(tmp_path):
     """Write a policy of the cart with random weights; return its path."""
 
-    def write(**parameters):
+    def write(scale=0.5, **parameters):
         spec = EnvSpec(f"{controlled.__file__}:Cart", parameters, randomize=True)
         env = spec.make()
         path = tmp_path / "cart.safetensors"
-        make_policy(describe(env), scale=0.5, spec=spec.__dict__).write(path)
+        make_policy(describe(env), scale=scale, spec=spec.__dict__).write(path)
         env.close()
         return path
 
@@ -63,6 +64,22 @@ def test_both_files_are_verified_within_limits(policy_of, tmp_path):
     words = [word for word, _ in in_c.list_rows()]
     assert words == ["exported", "policy", "inputs", "target", "limits", "function", *words[6:]]
     assert (tmp_path / "cart.onnx").exists()
+    examples = [(tmp_path / name).read_text().splitlines() for name in ("cart.c.csv", "cart.onnx.csv")]
+    assert examples[0][0] == "places_0,places_1,goal_0,goal_1,action_0,action_1,target_0,target_1"
+    first = np.array(examples[1][1].split(","), float)
+    assert first[6:] == pytest.approx(first[:2] + 0.05 * first[4:6], abs=1e-7)  # a step, without limits
+    assert [len(lines) for lines in examples] == [101, 101]
+
+
+@pytest.mark.slow
+def test_a_policy_that_chatters_within_limits_of_acceleration(policy_of, tmp_path):
+    # Last bits of its actions decide when it turns round, and limited motions add up what differs.
+    limits = tmp_path / "limits.yaml"
+    limits.write_text(LIMITS.replace("lowpass_hz: 2\n", "").replace("acceleration: 1.0", "acceleration: 0.05"))
+    request = ExportRequest(str(policy_of(2.0)), ("c",), controller=True, limits=limits, output=tmp_path / "cart.c")
+    [report] = export_controller(request)
+    assert report.agreement.max_difference < 1e-5
+    assert report.closed_loop.agrees or not report.closed_loop.is_conclusive
 
 
 @pytest.mark.parametrize("name", ["onnx", pytest.param("c", marks=pytest.mark.slow)])

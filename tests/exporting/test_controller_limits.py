@@ -1,6 +1,8 @@
 """The limits in C are those in Python: the same actions and states, bit for bit, for any inputs and orders."""
 
 import collections
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import pytest
 from rlctl.deploy import Limits, SafetyFilter
 from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.players import STATUS
+from rlctl.exporting.controller.source import ControllerSource
 from tests.exporting.controllers import build_controller, make_arm, make_policy
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler (cc, or $CC) on this machine")
@@ -159,6 +162,18 @@ def test_limits_in_c_are_those_in_python(case, tmp_path):
     faults = {"missing", "not finite", "too old", "invalid action", "no action"}
     faults |= {"out of range", "frozen"} if "sensors" in CASES[case][1] else set()
     assert min(seen[reason] for reason in faults) >= 5
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler")
+@pytest.mark.parametrize("case", ["position", "step"])
+def test_the_file_compiles_as_c_plus_plus(case, tmp_path):
+    arm, options = CASES[case]
+    limits = Limits.model_validate({"joints": JOINTS, **options})
+    code = ControllerSource(make_policy(make_arm(**arm)), "arm", limits).write()
+    (tmp_path / "arm.h").write_text(code.header)
+    (tmp_path / "arm.c").write_text(code.source)
+    strict = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only"]
+    subprocess.run(["c++", "-x", "c++", *strict, "arm.c"], cwd=tmp_path, check=True)
 
 
 @pytest.mark.slow

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.errors import RecipeError, UsageError
 from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.graph import build_graph
 from rlctl.exporting.controller.input_mapping import read_mapping
-from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.exporting.controller.players import CController, MappedController, OnnxController, compile_controller
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.numpy_policy import NumpyPolicy
@@ -30,7 +30,7 @@ def policy():
 @pytest.fixture
 def maps(policy, tmp_path):
     (tmp_path / "mapping.yaml").write_text(MAPPING)
-    return read_mapping(tmp_path / "mapping.yaml", ControllerLayout(policy.info))
+    return read_mapping(tmp_path / "mapping.yaml", ControllerLayout(policy.info.env, policy.info.spec.frame_stack))
 
 
 def test_values_and_their_inverse(maps):
@@ -75,7 +75,7 @@ def test_a_controller_maps_its_inputs(policy, maps, tmp_path, form):
 def test_what_does_not_fit(policy, tmp_path, text, error, message):
     (tmp_path / "mapping.yaml").write_text(text)
     with pytest.raises(error) as caught:
-        read_mapping(tmp_path / "mapping.yaml", ControllerLayout(policy.info))
+        read_mapping(tmp_path / "mapping.yaml", ControllerLayout(policy.info.env, policy.info.spec.frame_stack))
     assert message in str(caught.value)
 
 

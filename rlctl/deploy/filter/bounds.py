@@ -39,6 +39,7 @@ class Bounds:
     resolution: Array  # difference between two neighbouring commands near action 1
     position_name: str  # name of the position bounds in events
     speed_name: str
+    leads_back: bool = False  # whether a command outside its bounds may stay there, and only move back
 
     def __post_init__(self) -> None:
         self.bounds_position = bool(np.isfinite(self.position).any())
@@ -120,6 +121,13 @@ class Bounds:
             "slack_high": self._slack_high,
         }
 
+    def clip_value(self, value: Array, reference: Array) -> Array:
+        """Return a value within the bounds of the command, or between them and the last one, `reference`."""
+        low, high = self.low, self.high
+        if self.leads_back:
+            low, high = np.minimum(low, reference), np.maximum(high, reference)
+        return np.asarray(np.minimum(np.maximum(value, low), high))
+
     def keeps_ends(self, value: Array) -> bool:
         """Return whether a value is within its bounds."""
         return _are_equal(np.minimum(np.maximum(value, self.low), self.high), value)
@@ -133,7 +141,10 @@ class Bounds:
 
         This is the last check, of the action that was computed: it uses none of the results of `bound`.
         """
-        if not self._is_between(command, self._slack_low, self._slack_high):
+        low, high = self._slack_low, self._slack_high
+        if self.leads_back and reference is not None:
+            low, high = np.minimum(low, reference - self._slack), np.maximum(high, reference + self._slack)
+        if not self._is_between(command, low, high):
             return False
         if reference is None and self.is_value:
             return True  # the position is unknown

@@ -35,7 +35,8 @@ class Command:
         assert isinstance(fitted.space, spaces.Box)  # what has bounds
         self._space = fitted.space
         self._safe, self._home = fitted.safe, fitted.home
-        self._is_position = limits.command == "position"
+        self._steps = fitted.steps
+        self._is_position = limits.command == "position" or self._steps is not None
         self.blend_steps = round(min(limits.blend_in_s / bounds.dt, _MAX_STEPS))
         cutoff = limits.lowpass_hz
         self.alpha = 1.0 if cutoff is None else 1.0 - math.exp(-2.0 * math.pi * cutoff * bounds.dt)
@@ -50,7 +51,7 @@ class Command:
         self.position: Array | None = None  # measured positions of the joints
         self._expected: Array | None = None  # positions that the joints should have reached by the last command
         self._reference: Array | None = None  # the last command's value, or the measured positions
-        self._before = self._zeros  # the motion of the last step
+        self._before = self._step = self._zeros  # the motion of the last step, and its distance from the position
         self._sent: NDArray[Any] | None = None  # the last action
         self._smooth: Array | None = None
         self.begin_blend()
@@ -76,7 +77,14 @@ class Command:
     @property
     def motion(self) -> Array | None:
         """The last commanded motion, where commands are motions."""
+        if self._steps is not None:
+            return self._step
         return None if self._bounds.is_value else self._before
+
+    @property
+    def target(self) -> Array | None:
+        """Where the joints were sent last, for steps that are bounded as targets; None before the first one."""
+        return None if self._steps is None else self._reference
 
     def find_error(self) -> float:
         """Return the largest difference between a joint's position and the expected one; NaN if unknown."""
@@ -88,10 +96,18 @@ class Command:
     def follow(self, action: Array) -> NDArray[Any]:
         """Return the allowed action closest to the policy's. Raises `UnsafeCommand`."""
         start = self._present(action)
+        if self._steps is not None:
+            return self._follow_step(self._steps.read(action), start)
         target = action if self.is_action else self._bounds.offset + action * self._bounds.factor
         if self.alpha < 1.0 or self._blend_left:
             target = self._apply_smoothing(self._bounds.clip_ends(target, self._note), start)
         return self._move(target)
+
+    def _follow_step(self, step: Array, start: Array) -> NDArray[Any]:
+        assert self.position is not None  # without it the filter holds
+        if self.alpha < 1.0 or self._blend_left:
+            step = self._apply_smoothing(step, start - self.position)
+        return self._move(self.position + step)
 
     def _apply_smoothing(self, target: Array, start: Array) -> Array:
         """Apply low-pass and blend to a command within its bounds, so that neither overflows nor winds up."""
@@ -109,6 +125,8 @@ class Command:
     def rest(self, go_home: bool) -> NDArray[Any]:
         """Return the action that brakes the robot and keeps it there, or brings it home; raises `UnsafeCommand`."""
         self._smooth = None
+        if self._steps is not None and self.position is None:
+            return self._steps.write(None, None)
         present = self._present(None)
         home = self._home if go_home else None
         if self._bounds.is_value:
@@ -121,6 +139,8 @@ class Command:
         self._blend_left, self._before = 0, self._zeros
         if not self._bounds.is_value:
             return self._as_action(self._zeros)
+        if self._steps is not None:
+            return self._steps.write(self._reference, self.position)
         if self._sent is not None:
             return self._sent.copy()
         return self._as_action(self._safe if self._reference is None else self._reference)
@@ -140,7 +160,7 @@ class Command:
             start = self._bounds.offset + action * self._bounds.factor
         else:  # positions are not measured
             return self._safe if self._home is None else self._home
-        self._reference = np.minimum(np.maximum(start, self._bounds.low), self._bounds.high)
+        self._reference = self._bounds.clip_value(start, start)
         away = np.abs(self._reference - start)
         if self.position is not None and away.max(initial=0.0) > 1e-6:
             index = int(away.argmax())
@@ -157,14 +177,20 @@ class Command:
             command = target
         else:
             x = bounds.bound(target - reference, before, reference, self._note)
-            command = np.minimum(np.maximum(reference + x, bounds.low), bounds.high)
+            command = bounds.clip_value(reference + x, reference)
         action = self._as_action(command)
         if self._space.dtype.kind != "f" and not self._keeps_limits(action):
             # The nearest whole action may be beyond a limit; the next one towards the present command is not.
             present = self._zeros if not bounds.is_value else self._safe if reference is None else reference
             action = self._as_action(command, np.where(command > present, -1, 1))
-        if not self._keeps_limits(action):
+        if self._steps is not None:
+            is_safe = bounds.keeps_limits(command, before, reference)
+        else:
+            is_safe = self._keeps_limits(action)
+        if not is_safe:
             raise UnsafeCommand("no command within the limits was found", "limits", str(action.tolist()))
+        if self._steps is not None and self.position is not None:
+            self._step = command - self.position
         self._before, self._sent = x, action.copy()  # the caller may write into the returned array
         if bounds.is_value and reference is not None:
             self._reference = command if self._space.dtype.kind == "f" else self._read_command(action)
@@ -179,6 +205,8 @@ class Command:
 
     def _as_action(self, command: Array, direction: NDArray[np.int64] | None = None) -> NDArray[Any]:
         """Return the action of a command; whole numbers are rounded, or per joint: -1 down, 1 up."""
+        if self._steps is not None:
+            return self._steps.write(command, self.position)
         action = command if self.is_action else (command - self._bounds.offset) / self._bounds.factor
         if self._space.dtype.kind != "f":
             action = (

@@ -9,8 +9,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.deploy.filter.bounds import Bounds
+from rlctl.deploy.filter.defaults import fill_in, find_positions
 from rlctl.deploy.filter.limits import JointLimits, Limits
-from rlctl.deploy.filter.observation import MeasuredPositions, ObservationLayout
+from rlctl.deploy.filter.observation import MeasuredPositions, ObservationLayout, SensorChecks
+from rlctl.deploy.filter.steps import Steps, bound_targets
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RecipeError, UsageError, check_name
 from rlctl.task.joints import Joints
@@ -32,11 +34,14 @@ _NO_CONTROL_DT = "limits: this policy has no control_dt; write control_dt: SECON
 class FittedLimits:
     """The limits of one policy, as arrays."""
 
+    limits: Limits  # with what the policy knows in place of what they leave out
     layout: ObservationLayout
     space: spaces.Space[Any]  # the action space
     control_dt: float | None
+    steps: Steps | None  # steps that are bounded as targets
     bounds: Bounds | None  # None where actions are choices
     measured: MeasuredPositions | None
+    sensors: SensorChecks
     home: Array | None
     safe: Array  # the command while holding or stopped, if commands are values
 
@@ -54,12 +59,15 @@ def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
 @np.errstate(over="ignore", invalid="ignore")  # a later check refuses such numbers
 def _fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     layout = ObservationLayout(info)
+    limits = fill_in(limits, info, layout)
     control_dt = limits.control_dt or info.control_dt
     if control_dt is not None and not 1e-9 <= control_dt <= 1e9:
         raise RecipeError(f"limits: control_dt is {control_dt:g} s; it must be from 1e-9 to 1e9 s")
     _, space = info.spaces()
     count = math.prod(space.shape or ())
     bounds: Bounds | None = None
+    steps = None
+    measured = _find_measured(limits.measured.position, layout, info, count)
     if isinstance(space, spaces.Box):
         known = info.joints if info.joints is not None and len(info.joints.names) == count else None
         if limits.joints is not None and known is not None and limits.joints != list(known.names):
@@ -70,17 +78,20 @@ def _fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
         if len(names) != count or len(set(names)) != count:
             raise RecipeError(f"limits: joints: {len(set(names))} different names, the action has {count} elements")
         bounds = _make_bounds(limits, space, names, control_dt, known)
+        bounds, steps = bound_targets(bounds, space) if measured and limits.kind == "step" else (bounds, None)
     elif limits.limits or limits.lowpass_hz:
         raise UsageError(
             "limits: the actions of this policy are discrete choices; only continuous actions can be limited"
         )
-    measured = _find_measured(limits, layout, info, count)
     home = _read_list(limits, "home", count)
     if (limits.lowpass_hz or limits.blend_in_s) and control_dt is None:
         raise RecipeError(_NO_CONTROL_DT)
     _check_home(limits, bounds, home)
     _check_measured(limits, bounds, measured, layout)
-    return FittedLimits(layout, space, control_dt, bounds, measured, home, _make_safe_command(limits, bounds, count))
+    safe = _make_safe_command(limits, bounds, count)
+    positions = measured or _find_measured(find_positions(info, layout), layout, info, count)
+    sensors = SensorChecks(limits, layout, control_dt, positions, info.joints)
+    return FittedLimits(limits, layout, space, control_dt, steps, bounds, measured, sensors, home, safe)
 
 
 def _make_bounds(
@@ -93,14 +104,14 @@ def _make_bounds(
     joints = [_merge(limits, name, _list_known(limits, known, index)) for index, name in enumerate(names)]
     for joint, name in zip(joints, names, strict=True):
         _check_can_be_limited(limits, joint, name)
-    timed = limits.command == "speed" or any(joint.speed or joint.acceleration or joint.rate for joint in joints)
+    timed = limits.kind == "speed" or any(joint.speed or joint.acceleration or joint.rate for joint in joints)
     if timed and control_dt is None:
         raise RecipeError(_NO_CONTROL_DT)
-    dt, is_value, moves = control_dt or 1.0, limits.command not in ("step", "speed"), limits.command in _MOVING
+    dt, is_value, moves = control_dt or 1.0, limits.kind not in ("step", "speed"), limits.kind in _MOVING
     scale, offset = _choose_units(limits, space, known, names)
     if not is_value and offset.any():
-        raise RecipeError(f"limits: offset: leave it out; with command: {limits.command}, action 0 means no motion")
-    factor = scale * (dt if limits.command == "speed" else 1.0)
+        raise RecipeError(f"limits: offset: leave it out; with command: {limits.kind}, action 0 means no motion")
+    factor = scale * (dt if limits.kind == "speed" else 1.0)
     largest, digits = _describe_numbers(space.dtype)
     low = np.maximum(np.maximum(space.low.ravel(), -largest), _gather(joints, "action", -np.inf, 0))
     high = np.minimum(np.minimum(space.high.ravel(), largest), _gather(joints, "action", np.inf, 1))
@@ -142,7 +153,7 @@ def _make_bounds(
         _drop_infinite(change),
         precision=8.0 * digits,
         resolution=factor * digits,
-        position_name="position" if moves else limits.command,
+        position_name="position" if moves else limits.kind,
         speed_name="speed" if moves else "rate",
     )
 
@@ -182,23 +193,23 @@ def _list_known(limits: Limits, joints: Joints | None, index: int) -> dict[str, 
     known: dict[str, Any] = {}
     if joints is None:
         return known
-    measured, moves = limits.measured.position is not None, limits.command in _MOVING
-    if joints.low and joints.high and (limits.command == "position" or (moves and measured)):
+    measured, moves = limits.measured.position is not None, limits.kind in _MOVING
+    if joints.low and joints.high and (limits.kind == "position" or (moves and measured)):
         low, high = joints.low[index], joints.high[index]
         known |= {"position": (low, high)} if low < high else {}
     if joints.max_speed and moves and measured:
         known |= {"speed": speed} if (speed := joints.max_speed[index]) > 0 else {}
-    if joints.max_torque and limits.command == "torque":
+    if joints.max_torque and limits.kind == "torque":
         known |= {"torque": torque} if (torque := joints.max_torque[index]) > 0 else {}
     return known
 
 
 def _check_can_be_limited(limits: Limits, joint: JointLimits, name: str) -> None:
     for key in joint.model_fields_set:
-        if key not in _CAN_BE_LIMITED[limits.command]:
-            can = ", ".join(_CAN_BE_LIMITED[limits.command])
+        if key not in _CAN_BE_LIMITED[limits.kind]:
+            can = ", ".join(_CAN_BE_LIMITED[limits.kind])
             raise RecipeError(
-                f"limits: {name}.{key}: with command: {limits.command} only {can} can be limited; "
+                f"limits: {name}.{key}: with command: {limits.kind} only {can} can be limited; "
                 "set command: to what an action is, or check a measured value with sensors:"
             )
 
@@ -206,12 +217,12 @@ def _check_can_be_limited(limits: Limits, joint: JointLimits, name: str) -> None
 def _choose_units(limits: Limits, space: spaces.Box, known: Joints | None, names: list[str]) -> tuple[Array, Array]:
     scale: Any = 1.0
     offset: Any = 0.0
-    if known is not None and known.command[0] == limits.command:
+    if known is not None and known.command[0] == limits.kind:
         scale = known.command[1]
-        offset = (known.default_positions or 0.0) if limits.command == "position" else 0.0
-    elif limits.scale is None and limits.command != "action" and (space.low == -1).all() and (space.high == 1).all():
+        offset = (known.default_positions or 0.0) if limits.kind == "position" else 0.0
+    elif limits.scale is None and limits.kind != "action" and (space.low == -1).all() and (space.high == 1).all():
         raise RecipeError(
-            f"limits: scale: required when actions range from -1 to 1; write scale: NUMBER, the {limits.command} of "
+            f"limits: scale: required when actions range from -1 to 1; write scale: NUMBER, the {limits.kind} of "
             "action 1 in rad, rad/s or N m; 1 if actions are in that unit"
         )
     return _spread("scale", limits.scale, scale, names), _spread("offset", limits.offset, offset, names)
@@ -228,8 +239,8 @@ def _gather(joints: list[JointLimits], key: str, default: float, end: int) -> Ar
     return np.array([default if (ends := getattr(joint, key)) is None else ends[end] for joint in joints])
 
 
-def _find_measured(limits: Limits, layout: ObservationLayout, info: EnvInfo, count: int) -> MeasuredPositions | None:
-    if (name := limits.measured.position) is None:
+def _find_measured(name: str | None, layout: ObservationLayout, info: EnvInfo, count: int) -> MeasuredPositions | None:
+    if name is None:
         return None
     check_name(name, layout.slices, "limits: measured.position: no observation", RecipeError, listed="Known")
     part = layout.slices[name]
@@ -256,8 +267,8 @@ def _check_home(limits: Limits, bounds: Bounds | None, home: Array | None) -> No
         if limits.on_fault == "home":
             raise RecipeError("limits: on_fault: home: it needs the home position; write home: [positions]")
         return
-    if limits.command not in _MOVING or bounds is None:
-        raise RecipeError(f"limits: home: actions that command {limits.command!r} cannot bring a robot to positions")
+    if limits.kind not in _MOVING or bounds is None:
+        raise RecipeError(f"limits: home: actions that command {limits.kind!r} cannot bring a robot to positions")
     if ((home < bounds.position[0]) | (home > bounds.position[1])).any():
         raise RecipeError("limits: home: outside the position limits")
 
@@ -268,7 +279,7 @@ def _check_measured(
     if measured is not None or bounds is None:
         return
     moves = bounds.speed is not None or bounds.change is not None or limits.blend_in_s > 0
-    needs_start = limits.command == "position" and moves
+    needs_start = limits.kind == "position" and moves
     if needs_start or (not bounds.is_value and bounds.bounds_position) or limits.home is not None:
         raise RecipeError(
             "limits: these limits need the positions of the joints; write measured: {position: NAME} "
@@ -278,8 +289,8 @@ def _check_measured(
 
 def _make_safe_command(limits: Limits, bounds: Bounds | None, count: int) -> Array:
     safe = _read_list(limits, "safe_action", count)
-    if safe is not None and limits.command in _MOVING:
-        raise RecipeError(f"limits: safe_action: leave it out; with command: {limits.command}, it means no motion")
+    if safe is not None and limits.kind in _MOVING:
+        raise RecipeError(f"limits: safe_action: leave it out; with command: {limits.kind}, it means no motion")
     if bounds is None:
         return np.zeros(count)
     command = bounds.offset + (np.zeros(count) if safe is None else safe) * bounds.factor

@@ -51,7 +51,7 @@ class Measured(Section):
     """Which observations hold the joints' state, one element per element of the action."""
 
     position: str | None = None
-    """Name of the observation with the joint positions."""
+    """Name of the observation with the joint positions; null: the one that the task names."""
 
 
 class Limits(Section):
@@ -64,8 +64,14 @@ class Limits(Section):
         """The file that the limits were read from."""
         return self._file
 
-    command: Literal["position", "step", "speed", "torque", "action"] = "action"
-    """What an action commands: joint positions, steps from the present positions, speeds, torques, or anything."""
+    @property
+    def kind(self) -> str:
+        """What an action commands, or `action` where that is left to the task."""
+        return self.command or "action"
+
+    command: Literal["position", "step", "speed", "torque", "action"] | None = None
+    """What an action commands: joint positions, steps from the present positions, speeds, torques, or anything. null:
+    what the task says, else `action`."""
     scale: Positive | list[Positive] | None = None
     """Command per 1 of the action, in the command's unit; one number, or one per joint. null: the task's, or 1."""
     offset: Number | list[Number] | None = None
@@ -95,6 +101,10 @@ class Limits(Section):
     """Action while holding or stopped, for commands of torque and action; null: zero."""
     control_dt: Positive | None = None
     """Time between two actions [s]; null: the policy's."""
+
+
+NO_LIMITS = Limits(command="action")
+"""Only the bounds of the action."""
 
 
 def read_limits(path: Path) -> Limits:

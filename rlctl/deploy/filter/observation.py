@@ -12,6 +12,7 @@ from rlctl.deploy.filter.limits import Limits
 from rlctl.environments.dict_spaces import SINGLE, split, split_space
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RecipeError, check_name, did_you_mean, short_repr
+from rlctl.task.joints import Joints
 
 Array = NDArray[Any]
 
@@ -147,6 +148,11 @@ class MeasuredPositions:
         positions = positions if self.scale is None else positions / self.scale
         return positions if self.offset is None else positions + self.offset
 
+    def write(self, positions: Array) -> Array:
+        """Return positions as the observation has them."""
+        shifted = positions if self.offset is None else positions - self.offset
+        return shifted if self.scale is None else shifted * self.scale
+
 
 Fault = tuple[str, float, float]  # kind and name of the observation, value and limit
 
@@ -154,13 +160,26 @@ Fault = tuple[str, float, float]  # kind and name of the observation, value and 
 class SensorChecks:
     """Checks the numbers of successive observations: finite, in range, not too old, not frozen."""
 
-    def __init__(self, limits: Limits, layout: ObservationLayout, control_dt: float | None) -> None:
+    def __init__(
+        self,
+        limits: Limits,
+        layout: ObservationLayout,
+        control_dt: float | None,
+        measured: MeasuredPositions | None = None,
+        joints: Joints | None = None,
+    ) -> None:
         for name in limits.sensors:
             check_name(name, layout.slices, "limits: sensors: no observation", RecipeError, listed="Known")
         self._layout = layout
         self.oldest = math.inf if control_dt is None else limits.max_age_periods * control_dt
         self.low, self.high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
         self.frozen: list[tuple[str, slice, int]] = []
+        if measured is not None and joints is not None and joints.low and joints.high:
+            # One range more to each side: no joint gets there, but one that is measured in degrees does.
+            low, high = np.array(joints.low), np.array(joints.high)
+            width = np.where(low < high, high - low, np.inf)  # model files write a missing limit as 0
+            ends = np.array([measured.write(low - width), measured.write(high + width)])
+            self.low[measured.part], self.high[measured.part] = ends.min(axis=0), ends.max(axis=0)
         for name, sensor in limits.sensors.items():
             part = layout.slices[name]
             if sensor.range is not None:

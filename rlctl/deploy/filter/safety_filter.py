@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from rlctl.deploy.filter.bounds import Intervention, Kind, SafetyEvent
 from rlctl.deploy.filter.command import Command, UnsafeCommand
 from rlctl.deploy.filter.fitting import fit_limits
-from rlctl.deploy.filter.limits import Limits, read_limits
-from rlctl.deploy.filter.observation import ObservationError, SensorChecks, read_numbers
+from rlctl.deploy.filter.limits import NO_LIMITS, Limits, read_limits
+from rlctl.deploy.filter.observation import ObservationError, read_numbers
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import UsageError, short_repr
 
@@ -44,14 +44,14 @@ class SafetyFilter:
         self, info: EnvInfo, limits: Limits | Path | str | None = None, *, clock: Callable[[], float] = time.time
     ) -> None:
         if not isinstance(limits, Limits):
-            limits = Limits() if limits is None else read_limits(Path(limits))
+            limits = NO_LIMITS if limits is None else read_limits(Path(limits))
         fitted = fit_limits(limits, info)
-        self.limits, self.layout, self.control_dt = limits, fitted.layout, fitted.control_dt
+        self.limits, self.layout, self.control_dt = fitted.limits, fitted.layout, fitted.control_dt
         self._space, self._measured, self._home = fitted.space, fitted.measured, fitted.home
-        self._sensors = SensorChecks(limits, fitted.layout, fitted.control_dt)
+        self._sensors = fitted.sensors
         bounds = fitted.bounds
         self._joints = [] if bounds is None else bounds.names
-        self.command = None if bounds is None else Command(limits, fitted, bounds, self._record_intervention)
+        self.command = None if bounds is None else Command(self.limits, fitted, bounds, self._record_intervention)
         self._clock = clock
         self._history: collections.deque[SafetyEvent | Intervention] = collections.deque(maxlen=_MAX_EVENTS)
         count = math.prod(fitted.space.shape or ())

@@ -5,11 +5,9 @@ import math
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.deploy.robot.comparison import CommandDifference
-from rlctl.errors import short_repr
 
 
 @dataclasses.dataclass
@@ -35,25 +33,6 @@ class CommandCounts:
             return math.nan, math.nan, math.nan
         p50, p99, worst = np.quantile(self.response_s, (0.5, 0.99, 1.0)).tolist()
         return p50, p99, worst
-
-
-def read_action(values: Any, space: spaces.Space[Any]) -> NDArray[Any]:
-    """Return a command as an action, clipped to the bounds; raises `ValueError` with the reason if it is none."""
-    shape = space.shape or ()
-    try:
-        action = np.asarray(values)
-        if action.dtype.kind not in "biuf" or action.size != math.prod(shape):
-            raise ValueError
-        action = action.reshape(shape)
-    except (ValueError, TypeError):
-        raise ValueError(f"{short_repr(values)} is not an action of {math.prod(shape)} numbers") from None
-    if not np.isfinite(action).all():
-        raise ValueError(f"the action is not finite: {short_repr(action.tolist())}")
-    if isinstance(space, spaces.Box):
-        return np.clip(action, space.low, space.high).astype(space.dtype)
-    if not space.contains(action := action.astype(space.dtype)):
-        raise ValueError(f"{short_repr(action.tolist())} is not in {space}")
-    return action
 
 
 class CommandQueue:

@@ -1,4 +1,4 @@
-"""How much the commands of a program differ from the actions of the policy that it should run."""
+"""How much the commands of a program differ from those of the policy that it should run."""
 
 import collections
 import dataclasses
@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.deploy.filter.observation import ObservationLayout
-from rlctl.deploy.robot.controller import SentObservation
+from rlctl.deploy.robot.interface import Interface
+from rlctl.deploy.robot.program import SentObservation
 from rlctl.policy.policy import Policy
 
 
 @dataclasses.dataclass(frozen=True)
 class CommandDifference:
-    """The differences of one element of the action, in its own unit."""
+    """The differences of one element of the commands, in its own unit."""
 
     name: str
     mean: float  # of the absolute differences
@@ -30,14 +30,15 @@ class CommandComparison:
     Observations that are not finite are left out: the policy has no answer to them.
     """
 
-    def __init__(self, policy: Policy, layout: ObservationLayout, names: Sequence[str]) -> None:
-        self._policy, self._layout, self._names = policy, layout, names
+    def __init__(self, policy: Policy, interface: Interface, names: Sequence[str]) -> None:
+        self._policy, self._interface, self._names = policy, interface, names
         self._frames: collections.deque[Any] = collections.deque(maxlen=policy.info.spec.frame_stack)
         self.reset()
 
     def reset(self) -> None:
         """Forget all differences."""
-        self._actions: dict[int, tuple[NDArray[Any], int, int]] = {}  # by sequence: with episode and step
+        self._episode = -1
+        self._commands: dict[int, tuple[NDArray[Any], int, int]] = {}  # by sequence: with episode and step
         self._sum = np.zeros(len(self._names))
         self._largest = np.full(len(self._names), -1.0)
         self._where = [(0, 0)] * len(self._names)
@@ -45,31 +46,34 @@ class CommandComparison:
 
     def observe(self, sent: SentObservation) -> None:
         """Let the policy act on an observation, as the program should."""
-        if sent.step == 0:
+        if sent.episode != self._episode:
+            self._episode = sent.episode
             self._policy.reset()
+            self._interface.begin()
             self._frames.clear()
-            self._actions.clear()
+            self._commands.clear()
         if not all(np.isfinite(part).all() for part in sent.parts.values()):
             return
-        observation = self._layout.read(sent.parts)
+        observation = self._interface.observe(sent.parts, sent.step)
         if (frames := self._frames.maxlen or 1) > 1:
             self._frames.extend([observation] * (1 if self._frames else frames))
             observation = np.concatenate(self._frames, axis=-1)
-        self._actions[sent.sequence] = self._policy.predict(observation), sent.episode, sent.step
+        command = self._interface.find_command(self._policy.predict(observation), sent.parts)
+        self._commands[sent.sequence] = command, sent.episode, sent.step
 
     def compare(self, sequence: int, command: NDArray[Any]) -> None:
         """Compare the command for an observation."""
-        if (expected := self._actions.pop(sequence, None)) is None:
+        if (expected := self._commands.pop(sequence, None)) is None:
             return
-        action, episode, step = expected
-        difference = np.abs(np.ravel(command).astype(float) - np.ravel(action))
+        own, episode, step = expected
+        difference = np.abs(np.ravel(command).astype(float) - np.ravel(own))
         self.count += 1
         self._sum += difference
         for index in np.flatnonzero(difference > self._largest):
             self._largest[index], self._where[index] = difference[index], (episode, step)
 
     def differences(self) -> list[CommandDifference]:
-        """Return the differences per element of the action; empty if nothing was compared."""
+        """Return the differences per element of the commands; empty if nothing was compared."""
         if not self.count:
             return []
         rows = zip(self._names, (self._sum / self.count).tolist(), self._largest.tolist(), self._where, strict=True)

@@ -2,13 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.deploy.filter.observation import ObservationLayout
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, check_name, did_you_mean
@@ -26,17 +25,17 @@ class Faults:
     """The faults that act together in each episode."""
 
     text: str = ""  # as the user wrote them; empty: none
-    delay_s: float = 0.0  # of a round trip: how much later a command acts [s]
-    jitter_s: float = 0.0  # largest further delay, drawn for each command [s]
+    delay_s: float = 0.0  # of a measurement on its way to the program, and so of its command [s]
+    jitter_s: float = 0.0  # largest further delay, drawn for each measurement [s]
     drop: float = 0.0  # probability that an observation is lost, and that a command is
     frozen: tuple[str, ...] = ()  # observations that no longer change, from a random step on
     nan: tuple[str, ...] = ()  # observations that are not a number, from a random step on
     stuck: tuple[str, ...] = ()  # joints that stay where an episode begins
 
-    def check(self, layout: ObservationLayout, control_dt: float | None) -> None:
+    def check(self, names: Iterable[str], control_dt: float | None) -> None:
         """Raise `UsageError` for a sensor that the robot does not have, or a delay without a `control_dt`."""
         for name in (*self.frozen, *self.nan):
-            check_name(name, layout.slices, f"--fault {self.text}: no observation", UsageError, listed="There is")
+            check_name(name, names, f"--fault {self.text}: no observation", UsageError, listed="There is")
         if (self.delay_s or self.jitter_s) and control_dt is None:
             raise UsageError(f"--fault {self.text}: this task has no control_dt, so its steps take no known time")
 
@@ -99,7 +98,7 @@ class EpisodeFaults:
         self._last: dict[str, NDArray[Any]] = {}  # the values of frozen sensors
 
     def draw(self) -> tuple[bool, bool, float]:
-        """Return whether a step's observation is lost, whether its command is, and how late its command is [s]."""
+        """Return whether a step's observation is lost, whether its command is, and how late it is [s]."""
         lost, command_lost, late = self._rng.random(3).tolist()
         faults = self._faults
         return lost < faults.drop, command_lost < faults.drop, faults.delay_s + late * faults.jitter_s

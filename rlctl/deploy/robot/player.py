@@ -7,14 +7,13 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from rlctl.deploy.filter.observation import ObservationLayout
-from rlctl.deploy.robot.commands import CommandCounts, CommandQueue, read_action
+from rlctl.deploy.robot.commands import CommandCounts, CommandQueue
 from rlctl.deploy.robot.comparison import CommandComparison
-from rlctl.deploy.robot.controller import Arrival, ControlProgram, SentObservation
 from rlctl.deploy.robot.faults import EpisodeFaults, Faults
+from rlctl.deploy.robot.interface import Interface, Parts
+from rlctl.deploy.robot.program import Arrival, ControlProgram, SentObservation
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import AnswerIsNo
-from rlctl.policy.players.named import ZeroPlayer
 from rlctl.rollout.messages import EpisodeResult, FailedInEpisode, describe_failure, make_error
 from rlctl.rollout.running_episode import RunningEpisode
 
@@ -25,8 +24,8 @@ class RobotPlayer:
     """A robot that sends what it measures at every step, and does what the newest command says.
 
     A command that arrives within its control step acts in that step, as in training. Without a newer one the last
-    action acts again; before the first one it is 0, or the nearest to it. In lock-step the robot waits for each
-    command, and delays are delays of the simulated time.
+    command acts again; before the first one the action is 0, or the nearest to it. In lock-step the robot waits for
+    each command, and delays are delays of the simulated time.
     """
 
     def __init__(
@@ -34,6 +33,7 @@ class RobotPlayer:
         env: Any,
         info: EnvInfo,
         controller: ControlProgram,
+        interface: Interface,
         *,
         task: str,
         level: float,
@@ -43,14 +43,13 @@ class RobotPlayer:
     ) -> None:
         metrics = [name for name, weight in info.reward_weights.items() if weight == 0]
         self._episode = RunningEpisode(env, 0, metrics)
-        self._info, self._layout, self._space = info, ObservationLayout(info), env.action_space
+        self._info, self._interface = info, interface
         self._task, self._level, self._timeout_s, self._realtime = task, level, timeout_s, realtime
         self._controller, self._comparison = controller, comparison
         self._dt = info.control_dt or math.inf
         self._loop = asyncio.get_running_loop()
-        self._first_action, _ = ZeroPlayer(self._space).act(None, 0, 0)
         self._sequence = 0
-        self._heard = self._loop.time()  # when the program last sent something
+        self._unanswered_s = math.inf  # when the first observation was sent since the program last sent something
 
     async def play(
         self, seeds: Sequence[int], faults: Faults, watch: Callable[[int], None]
@@ -75,15 +74,19 @@ class RobotPlayer:
         self._drawn = EpisodeFaults(faults, seed, self._info)
         self._queue, self._number = CommandQueue(), number
         self._waiting: dict[int, tuple[float, float, bool]] = {}  # by sequence: when it was sent, delay, loss
-        self._controller.arrivals.clear()
-        action = self._first_action
+        if self._controller.arrivals:  # of the episode before
+            self._controller.arrivals.clear()
+            self._unanswered_s = math.inf
+        self._begins, newest = True, None  # the newest command
         observation = self._call(lambda: self._episode.start(seed, self._level))
         self._begin_s = self._loop.time()
         while True:
             step = self._episode.step
-            command = await self._exchange(observation, step)
+            measured = self._interface.measure(observation)
+            command = await self._exchange(measured, step)
             self._counts.held += command is None
-            action = action if command is None else command
+            newest = newest if command is None else command
+            action = self._interface.find_action(newest, measured)
             self._episode.step = step + 1
             # `chosen` is bound now: the next step has another action.
             observation, _, terminated, truncated, info = self._call(
@@ -103,17 +106,19 @@ class RobotPlayer:
             failure.__cause__ = error
             raise make_error(describe_failure(failure), self._task) from error
 
-    async def _exchange(self, observation: Any, step: int) -> NDArray[Any] | None:
+    async def _exchange(self, measured: Parts, step: int) -> NDArray[Any] | None:
         """Send what the sensors measure; return the newest command at the end of the step, None if there is none."""
         self._sequence += 1
         lost, command_lost, delay_s = self._drawn.draw()
-        parts = self._drawn.disturb(self._layout.name_parts(observation), step)
-        sent = SentObservation(self._sequence, self._number, step, parts)
+        parts, time_s = self._drawn.disturb(measured, step), 0.0 if math.isinf(self._dt) else step * self._dt
+        sent = SentObservation(self._sequence, self._number, step, parts, self._begins, time_s, delay_s)
         if self._realtime:
             self._check_clock(step)
         self._counts.lost += lost or command_lost
         if not lost:
-            self._waiting[self._sequence] = self._loop.time(), delay_s, command_lost
+            now, self._begins = self._loop.time(), False
+            self._waiting[self._sequence] = now, delay_s, command_lost
+            self._unanswered_s = min(self._unanswered_s, now)
             await self._controller.send(sent)
             if self._comparison is not None:
                 self._comparison.observe(sent)
@@ -151,22 +156,21 @@ class RobotPlayer:
         where = f"in episode {self._number}, step {self._episode.step}"
         if self._controller.closed:
             raise AnswerIsNo(f"the program has disconnected {where}")
-        first_sent_s = next(iter(self._waiting.values()))[0] if self._waiting else math.inf
-        if self._loop.time() - max(self._heard, first_sent_s) > self._timeout_s:
+        if self._loop.time() - self._unanswered_s > self._timeout_s:
             raise AnswerIsNo(f"the program has sent nothing for {self._timeout_s:g} s, {where}")
 
     def _read_arrivals(self) -> None:
         while self._controller.arrivals:
             arrival = self._controller.arrivals.popleft()
-            self._heard = arrival.at
             self._read(arrival)
+            self._unanswered_s = arrival.at if self._waiting else math.inf
 
     def _read(self, arrival: Arrival) -> None:
         counts = self._counts
-        problem, action = arrival.problem, None
-        if not problem:
+        problem, command = arrival.problem, None
+        if not problem and arrival.values is not None:
             try:
-                action = read_action(arrival.values, self._space)
+                command = self._interface.read(arrival.values)
             except ValueError as error:
                 problem = str(error)
         if problem:
@@ -177,11 +181,11 @@ class RobotPlayer:
         sent_s, delay_s, is_lost = waiting
         counts.response_s.append(arrival.at - sent_s)
         counts.late += counts.response_s[-1] > self._dt
-        if action is None:
+        if command is None:
             return
         if self._comparison is not None:
-            self._comparison.compare(arrival.sequence, action)
+            self._comparison.compare(arrival.sequence, command)
         if not is_lost:
             # In lock-step the simulated clock stands still while the program computes.
             step_s = (self._episode.step * self._dt) if not self._realtime else arrival.at - self._begin_s
-            self._queue.put((step_s if self._dt < math.inf else 0.0) + delay_s, arrival.sequence, action)
+            self._queue.put((step_s if self._dt < math.inf else 0.0) + delay_s, arrival.sequence, command)

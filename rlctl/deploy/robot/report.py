@@ -28,14 +28,22 @@ def show(report: RobotReport, json: str | None, gates: Gates) -> None:
     settings = f"seed {report.seed}", report.spec.engine, describe_randomization(report.info.events)
     out.print(", ".join(filter(None, [episodes, *settings])))
     has_success = report.scores[0].outcome.success_rate is not None
-    columns = ("", *(("success", "95 % interval") if has_success else ()), "return", "steps", "steps/s", "held", "lost")
+    columns = (
+        "",
+        *(("success", "95 % interval") if has_success else ()),
+        "return",
+        "steps",
+        "steps/s",
+        "held",
+        "dropped",
+    )
     output.print_table(columns, [_list_scores(score) for score in report.scores], left=("",))
     _show_times(report)
     _show_differences(report)
     for score in report.scores:
         if score.commands.refused:
             out.print(
-                f"{_name(score)}: {score.commands.refused:,} messages were no action, the first: "
+                f"{_name(score)}: {score.commands.refused:,} messages were no command, the first: "
                 f"{score.commands.first_problem}"
             )
 
@@ -88,7 +96,7 @@ def _show_differences(report: RobotReport) -> None:
         worst = max(score.commands.differences, key=lambda difference: difference.largest)
         mean = float(np.mean([difference.mean for difference in score.commands.differences]))
         out.print(
-            f"{_name(score)}: {score.commands.compared:,} commands differ from the policy's actions by "
+            f"{_name(score)}: {score.commands.compared:,} commands differ from the policy's ({report.command}) by "
             f"{mean:.3g} on average, at most {worst.largest:.3g} ({worst.name}, episode {worst.episode}, "
             f"step {worst.step})"
         )
@@ -101,6 +109,7 @@ def as_json(report: RobotReport) -> dict[str, Any]:
             {
                 "task": {"name": report.spec.task, "parameters": report.spec.parameters},
                 "controller": report.controller,
+                "command": report.command,
                 "policy": report.policy,
                 "versions": collect_versions(),
                 "events": report.info.events,

@@ -15,6 +15,13 @@ class RobotRequest:
     policy: Annotated[
         str | None, Option("Compare the commands with this policy: a run, a policy file or a task.", metavar="RUN")
     ] = None
+    controller: Annotated[
+        bool,
+        Option(
+            "Send what an exported controller takes, and take its joint targets; default: observation and action.",
+            ("--controller",),
+        ),
+    ] = False
     episodes: Annotated[int, Option("Episodes, each with its own seed; as many with each --fault.", min=1)] = 100
     seed: EpisodeSeed = 0
     realtime: Annotated[bool, Option("Keep to the clock; default: wait for each command.", ("--realtime",))] = False

@@ -10,18 +10,18 @@ import selectors
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
-
-from gymnasium import spaces
+from typing import TYPE_CHECKING, Any
 
 from rlctl import output
-from rlctl.deploy.filter.observation import ObservationLayout
 from rlctl.deploy.robot import packets
 from rlctl.deploy.robot.commands import CommandCounts
 from rlctl.deploy.robot.comparison import CommandComparison
 from rlctl.deploy.robot.faults import Faults, parse_faults, set_stuck_joints
+from rlctl.deploy.robot.interface import ControllerInterface, Interface, PolicyInterface
+from rlctl.deploy.robot.listener import wait_for_controller
 from rlctl.deploy.robot.player import RobotPlayer
 from rlctl.deploy.robot.request import RobotRequest
+from rlctl.deploy.server.access import find_key
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError, explain_missing_package
@@ -36,6 +36,9 @@ from rlctl.rollout.messages import EpisodeResult
 from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.run import lookup
 from rlctl.version import __version__
+
+if TYPE_CHECKING:
+    from rlctl.deploy.robot.websocket import Door
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +59,7 @@ class RobotReport:
     spec: EnvSpec
     info: EnvInfo
     controller: str  # how the program was connected
+    command: str  # what a command is, in words
     policy: Path | None  # the policy to which its commands were compared
     seed: int
     realtime: bool
@@ -91,10 +95,6 @@ def run_robot(
 
     `on_start` is called with the addresses at which it can connect. Raises `AnswerIsNo` if no program connects.
     """
-    try:
-        from rlctl.deploy.robot import listener  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise UsageError(explain_missing_package("rlctl robot", error.name, "serve")) from None
     gates.check_reachable(request.episodes)
     faults = [Faults(), *map(parse_faults, request.fault)]
     file, policy = _find_policy(request, pretrained)
@@ -105,19 +105,19 @@ def run_robot(
             gates.check_possible(info.has_success)
         if request.realtime and info.control_dt is None:
             raise UsageError(f"--realtime: {spec.task} has no control_dt, so its steps take no known time")
-        layout = ObservationLayout(info)
+        interface = (ControllerInterface if request.controller else PolicyInterface)(env, info)
         for fault in faults:
-            fault.check(layout, info.control_dt)
+            fault.check(interface.shapes, info.control_dt)
             set_stuck_joints(env, spec, fault.stuck)  # raises before a program connects
         if policy is not None and file is not None and policy.info.spec.frame_stack == 1:
             policy.info.check_fits(info, file)
-        comparison = None if policy is None else CommandComparison(policy, layout, name_actions(info, env))
-        test = _Test(request, env, info, spec, comparison)
+        comparison = None if policy is None else CommandComparison(policy, interface, name_actions(info, env))
+        test = _Test(request, env, info, spec, interface, comparison)
         with asyncio.Runner(loop_factory=_make_loop) as runner:
             name, scores, problem = runner.run(test.run(faults, on_start))
     if scores:
         gates.check_possible(scores[0].outcome.success_rate is not None)
-    return RobotReport(spec, info, name, file, request.seed, request.realtime, scores, problem)
+    return RobotReport(spec, info, name, interface.answer, file, request.seed, request.realtime, scores, problem)
 
 
 def _make_loop() -> asyncio.AbstractEventLoop:
@@ -150,25 +150,30 @@ def name_actions(info: EnvInfo, env: Any) -> list[str]:
 
 class _Test:
     def __init__(
-        self, request: RobotRequest, env: Any, info: EnvInfo, spec: EnvSpec, comparison: CommandComparison | None
+        self,
+        request: RobotRequest,
+        env: Any,
+        info: EnvInfo,
+        spec: EnvSpec,
+        interface: Interface,
+        comparison: CommandComparison | None,
     ) -> None:
         self._request, self._env, self._info, self._spec = request, env, info, spec
-        self._comparison = comparison
+        self._interface, self._comparison = interface, comparison
 
     async def run(
         self, faults: list[Faults], on_start: Callable[[list[str]], None]
     ) -> tuple[str, list[FaultScore], str]:
-        from rlctl.deploy.robot.listener import wait_for_controller
-        from rlctl.deploy.server.access import find_key
-
-        request = self._request
+        request, udp_sizes = self._request, self._find_udp_sizes()
         key = find_key(request.host, request.key_file)
-        waiting = wait_for_controller(request, key, self._describe(), self._find_udp_sizes(), on_start)
+        door = self._make_door(key, is_needed=udp_sizes is None)
+        waiting = wait_for_controller(request, key, door, udp_sizes, on_start)
         async with waiting as controller:
             player = RobotPlayer(
                 self._env,
                 self._info,
                 controller,
+                self._interface,
                 task=self._spec.task,
                 level=self._spec.level,
                 timeout_s=request.timeout_s,
@@ -194,6 +199,18 @@ class _Test:
             results, counts = await player.play(seeds, faults, show)
         return FaultScore(faults, summarize(results), results, counts, time.perf_counter() - begin)
 
+    def _make_door(self, key: str | None, *, is_needed: bool) -> Door | None:
+        """Return what takes WebSocket clients; None without its packages, which UDP does not need."""
+        try:
+            from rlctl.deploy.robot.websocket import Door
+        except ModuleNotFoundError as error:
+            install = explain_missing_package("a WebSocket", error.name, "serve")
+            if is_needed:
+                raise UsageError(f"{install}; images and discrete actions have no UDP") from None
+            output.print_notes([f"only UDP: {install}"])
+            return None
+        return Door(self._request, key, self._describe())
+
     def _describe(self) -> dict[str, Any]:
         """Return the first message to a program: what a policy server tells its clients, as far as a robot knows it."""
         info = self._info
@@ -201,15 +218,14 @@ class _Test:
             "server": f"rlctl {__version__}",
             "task": self._spec.task,
             "control_dt": info.control_dt,
-            "observation": {name: list(shape) for name, shape in ObservationLayout(info).shapes.items()},
-            "observation_units": dict(info.observation_units),
+            "observation": {name: list(shape) for name, shape in self._interface.shapes.items()},
+            "observation_units": self._interface.units,
+            "command": self._interface.answer,
             "action_meaning": info.action_meaning,
             "env": info.model_dump(mode="json"),
         }
 
     def _find_udp_sizes(self) -> tuple[int, int] | None:
         """Return the sizes of packets; None for images, discrete actions and what does not fit into a packet."""
-        layout, space = ObservationLayout(self._info), self._env.action_space
-        sizes = layout.size, math.prod(space.shape or ())
-        fits = max(sizes) <= packets.MOST_VALUES and list(layout.slices) == list(layout.shapes)
-        return sizes if fits and isinstance(space, spaces.Box) else None
+        sizes = self._interface.sizes
+        return sizes if sizes is not None and max(sizes) <= packets.MOST_VALUES else None

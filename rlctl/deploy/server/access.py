@@ -1,15 +1,19 @@
 """Who may connect: loopback without a key, other machines with one, no pages of other sites."""
 
+from __future__ import annotations
+
 import hmac
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
-
-from aiohttp import web
 
 from rlctl.deploy.server.request import KEY_VARIABLE, LOOPBACK
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.storage import untrusted
+
+if TYPE_CHECKING:
+    from aiohttp import web
 
 _LONGEST_KEY = 4096  # [bytes]
 

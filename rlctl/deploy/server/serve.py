@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rlctl.deploy.filter.limits import Limits, read_limits
+from rlctl.deploy.filter.limits import NO_LIMITS, read_limits
 from rlctl.deploy.server.request import ServeRequest
 from rlctl.deploy.server.session import load_served_policy
 from rlctl.errors import RlctlError, UsageError, explain_missing_package
@@ -31,7 +31,7 @@ def make_server(file: Path, request: ServeRequest) -> PolicyServer:
     except ModuleNotFoundError as error:
         raise UsageError(explain_missing_package("rlctl serve", error.name, "serve")) from None
     key = find_key(request.host, request.key_file)
-    limits = Limits() if request.limits is None else read_limits(request.limits)
+    limits = NO_LIMITS if request.limits is None else read_limits(request.limits)
     if not request.watchdog:
         limits = limits.model_copy(update={"watchdog_periods": 0.0})
     return PolicyServer(load_served_policy(file), request, limits, key)

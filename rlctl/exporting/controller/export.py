@@ -11,15 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from rlctl.deploy.controller_layout import ControllerLayout, JointTarget
 from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
 from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
+from rlctl.exporting.controller.example import ROWS, write_example
 from rlctl.exporting.controller.graph import build_graph
 from rlctl.exporting.controller.input_mapping import InputMaps, read_mapping
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
 from rlctl.exporting.controller.players import (
     CController,
     Controller,
@@ -62,7 +63,8 @@ class ControllerReport(ExportReport):
         else:
             sizes = ", ".join(f"{name}[{size}]" for name, size in details["input_sizes"].items())
             rows = [*rows[:2], ("inputs", sizes), *rows[2:]]
-        return [*rows[:3], *target, ("limits", details["limits"]), *rows[3:]]
+        example = [("example", f"{path}: inputs and outputs of {ROWS} steps")] if (path := details["example"]) else []
+        return [*rows[:3], *target, ("limits", details["limits"]), *rows[3:-1], *example, *rows[-1:]]
 
 
 def export_controller(request: ExportRequest) -> list[ExportReport]:
@@ -85,13 +87,17 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
         check_environment(source.file, torch_policy.info, built)
         # Policies that were trained before their task declared its terms do not contain them.
         policy = torch_policy.file.with_info(env=built)
-        layout = ControllerLayout(policy.info)
+        layout = _describe_controller(policy)
         maps = {} if request.mapping is None else read_mapping(request.mapping, layout)
         export = _Export(torch_policy, policy, verify.TaskPlayer(layout, env, spec.task), limits, maps)
         write = {"onnx": export.write_onnx, "c": export.write_c}
         return [write[form](target.with_suffix(f".{form}")) for form in request.formats]
     finally:
         env.close()
+
+
+def _describe_controller(policy: PolicyFile) -> ControllerLayout:
+    return ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
 
 
 def _choose_spec(spec: EnvSpec, sim: str | None) -> EnvSpec:
@@ -114,11 +120,12 @@ class _Export:
         model = build_graph(self.policy, self.maps)
         content = encode(model)
         controller = OnnxController(content)
-        target = ControllerLayout(self.policy.info).find_target(None, None)
+        target = _describe_controller(self.policy).find_target(None)
         fields, recorded = self._verify(path, controller, target, is_limited=False)
         inputs = recorded[0].inputs[0]
         median = float(np.median(timeit.repeat(lambda: controller.step(inputs), number=1, repeat=330)[30:])) * 1e6
         files.write_bytes(path, content)
+        example = self._write_example(path, controller, recorded)
         ports = {
             kind: [{"name": port.name, "dtype": port.type[len("tensor(") : -1], "shape": port.shape} for port in some]
             for kind, some in (
@@ -126,13 +133,18 @@ class _Export:
                 ("outputs", controller.session.get_outputs()),
             )
         }
-        details = {"opset": model.opset_import[0].version, **ports, "limits": "none: the limits are in the C file"}
+        details = {
+            "opset": model.opset_import[0].version,
+            **ports,
+            "example": example,
+            "limits": "none: the limits are in the C file",
+        }
         return self._report(path, len(content), details, target, median, fields)
 
     def write_c(self, path: Path) -> ControllerReport:
         """Write and verify the C file and its header, with the limits."""
         source = ControllerSource(self.policy, path.stem, self.limits, self.maps)
-        compiler, median = find_compiler(), None
+        compiler, median, example = find_compiler(), None, None
         command = os.environ.get("CC") or "cc"
         fields: dict[str, Any] = {"not_verified": f"there is no C compiler {command!r}; set CC to one"}
         code = source.write()
@@ -142,6 +154,7 @@ class _Export:
                 controller = CController(source.layout, library, has_target=source.target is not None)
                 fields, recorded = self._verify(path, controller, source.target, is_limited=self.limits is not None)
                 median, longest = verify.measure_step(controller, recorded)
+                example = self._write_example(path, controller, recorded)
             code = source.write(
                 f"A step took {median:.1f} us (median; {longest:.1f} us were enough for 99 % of the steps) "
                 f"on {platform.machine()} with {Path(compiler[0]).name} {FLAGS[1]}."
@@ -151,11 +164,18 @@ class _Export:
         files.write_text(path, code.source)
         size = len(code.source.encode()) + len(code.header.encode())
         limits = "the bounds of the action; --limits FILE adds others" if self.limits is None else str(self.limits.file)
-        details = {"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0], "limits": limits}
+        details = {"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0]}
+        details |= {"example": example, "limits": limits}
         return self._report(path, size, details, source.target, median, fields)
 
+    def _write_example(self, path: Path, controller: Controller, recorded: list[verify.Recorded]) -> Path:
+        example = path.with_name(f"{path.name}.csv")
+        program = MappedController(controller, self.maps)  # whose values the file has
+        files.write_text(example, write_example(controller, [program.undo(inputs) for inputs in recorded[0].inputs]))
+        return example
+
     def _make_reference(self, policy: Policy, is_limited: bool) -> verify.LimitedPolicy:
-        return verify.LimitedPolicy(ControllerLayout(self.policy.info), policy, self.limits if is_limited else None)
+        return verify.LimitedPolicy(_describe_controller(self.policy), policy, self.limits if is_limited else None)
 
     @functools.lru_cache(maxsize=2)  # noqa: B019 (for one export)
     def _record(self, is_limited: bool) -> list[verify.Recorded]:
@@ -163,10 +183,12 @@ class _Export:
 
     @functools.lru_cache(maxsize=2)  # noqa: B019
     def _check_conclusive(self, is_limited: bool) -> tuple[bool, bool]:
-        changed = dataclasses.replace(self.policy, tensors=change_last_bits(self.policy.tensors))
-        policies: tuple[Policy, Policy] = self.torch_policy, NumpyPolicy(changed)
-        references = [self._make_reference(policy, is_limited) for policy in policies]
-        return verify.check_conclusive(self.player, (references[0], references[1]), self._record(is_limited))
+        changed = (
+            dataclasses.replace(self.policy, tensors=tensors) for tensors in change_last_bits(self.policy.tensors)
+        )
+        others = (self._make_reference(NumpyPolicy(policy), is_limited) for policy in changed)
+        original = self._make_reference(self.torch_policy, is_limited)
+        return verify.check_conclusive(self.player, original, others, self._record(is_limited))
 
     def _verify(
         self, path: Path, controller: Controller, target: JointTarget | None, *, is_limited: bool
@@ -191,7 +213,7 @@ class _Export:
         median: float | None,
         fields: dict[str, Any],
     ) -> ControllerReport:
-        sizes = {part.name: part.size for part in ControllerLayout(self.policy.info).quantities}
+        sizes = {part.name: part.size for part in _describe_controller(self.policy).quantities}
         mapping = {name: one.describe() for name, one in self.maps.items()}
         details = {**details, "input_sizes": sizes, "mapping": mapping}
         details["target"] = "" if target is None else target.formula

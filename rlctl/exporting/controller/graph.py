@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 import onnx
 
-from rlctl.errors import UsageError
+from rlctl.deploy.controller_layout import ControllerLayout, JointTarget, Observed, Stack
 from rlctl.exporting.actor import emit_actor, make_metadata
 from rlctl.exporting.controller.input_mapping import InputMap, InputMaps
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Stack
 from rlctl.exporting.controller.symbols import GraphSymbol
 from rlctl.exporting.layers import BATCH, Graph, concatenate
 from rlctl.policy import onnx_policy
@@ -26,10 +25,17 @@ def build_graph(policy: PolicyFile, maps: InputMaps | None = None) -> onnx.Model
     return _Writer(policy, maps or {}).write()
 
 
+def name_input(quantity: str) -> str:
+    """Return the name of a quantity's input: its own, or with `_input` where the graph itself uses that name."""
+    is_taken = quantity.startswith("/") or quantity in _TAKEN or quantity.endswith("_out")
+    return f"{quantity.lstrip('/')}_input" if is_taken else quantity
+
+
 class _Writer:
     def __init__(self, policy: PolicyFile, maps: InputMaps) -> None:
-        self._policy, self._layout, self._graph = policy, ControllerLayout(policy.info), Graph()
-        self._target = self._layout.find_target(None, None)
+        self._policy, self._graph = policy, Graph()
+        self._layout = ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
+        self._target = self._layout.find_target(None)
         self._inputs = {part.name: self._add_input(part.name, part.size, part.unit) for part in self._layout.quantities}
         self._inputs |= {name: self._map_input(name, one) for name, one in maps.items()}
         self._states: list[str] = []
@@ -39,9 +45,8 @@ class _Writer:
             self._steps = self._graph.input(STEPS, np.int64, (BATCH, 1), f"steps of the episode; {_ZEROS}")
 
     def _add_input(self, name: str, size: int, unit: str) -> str:
-        if name.startswith("/") or name in _TAKEN or name.endswith("_out"):
-            raise UsageError(f"export --controller: an input named {name!r} cannot be written as ONNX; rename it")
-        return self._graph.input(name, self._layout.dtype, (BATCH, size), f"[{unit}]" if unit else "")
+        graph, shape = self._graph, (BATCH, size)
+        return graph.input(name_input(name), self._layout.dtype, shape, f"[{unit}]" if unit else "")
 
     def _map_input(self, name: str, one: InputMap) -> str:
         """Add the mapping from the program's values of an input to the policy's."""
@@ -80,7 +85,7 @@ class _Writer:
         target = self._target
         return metadata | {
             onnx_policy.CONTROLLER_KEY: "1",
-            "input_names": ",".join(part.name for part in quantities),
+            "input_names": ",".join(name_input(part.name) for part in quantities),
             "input_sizes": ",".join(str(part.size) for part in quantities),
             "input_units": ",".join(part.unit.replace(",", ";") for part in quantities),
             **({"target": target.formula} if target is not None else {}),
@@ -97,7 +102,7 @@ class _Writer:
         if term.internal == "last_action":
             symbols = [GraphSymbol(graph, self._read(self._last_action), part.size)]
         elif term.internal == "time":
-            dt = graph.constant("controller/control_dt", np.float64(self._layout.info.env.control_dt))
+            dt = graph.constant("controller/control_dt", np.float64(self._layout.env.control_dt))
             symbols = [GraphSymbol(graph, graph.add("Mul", self._read(self._steps), dt), 1)]
         parts: list[GraphSymbol] = term.compute(*symbols)
         joined = concatenate(graph, [symbol.value for symbol in parts])

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.deploy.diagnose.mapping import CorrectedMapping, TermMapping
 from rlctl.errors import RecipeError, UsageError, check_name
-from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.storage import yaml_text
 
 

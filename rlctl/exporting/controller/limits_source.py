@@ -12,7 +12,6 @@ from rlctl.deploy.filter.bounds import Bounds
 from rlctl.deploy.filter.command import Command
 from rlctl.deploy.filter.fitting import FittedLimits
 from rlctl.deploy.filter.limits import Limits
-from rlctl.deploy.filter.observation import SensorChecks
 from rlctl.exporting.c_layers import write_array, write_number
 
 
@@ -46,7 +45,12 @@ class LimitsSource:
     @property
     def is_position(self) -> bool:
         """Whether a command is a position."""
-        return self.limits.command == "position"
+        return self.limits.command == "position" or self.tracks
+
+    @property
+    def tracks(self) -> bool:
+        """Whether steps are bounded as targets: a command is the target of a joint, of type double."""
+        return self.fitted.steps is not None
 
     @property
     def is_action(self) -> bool:
@@ -108,32 +112,31 @@ class LimitsSource:
         """Where the quantities have the joints' positions; None if they are not measured."""
         return None if self.fitted.measured is None else self.fitted.measured.part.start
 
-    @functools.cached_property
-    def _sensors(self) -> SensorChecks:
-        return SensorChecks(self.limits, self.fitted.layout, self.fitted.control_dt)
-
     @property
     def has_range(self) -> bool:
         """Whether a sensor has a range."""
-        return self._sensors.has_range
+        return self.fitted.sensors.has_range
 
     @property
     def oldest(self) -> str:
         """Largest age of a measurement [s]."""
-        return write_number(np.float64(self._sensors.oldest), "double")
+        return write_number(np.float64(self.fitted.sensors.oldest), "double")
 
     @property
     def frozen(self) -> list[tuple[str, slice, int]]:
         """Name, place and largest number of equal steps of the quantities that must not freeze."""
-        return self._sensors.frozen
+        return self.fitted.sensors.frozen
 
     def list_arrays(self) -> dict[str, str]:
         """Return the definitions of all constant arrays by name."""
-        fitted, sensors, space = self.fitted, self._sensors, self.fitted.space
+        fitted, sensors, space = self.fitted, self.fitted.sensors, self.fitted.space
         assert isinstance(space, spaces.Box)
         numbers: dict[str, Any] = {
             **self.bounds.list_constants(),
             "safe_command": fitted.safe,
+            "step_factor": None if fitted.steps is None else fitted.steps.factor,
+            "step_low": None if fitted.steps is None else fitted.steps.low,
+            "step_high": None if fitted.steps is None else fitted.steps.high,
             "home": fitted.home,
             "action_low": space.low.ravel().astype(np.float64),
             "action_high": space.high.ravel().astype(np.float64),
@@ -167,7 +170,7 @@ class LimitsSource:
         """What a fault leads to, for the header."""
         if self.on_fault != "hold":
             return f"A fault of the inputs or the policy: {self.on_fault}."
-        still = "no motion" if not self.is_value else "the present position"
+        still = "no motion" if not self.is_value else "the present target, after braking"
         if self.is_value and not self.is_position:
             still = f"action {_shorten(self.limits.safe_action or 0.0)}"
         return f"A fault of the inputs or the policy: {still}, until the fault ends."

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.errors import AnswerIsNo, short_repr
 from rlctl.exporting.c_source import FLAGS, CSource
-from rlctl.exporting.controller.graph import LAST_ACTION, TARGET
+from rlctl.exporting.controller.graph import LAST_ACTION, TARGET, name_input
 from rlctl.exporting.controller.input_mapping import InputMaps
-from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type
 from rlctl.policy.onnx_policy import ACTION, open_session
 
@@ -39,8 +39,14 @@ class Controller(abc.ABC):
         """Return the action and, where the task says what it commands, the targets."""
 
     @abc.abstractmethod
-    def set_last_action(self, action: NDArray[Any]) -> None:
-        """Replace the last action: a feedback may magnify its last bits, so recorded episodes are followed."""
+    def follow(
+        self, inputs: Inputs, requested: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.float64] | None]:
+        """Take a step of a recorded episode: return the policy's action, and the action and targets for `requested`.
+
+        The recorded action replaces the policy's own because the feedback of the last action and limits of acceleration
+        magnify last bits from step to step.
+        """
 
 
 class CController(Controller):
@@ -53,7 +59,7 @@ class CController(Controller):
         self._memory = np.zeros(-(-self.library.rlctl_state_size() // 8), np.float64)
         self.state = self._memory.ctypes.data_as(ctypes.c_void_p)
         self._layout, self._has_target = layout, has_target
-        self.action = np.zeros(layout.action_size, action_type(layout.info))
+        self.action = np.zeros(layout.action_size, action_type(layout.env))
         self._target = np.zeros(layout.action_size)
         self._status = np.zeros(2, np.intc)
         self._outputs = [array.ctypes.data_as(ctypes.c_void_p) for array in (self.action, self._target, self._status)]
@@ -77,18 +83,24 @@ class CController(Controller):
 
     def step(self, inputs: Inputs | None, age_s: float = 0.0) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
         """Return copies of action and targets."""
-        pointer = None
-        if inputs is not None:
-            self._values[:] = np.concatenate([np.ravel(inputs[part.name]) for part in self._layout.quantities])
-            pointer = self._values.ctypes.data_as(ctypes.c_void_p)
+        pointer = None if inputs is None else self._point_to(inputs)
         self.may_send = bool(self.library.rlctl_step(self.state, pointer, ctypes.c_double(age_s), *self._outputs))
         action = self.action.reshape(self._layout.action_space.shape).copy()
         return action, self._target.copy() if self._has_target else None
 
-    def set_last_action(self, action: NDArray[Any]) -> None:
-        """Replace the last action."""
-        self.action[:] = action.ravel()
-        self.library.rlctl_set_last_action(self.state, self._outputs[0])
+    def follow(
+        self, inputs: Inputs, requested: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.float64] | None]:
+        """Take a step of a recorded episode."""
+        own = requested.ravel().astype(self.action.dtype)
+        pointers = self._point_to(inputs), own.ctypes.data_as(ctypes.c_void_p)
+        self.library.rlctl_follow(self.state, *pointers, *self._outputs)
+        target = self._target.copy() if self._has_target else None
+        return own.reshape(self._layout.action_space.shape), self.action.copy(), target
+
+    def _point_to(self, inputs: Inputs) -> ctypes.c_void_p:
+        self._values[:] = np.concatenate([np.ravel(inputs[part.name]) for part in self._layout.quantities])
+        return self._values.ctypes.data_as(ctypes.c_void_p)
 
     def limit(self, values: NDArray[np.float64] | None, age_s: float, requested: NDArray[Any] | None) -> NDArray[Any]:
         """Return the action of the limits alone, for a policy's action."""
@@ -122,16 +134,21 @@ class OnnxController(Controller):
 
     def step(self, inputs: Inputs) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
         """Return action and targets."""
-        feed = {name: np.asarray(value, self._dtypes[name]).reshape(1, -1) for name, value in inputs.items()}
+        named = {name_input(name): value for name, value in inputs.items()}
+        feed = {name: np.asarray(value, self._dtypes[name]).reshape(1, -1) for name, value in named.items()}
         results = dict(zip(self._outputs, self.session.run(self._outputs, feed | self._state), strict=True))
         self._state = {name: results[f"{name}_out"] for name in self._states}
         target = results.get(TARGET)
         return results[ACTION][0], None if target is None else target[0]
 
-    def set_last_action(self, action: NDArray[Any]) -> None:
-        """Replace the last action, if it is part of the state."""
+    def follow(
+        self, inputs: Inputs, requested: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.float64] | None]:
+        """Take a step of a recorded episode."""
+        action, target = self.step(inputs)
         if LAST_ACTION in self._state:
-            self._state[LAST_ACTION] = action.reshape(1, -1).astype(self._dtypes[LAST_ACTION])
+            self._state[LAST_ACTION] = requested.reshape(1, -1).astype(self._dtypes[LAST_ACTION])
+        return action, action, target
 
 
 class MappedController(Controller):
@@ -146,12 +163,17 @@ class MappedController(Controller):
 
     def step(self, inputs: Inputs) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
         """Return the action and the targets for the robot's quantities, as the policy expects them."""
-        wrong = {name: self._maps[name].undo(value) if name in self._maps else value for name, value in inputs.items()}
-        return self._controller.step(wrong)
+        return self._controller.step(self.undo(inputs))
 
-    def set_last_action(self, action: NDArray[Any]) -> None:
-        """Replace the last action."""
-        self._controller.set_last_action(action)
+    def follow(
+        self, inputs: Inputs, requested: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.float64] | None]:
+        """Take a step of a recorded episode."""
+        return self._controller.follow(self.undo(inputs), requested)
+
+    def undo(self, inputs: Inputs) -> Inputs:
+        """Return what a program with the wrong mapping measures where the robot's quantities are these."""
+        return {name: self._maps[name].undo(value) if name in self._maps else value for name, value in inputs.items()}
 
 
 _DTYPES: dict[str, np.dtype[Any]] = {

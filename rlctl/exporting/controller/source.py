@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from rlctl.deploy.controller_layout import ControllerLayout, JointTarget, Observed, Quantity
 from rlctl.deploy.filter.fitting import fit_limits
-from rlctl.deploy.filter.limits import Limits
+from rlctl.deploy.filter.limits import NO_LIMITS, Limits
 from rlctl.exporting import c_source
 from rlctl.exporting.c_layers import CWriter, write_number
 from rlctl.exporting.c_source import CSource, Layout
 from rlctl.exporting.controller.input_mapping import InputMaps
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Quantity
 from rlctl.exporting.controller.limits_source import LimitsSource
 from rlctl.exporting.controller.symbols import CSymbol
 from rlctl.policy.file import PolicyFile
@@ -49,12 +49,13 @@ class ControllerSource:
         self, policy: PolicyFile, file_name: str, limits: Limits | None, maps: InputMaps | None = None
     ) -> None:
         c_source.check_can_be_written(policy)
-        self.layout = layout = ControllerLayout(policy.info)
-        self.limits, self._maps = limits or Limits(), maps or {}
-        fitted = fit_limits(self.limits, layout.inputs_info)
+        self.layout = layout = ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
+        self._maps = maps or {}
+        fitted = fit_limits(limits or NO_LIMITS, layout.inputs_info)
+        self.limits = fitted.limits
         assert fitted.bounds is not None  # the actions are in a Box
         self._limits_source = LimitsSource(self.limits, fitted, fitted.bounds)
-        self.target = layout.find_target(limits, fitted.bounds)
+        self.target = layout.find_target(None if limits is None else fitted)
         self.name = c_source.make_identifier(file_name)
         self._values = self._describe(policy)
 
@@ -129,7 +130,7 @@ class ControllerSource:
         if part.term.internal == "last_action":
             symbols = [CSymbol([f"(double)state->last_action[{index}]" for index in range(part.size)])]
         elif part.term.internal == "time":
-            symbols = [CSymbol([f"((double)state->steps * {self.layout.info.env.control_dt!r})"])]
+            symbols = [CSymbol([f"((double)state->steps * {self.layout.env.control_dt!r})"])]
         parts: list[CSymbol] = part.term.compute(*symbols)
         expressions = [element for symbol in parts for element in symbol.elements]
         return [f"newest[{part.newest + i}] = ({kind}){text};" for i, text in enumerate(expressions)]
@@ -153,7 +154,7 @@ class ControllerSource:
 
     def _list_arrays(self, described: Layout) -> list[tuple[str, str, str, list[str]]]:
         """Return the header's constant arrays: type, name, the macro of the length, and the values as C."""
-        quote, target, env = c_source.quote, self.target, self.layout.info.env
+        quote, target, env = c_source.quote, self.target, self.layout.env
         quantities = self.layout.quantities
         arrays: list[tuple[str, str, str, list[str]]] = [
             ("char *const", "input_names", "INPUTS", [quote(quantity.name) for quantity in quantities]),
@@ -170,6 +171,8 @@ class ControllerSource:
                 numbers |= {"target_low": target.low, "target_high": target.high}
         if env.joints is not None and env.joints.default_positions:
             numbers.setdefault("default_positions", np.array(env.joints.default_positions))
+        if env.joints is not None and env.joints.low and env.joints.high:
+            numbers |= {"joint_low": np.array(env.joints.low), "joint_high": np.array(env.joints.high)}
         for name, array in numbers.items():
             arrays.append(("double", name, "ACTION_SIZE", [write_number(value, "double") for value in array]))
         return arrays

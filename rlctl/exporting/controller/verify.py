@@ -2,19 +2,18 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.deploy.controller_layout import ControllerLayout, JointTarget
 from rlctl.deploy.filter.limits import Limits
 from rlctl.deploy.filter.safety_filter import SafetyFilter
-from rlctl.environments.dict_spaces import SINGLE, split
 from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
 from rlctl.exporting.controller.players import CController, Controller, Inputs
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, compare_episodes
 from rlctl.policy.policy import Policy
@@ -29,9 +28,18 @@ _TIMED_STEPS, _MEAN_OF = 3000, 10
 class LimitedPolicy:
     """The policy in Python, within the limits: what a controller is compared with."""
 
+    requested: NDArray[Any]
+    """The policy's last action, before the limits; zeros where it could not act."""
+
     def __init__(self, layout: ControllerLayout, policy: Policy, limits: Limits | None) -> None:
         self._layout, self._policy = layout, policy
         self._safety = None if limits is None else SafetyFilter(layout.inputs_info, limits)
+
+    @property
+    def target(self) -> NDArray[Any] | None:
+        """A copy of the last target, where the limits bound targets."""
+        command = None if self._safety is None else self._safety.command
+        return None if command is None or command.target is None else command.target.copy()
 
     def begin(self) -> None:
         """Begin an episode, and end what the limits hold."""
@@ -43,10 +51,12 @@ class LimitedPolicy:
     def act(self, observation: Any, inputs: Inputs) -> NDArray[Any]:
         """Return the action for what the policy observes and what the robot measures."""
         if self._safety is None:
-            return self._policy.predict(observation)
+            self.requested = self._policy.predict(observation)
+            return self.requested
         values = np.concatenate([np.ravel(value) for value in inputs.values()]).astype(self._layout.dtype)
         is_sound = self._safety.observe(values)
-        return np.asarray(self._safety.limit(self._policy.predict(observation) if is_sound else None))
+        self.requested = self._policy.predict(observation) if is_sound else np.zeros(self._layout.action_size)
+        return np.asarray(self._safety.limit(self.requested if is_sound else None))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +66,8 @@ class Recorded:
     inputs: list[Inputs]
     actions: list[NDArray[Any]]
     episode: Episode
+    requested: list[NDArray[Any]] = dataclasses.field(default_factory=list)  # the policy's actions, before the limits
+    targets: list[NDArray[Any] | None] = dataclasses.field(default_factory=list)  # those that the limits bound
 
 
 class TaskPlayer:
@@ -73,7 +85,7 @@ class TaskPlayer:
         while not ended:
             if len(actions) == MOST_STEPS:
                 raise TaskError(f"{self._task}: the episode of seed {seed} has not ended after {MOST_STEPS:,} steps")
-            inputs = self._measure(observation)
+            inputs = self._layout.measure(observation, getattr(self._env.unwrapped, "measured", {}))
             action = np.array(act(observation, inputs))
             measured.append(inputs)
             actions.append(action)
@@ -83,24 +95,6 @@ class TaskPlayer:
         success = info.get("is_success")
         result = EpisodeResult(0, seed, total, len(actions), None if success is None else bool(success), {}, None)
         return Recorded(measured, actions, Episode(result))
-
-    def _measure(self, observation: Any) -> Inputs:
-        """Return the quantities of the last observation, in the order of the inputs."""
-        flat = split(observation)
-        values: dict[str, NDArray[Any]] = {}
-        for part in self._layout.observed:
-            if part.term is None:
-                source = np.ravel(flat[part.key])
-                start = part.start if part.key == SINGLE else 0
-                if self._layout.frames > 1:
-                    start = len(source) - self._layout.newest_size + part.newest
-                newest = start + part.size * (part.frames - 1)
-                values[part.name] = source[newest : newest + part.size]
-                continue
-            measured = self._env.unwrapped.measured[part.name]  # type: ignore[attr-defined]  # only tasks have terms
-            quantities = measured if isinstance(measured, tuple) else (measured,)
-            values |= {name: np.ravel(value) for name, value in zip(part.term.inputs, quantities, strict=False)}
-        return {quantity.name: np.array(values[quantity.name]) for quantity in self._layout.quantities}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,23 +112,37 @@ def record(player: TaskPlayer, reference: LimitedPolicy) -> list[Recorded]:
     while len(recorded) < EPISODES or sum(len(episode.actions) for episode in recorded) < _MIN_OBSERVATIONS:
         seed = episode_seeds(0, Stream.VERIFY, len(recorded) + 1)[-1]
         reference.begin()
-        recorded.append(player.play(seed, reference.act))
+        between: list[tuple[NDArray[Any], NDArray[Any] | None]] = []
+
+        def act(observation: Any, inputs: Inputs, between: list[Any] = between) -> NDArray[Any]:
+            action = reference.act(observation, inputs)
+            between.append((reference.requested, reference.target))
+            return action
+
+        played = player.play(seed, act)
+        requested, targets = map(list, zip(*between, strict=True))
+        recorded.append(dataclasses.replace(played, requested=requested, targets=targets))
     return recorded
 
 
 def verify_controller(
     player: TaskPlayer, recorded: Sequence[Recorded], controller: Controller, target: JointTarget | None
 ) -> ControllerAgreement:
-    """Compare a controller with recorded episodes, step by step; then let it act in the first of them."""
+    """Compare a controller with recorded episodes, step by step; then let it act in the first of them.
+
+    In each step the policy's action is compared, and what the limits make of the recorded one.
+    """
     agreement, worst = Agreement(), 0.0
     for episode in recorded:
         controller.begin()
-        for inputs, expected in zip(episode.inputs, episode.actions, strict=True):
-            action, targets = controller.step(inputs)
+        steps = zip(episode.inputs, episode.requested, episode.actions, episode.targets, strict=True)
+        for inputs, requested, expected, bounded in steps:
+            own, action, targets = controller.follow(inputs, requested)
+            _compare(agreement, requested, own)
             _compare(agreement, expected, action)
-            controller.set_last_action(expected)
             if target is not None and targets is not None:
-                worst = max(worst, _compare(agreement, find_targets(target, inputs, expected), targets))
+                wanted = target.find_targets(inputs, expected) if bounded is None else bounded
+                worst = max(worst, _compare(agreement, wanted, targets))
     agreement.observations = sum(len(episode.actions) for episode in recorded)
 
     def act(observation: Any, inputs: Inputs) -> NDArray[Any]:
@@ -149,36 +157,24 @@ def verify_controller(
 
 
 def check_conclusive(
-    player: TaskPlayer, references: tuple[LimitedPolicy, LimitedPolicy], recorded: Sequence[Recorded]
+    player: TaskPlayer, reference: LimitedPolicy, changed: Iterable[LimitedPolicy], recorded: Sequence[Recorded]
 ) -> tuple[bool, bool]:
     """Return whether a policy repeats its recorded episodes, and whether they change with the last bits of its weights.
 
-    The references are the policy and one with other last bits.
+    `changed` are the policy with other last bits, within the same limits.
     """
-    loops = []
-    for reference in references:
+    episodes = [episode.episode for episode in recorded[:EPISODES]]
+
+    def play_again(reference: LimitedPolicy) -> ClosedLoop:
         again = []
-        for episode in recorded[:EPISODES]:
+        for episode in episodes:
             reference.begin()
-            again.append(player.play(episode.episode.result.seed, reference.act).episode)
-        loops.append(compare_episodes([episode.episode for episode in recorded[:EPISODES]], again))
-    repeats = loops[0].agrees and loops[0].max_return_difference == 0.0
-    return repeats, repeats and not loops[1].agrees
+            again.append(player.play(episode.result.seed, reference.act).episode)
+        return compare_episodes(episodes, again)
 
-
-def find_targets(target: JointTarget, inputs: Inputs, action: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the joints' targets for an action, from their definition."""
-    base = target.default
-    if target.kind == "step":
-        values = np.concatenate([np.ravel(value) for value in inputs.values()])
-        base = values[target.measured : target.measured + len(target.factor)]
-    targets = np.asarray(base + target.factor * action.ravel(), np.float64)
-    if not target.clips:
-        return targets
-    low, high = target.low, target.high
-    if target.clips == "towards":
-        low, high = np.minimum(low, base), np.maximum(high, base)
-    return np.clip(targets, low, high)
+    loop = play_again(reference)
+    repeats = loop.agrees and loop.max_return_difference == 0.0
+    return repeats, repeats and any(not play_again(other).agrees for other in changed)
 
 
 def _compare(agreement: Agreement, expected: NDArray[Any], actual: NDArray[Any]) -> float:

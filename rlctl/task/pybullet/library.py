@@ -54,7 +54,7 @@ def _import_silently(name: str) -> ModuleType:
             raise
         raise UsageError(
             f"PyBullet is not installed: {INSTALL_PYBULLET}\n"
-            "or simulate in MuJoCo, unless the task needs models of PyBullet: --set sim=mujoco"
+            "or simulate in MuJoCo, unless the task needs models of PyBullet: --sim mujoco"
         ) from None
     finally:
         os.dup2(stderr, 2)

@@ -44,8 +44,8 @@ def test_a_whole_file(write, arm):
         ("comand: step", "limits.yaml:1: no key 'comand'. Did you mean 'command'? Keys here: command, scale"),
         (
             "command: steps",
-            "limits.yaml:1: command: expected position or step or speed or torque or action, got 'steps'. "
-            "Did you mean 'step'?",
+            "limits.yaml:1: command: expected position or step or speed or torque or action or null, "
+            "got 'steps'. Did you mean 'step'?",
         ),
         (
             "limits:\n  elbow: {position: [1, -1]}",
@@ -120,6 +120,33 @@ def test_what_the_task_knows_of_its_joints(write, arm):
         SafetyFilter(arm, write("joints: [knee, hip]"))
     with pytest.raises(RecipeError, match="action 0 means no motion"):
         SafetyFilter(arm, write("{command: speed, offset: 1}"))
+
+
+def test_what_limits_leave_out_comes_from_the_task(write, arm):
+    known = Joints(["hip", "knee"], action_step=[0.1, 0.1], measured="angles", low=[-1, -2], high=[1, 2])
+    scaled = {"positions": terms.Scaled("angles", offset=(0.5, 0.0))}
+    described = arm.model_copy(update={"joints": known, "observation_terms": scaled})
+    safety = SafetyFilter(described, write("limits: {all: {speed: 0.5}}"))
+    assert (safety.limits.command, safety.limits.measured.position) == ("step", "positions")
+    safety.observe(observe_at(0, 0))  # the hip at 0.5 rad
+    assert safety.command.position == pytest.approx([0.5, 0.0])
+    assert safety.limit([1.0, 0.2]) == pytest.approx([0.5, 0.2])  # 0.05 rad in 0.1 s
+    assert SafetyFilter(described).limits.command == "action"  # without limits only the action is bounded
+    assert SafetyFilter(arm, write("limits: {all: {rate: 0.5}}")).limits.command == "action"
+
+
+def test_positions_in_degrees_are_out_of_range(write, arm):
+    known = Joints(["hip", "knee"], action_step=[0.1, 0.1], measured="positions", low=[-1, 0], high=[2, 0])
+    described = arm.model_copy(update={"joints": known})
+    safety = SafetyFilter(described, write("limits: {all: {speed: 0.5}}"))
+    # A joint may be a range of 3 rad outside its own, -1 to 2, but not in degrees; the knee has no range.
+    assert safety.observe(observe_at(-3.9, 80))
+    assert not safety.observe(observe_at(57, 0))
+    assert safety.events[-1].name == "positions[0] out of range"
+    assert safety.events[-1].limit == pytest.approx(5.0)
+    assert not SafetyFilter(described).observe(observe_at(57, 0))  # without limits too
+    own = SafetyFilter(described, write("sensors: {positions: {range: [-100, 100]}}"))
+    assert own.observe(observe_at(57, 0))
 
 
 def test_position_limits_stay_within_the_robot_models(write, arm):

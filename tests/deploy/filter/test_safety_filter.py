@@ -267,12 +267,56 @@ def test_positions_keep_every_limit(steps, on_fault, lowpass):
 
 
 @settings(REPEATABLE, max_examples=40)
-@given(steps=STEPS, command=st.sampled_from(["step", "speed"]))
-def test_motions_keep_every_limit(steps, command):
+@given(steps=STEPS, on_fault=st.sampled_from(["hold", "home", "stop"]), lowpass=st.sampled_from([None, 2.0]))
+def test_targets_of_steps_keep_every_limit(steps, on_fault, lowpass):
+    limits = {"position": [-1.0, 0.8], "speed": 2.0, "acceleration": 6.0}
+    safety = make_filter(
+        make_arm(), command="step", scale=0.5, limits={"all": limits}, home=[0.1, 0.2], on_fault=on_fault,
+        lowpass_hz=lowpass, blend_in_s=0.2,
+    )  # fmt: skip
+    targets: list[np.ndarray] = []
+    for action, positions, order in steps:
+        if order == "reset" or (order == "resume" and safety.state == "stopped"):
+            targets.clear()  # the next target begins at the measured positions
+        give_order(safety, order)
+        out = run_filter(safety, observe_at(*positions), action)
+        if safety.command.target is None:
+            assert (out == 0.0).all()
+            continue
+        before = targets[-1] if targets else safety.command.position
+        targets.append(safety.command.target.copy())
+        assert (targets[-1] <= np.maximum(0.8, before) + 1e-9).all()  # from outside only back
+        assert (targets[-1] >= np.minimum(-1.0, before) - 1e-9).all()
+        # The action leads from the measured position to the target; 1 of it is 0.5 rad, and it ranges from -10 to 10.
+        step = np.clip(targets[-1] - safety.command.position, -5.0, 5.0)
+        assert out == pytest.approx(step / 0.5, rel=1e-6, abs=1e-6)
+    rows = np.array(targets).reshape(-1, 2)
+    rounding, moved = 1e-9 * (1.0 + np.abs(rows)), np.diff(rows, axis=0)
+    assert (np.abs(moved) <= 0.2 + rounding[1:]).all()  # 2 rad/s over 0.1 s
+    assert (np.abs(np.diff(moved, axis=0)) <= 0.06 + rounding[2:]).all()  # 6 rad/s^2 over 0.1 s twice
+
+
+def test_a_target_brakes_while_holding_and_does_not_jump_afterwards(arm):
+    safety = make_filter(arm, command="step", scale=0.5, limits={"all": {"speed": 2.0, "acceleration": 6.0}})
+    joint, targets = 0.0, [0.0]
+    for step in range(40):
+        is_missing = 10 <= step < 30
+        safety.observe(None if is_missing else observe_at(joint, 0.0))
+        safety.limit(None if is_missing else [1.0, 0.0])
+        targets.append(float(safety.command.target[0]))
+        joint += 0.5 * (targets[-1] - joint)  # the joint lags behind its target
+    moved = np.diff(targets)
+    assert moved[9] == pytest.approx(0.2)  # at full speed when the measurements end
+    assert moved[10:14] == pytest.approx([0.14, 0.08, 0.02, 0.0])
+    assert np.abs(np.diff(moved)).max() <= 0.06 + 1e-9
+
+
+@settings(REPEATABLE, max_examples=40)
+@given(steps=STEPS)
+def test_speeds_keep_every_limit(steps):
     limits = {"position": [-1.0, 0.8], "speed": 2.0}
-    safety = make_filter(make_arm(), command=command, limits={"all": limits}, home=[0.1, 0.2])
-    factor = 1.0 if command == "step" else 0.1
-    known = None
+    safety = make_filter(make_arm(), command="speed", limits={"all": limits}, home=[0.1, 0.2])
+    factor, known = 0.1, None
     for action, positions, order in steps:
         give_order(safety, order)
         if order == "reset":

@@ -89,6 +89,8 @@ class Oracle:
         unit = 1.0 if limits.scale is None else np.broadcast_to(limits.scale, 2)
         self.factor = unit * np.ones(2) * (dt if limits.command == "speed" else 1.0)
         self.offset = np.broadcast_to(0.0 if limits.offset is None else limits.offset, 2)
+        moves = np.isfinite([self.read("speed", np.inf) * dt, self.read("acceleration", np.inf) * dt**2]).any()
+        self.tracks = limits.command == "step" and space.dtype.kind == "f" and bool(moves)
         self.eps = np.finfo(space.dtype).eps if space.dtype.kind == "f" else np.finfo(np.float64).eps
         self.quantum = 1.0 if space.dtype.kind == "i" else self.eps
         self.forget()
@@ -116,6 +118,28 @@ class Oracle:
                 np.minimum(high, np.minimum(position[1], torque)),
             )
         return low, high
+
+    def find_broken_target(self, action, target, position):
+        """Return what the target of a step breaks, or where the action is not the step to it."""
+        before = position if self.before is None else self.before
+        if target is None or position is None:
+            return "" if (action == np.clip(0.0, self.space.low, self.space.high)).all() else "no target"
+        low, high = self.find_range()
+        largest = self.factor * min(float(np.finfo(self.space.dtype).max), 1e30)  # actions without bounds end there
+        step = np.clip(target - position, np.maximum(low, -largest), np.minimum(high, largest))
+        slack = 20 * self.eps * np.abs(step) + 2 * self.eps * self.factor + 1e-300
+        if not (np.abs(action.astype(np.float64) * self.factor - step) <= slack).all():
+            return "action"
+        slack = 20 * np.finfo(np.float64).eps * (np.abs(target) + np.abs(before) + 1.0)
+        low, high = self.read("position", (-1e30, 1e30)).T
+        if not ((np.minimum(low, before) - slack <= target) & (target <= np.maximum(high, before) + slack)).all():
+            return "position"
+        x, self.before = target - before, target.copy()
+        if not (np.abs(x) <= self.read("speed", np.inf) * self.dt + slack).all():
+            return "speed"
+        motion, self.motion = self.motion if self.motion is not None else np.zeros(2), x
+        allowed = self.read("acceleration", np.inf) * self.dt**2 + 4 * slack
+        return "" if (np.abs(x - motion) <= allowed).all() else "acceleration"
 
     def find_broken(self, action, position):
         """Return what the action breaks; `position` is None where it was not measured."""
@@ -174,6 +198,7 @@ def attack(options, space, dt, steps):
     with np.errstate(all="ignore"):
         oracle, position = Oracle(limits, box, dt), None
     for order, hand, action, where, age, _ in steps:
+        was_stopped = safety.state == "stopped"
         try:
             if order in ("override", "policy"):
                 safety.override(hand if order == "override" else None)
@@ -181,10 +206,10 @@ def attack(options, space, dt, steps):
                 getattr(safety, order)()
         except (ValueError, UsageError):
             assert order in ("override", "home")
-        if order == "reset":
+        if order == "reset" or (oracle.tracks and order == "resume" and was_stopped):
             with np.errstate(all="ignore"):
                 oracle.forget()
-            position = None
+            position = None if order == "reset" else position
         observation = np.array([*where, 0.0, where[0], 0.0])
         position = where if safety.observe(observation, age) else position
         with warnings.catch_warnings(action="error"):
@@ -195,7 +220,10 @@ def attack(options, space, dt, steps):
         assert (box.low <= output).all()
         assert (output <= box.high).all()
         with np.errstate(all="ignore"):
-            broken = oracle.find_broken(output, position)
+            if oracle.tracks:
+                broken = oracle.find_broken_target(output, safety.command.target, position)
+            else:
+                broken = oracle.find_broken(output, position)
         assert broken == "" or safety.state == "stopped"
         assert safety.reason != NO_COMMAND or safety.state == "stopped"
         for event in safety.events:

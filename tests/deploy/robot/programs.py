@@ -4,22 +4,26 @@ import contextlib
 import socket
 import threading
 
+import numpy as np
+
 from rlctl.deploy.robot import packets
 from rlctl.deploy.robot.packets import Kind, Packet
 from rlctl.deploy.server.client import PolicyClient
 from rlctl.errors import PolicyError
 
 
-def control_by_udp(port, act, key=b"", repeats=1):
-    """Answer observations until the test is over; `act(values)` returns an action, or None for no answer."""
+def control_by_udp(port, act, key=b"", repeats=1, reads="values"):
+    """Answer until the test is over; `act(values)`, or of packets, returns a command, a kind, or None for no answer."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as robot:
         robot.connect(("127.0.0.1", port))
         robot.settimeout(20)
         robot.send(packets.pack(Packet(Kind.HELLO, key=key)))
         while (packet := packets.unpack(robot.recv(65536))).kind is not Kind.END:
-            action = act(packet.values)
-            for _ in range(0 if action is None else repeats):
-                command = packet._replace(kind=Kind.COMMAND, values=action)
+            answer = act(packet if reads == "packets" else packet.values)
+            for _ in range(0 if answer is None else repeats):
+                command = packet._replace(kind=Kind.COMMAND, values=answer)
+                if isinstance(answer, Kind):
+                    command = packet._replace(kind=answer, values=np.zeros(0, np.float32))
                 robot.send(packets.pack(command))
 
 

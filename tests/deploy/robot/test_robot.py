@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import socket
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,10 @@ from rlctl.deploy.robot.robot import run_robot
 from rlctl.deploy.server.session import Session, load_served_policy
 from rlctl.environments.info import describe
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
-from rlctl.errors import AnswerIsNo, EpisodeFailed
+from rlctl.errors import AnswerIsNo, EpisodeFailed, UsageError
 from rlctl.evaluation.request import NO_GATES, Gates
 from tests.deploy.robot.programs import Answers, Started, control_by_udp, control_by_websocket
+from tests.exporting import controlled
 from tests.rollout.policies import linear
 from tests.task import tasks
 
@@ -61,9 +63,9 @@ def test_a_program_in_lock_step(program, act, name):
         report.check(Gates(min_return=0.0))
 
 
-def write_policy(file, weight, frames=1):
-    """Write a linear policy of the slider; return its file's name."""
-    spec = EnvSpec(SLIDER, frame_stack=frames)
+def write_policy(file, weight, frames=1, task=SLIDER):
+    """Write a linear policy of a task; return its file's name."""
+    spec = EnvSpec(task, frame_stack=frames)
     with contextlib.closing(spec.make()) as env:
         policy = linear(describe(env), weight, log_std=0.0)
     info = policy.info.model_copy(update={"spec": spec})
@@ -124,6 +126,59 @@ def test_a_delay_of_the_commands():
     assert late.outcome.success_rate == 0.0
     with pytest.raises(AnswerIsNo, match=r"^gate missed: success rate 0.000 is below 0.5 with delay=0.2$"):
         report.check(Gates(min_success=0.5))
+
+
+CART = f"{Path(controlled.__file__)}:Cart"  # 120 steps of 0.1 s; two joints, an action steps by 0.05
+
+
+def test_a_controller_gets_what_is_measured_and_sends_targets(tmp_path):
+    # Inputs: places (2), goal (2). The policy observes places three times, goal - places, last action.
+    weight = np.zeros((2, 10))
+    weight[:, 6:8] = 10 * np.eye(2)  # by the vector to the goal
+    weight[:, 8:] = 0.25 * np.eye(2)
+    policy = write_policy(tmp_path / "policy.safetensors", weight.tolist(), task=CART)
+    seen, last = [], [np.zeros(2)]
+
+    def act(packet):
+        if packet.step == 0:
+            last[0] = np.zeros(2)
+        places, goal = packet.values[:2], packet.values[2:]
+        last[0] = np.clip(10 * (goal - places) + 0.25 * last[0], -1, 1)
+        seen.append((packet.kind, packet.time_s, packet.age_s, *packet.values))
+        return np.clip(places + 0.05 * last[0], -2, 2).astype(np.float32)
+
+    report = play(control_by_udp, act, task=CART, episodes=1, policy=policy, controller=True, fault=["delay=0.2"],
+                  options={"reads": "packets"})  # fmt: skip
+    healthy, late = report.scores
+    assert report.command == "joint position [rad or m]"
+    assert (healthy.outcome.success_rate, healthy.commands.held) == (1.0, 0)
+    assert (healthy.commands.compared, late.commands.compared) == (120, 120)
+    for score in report.scores:
+        assert max(difference.largest for difference in score.commands.differences) < 1e-6
+    assert seen[1][:3] == (Kind.MEASUREMENT, pytest.approx(0.1), 0.0)
+    assert {row[2] for row in seen[120:]} == {0.2}
+    # A target stays where it is: the joint stands while late commands have not come. One step moves it by 0.05.
+    places = np.array(seen)[:, 3]
+    assert places[:120][1] - places[0] == pytest.approx(0.05 * np.sign(places[1] - places[0]), abs=1e-6)
+    assert places[120] == places[121] == places[122] != places[123]
+
+
+def test_a_controller_that_commands_nothing():
+    report = play(control_by_udp, lambda packet: Kind.NO_COMMAND, task=CART, episodes=1, controller=True,
+                  options={"reads": "packets"})  # fmt: skip
+    counts = report.scores[0].commands
+    assert (counts.held, counts.refused, len(counts.response_s)) == (120, 0, 120)
+
+
+def test_udp_needs_no_package_for_websockets(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rlctl.deploy.robot.websocket", None)
+    monkeypatch.setitem(sys.modules, "aiohttp", None)
+    report = play(control_by_udp, step_down)
+    assert report.scores[0].outcome.success_rate == 1.0
+    assert capsys.readouterr().err.splitlines()[0].startswith("only UDP: a WebSocket needs ")
+    request = RobotRequest("CartPole-v1", port=0, episodes=1)
+    with pytest.raises(UsageError, match=r"^a WebSocket needs .*: pip install .*aiohttp.*; images and discrete"):
+        run_robot(request, lambda addresses: None, changes=UNCHANGED, gates=NO_GATES)
 
 
 def test_faults_repeat_with_the_seed():
@@ -219,6 +274,14 @@ def test_real_time():
     # Without the third command the second acts again, so nothing changes; on a busy machine others may be late too.
     assert score.commands.held >= 2
     assert len(score.commands.robot_late_s) == 10
+
+
+def test_a_program_that_goes_away_in_real_time():
+    answers = iter([step_down] * 7)  # it is gone in the second episode, whose 0.5 s are shorter than the timeout
+    report = play(control_by_udp, lambda values: next(answers, lambda values: None)(values), episodes=9, realtime=True,
+                  timeout_s=0.7)  # fmt: skip
+    with pytest.raises(AnswerIsNo, match=r"^the program has sent nothing for 0.7 s, in episode [23], step \d$"):
+        report.check(NO_GATES)
 
 
 def test_a_simulation_that_is_slower_than_the_clock():

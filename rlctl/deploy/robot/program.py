@@ -1,4 +1,4 @@
-"""The program under test, connected by WebSocket or UDP: observations go to it, its commands come back."""
+"""The program under test: what the sensors measure goes to it, its commands come back; and its connection by UDP."""
 
 import abc
 import asyncio
@@ -7,16 +7,13 @@ import hmac
 import secrets
 from typing import Any, NamedTuple
 
-import aiohttp
 import numpy as np
-from aiohttp import web
 from numpy.typing import NDArray
 
 from rlctl.deploy.robot import packets
 from rlctl.deploy.robot.packets import Kind, Packet
-from rlctl.deploy.server import messages
-from rlctl.errors import short_repr
 
+_ANSWERS = (Kind.COMMAND, Kind.NO_COMMAND)
 _END_COPIES = 3  # of the last packet, because one may be lost
 
 
@@ -27,6 +24,9 @@ class SentObservation(NamedTuple):
     episode: int
     step: int
     parts: dict[str, NDArray[Any]]
+    begins: bool = False  # whether it is the first that is sent in its episode
+    time_s: float = 0.0  # when it was measured, from the start of the episode [s]
+    age_s: float = 0.0  # how old it is when the program gets it: the delay of a fault [s]
 
 
 class Arrival(NamedTuple):
@@ -34,7 +34,7 @@ class Arrival(NamedTuple):
 
     sequence: int
     at: float  # time of the event loop [s]
-    values: Any = None
+    values: Any = None  # None: it commands nothing
     problem: str = ""
 
 
@@ -80,62 +80,18 @@ class ControlProgram(abc.ABC):
         self._wake()
 
 
-class WebSocketController(ControlProgram):
-    """A program that has connected by WebSocket. An answer without a `sequence` is for the next observation in turn."""
-
-    def __init__(self, name: str, loop: asyncio.AbstractEventLoop, socket: web.WebSocketResponse) -> None:
-        super().__init__(name, loop)
-        self._socket = socket
-        self._sent: collections.deque[int] = collections.deque()  # sequences that are not answered yet
-
-    async def send(self, observation: SentObservation) -> None:
-        """Send an observation as a policy server's client does; `reset` begins an episode."""
-        content: dict[str, Any] = dict(observation.parts)
-        content["sequence"] = observation.sequence
-        if observation.step == 0:
-            content["reset"] = True
-        self._sent.append(observation.sequence)
-        try:
-            await self._socket.send_bytes(messages.pack(content))
-        except ConnectionError:
-            self._close()
-
-    async def receive(self) -> None:
-        """Read the program's answers until it disconnects."""
-        async for message in self._socket:
-            first = self._sent.popleft() if self._sent else 0
-            try:
-                if message.type is not aiohttp.WSMsgType.BINARY:
-                    raise messages.MessageError("text frame received; send binary frames of msgpack")
-                content = messages.unpack(message.data)
-                if not isinstance(content, dict) or "actions" not in content:
-                    raise messages.MessageError(f"no map with actions: {short_repr(content)}")
-            except messages.MessageError as error:
-                self._deliver(first, problem=str(error))
-                continue
-            number = content.get("sequence", first)
-            self._deliver(number if isinstance(number, int) else first, content["actions"])
-        self._close()
-
-    def _close(self) -> None:
-        self.closed = True
-        self._wake()
-
-    async def end(self) -> None:
-        """Close the connection."""
-        await self._socket.close(message=b"the test is over")
-
-
 class UdpController(ControlProgram, asyncio.DatagramProtocol):
     """The first program that says hello at the robot's UDP port, with the key if one is needed."""
 
     resends = True
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, sizes: tuple[int, int], key: str | None) -> None:
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, sizes: tuple[int, int], key: str | None, *, sends: Kind
+    ) -> None:
         super().__init__("udp", loop)
         self.connected: asyncio.Future[None] = loop.create_future()
         self.refused = 0  # packets of others, and what is no packet
-        self._sizes, self._key = sizes, key
+        self._sizes, self._key, self._sends = sizes, key, sends
         self._session = secrets.randbits(64)
         self._address: Any = None
         self._transport: asyncio.DatagramTransport
@@ -157,8 +113,8 @@ class UdpController(ControlProgram, asyncio.DatagramProtocol):
         if packet.kind is Kind.HELLO and self._address is None and self._accepts(packet.key):
             self._address, self.name = address, f"udp {address[0]}:{address[1]}"
             self.connected.set_result(None)
-        elif packet.kind is Kind.COMMAND and address == self._address and packet.session == self._session:
-            self._deliver(packet.sequence, packet.values)
+        elif packet.kind in _ANSWERS and address == self._address and packet.session == self._session:
+            self._deliver(packet.sequence, packet.values if packet.kind is Kind.COMMAND else None)
         elif packet.kind is not Kind.HELLO or address != self._address:  # a hello is repeated until it is answered
             self.refused += 1
 
@@ -169,10 +125,11 @@ class UdpController(ControlProgram, asyncio.DatagramProtocol):
         """Ignore that nobody listens: the program may start again; asyncio calls it."""
 
     async def send(self, observation: SentObservation) -> None:
-        """Send an observation's values in the order of its names."""
+        """Send what was measured, in the order of its names."""
         values = np.concatenate([part.ravel() for part in observation.parts.values()]).astype(np.float32)
         numbers = (observation.sequence, observation.episode, observation.step)
-        self._send(Packet(Kind.OBSERVATION, self._session, *numbers, self._sizes, values))
+        times = (observation.time_s, observation.age_s)
+        self._send(Packet(self._sends, self._session, *times, *numbers, self._sizes, values))
 
     def _send(self, packet: Packet) -> None:
         self._transport.sendto(packets.pack(packet), self._address)

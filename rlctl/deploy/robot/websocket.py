@@ -1,0 +1,92 @@
+"""A program that connects to the robot by WebSocket; needs aiohttp and msgpack, which UDP does not."""
+
+import asyncio
+import collections
+from typing import Any
+
+import aiohttp
+from aiohttp import web
+
+from rlctl.deploy.robot.program import ControlProgram, SentObservation
+from rlctl.deploy.robot.request import RobotRequest
+from rlctl.deploy.server import messages
+from rlctl.deploy.server.access import find_problem, is_websocket
+from rlctl.deploy.server.request import LOOPBACK
+from rlctl.errors import short_repr
+
+_LARGEST_COMMAND = 2**20  # [bytes]
+
+
+class WebSocketController(ControlProgram):
+    """A program that has connected by WebSocket. An answer without a `sequence` is for the next observation in turn."""
+
+    def __init__(self, name: str, loop: asyncio.AbstractEventLoop, socket: web.WebSocketResponse) -> None:
+        super().__init__(name, loop)
+        self._socket = socket
+        self._sent: collections.deque[int] = collections.deque()  # sequences that are not answered yet
+
+    async def send(self, observation: SentObservation) -> None:
+        """Send an observation as a policy server's client does; `reset` begins an episode."""
+        content: dict[str, Any] = dict(observation.parts)
+        content["sequence"] = observation.sequence
+        content["age_s"] = observation.age_s
+        if observation.begins:
+            content["reset"] = True
+        self._sent.append(observation.sequence)
+        try:
+            await self._socket.send_bytes(messages.pack(content))
+        except ConnectionError:
+            self._close()
+
+    async def receive(self) -> None:
+        """Read the program's answers until it disconnects."""
+        async for message in self._socket:
+            first = self._sent.popleft() if self._sent else 0
+            try:
+                if message.type is not aiohttp.WSMsgType.BINARY:
+                    raise messages.MessageError("text frame received; send binary frames of msgpack")
+                content = messages.unpack(message.data)
+                if not isinstance(content, dict) or "actions" not in content:
+                    raise messages.MessageError(f"no map with actions: {short_repr(content)}")
+            except messages.MessageError as error:
+                self._deliver(first, problem=str(error))
+                continue
+            number = content.get("sequence", first)
+            self._deliver(number if isinstance(number, int) else first, content["actions"])
+        self._close()
+
+    def _close(self) -> None:
+        self.closed = True
+        self._wake()
+
+    async def end(self) -> None:
+        """Close the connection."""
+        await self._socket.close(message=b"the test is over")
+
+
+class Door:
+    """Takes the first WebSocket client as the program under test, and refuses all others."""
+
+    def __init__(self, request: RobotRequest, key: str | None, metadata: dict[str, Any]) -> None:
+        self._is_local, self._key = request.host in LOOPBACK, key
+        self._metadata = messages.pack(metadata)
+        self.server = web.Server(self.answer, access_log=None)
+        self.taken = False
+        self.connected: asyncio.Future[ControlProgram] = asyncio.get_running_loop().create_future()
+
+    async def answer(self, request: web.BaseRequest) -> web.StreamResponse:
+        """Answer a request."""
+        if problem := find_problem(request, self._is_local, self._key):
+            return web.json_response({"error": problem[1]}, status=problem[0])
+        if not is_websocket(request):
+            return web.json_response({"error": "this is rlctl robot: connect by WebSocket or UDP"}, status=426)
+        if self.taken:
+            return web.json_response({"error": "another program is connected"}, status=409)
+        self.taken = True
+        socket = web.WebSocketResponse(compress=False, max_msg_size=_LARGEST_COMMAND, timeout=1.0)
+        await socket.prepare(request)
+        await socket.send_bytes(self._metadata)
+        controller = WebSocketController(f"ws {request.remote}", asyncio.get_running_loop(), socket)
+        self.connected.set_result(controller)
+        await controller.receive()
+        return socket
