@@ -11,6 +11,7 @@ from rlctl_locomotion.driven import Driven
 from rlctl_locomotion.quadruped import FEET, LEGS
 
 LIMP_S = 0.5  # [s] at the start, in which the motors are off and the robot falls
+CALM = 0.3  # [m/s], of the trunk; a turn of 1 rad/s counts as 0.2 m/s
 STILL_S = 0.5  # [s], for which it stands still before the end of an episode that succeeds
 CORNERS = np.stack(np.meshgrid((-0.23, 0.23), (-0.15, 0.15), (-0.06, 0.06)), -1).reshape(
     -1, 3
@@ -27,8 +28,8 @@ class GetUp(Driven):
 
     still: np.ndarray = field(init=False, repr=False)  # steps since which it stands still
 
-    reach: ClassVar[np.ndarray] = np.array([0.4, 0.6, 0.4] * 4)  # [rad]; a foot reaches the ground behind the back
-    action_meaning = "joint angles from the stance; 1 is 0.6 rad of an upper leg, 0.4 of a hip or a lower leg"
+    reach: ClassVar[np.ndarray] = np.array([0.3, 0.6, 0.3] * 4)  # [rad]; a foot reaches the ground behind the back
+    action_meaning = "joint angles from the stance; 1 is 0.6 rad of an upper leg, 0.3 of a hip or a lower leg"
     reward_weights = {
         "upright": 0.1,
         "height": 0.15,
@@ -50,7 +51,7 @@ class GetUp(Driven):
     }
 
     rlctl_ignore = {
-        "RL106": "action 1 is 0.4 or 0.6 rad; up to 4 it may target angles out of reach, for force",
+        "RL106": "action 1 is 0.3 or 0.6 rad; up to 4 it may target angles out of reach, for force",
         "RL611": "getting up and standing still is what training is for; random actions do not stand still",
     }
 
@@ -88,7 +89,7 @@ class GetUp(Driven):
         self.distance = np.sqrt(rewards.squared(self.body.joint_positions - self.stance))  # [rad], from the stance
         self.speed = np.linalg.norm(self.velocity, axis=1) + 0.2 * np.linalg.norm(self.turning, axis=1)  # [m/s]
         is_up = (self.gravity[:, 2] < -0.95) & (np.abs(self.height - self.target_height) < 0.05)
-        self.still = np.where(is_up & (self.distance < 0.2) & (self.speed < 0.15), self.still + 1, 0)
+        self.still = np.where(is_up & (self.distance < 0.2) & (self.speed < CALM), self.still + 1, 0)
 
     def is_terminated(self) -> np.ndarray:
         """Never: it may fall again, and get up again."""

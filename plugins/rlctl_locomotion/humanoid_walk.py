@@ -21,6 +21,7 @@ OTHER_SIDE = (-7, -8, 9, 10, 11, -12, -1, -2, 3, 4, 5, -6, 15, 16, 13, 14)  # ya
 PERIOD_S = 0.7  # [s], of two steps
 SOLE = 0.06  # [m], from an ankle to the ground
 SWING = 0.07  # [m], how high a foot is lifted
+LEAST_SWING = 0.01  # [m]; a foot that is lower near the top of its swing has missed its step
 
 
 @dataclass
@@ -47,14 +48,13 @@ class HumanoidWalk(Walk):
     lowest: ClassVar[np.ndarray] = np.array([-0.3, -0.3, -0.6])
     highest: ClassVar[np.ndarray] = np.array([0.8, 0.3, 0.6])
 
-    scale = 0.3
     action_space = Box(-4.0, 4.0, (16,), np.float32)
     observation_units = {**Walk.observation_units, "phase": "sine and cosine"}
     observation_terms = {
         **Walk.observation_terms,
         "joint_positions": terms.Scaled("joint_positions", offset=tuple(STANCE)),
     }
-    reward_weights = {**Walk.reward_weights, "gait": 0.4, "pose": -0.3}
+    reward_weights = {**Walk.reward_weights, "tracking": 0.3, "turning": 0.15, "gait": 0.3, "pose": -0.3}
     per_world = {**Walk.per_world, "last_action": (16,), "action_change": (16,), "phase": (2,)}
     mirror = {
         **Walk.mirror,
@@ -80,10 +80,17 @@ class HumanoidWalk(Walk):
             [sine * np.cos(turn) + cosine * np.sin(turn), cosine * np.cos(turn) - sine * np.sin(turn)], -1
         )
 
+    def is_terminated(self) -> np.ndarray:
+        """It has fallen, or missed a step: standing is easier than walking, and nothing else makes it lift a foot."""
+        return super().is_terminated()
+
     def measure(self) -> None:
         """Compute what rewards, success and the end share, once per step."""
         super().measure()
         self.foot_heights = self.measure_feet()
+        self.wanted = SWING * np.maximum(self.phase[:, :1] * (1.0, -1.0), 0.0)  # [m], of the soles
+        missed = (self.wanted > 0.9 * SWING) & (self.foot_heights < LEAST_SWING)
+        self.fallen |= missed.any(axis=1)
 
     def measure_feet(self) -> np.ndarray:
         """Return the heights of the soles above the ground [m], left and right, shape (worlds, 2)."""
@@ -100,10 +107,9 @@ class HumanoidWalk(Walk):
 
     def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
         """Return how well command and clock are followed, and how calmly."""
-        wanted = SWING * np.maximum(self.phase[:, :1] * (1.0, -1.0), 0.0)
-        bent = (self.body.joint_positions - self.stance)[:, KEPT]
+        bent = np.compress(KEPT, self.body.joint_positions - self.stance, axis=1)
         return {
             **super().rewards(action),
-            "gait": 1.0 - np.abs(self.foot_heights - wanted).mean(axis=1) / SWING,
+            "gait": 1.0 - np.abs(self.foot_heights - self.wanted).mean(axis=1) / SWING,
             "pose": rewards.squared(bent),
         }
