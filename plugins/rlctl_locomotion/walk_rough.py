@@ -1,20 +1,17 @@
 """Walk on rough ground that the robot does not see: `walk` with pushes, slippery ground, noise and delay."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from rlctl.task import Body, Event, Sim, TaskError, WorldRngs, events, rough_heights
 from rlctl.task.rotations import rotate_inverse
 from rlctl_locomotion.quadruped import FEET
-from rlctl_locomotion.walk import HIGHEST, LOWEST, STANCE, START_HEIGHT, Walk
+from rlctl_locomotion.walk import Walk
 
 HIGHEST_BUMPS = 0.1  # [m]; above, the legs are too short
-CELL = 0.2  # [m], between the points of the ground
-SIZE = (50.0, 80.0)  # [m], of the ground along x and y: in an episode at most 22 m are walked
-FLAT, FULL = -30.0, 0.0  # [m]: from y = FLAT to FULL the bumps grow from 0 to their height
 START = 2.0  # [m], half of the length of the square in which episodes begin
-EASIEST, HARDEST = FLAT, 15.0  # [m]: y of the middle of that square at level 0 and at level 1
 PUSH = {"from": (0.0, 0.3), "to": (0.0, 1.0)}  # [m/s], at level 0 and at level 1
 SCANNED = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.2, 0.2, 3), indexing="ij"), -1).reshape(-1, 2)
 """Points around the robot [m] whose heights the critic sees, in its own frame without roll and pitch."""
@@ -28,6 +25,10 @@ class WalkRough(Walk):
     terrain_seed: int = 0
     episode_s: float = 20.0
 
+    cell: ClassVar[float] = 0.2  # [m], between the points of the ground
+    size: ClassVar[tuple[float, float]] = (50.0, 80.0)  # [m], along x and y: in an episode at most 22 m are walked
+    flat_y: ClassVar[float] = -30.0  # [m], where episodes of level 0 begin
+    hardest_y: ClassVar[float] = 15.0  # [m], where those of level 1 begin
     scale = 0.4
     # Lower than on flat ground, for quick corrections after pushes; what -0.012 does here was not measured.
     reward_weights = {**Walk.reward_weights, "smoothness": -0.005}
@@ -53,22 +54,28 @@ class WalkRough(Walk):
     }
 
     def load_ground(self, sim: Sim) -> Body:
-        """Load rough ground, whose bumps grow along y; raises `TaskError` for bumps that are too high."""
+        """Load ground that gets rougher along y."""
+        heights = self.draw_heights()
+        y = (np.arange(heights.shape[1]) - (heights.shape[1] - 1) / 2) * self.cell
+        self.heights = heights * np.clip(self.find_roughness(y), 0.0, 1.0)
+        return sim.add_height_field("ground", self.heights, cell=self.cell)
+
+    def draw_heights(self) -> np.ndarray:
+        """Return bumps of full height, shape (along x, along y) [m]; raises `TaskError` for some that are too high."""
         if not 0 <= self.rough <= HIGHEST_BUMPS:
             raise TaskError(f"rough: bumps of {self.rough:g} m; give a height from 0 to {HIGHEST_BUMPS:g} m")
-        heights = rough_heights(self.terrain_seed, size=SIZE, cell=CELL, roughness=self.rough)
-        y = (np.arange(heights.shape[1]) - (heights.shape[1] - 1) / 2) * CELL
-        self.heights = heights * np.clip((y - FLAT) / (FULL - FLAT), 0.0, 1.0)
-        return sim.add_height_field("ground", self.heights, cell=CELL)
+        return rough_heights(self.terrain_seed, size=self.size, cell=self.cell, roughness=self.rough)
 
-    def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
-        """Stand somewhere, with a commanded velocity."""
+    def find_roughness(self, y: np.ndarray) -> np.ndarray:
+        """Return how rough the ground is at y [m]: flat at 0, of full height at 1."""
+        return 1.0 - y / self.flat_y
+
+    def draw_place(self, rng: WorldRngs, worlds: np.ndarray) -> np.ndarray:
+        """Return where the trunk starts [m], shape (k, 3): on ground as rough as the world's level says."""
         place = rng.uniform(-START, START, 2)
-        place[:, 1] += EASIEST + (HARDEST - EASIEST) * self.level[worlds]
+        place[:, 1] += self.flat_y + (self.hardest_y - self.flat_y) * self.level[worlds]
         around = self.find_heights(place[:, None] + SCANNED)
-        self.body.set_base(np.column_stack([place, START_HEIGHT + around.max(axis=1)]), worlds=worlds)
-        self.body.set_joints(STANCE + rng.uniform(-self.start_noise, self.start_noise, 12), worlds=worlds)
-        self.command[worlds] = rng.uniform(LOWEST, HIGHEST)
+        return np.column_stack([place, self.start_height + around.max(axis=1)])
 
     def privileged(self) -> dict[str, np.ndarray]:
         """Return the velocity, the heights of trunk and feet above the ground, and the ground around the robot."""
@@ -89,7 +96,7 @@ class WalkRough(Walk):
     def find_heights(self, places: np.ndarray) -> np.ndarray:
         """Return the heights of the ground [m] at places (..., 2) [m], between the points of the grid bilinearly."""
         last = np.array(self.heights.shape) - 1
-        position = np.clip(places / CELL + last / 2, 0.0, last - 1e-9)
+        position = np.clip(places / self.cell + last / 2, 0.0, last - 1e-9)
         corner = position.astype(int)
         (x, y), (right, up) = np.moveaxis(corner, -1, 0), np.moveaxis(position - corner, -1, 0)
         low = self.heights[x, y] * (1 - right) + self.heights[x + 1, y] * right

@@ -83,4 +83,4 @@ def test_a_computed_term_is_not_mapped(tmp_path):
     env = make_arm(observation_terms={"goal": terms.Gravity("orientation")}, quantity_sizes={"orientation": 4})
     (tmp_path / "mapping.yaml").write_text("observations: {goal: {sign: [1, 1, -1]}}")
     with pytest.raises(UsageError, match="goal is computed inside the controller, from orientation; map that instead"):
-        read_mapping(tmp_path / "mapping.yaml", ControllerLayout(make_policy(env).info))
+        read_mapping(tmp_path / "mapping.yaml", ControllerLayout(env, 1))

@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl_locomotion.walk_rough import CELL, WalkRough
+from rlctl_locomotion.walk_rough import WalkRough
 
 pytest.importorskip("mujoco")
 
@@ -15,7 +15,15 @@ pytest.importorskip("mujoco")
 def test_heights_between_the_points_of_the_grid():
     task = WalkRough()
     task.heights = np.array([[0.0, 0.0, 0.0], [0.0, 0.04, 0.02], [0.0, 0.0, 0.0]])  # the middle is at 0, 0
-    places = np.array([[0.0, 0.0], [0.0, CELL / 2], [CELL / 2, CELL / 2], [-CELL, 0.0], [99.0, 99.0]])
+    places = np.array(
+        [
+            [0.0, 0.0],
+            [0.0, WalkRough.cell / 2],
+            [WalkRough.cell / 2, WalkRough.cell / 2],
+            [-WalkRough.cell, 0.0],
+            [99.0, 99.0],
+        ]
+    )
     # Half way to 0.02 it is 0.03; in the middle of 0.04, 0.02, 0 and 0 it is 0.015; outside it is that of the edge.
     np.testing.assert_allclose(task.find_heights(places), [0.04, 0.03, 0.015, 0.0, 0.0], atol=1e-9)
 

@@ -45,6 +45,24 @@ def scene(tmp_path):
     return tmp_path / "scene.xml"
 
 
+LEGS = """<mujoco model="legs"><worldbody><body name="trunk" pos="0 0 1"><freejoint/><geom size="0.1"/>
+<body name="left"><joint name="l" axis="0 1 0"/><geom type="capsule" size="0.05" fromto="0 0 0 0 0 -.5" MASKS/></body>
+<body name="right"><joint name="r" axis="0 1 0"/><geom type="capsule" size="0.05" fromto="0 0 0 0 0 -.5" MASKS/></body>
+</body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("masks", "contacts"), [("", 1), ('contype="1" conaffinity="0"', 0), ('contype="2" conaffinity="6"', 1)]
+)
+def test_parts_of_a_body_collide_as_the_masks_of_its_file_say(masks, contacts, tmp_path):
+    (tmp_path / "legs.xml").write_text(LEGS.replace("MASKS", masks))
+    sim = make_sim()
+    sim.load("legs", tmp_path / "legs.xml", self_collision=True)
+    sim.save()
+    sim.step()
+    assert sim.data.ncon == contacts
+
+
 def test_a_model_of_menagerie_falls_onto_its_floor(scene, capfd):
     sim = make_sim()
     robot = sim.load("robot", scene)

@@ -26,6 +26,8 @@ class Parts:
             (number, geom.parent.name) for number, geom in enumerate(child.geoms) if is_colliding(geom)
         ]
         """Number and link of the geoms that collide."""
+        self.masks = [(int(geom.contype), int(geom.conaffinity)) for geom in child.geoms]
+        """MuJoCo's collision masks as the file has them, by number of the geom."""
         self.moving: set[str] = set()
         """Links that are not fixed to the world."""
         self.ancestors: dict[str, set[str]] = {WORLD: set()}
@@ -49,6 +51,11 @@ class Parts:
     def full_name(self, link: str) -> str:
         """Return the name of a link, or of the world, in the compiled model."""
         return link if link == WORLD else f"{self.name}/{link}"
+
+    def may_collide(self, one: int, two: int) -> bool:
+        """Return whether the file's masks let two of its own geoms collide, by MuJoCo's rule."""
+        (type_one, affinity_one), (type_two, affinity_two) = self.masks[one], self.masks[two]
+        return bool(type_one & affinity_two or type_two & affinity_one)
 
     def bind(self, model: Any) -> None:
         """Look up the numbers in a compiled model."""

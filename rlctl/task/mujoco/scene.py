@@ -200,7 +200,7 @@ class MujocoScene:
                 collide = link in parts.moving or other in parts.moving
             else:
                 related = link == other or link in parts.ancestors[other] or other in parts.ancestors[link]
-                collide = self_collision and not related
+                collide = self_collision and not related and parts.may_collide(one, two)
             if collide:
                 self._add_pair(parts, one, link, parts, two, other)
 
