@@ -1,6 +1,7 @@
 """Builds environments whose episodes can be drawn."""
 
 import contextlib
+import copy
 from typing import Any
 
 import gymnasium
@@ -20,6 +21,10 @@ class DrawableEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.bullet_log = log
         self.no_pictures = no_pictures  # why it cannot draw itself; empty if it might
         self._stop = stop
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Env:
+        """Return a copy of the environment alone, whose calls are not logged."""
+        return copy.deepcopy(self.env, memo)
 
     def close(self) -> None:
         """Close the environment."""
