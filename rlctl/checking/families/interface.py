@@ -105,8 +105,10 @@ def _find_exceptions(records: Records) -> Iterator[RuleFinding]:
 @check("RL208")
 def _find_ends_of_process(records: Records) -> Iterator[RuleFinding]:
     without_opengl = any(opengl_fix(failure.error) for failure in select_failures(records, "raised"))
+    # Of a process that ends at once, the last line that says so may be lost: another process has it.
+    without_display = {(failure.call, failure.error) for failure in records.failures if display_error(failure)}
     for failure in select_failures(records, "died"):
-        if not display_error(failure) and not without_opengl:  # RL216 or RL207 says why
+        if (failure.call, failure.error) not in without_display and not without_opengl:  # RL216 or RL207 says why
             yield RuleFinding("RL208", failure.message, failure.place)
 
 
