@@ -3,6 +3,7 @@
 import ast
 import functools
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -118,8 +119,9 @@ def test_no_two_modules_import_each_other():
 
 
 def test_a_class_name_means_one_thing():
-    trees = [ast.parse(file.read_text()) for file in files("rlctl")]
-    names = [node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    texts = [file.read_text() for file in files("rlctl")]
+    names = [name for text in texts for name in re.findall(r"^ *class (\w+)[(:]", text, re.MULTILINE)]
+    assert len(names) > 100
     assert {name for name in names if names.count(name) > 1} == set()
 
 

@@ -17,10 +17,10 @@ def broken_joints(name, rule, twin, severity="warning"):
 
 
 CASES = [
+    broken("ArmQuaternion", "RL116", "error", "ArmRightQuaternion"),
     broken("HopperQuaternion", "RL116", "error"),
     broken("HopperVelocity", "RL116", "error", "HopperRightVelocity"),
     broken("HopperHeading", "RL116", "error", "HopperRightHeading"),
-    broken("ArmQuaternion", "RL116", "error", "ArmRightQuaternion"),
     broken("ArmBeyondLimits", "RL804"),
     broken("HopperExplodes", "RL805"),
     broken("HopperInTheGround", "RL807"),
@@ -34,8 +34,8 @@ CASES = [
     broken("ArmOrder", "RL811", "error"),
     broken("ArmOrderOfRanges", "RL811", "error", "ArmRange"),
     broken("HopperOrder", "RL811", "error"),
-    broken("HopperOtherSoles", "RL812", twin="HopperThighs"),
     broken("ArmTouchesWithPalm", "RL812", twin="ArmTouchesWithFinger"),
+    broken("HopperOtherSoles", "RL812", twin="HopperThighs"),
     broken("ArmOldTip", "RL815"),
     broken("ArmOldSensor", "RL815", twin="ArmRightSensor"),
     broken("ArmResetsWithoutForward", "RL815"),
@@ -47,8 +47,8 @@ CASES = [
     broken("HopperSlips", "RL817", "error", "HopperFriction"),
     broken("ArmKeepsActivation", "RL302", "error", "ArmResets"),
     broken("HopperKeepsTime", "RL301", "error", "HopperResets"),
-    broken("HopperForces", "RL818", twin="HopperRightForces"),
     broken("ArmInverse", "RL818", twin="ArmActuator"),
+    broken("HopperForces", "RL818", twin="HopperRightForces"),
     case("broken_mujoco_joints.py:ArmLimitsInRadians", ("RL804", "warning"), twin="mujoco_robots.py:MujocoArm"),
     broken_joints("ArmIncrementsInOtherOrder", "RL811", "ArmIncrements", "error"),
     broken_joints("HopperIncrementsInOtherOrder", "RL811", "HopperIncrements", "error"),

@@ -49,6 +49,7 @@ def test_it_records_and_reports_without_a_run(replay, tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == {"Tumble-zero.rrd", "Tumble-zero.npz"}
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_narrow_terminal_has_fewer_columns(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

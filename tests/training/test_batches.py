@@ -27,9 +27,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(
-    "case", [case if case == "ppo" else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
 def test_equal_on_any_number_of_workers(train, monkeypatch, case):
     runs = []
     for count in (1, 2, 3):

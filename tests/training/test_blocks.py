@@ -134,6 +134,7 @@ class EndsInChildren(DqnGradients):
         super().compute(phase, task)
 
 
+@pytest.mark.slow
 def test_without_its_processes_an_update_continues(capfd):
     blocks = Blocks(EndsInChildren, DQN, 4, cores=2)
     blocks.arrays["noise"][0, 0] = os.getpid()

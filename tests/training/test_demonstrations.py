@@ -175,7 +175,8 @@ def kill_at(monkeypatch):
     return kill
 
 
-@pytest.mark.parametrize("case", [pytest.param("ppo", marks=pytest.mark.slow), "sac with gSDE, normalised"])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["ppo", "sac with gSDE, normalised"])
 @pytest.mark.usefixtures("every_boundary")
 def test_killed_and_resumed(record, changed, train, resume, monkeypatch, kill_at, case):
     monkeypatch.setattr(demonstrations, "_UPDATES", 50)

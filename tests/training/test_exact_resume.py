@@ -108,7 +108,6 @@ CASES = {
 # trainings of plain ppo and sac are in tests/crash.
 QUICK = {
     *("ppo with gSDE", "ppo, curriculum", "sac, hindsight, normalised"),
-    "ppo, privileged, on worlds in batches",
 }
 
 

@@ -109,6 +109,7 @@ def test_a_signal_saves_a_checkpoint_and_leaves_no_child(start, rlctl, tmp_path,
     assert json.loads(done.stdout)["steps"] == steps + 64
 
 
+@pytest.mark.slow
 def test_a_killed_run_leaves_no_worker_and_does_not_block_the_next(start, rlctl, tmp_path):
     training = start(tmp_path, "--set", "eval.every_steps=64")
     wait_for(lambda: list(tmp_path.glob("runs/*/*/checkpoints/0*")))

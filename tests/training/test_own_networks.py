@@ -81,6 +81,7 @@ def trained(train):
     return train("Line", {**TINY, "policy_kwargs": {**GATED, "activation_fn": "torch.nn:Mish", "net_arch": [8]}})
 
 
+@pytest.mark.slow
 def test_whole_way_of_a_policy(trained, train, tmp_path):
     run = trained.run
     policy = PolicyFile.read(run.last_policy)
