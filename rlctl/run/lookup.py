@@ -6,7 +6,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rlctl.environments import installed, registry, suggestions
@@ -106,20 +106,28 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> Fou
     """Return the policy that the argument RUN names, which may be a policy file.
 
     A task's name means its newest run that has such a policy; if `which` is `pretrained`, the policy that it ships.
-    A note warns if the task's source has changed since the training.
+    A note warns if the task's source has changed since the training or the export, or if its engine is missing.
     """
     if text is not None and which != PRETRAINED and store.is_address(text):
         text = str(store.fetch(text))
     policy = _find_policy(text, which, root)
-    notes = []
-    if policy.run is not None and (change := describe_source_change(policy.run)):
-        notes.append(f"warning: {change}; its score may have changed")
-    info = None
+    return dataclasses.replace(policy, notes=(*policy.notes, *_list_warnings(policy)))
+
+
+def _list_warnings(policy: FoundPolicy) -> Iterator[str]:
+    info: PolicyInfo | None = None
     with contextlib.suppress(ArtifactError):  # whoever reads the whole file raises it too
         info = PolicyFile.read_info(policy.file) if policy.file.suffix == ".safetensors" else None
+    change = None
+    if policy.run is not None:
+        change = describe_source_change(policy.run)
+    elif info is not None and info.provenance is not None:
+        digest = info.provenance.source_sha256
+        change = _describe_source_change(info.spec.task, digest, "this policy was exported")
+    if change:
+        yield f"warning: {change}; its score may have changed"
     if info is not None and info.spec.lacks_pybullet:
-        notes.append("warning: trained in PyBullet, which is not installed, so MuJoCo simulates; scores may differ")
-    return dataclasses.replace(policy, notes=(*policy.notes, *notes))
+        yield "warning: trained in PyBullet, which is not installed, so MuJoCo simulates; scores may differ"
 
 
 def describe_source_change(run: RunDirectory) -> str | None:
@@ -146,8 +154,7 @@ def _find_policy(text: str | None, which: str, root: Path) -> FoundPolicy:
         path = Path(text)
         if not path.exists():
             raise ArtifactError(f"{path}: no such file")
-        owner = find_owner(path)
-        return FoundPolicy(path, owner, () if owner else _warn_of_changed_task(path))
+        return FoundPolicy(path, find_owner(path))
     run = find_run(text, root)
     if text is not None and (Path(text) / "run.json").is_file():
         return FoundPolicy(run.policy_file(which), run)
@@ -166,21 +173,8 @@ def _find_policy(text: str | None, which: str, root: Path) -> FoundPolicy:
 
 def _find_shipped(task: str | None) -> FoundPolicy:
     file = find_shipped_policy(task)
-    info = PolicyFile.read_info(file)
-    notes = (f"shipped policy {file}: step {info.training_steps:,}", *_warn_of_changed_task(file))
-    return FoundPolicy(file, None, notes)
-
-
-def _warn_of_changed_task(file: Path) -> tuple[str, ...]:
-    """Return a note if the task's source has changed since a policy file was exported; none of other files."""
-    try:
-        info = PolicyFile.read_info(file) if file.suffix == ".safetensors" else None
-    except ArtifactError:  # whoever reads the tensors raises it too
-        return ()
-    if info is None or info.provenance is None:
-        return ()
-    change = _describe_source_change(info.spec.task, info.provenance.source_sha256, "this policy was exported")
-    return (f"warning: {change}; its score may have changed",) if change else ()
+    note = f"shipped policy {file}: step {PolicyFile.read_info(file).training_steps:,}"
+    return FoundPolicy(file, None, (note,))
 
 
 def find_owner(file: Path) -> RunDirectory | None:
