@@ -12,6 +12,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.evaluation import episode_statistics
 from rlctl.evaluation.episode_statistics import Spread
+from rlctl.evaluation.failures import FailurePattern, find_patterns
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, find_player, load_baseline
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.evaluation.sequential import find_interval, is_decided, is_settled
@@ -49,6 +50,7 @@ class Evaluation:
     limited_by: Path | None = None
     unlimited: "Evaluation | None" = None  # the same episodes without limits
     action_change: float | None = None  # mean of |action - previous action|; None if it was not measured
+    failure_patterns: list[FailurePattern] = dataclasses.field(default_factory=list)  # what failures have in common
     planned: int | None = None  # episodes that would have been played to the end, if the gate could be decided early
 
     @property
@@ -208,6 +210,7 @@ def _summarize(
         final_distance=Spread.of(distances) if distances else None,
         max_steps=workers.info.max_steps,
         action_change=episode_statistics.mean_action_change(episodes) if request.measure_actions else None,
+        failure_patterns=find_patterns(episodes, workers.info),
         planned=request.episodes if request.decide_early else None,
     )
 

@@ -43,6 +43,8 @@ def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
         out.print(f"success rate {result.success_rate:.1%}  (95 % interval {low:.1%} to {high:.1%})")
     if result.planned is not None and gates.min_success is not None:
         out.print(_format_decision(result, result.planned, gates.min_success))
+    for pattern in result.failure_patterns:
+        out.print(f"  {pattern}")
     rows = [("return", *_format_spread(result.returns)), ("length", *_format_spread(result.lengths))]
     if result.final_distance is not None:
         rows.append(("final distance", *_format_spread(result.final_distance)))
@@ -123,6 +125,7 @@ def as_json(result: Evaluation) -> dict[str, Any]:
         "terms": result.terms,
         "metrics": result.metrics,
         "final_distance": result.final_distance,
+        "failure_patterns": result.failure_patterns,
         "episodes": result.rows(),
     }
     if result.spec.stage:

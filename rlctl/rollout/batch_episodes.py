@@ -211,6 +211,7 @@ class BatchEpisodes:
             None if np.isnan(self._deepest[world]) else float(self._deepest[world]),
             acting=acting / max(acting + stepping, 1e-9),
             metrics={name: float(sums[index]) / steps for index, name in enumerate(names) if not self._weights[index]},
+            drawn=dict(self.env.drawn[world]),
         )
 
     def close(self) -> None:

@@ -29,6 +29,7 @@ class Episode:
     result: EpisodeResult
     trajectory: Trajectory | None = None
     terminated: bool = False  # whether its last step terminated it; else it was truncated
+    first: dict[str, NDArray[Any]] = dataclasses.field(default_factory=dict)  # its first observation, as it is stored
 
     @property
     def recorded(self) -> Trajectory:
@@ -107,7 +108,7 @@ def play_episodes(
                 if result is not None:
                     del running[env]
                     terminated = bool(workers.arrays.segment.terminated[env, result.row])
-                    episodes[recorder.index] = Episode(result, recorder.finish(), terminated)
+                    episodes[recorder.index] = Episode(result, recorder.finish(), terminated, recorder.first)
                 elif workers.info.max_steps is None and recorder.steps >= MOST_STEPS:
                     raise TaskError(
                         f"task {workers.spec.task!r}: the episode of seed {seeds[recorder.index]} has not ended within "
@@ -125,9 +126,12 @@ class _Recorder:
         self._record = record
         self.steps = 0  # number of recorded steps
         self._parts: list[Trajectory] = []
+        self.first: dict[str, NDArray[Any]] = {}  # the observation with which the episode begins
 
     def add(self, workers: Workers, env: int, steps: int) -> None:
         """Copy the first steps of an environment's segment."""
+        if not self.steps:
+            self.first = {key: rows[env, 0].copy() for key, rows in workers.arrays.segment.observation.items()}
         self.steps += steps
         if self._record:
             segment = workers.arrays.segment

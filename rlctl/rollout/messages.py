@@ -151,6 +151,8 @@ class EpisodeResult:
     """Fraction of the episode's time that the policy took; the environment took the rest."""
     metrics: dict[str, float] = dataclasses.field(default_factory=dict)
     """Mean per step of each reward term of weight 0, as the task returned it."""
+    drawn: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict, compare=False)
+    """What the events drew last, by event."""
 
 
 @dataclasses.dataclass(frozen=True)

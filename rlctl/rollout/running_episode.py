@@ -108,6 +108,7 @@ class RunningEpisode:
             self._deepest_contact,
             self.acting_s / max(self.acting_s + self.stepping_s, 1e-9),
             {name: float(total) / self.step for name, total in self._raw_sums.items()},
+            dict(self.env.unwrapped.drawn) if self._is_task else {},
         )
 
 

@@ -60,6 +60,7 @@ class BatchEnv:
         """Steps since the start of each world's episode."""
         self._streams: list[Streams] = [{} for _ in range(worlds)]
         self._levels = np.ones(worlds)
+        self.drawn: list[dict[str, Drawn]] = [{} for _ in range(worlds)]  # by events, in the running episodes
         task.prepare(self.sim, worlds)
         self.sim.save()
         self.set_events(single)
@@ -106,6 +107,7 @@ class BatchEnv:
         if self._privileged is not None:
             self._privileged[worlds] = 0.0  # what is of an event that has not acted yet
         for world, seed in zip(worlds.tolist(), seeds, strict=True):
+            self.drawn[world] = {}
             self._streams[world] = seed_streams(self._events, int(seed))
             self._act("reset", world)
         self.task.clear_kept(worlds)
@@ -142,7 +144,8 @@ class BatchEnv:
         return chosen
 
     def _note(self, world: int, drawn: Mapping[str, Drawn]) -> None:
-        """Let the critic see what events drew."""
+        """Keep what events drew, and let the critic see it."""
+        self.drawn[world].update(drawn)
         if self._privileged is not None and self._single.privileged is not None:
             with in_world(world):
                 self._single.privileged.write_events(self._privileged[world], drawn)

@@ -78,7 +78,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self._running = self._closed = False
         self._streams: Streams = {}
         self._markers: dict[str, int] = {}
-        self._drawn: dict[str, Drawn] = {}
+        self.drawn: dict[str, Drawn] = {}
         """Values that the events of this episode drew, the last ones of those at an interval."""
         self.privileged: PrivilegedFormat | None = None  # what only a critic sees, after `show_critic`
         try:
@@ -137,7 +137,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     def observe_privileged(self) -> NDArray[np.float32]:
         """Return what only the critic sees now, shape (size,); call `show_critic` once before."""
         assert self.privileged is not None
-        return self.privileged.observe(self.task, self._drawn, self._step)
+        return self.privileged.observe(self.task, self.drawn, self._step)
 
     def set_events(self, events: EventSettings, added: Mapping[str, Event] | None = None) -> None:
         """Let only the events of `events` and the `added` ones act; call `reset` afterwards.
@@ -202,7 +202,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         self._running = True
         observation = self._observe()
         drawn |= self._signals.drawn
-        self._drawn = dict(drawn)
+        self.drawn = dict(drawn)
         info: dict[str, Any] = {"events": drawn} if drawn else {}
         if self.render_mode == "human":
             self.move_markers()
@@ -238,7 +238,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         if self._acting.periods:
             drawn = self._acting.run_due(self._step, self.sim, self._streams, self._episode_level)
             info.update({"events": drawn} if drawn else {})
-            self._drawn.update(drawn)
+            self.drawn.update(drawn)
         if self.has_success:
             info["is_success"] = self._read_flag("is_success")
         self._running = not (terminated or truncated)
