@@ -51,6 +51,11 @@ class Curriculum:
         return LevelRule(**level.model_dump()) if isinstance(level, FollowingLevel) else None
 
     @property
+    def has_levels(self) -> bool:
+        """Whether levels follow success in any stage."""
+        return any(isinstance(stage.level, FollowingLevel) for stage in self.stages)
+
+    @property
     def title(self) -> str:
         """The current stage as text: `stage 2 of 3: tolerance 0.1`."""
         return format_title(self._progress.stage, self.stages)

@@ -69,7 +69,7 @@ class Metrics:
             "fps": round((steps - self._last_row_steps) / elapsed_s, 1),
             "playing": round(env.waited_s / elapsed_s, 3),
             **learner.curriculum.columns(),
-            **({"level": round(float(env.levels.mean()), 4)} if learner.curriculum.level_rule else {}),
+            **({"level": round(float(env.levels.mean()), 4)} if learner.curriculum.has_levels else {}),
             **measurements.training_row(recent, env.workers.info.reward_weights, logger.name_to_value),
             **measurements.measure(learner.model, env, progress.last_row, learner.recipe.total_timesteps),
         }

@@ -53,6 +53,16 @@ def test_what_is_mastered_gets_harder(train, task):
     assert first.observations[0, 0] == 1.0  # what the task observes is its level
 
 
+def test_the_table_has_levels_if_a_later_stage_has(train):
+    always = {"level": 0.2, "promote": {"return": -1000.0, "window": 1}}
+    settings = {**SMALL, "stages": [always, {"level": {"start": 0.4, "up": 0.1}}]}
+    with train(BATCH, settings, envs="").run.metrics_file.open() as file:
+        rows = [(int(row["stage"]), float(row["level"])) for row in csv.DictReader(file)]
+    assert rows[0] == (1, 0.2)
+    assert rows[-1][0] == 2
+    assert rows[-1][1] >= 0.4
+
+
 def test_the_episode_that_failed_is_reproduced_at_its_level(train, tmp_path):
     settings = {**following(), "task": {"faulty_level": 0.5}}
     with pytest.raises(TaskError, match=BROKEN):
