@@ -13,6 +13,7 @@ from rlctl.checking.children import Supervisor
 from rlctl.checking.records import Records
 from rlctl.checking.rules import RULES, NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.values import name_leaf
+from rlctl.checking.working_copy import find_outdated, find_root, prefer_working_copy
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, did_you_mean
@@ -70,7 +71,14 @@ class CheckReport:
         return int(is_bad or (self.strict and bool(self.out_of_time)))
 
     def locate(self, finding: RuleFinding) -> tuple[Path, int] | None:
-        """Return file and line of what causes a finding: a call, else the method that it is about, else the class."""
+        """Return file and line of what causes a finding: a call, else the method that it is about, else the class.
+
+        Of an installed copy of a file of the current folder, that file.
+        """
+        place = self._locate(finding)
+        return place and (prefer_working_copy(place[0]), place[1])
+
+    def _locate(self, finding: RuleFinding) -> tuple[Path, int] | None:
         if finding.where is not None:
             return Path(finding.where[0]), finding.where[1]
         built = self.records.built
@@ -83,6 +91,19 @@ class CheckReport:
             method = f"{kind}_space" if f"{kind}_space" in built.places else method
         file_name, line = built.places.get(method) or (built.file, built.line or 1)
         return Path(file_name), line
+
+    @property
+    def outdated(self) -> str:
+        """A line that says that Python imported another version of the task than the current folder has; or empty."""
+        file = Path(self.records.built.file) if self.records.built and self.records.built.file else None
+        file = file or registry.find_source_file(self.task)
+        if file is None or self.task.rpartition(":")[0].endswith(".py") or not (pair := find_outdated(file)):
+            return ""
+        imported, own = pair[0], pair[1].relative_to(Path.cwd())
+        return (
+            f"warning: this checked {imported}, and {own} of this folder differs; "
+            f"to check this folder: PYTHONPATH={find_root(own)} rlctl check-env {self.task}"
+        )
 
     def fingerprint(self, finding: RuleFinding) -> str:
         """Return what identifies a finding in every run: no number of a message, which differ from run to run."""

@@ -4,7 +4,7 @@ import io
 import itertools
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from rlctl.checking.families.speed import format_speed
 from rlctl.checking.junit import to_junit
 from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, find_rule
 from rlctl.checking.tool_formats import Row, action_rows, observation_rows, to_annotations, to_json, to_sarif
+from rlctl.checking.working_copy import is_own
 from rlctl.environments import registry
 from rlctl.environments.info import describe_randomization
 from rlctl.environments.places import format_place
@@ -50,6 +51,19 @@ def pair_targets(forms: Sequence[str], targets: Sequence[str]) -> list[tuple[str
     if not len(forms) - 1 <= len(targets) <= len(forms):
         raise UsageError(f"{len(forms)} --format and {len(targets)} -o: give each format its -o, in the same order")
     return list(itertools.zip_longest(forms, targets))
+
+
+PLACED = ("github", "sarif")  # formats whose readers show only what is in a file of the repository
+
+
+def show_notes(report: CheckReport, forms: Collection[str]) -> None:
+    """Print to stderr whether other code than this folder's was checked, and which findings have no place in it."""
+    if report.outdated:
+        print(report.outdated, file=sys.stderr)
+    places = [report.locate(finding) for finding in report.verdict.findings if set(forms) & {*PLACED}]
+    if outside := [place[0] for place in places if place is not None and not is_own(place[0])]:
+        count = output.format_count(len(outside), "finding")
+        print(f"{count} in files outside of this folder, not shown in its code: {outside[0]}", file=sys.stderr)
 
 
 def show_crashes(report: CheckReport) -> None:

@@ -81,6 +81,7 @@ def check_env(
     report = check(spec, rules=rules, strict=strict, env_timeout_s=env_timeout, budget_s=budget)
     report.subtract(known)
     formats.show_crashes(report)
+    formats.show_notes(report, [name for name, _ in targets])
     if json is not None:
         formats.show(report, "json", json)
     for name, target in targets if json != "-" else ():
