@@ -48,9 +48,11 @@ def show(report: CheckReport, form: str, target: str | None) -> None:
 def pair_targets(forms: Sequence[str], targets: Sequence[str]) -> list[tuple[str, str | None]]:
     """Return each format of a report with its file, or stdout; raises `UsageError` if not one at most goes there."""
     forms = list(forms) or ["text"]
-    if not len(forms) - 1 <= len(targets) <= len(forms):
-        raise UsageError(f"{len(forms)} --format and {len(targets)} -o: give each format its -o, in the same order")
-    return list(itertools.zip_longest(forms, targets))
+    pairs: list[tuple[str, str | None]] = list(zip(forms, [*targets, *[None] * len(forms)], strict=False))
+    if len(targets) > len(forms) or sum(target in (None, "-") for _, target in pairs) > 1:
+        example = " ".join(f"--format {form} -o FILE" for form in forms)
+        raise UsageError(f"give each --format its -o FILE after it; one at most goes to stdout: {example}")
+    return pairs
 
 
 PLACED = ("github", "sarif")  # formats whose readers show only what is in a file of the repository

@@ -12,8 +12,10 @@ import jsonschema
 import pydantic
 import pytest
 import sarif_pydantic
+import typer
 from gymnasium import spaces
 
+from rlctl import cli
 from rlctl.checking import families, tool_formats
 from rlctl.checking.check import CheckReport, CheckVerdict, judge
 from rlctl.checking.formats import FORMATS, pair_targets, to_text
@@ -291,14 +293,28 @@ def test_a_strict_check_fails_for_rules_without_time_to_judge_them(report):
 
 
 @pytest.mark.parametrize(
-    ("forms", "targets", "pairs"),
-    [([], [], [("text", None)]), (["sarif", "junit"], ["a", "b"], [("sarif", "a"), ("junit", "b")]),
-     (["junit", "text"], ["a"], [("junit", "a"), ("text", None)])],
-)  # fmt: skip
-def test_formats_and_their_files(forms, targets, pairs):
-    assert pair_targets(forms, targets) == pairs
-    with pytest.raises(UsageError, match="give each format its -o, in the same order"):
-        pair_targets(forms, [*targets, "c", "d"])
+    ("arguments", "pairs"),
+    [
+        ("", [("text", None)]),
+        ("-o a", [("text", "a")]),
+        ("--format sarif -o a --format junit --output=b", [("sarif", "a"), ("junit", "b")]),
+        ("--format junit -o a --format text", [("junit", "a"), ("text", None)]),
+        ("--format github --format junit -o a", [("github", "-"), ("junit", "a")]),
+        ("--format=sarif -oa --format github --format junit -o b", [("sarif", "a"), ("github", "-"), ("junit", "b")]),
+        ("-o a --format sarif", [("sarif", "a")]),
+        ("--format github --format sarif", None),
+        ("--format github -o a -o b", None),
+    ],
+)
+def test_a_file_belongs_to_the_format_before_it(arguments, pairs):
+    app = typer.main.get_command(cli.build_app(["check-env", "tasks"]))
+    command = app.commands["check-env"]
+    options = command.make_context("check-env", arguments.split()).params
+    if pairs is not None:
+        assert pair_targets(options["form"], options["output"]) == pairs
+        return
+    with pytest.raises(UsageError, match="give each --format its -o FILE after it"):
+        pair_targets(options["form"], options["output"])
 
 
 def test_a_baseline_of_another_task_is_refused(report):
