@@ -54,10 +54,17 @@ def check_env(
     ] = False,
     form: Annotated[
         list[ReportFormat],
-        Option("Format of the report; of several, each but one with its -o FILE after it.", ("--format",), default_text="text"),
+        Option(
+            "Format of the report; of several, each but one with its -o FILE after it.",
+            ("--format",),
+            default_text="text",
+        ),
     ] = [],
     output: Annotated[
-        list[str], Option("File of the report of the --format before it.", ("--output", "-o"), metavar="FILE", default_text="stdout")
+        list[str],
+        Option(
+            "File of the report of the --format before it.", ("--output", "-o"), metavar="FILE", default_text="stdout"
+        ),
     ] = [],
     json: Json = None,
     baseline: Annotated[
