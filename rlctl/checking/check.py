@@ -23,6 +23,8 @@ METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6
 """The method that the findings of a family are about, where nothing more is known."""
 OF_SPACES = ("RL103", "RL106", "RL108", "RL109")  # rules about what a space declares
 OF_OLD_GYM = ("RL106", "RL109", "RL207")  # which today's libraries cannot read or call: not faults of their own
+OF_AN_EXAMPLE = ("RL3", "RL120", "RL406", "RL407", "RL409", "RL810", "RL811", "RL814", "RL815", "RL816", "RL820")
+"""Rules whose finding shows one element of all that are wrong: without a seed, another one in another run."""
 LOADING = ("RL0", "RL216")  # judged even if no instance could be built
 
 
@@ -36,6 +38,7 @@ class CheckVerdict:
     not_judged: dict[str, str] = dataclasses.field(default_factory=dict)  # rule or part of the environment -> reason
     not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)  # rule -> reason
     known: list[RuleFinding] = dataclasses.field(default_factory=list)  # also in the baseline
+    resolved: list[str] = dataclasses.field(default_factory=list)  # rule and element, in the baseline but not found
     crashed: dict[str, str] = dataclasses.field(default_factory=dict)  # rule or experiment -> traceback
 
 
@@ -107,8 +110,7 @@ class CheckReport:
 
     def fingerprint(self, finding: RuleFinding) -> str:
         """Return what identifies a finding in every run: no number of a message, which differ from run to run."""
-        # Which element differs first between two episodes is chance.
-        element = "" if finding.rule.startswith("RL3") else finding.evidence.get("element", "")
+        element = "" if finding.rule.startswith(OF_AN_EXAMPLE) else finding.evidence.get("element", "")
         return f"{self.task} {finding.rule} {element}".strip()
 
     def summarize(self) -> str:
@@ -131,6 +133,9 @@ class CheckReport:
             other = min(baseline).partition(" ")[0]
             raise UsageError(f"--baseline: its findings are of {other}, not of {self.task}: write the task as there")
         findings = self.verdict.findings
+        occurring = {self.fingerprint(finding) for finding in (*findings, *self.verdict.waived)}
+        gone = [known.removeprefix(f"{self.task} ") for known in sorted({*baseline} - occurring)]
+        self.verdict.resolved = [known for known in gone if known.partition(" ")[0] in self.verdict.judged]
         self.verdict.known += [finding for finding in findings if self.fingerprint(finding) in baseline]
         self.verdict.findings = [finding for finding in findings if self.fingerprint(finding) not in baseline]
 

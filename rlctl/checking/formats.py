@@ -59,9 +59,13 @@ PLACED = ("github", "sarif")  # formats whose readers show only what is in a fil
 
 
 def show_notes(report: CheckReport, forms: Collection[str]) -> None:
-    """Print to stderr whether other code than this folder's was checked, and which findings have no place in it."""
+    """Print to stderr whether other code than this folder's was checked, which findings have no place in it, and what
+    of the baseline was not found."""
     if report.outdated:
         print(report.outdated, file=sys.stderr)
+    if resolved := report.verdict.resolved:
+        count = output.format_count(len(resolved), "finding")
+        print(f"{count} of the baseline no longer found: {'; '.join(resolved)}; write it again", file=sys.stderr)
     places = [report.locate(finding) for finding in report.verdict.findings if set(forms) & {*PLACED}]
     if outside := [place[0] for place in places if place is not None and not is_own(place[0])]:
         count = output.format_count(len(outside), "finding")
