@@ -29,8 +29,8 @@ def check_env(
     Keywords are parameters of the task. `select` and `ignore` are prefixes of rule ids: `ignore=["RL5"]`. A finding
     has `rule`, `severity` ("error", "warning", "info"), `message`, `fix` and `evidence`; `str(finding)` is one line.
     Those of `baseline`, a report of `rlctl check-env --json` on the task under the same name, are left out.
-    Raises `UsageError` for an unknown task or parameter, `ArtifactError` for a file that is no report, and `TaskError` if no instance can be built and no finding
-    says why.
+    Raises `UsageError` for an unknown task or parameter, `ArtifactError` for a file that is no report, and `TaskError`
+    if no instance can be built and no finding says why.
     """
     from rlctl.checking.check import check
     from rlctl.checking.rules import choose_rules
