@@ -74,8 +74,7 @@ class Gates:
         for name in ("min_success", "min_success_lower"):
             rate = getattr(self, name)
             if rate is not None and not 0 <= rate <= 1:
-                hint = f"; {rate:g} % is {rate / 100:g}" if 1 < rate <= 100 else ""
-                raise UsageError(f"--{name.replace('_', '-')} {rate:g}: a rate is between 0 and 1{hint}")
+                raise UsageError(f"--{name.replace('_', '-')} {rate:g}: {_explain_rate(rate)}")
         if self.min_return is not None and math.isnan(self.min_return):
             raise UsageError("--min-return nan: every return would pass; give a number")
 
@@ -120,14 +119,30 @@ class Gates:
         return missed
 
 
+def _parse_rate(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        percent = text.strip().removesuffix("%")
+        number = float(percent) if percent.strip().replace(".", "", 1).isdecimal() else math.nan
+        raise UsageError(f"{text}: {_explain_rate(number)}") from None
+
+
+def _explain_rate(rate: float) -> str:
+    return f"a rate is between 0 and 1{f'; {rate:g} % is {rate / 100:g}' if 1 < rate <= 100 else ''}"
+
+
 def _count_successes(lower: float) -> int:
     return math.ceil(math.log(0.025) / math.log(lower)) if lower < 1 else 0
 
 
 NO_GATES = Gates()
 
-MinSuccess = Annotated[float | None, Option("Gate: exit 1 if the measured success rate is lower.", metavar="RATE")]
+MinSuccess = Annotated[
+    float | None, Option("Gate: exit 1 if the measured success rate is lower.", metavar="RATE", parse=_parse_rate)
+]
 MinSuccessLower = Annotated[
-    float | None, Option("Gate: exit 1 if the 95 % interval begins below this rate.", metavar="RATE")
+    float | None,
+    Option("Gate: exit 1 if the 95 % interval begins below this rate.", metavar="RATE", parse=_parse_rate),
 ]
 MinReturn = Annotated[float | None, Option("Gate: exit 1 below this mean return.", metavar="RETURN")]

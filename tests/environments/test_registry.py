@@ -310,7 +310,7 @@ def test_a_gymnasium_id_whose_class_cannot_be_imported(write_module):
     )
 
 
-def test_parameters_that_are_not_there(my_env):
+def test_parameters_that_are_not_there(my_env, write_module):
     assert error(RecipeError, "my_env.py:MyEnv", {"gian": 1}) == (
         "task.gian: my_env.py:MyEnv has no parameter 'gian'. Did you mean 'gain'? It has: gain."
     )
@@ -320,6 +320,10 @@ def test_parameters_that_are_not_there(my_env):
     )
     assert error(RecipeError, "Pendulum-v1", {"gg": 1}).startswith(
         "task.gg: Pendulum-v1 has no parameter 'gg'. Did you mean 'g'?"
+    )
+    write_module("teams.py", f"{ENV}\n    gymnasium.register('Dock-v0', entry_point=MyEnv)\n")
+    assert error(RecipeError, "teams:Dock-v0", {"gian": 1}) == (
+        "task.gian: teams:Dock-v0 has no parameter 'gian'. Did you mean 'gain'? It has: gain."
     )
 
 

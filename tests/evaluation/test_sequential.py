@@ -101,3 +101,10 @@ def test_what_the_remaining_episodes_cannot_change():
     assert not is_settled(0, 1, 100, 0.99)
     assert is_settled(95, 96, 100, 0.95)
     assert not is_settled(94, 94, 100, 0.95)
+
+
+@pytest.mark.parametrize("text", ["90%", "90 %", "90"])
+def test_a_rate_in_percent_is_explained(rlctl, text):
+    done = rlctl("eval", "reach", "--policy", "zero", "--min-success", text)
+    assert done.returncode == 2
+    assert done.stderr.endswith(f"{text}: a rate is between 0 and 1; 90 % is 0.9\n")
