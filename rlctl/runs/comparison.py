@@ -161,6 +161,8 @@ def compare_runs(
     margin: float | None = None,
 ) -> RunComparison:
     """Compare sides that have these names and runs; see `compare`."""
+    import scipy.stats  # noqa: F401 - which rlctl-core leaves out: say so before any episode is played
+
     _refuse_unequal(names, groups)
     runs = [run for group in groups for run in group]
     tasks = list(dict.fromkeys(str(run.status()["task"]) for run in runs))

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -228,3 +229,11 @@ def test_a_report_of_two_recipes_begins_with_the_verdict(root):
     assert (
         "- tested: success and return, p-values (not intervals) adjusted for all tests; if all are equal, 5% of" in text
     )
+
+
+def test_without_scipy_nothing_is_played(root, monkeypatch):
+    one, two = sorted((root / "0.9/Line").iterdir())
+    monkeypatch.setitem(sys.modules, "scipy.stats", None)
+    monkeypatch.setattr("rlctl.runs.comparison.run_evaluation", lambda *_: pytest.fail("played"))
+    with pytest.raises(ModuleNotFoundError):
+        compare([str(one), str(two)], EvalRequest(None, episodes=20))
