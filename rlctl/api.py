@@ -21,26 +21,30 @@ def check_env(
     select: Sequence[str] = (),
     ignore: Sequence[str] = (),
     env_timeout_s: float = 10.0,
+    baseline: str | os.PathLike[str] | None = None,
     **parameters: Any,
 ) -> list[RuleFinding]:
     """Check an environment as `rlctl check-env` does, in child processes, and return the findings, worst first.
 
     Keywords are parameters of the task. `select` and `ignore` are prefixes of rule ids: `ignore=["RL5"]`. A finding
     has `rule`, `severity` ("error", "warning", "info"), `message`, `fix` and `evidence`; `str(finding)` is one line.
-    Raises `UsageError` for an unknown task or parameter, and `TaskError` if no instance can be built and no finding
-    says why.
+    Those of `baseline`, a report of `rlctl check-env --json` on the task under the same name, are left out.
+    Raises `UsageError` for an unknown task or parameter, `ArtifactError` for a file that is no report, and `TaskError`
+    if no instance can be built and no finding says why.
     """
     from rlctl.checking.check import check
     from rlctl.checking.rules import choose_rules
+    from rlctl.checking.tool_formats import read_baseline
     from rlctl.environments.spec import EnvSpec
     from rlctl.errors import RlctlError, TaskError
 
-    rules = choose_rules(select, ignore)
+    rules, known = choose_rules(select, ignore), set() if baseline is None else read_baseline(Path(baseline))
     report = check(EnvSpec(task, parameters), rules=rules, env_timeout_s=env_timeout_s, show_progress=False)
+    report.subtract(known)
     if report.verdict.crashed:
         names, details = ", ".join(report.verdict.crashed), "\n".join(report.verdict.crashed.values())
         raise RlctlError(f"check_env: a bug in rlctl: {names} crashed on {task}; please report it", details=details)
-    if report.records.built is None and not report.verdict.findings:
+    if report.records.built is None and not (report.verdict.findings or report.verdict.known):
         raise TaskError(f"{task}: no instance could be built, so nothing was checked; rlctl check-env {task} shows why")
     return sorted(report.verdict.findings, key=lambda finding: (finding.severity.rank, finding.rule))
 

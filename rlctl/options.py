@@ -5,8 +5,9 @@ Python passes it, a group stores it and a child process receives it.
 """
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,6 +22,7 @@ class Option:
     max: float | None = None
     completes: Literal["task", "run", "algorithm"] | None = None  # what the shell offers after TAB
     default_text: str | None = None  # the default in help, if it differs from the field's own
+    parse: Callable[[str], Any] | None = None  # raises `UsageError` for a text that is no value
 
 
 @dataclasses.dataclass(frozen=True)

@@ -155,14 +155,50 @@ def test_my_task_as_a_wheel(tmp_path: Path) -> None:
     run("-m", "pytest", "-q", "-p", "no:cacheprovider", str(project / "tests"), cwd=empty, path=site)
 
 
-@pytest.mark.slow
-def test_the_check_env_action_runs(tmp_path: Path) -> None:
-    """The text of its step, as GitHub's runner executes it."""
-    action = yaml.safe_load((EXAMPLES / "ci" / "check-env" / "action.yml").read_text())
-    (step,) = [step for step in action["runs"]["steps"] if step.get("id") == "check"]
-    env = {**os.environ, "TASK": "pointmass.py:PointMass", "ARGUMENTS": "--select RL1", "NO_COLOR": "1"}
-    env |= {"RUNNER_TEMP": str(tmp_path), "GITHUB_OUTPUT": str(tmp_path / "output")}
+STEPS = yaml.safe_load((EXAMPLES / "ci" / "check-env" / "action.yml").read_text())["runs"]["steps"]
+
+
+def run_action(tmp_path: Path, task: str, arguments: str = "") -> tuple[int, dict[str, str]]:
+    """Run the text of the action's check, as GitHub's runner does; return its exit code and outputs."""
+    (step,) = [step for step in STEPS if step.get("id") == "check"]
+    output = tmp_path / "output"
+    output.unlink(missing_ok=True)
+    env = {**os.environ, "TASK": task, "ARGUMENTS": arguments, "NO_COLOR": "1"}
+    env |= {"RUNNER_TEMP": str(tmp_path), "GITHUB_OUTPUT": str(output)}
     env["PATH"] = f"{Path(sys.executable).parent}:{env['PATH']}"
     done = subprocess.run(["bash", "-e", "-c", step["run"]], cwd=EXAMPLES / "bare_env", env=env, check=False)
-    assert done.returncode == 0
-    assert json.loads(Path((tmp_path / "output").read_text().partition("=")[2].strip()).read_text())["findings"] == []
+    return done.returncode, dict(line.split("=", 1) for line in output.read_text().splitlines())
+
+
+@pytest.mark.slow
+def test_the_check_env_action_runs(tmp_path: Path) -> None:
+    code, outputs = run_action(tmp_path, "pointmass.py:PointMass", "--select RL1")
+    assert (code, outputs["exit-code"]) == (0, "0")
+    assert json.loads(Path(outputs["report"]).read_text())["findings"] == []
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
+def test_the_action_comments_on_the_check_that_it_ran(tmp_path: Path) -> None:
+    report = tmp_path / "check-env-pointmass.py-Nobody.json"
+    report.write_text('{"findings": []}')  # of an earlier use in the same job
+    code, outputs = run_action(tmp_path, "pointmass.py:Nobody", "--select RL99")
+    assert (code, outputs) == (2, {"report": str(report), "exit-code": "2"})
+    assert "The check did not run (exit code 2)." in comment(tmp_path, outputs, code)
+    report.write_text('{"findings": []}')
+    assert "No findings, but exit code 70" in comment(tmp_path, outputs, 70)
+
+
+def comment(tmp_path: Path, outputs: dict[str, str], code: int) -> str:
+    """Run the script of the action's comment; GitHub's API refuses the token, which is a warning."""
+    (step,) = [step for step in STEPS if "github-script" in step.get("uses", "")]
+    script = tmp_path / "comment.js"
+    script.write_text(
+        "const context = {repo: {}, issue: {number: 1}}, core = {warning: console.log}\n"
+        "const rest = {issues: {createComment: c => { console.log(c.body); throw Error('no permission') }}}\n"
+        "const github = {rest, paginate: async () => []}\n"
+        f";(async () => {{\n{step['with']['script']}\n}})()\n"
+    )
+    env = {**os.environ, "TASK": "pointmass.py:Nobody", "REPORT": outputs["report"], "EXIT_CODE": str(code)}
+    done = subprocess.run(["node", script], env=env, capture_output=True, text=True, check=True)
+    assert "no comment on the pull request: no permission" in done.stdout
+    return done.stdout

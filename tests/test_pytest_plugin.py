@@ -1,5 +1,6 @@
 """The pytest plugin: findings fail a test, tasks of a distribution become tests."""
 
+import json
 import textwrap
 
 import pytest
@@ -41,6 +42,8 @@ def run(pytester, test):
 
 
 def test_findings_fail_a_test(robots):
+    known = {"fingerprint": "robots.py:NotFinite RL601"}
+    robots.path.joinpath("baseline.json").write_text(json.dumps({"findings": [known], "known": []}))
     result = run(
         robots,
         """
@@ -50,11 +53,14 @@ def test_findings_fail_a_test(robots):
         def test_not_finite(check_env):
             check_env("robots.py:NotFinite", select=["RL601"])
 
+        def test_known(check_env):
+            check_env("robots.py:NotFinite", select=["RL601"], baseline="baseline.json")
+
         def test_missing(check_env):
             check_env("robots.py:Sownd", select=["RL6"])
         """,
     )
-    result.assert_outcomes(passed=1, failed=2)
+    result.assert_outcomes(passed=2, failed=2)
     result.stdout.fnmatch_lines(["*robots.py:NotFinite: 1 finding", "*RL601*", "*fix: *"])
     result.stdout.fnmatch_lines(["*no instance could be built*"])
 

@@ -13,6 +13,7 @@ from rlctl.checking.children import Supervisor
 from rlctl.checking.records import Records
 from rlctl.checking.rules import RULES, NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.values import name_leaf
+from rlctl.checking.working_copy import find_outdated, find_root, prefer_working_copy
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, did_you_mean
@@ -22,6 +23,8 @@ METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6
 """The method that the findings of a family are about, where nothing more is known."""
 OF_SPACES = ("RL103", "RL106", "RL108", "RL109")  # rules about what a space declares
 OF_OLD_GYM = ("RL106", "RL109", "RL207")  # which today's libraries cannot read or call: not faults of their own
+OF_AN_EXAMPLE = ("RL3", "RL120", "RL406", "RL407", "RL409", "RL810", "RL811", "RL814", "RL815", "RL816", "RL820")
+"""Rules whose finding shows one element of all that are wrong: without a seed, another one in another run."""
 LOADING = ("RL0", "RL216")  # judged even if no instance could be built
 
 
@@ -35,6 +38,7 @@ class CheckVerdict:
     not_judged: dict[str, str] = dataclasses.field(default_factory=dict)  # rule or part of the environment -> reason
     not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)  # rule -> reason
     known: list[RuleFinding] = dataclasses.field(default_factory=list)  # also in the baseline
+    resolved: list[str] = dataclasses.field(default_factory=list)  # rule and element, in the baseline but not found
     crashed: dict[str, str] = dataclasses.field(default_factory=dict)  # rule or experiment -> traceback
 
 
@@ -70,7 +74,14 @@ class CheckReport:
         return int(is_bad or (self.strict and bool(self.out_of_time)))
 
     def locate(self, finding: RuleFinding) -> tuple[Path, int] | None:
-        """Return file and line of what causes a finding: a call, else the method that it is about, else the class."""
+        """Return file and line of what causes a finding: a call, else the method that it is about, else the class.
+
+        Of an installed copy of a file of the current folder, that file.
+        """
+        place = self._locate(finding)
+        return place and (prefer_working_copy(place[0]), place[1])
+
+    def _locate(self, finding: RuleFinding) -> tuple[Path, int] | None:
         if finding.where is not None:
             return Path(finding.where[0]), finding.where[1]
         built = self.records.built
@@ -84,10 +95,22 @@ class CheckReport:
         file_name, line = built.places.get(method) or (built.file, built.line or 1)
         return Path(file_name), line
 
+    @property
+    def outdated(self) -> str:
+        """A line that says that Python imported another version of the task than the current folder has; or empty."""
+        file = Path(self.records.built.file) if self.records.built and self.records.built.file else None
+        file = file or registry.find_source_file(self.task)
+        if file is None or self.task.rpartition(":")[0].endswith(".py") or not (pair := find_outdated(file)):
+            return ""
+        imported, own = pair[0], pair[1].relative_to(Path.cwd())
+        return (
+            f"warning: this checked {imported}, and {own} of this folder differs; "
+            f"to check this folder: PYTHONPATH={find_root(own)} rlctl check-env {self.task}"
+        )
+
     def fingerprint(self, finding: RuleFinding) -> str:
         """Return what identifies a finding in every run: no number of a message, which differ from run to run."""
-        # Which element differs first between two episodes is chance.
-        element = "" if finding.rule.startswith("RL3") else finding.evidence.get("element", "")
+        element = "" if finding.rule.startswith(OF_AN_EXAMPLE) else finding.evidence.get("element", "")
         return f"{self.task} {finding.rule} {element}".strip()
 
     def summarize(self) -> str:
@@ -110,6 +133,9 @@ class CheckReport:
             other = min(baseline).partition(" ")[0]
             raise UsageError(f"--baseline: its findings are of {other}, not of {self.task}: write the task as there")
         findings = self.verdict.findings
+        occurring = {self.fingerprint(finding) for finding in (*findings, *self.verdict.waived)}
+        gone = [known.removeprefix(f"{self.task} ") for known in sorted({*baseline} - occurring)]
+        self.verdict.resolved = [known for known in gone if known.partition(" ")[0] in self.verdict.judged]
         self.verdict.known += [finding for finding in findings if self.fingerprint(finding) in baseline]
         self.verdict.findings = [finding for finding in findings if self.fingerprint(finding) not in baseline]
 

@@ -4,7 +4,7 @@ import io
 import itertools
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from rlctl.checking.families.speed import format_speed
 from rlctl.checking.junit import to_junit
 from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, find_rule
 from rlctl.checking.tool_formats import Row, action_rows, observation_rows, to_annotations, to_json, to_sarif
+from rlctl.checking.working_copy import is_own
 from rlctl.environments import registry
 from rlctl.environments.info import describe_randomization
 from rlctl.environments.places import format_place
@@ -47,9 +48,28 @@ def show(report: CheckReport, form: str, target: str | None) -> None:
 def pair_targets(forms: Sequence[str], targets: Sequence[str]) -> list[tuple[str, str | None]]:
     """Return each format of a report with its file, or stdout; raises `UsageError` if not one at most goes there."""
     forms = list(forms) or ["text"]
-    if not len(forms) - 1 <= len(targets) <= len(forms):
-        raise UsageError(f"{len(forms)} --format and {len(targets)} -o: give each format its -o, in the same order")
-    return list(itertools.zip_longest(forms, targets))
+    pairs: list[tuple[str, str | None]] = list(zip(forms, [*targets, *[None] * len(forms)], strict=False))
+    if len(targets) > len(forms) or sum(target in (None, "-") for _, target in pairs) > 1:
+        example = " ".join(f"--format {form} -o FILE" for form in forms)
+        raise UsageError(f"give each --format its -o FILE after it; one at most goes to stdout: {example}")
+    return pairs
+
+
+PLACED = ("github", "sarif")  # formats whose readers show only what is in a file of the repository
+
+
+def show_notes(report: CheckReport, forms: Collection[str]) -> None:
+    """Print to stderr whether other code than this folder's was checked, which findings have no place in it, and what
+    of the baseline was not found."""
+    if report.outdated:
+        print(report.outdated, file=sys.stderr)
+    if resolved := report.verdict.resolved:
+        count = output.format_count(len(resolved), "finding")
+        print(f"{count} of the baseline no longer found: {'; '.join(resolved)}; write it again", file=sys.stderr)
+    places = [report.locate(finding) for finding in report.verdict.findings if set(forms) & {*PLACED}]
+    if outside := [place[0] for place in places if place is not None and not is_own(place[0])]:
+        count = output.format_count(len(outside), "finding")
+        print(f"{count} in files outside of this folder, not shown in its code: {outside[0]}", file=sys.stderr)
 
 
 def show_crashes(report: CheckReport) -> None:

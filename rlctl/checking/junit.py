@@ -17,18 +17,22 @@ def to_junit(report: CheckReport) -> str:
     for finding in verdict.findings:
         findings[finding.rule].append(finding)
     waivers = report.records.built.waivers if report.records.built else {}
-    waived = {finding.rule: waivers[finding.rule] for finding in verdict.waived}
+    accepted = {finding.rule: "known from the baseline" for finding in verdict.known}
+    accepted |= {finding.rule: f"waived: {waivers[finding.rule]}" for finding in verdict.waived}
     suite = ElementTree.Element("testsuite", name=f"rlctl check-env {report.task}", time=f"{report.seconds:.3f}")
-    for rule in dict.fromkeys([*verdict.judged, *findings]):
-        case = _add_case(suite, rule)
+    for rule in dict.fromkeys([*verdict.judged, *accepted, *findings]):
+        case = _add_case(suite, report.task, rule)
         _add_texts(case, findings[rule], strict=report.strict)
-        if rule in waived and not findings[rule]:
-            _add(case, "skipped", message=f"waived: {waived[rule]}")
+        if rule in accepted and not findings[rule]:
+            _add(case, "skipped", message=accepted[rule])
     for rule, reason in {**verdict.not_applicable, **verdict.not_judged}.items():
         if rule not in findings:
-            _add(_add_case(suite, rule), "skipped", message=reason)
+            _add(_add_case(suite, report.task, rule), "skipped", message=reason)
     for name, trace in verdict.crashed.items():
-        _add(_add_case(suite, name), "error", trace, message="a bug in rlctl")
+        _add(_add_case(suite, report.task, name), "error", trace, message="a bug in rlctl")
+    if report.strict and (late := report.out_of_time):
+        message = f"no time to judge {', '.join(late)}: --budget SECONDS"
+        _add(_add_case(suite, report.task, "time ran out"), "failure", message=message, type="error")
     for kind, tag in (("tests", "testcase"), ("failures", "failure"), ("errors", "error"), ("skipped", "skipped")):
         suite.set(kind, str(len(list(suite.iter(tag)))))
     root = ElementTree.Element("testsuites")
@@ -37,9 +41,11 @@ def to_junit(report: CheckReport) -> str:
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, "unicode") + "\n"
 
 
-def _add_case(suite: ElementTree.Element, rule: str) -> ElementTree.Element:
+def _add_case(suite: ElementTree.Element, task: str, rule: str) -> ElementTree.Element:
     name = f"{rule} {RULES[rule].name}" if rule in RULES else rule
-    return ElementTree.SubElement(suite, "testcase", classname=FAMILIES.get(rule[:3], "check-env"), name=_clean(name))
+    # CI services put the reports of a pipeline together, and keep one of two cases of the same class and name.
+    classname = _clean(f"{task}.{FAMILIES.get(rule[:3], 'check-env')}")
+    return ElementTree.SubElement(suite, "testcase", classname=classname, name=_clean(name))
 
 
 def _add_texts(case: ElementTree.Element, findings: list[RuleFinding], *, strict: bool) -> None:

@@ -185,6 +185,7 @@ def to_sarif(report: CheckReport) -> str:
     driver = {"name": "rlctl", "version": __version__, "rules": [_describe_rule(rule) for rule in rules]}
     run = {
         "tool": {"driver": driver},
+        "automationDetails": {"id": f"rlctl/{report.task}/"},  # services keep one result of an upload with equal ids
         "invocations": [{**invocation, "toolExecutionNotifications": notifications}],
         "originalUriBaseIds": {"SRCROOT": {"uri": Path.cwd().as_uri() + "/"}},
         "results": results,

@@ -50,6 +50,8 @@ COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
     "bugreport": runs.report_bug,
 }
 
+_CLASSES = {"check-env": tasks.CheckCommand, "replay": eval.ReplayCommand}  # that read arguments in their own way
+
 
 def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
     """Return the Typer app with the named commands."""
@@ -72,7 +74,7 @@ def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
         if isinstance(command, typer.Typer):
             app.add_typer(command, name=name)
         else:
-            app.command(name, cls=eval.ReplayCommand if name == "replay" else None)(command)
+            app.command(name, cls=_CLASSES.get(name))(command)
     return app
 
 

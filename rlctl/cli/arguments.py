@@ -134,6 +134,7 @@ def _make_parameter(name: str, annotation: Any, default: Any) -> inspect.Paramet
             max=option.max,
             autocompletion=None if option.completes is None else _COMPLETIONS[option.completes],
             show_default=option.default_text or kind is not bool,
+            parser=option.parse,
         )
         annotation = Annotated[kind, made, option]
     default = inspect.Parameter.empty if default is dataclasses.MISSING else default

@@ -94,7 +94,7 @@ def compare_runs(
     ] = False,
     gate: Annotated[Literal["not-worse"] | None, Option("Exit 1 if any is worse than the first.")] = None,
     margin: Annotated[
-        float | None, Option("With --gate: exit 1 also if a larger loss is not excluded, e.g. 0.05.", min=0)
+        float | None, Option("Exit 1 unless the episodes exclude a larger loss of success, e.g. 0.05.", min=0)
     ] = None,
     json: Json = None,
 ) -> None:
@@ -104,10 +104,9 @@ def compare_runs(
     from rlctl.runs.comparison_report import show
 
     changes = parse_changes(settings)
-    result = compare(
-        runs, EvalRequest(None, task=task, episodes=episodes, seed=seed, changes=changes), threshold, force=force
-    )
-    show(result, json)
+    request = EvalRequest(None, task=task, episodes=episodes, seed=seed, changes=changes)
+    result = compare(runs, request, threshold, force=force, margin=margin)
+    show(result, json, gate, margin)
     if gate or margin is not None:
         result.check(margin)
 

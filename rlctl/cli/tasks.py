@@ -1,16 +1,38 @@
 """`rlctl check-env`, `rlctl tasks` and its commands, and `rlctl recipe`."""
 
 import enum
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from rlctl.cli.arguments import command, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.options import Argument, EnvTimeout, Json, Option, OptionalTask, Settings, Sim, TaskName
 
 ReportFormat = enum.StrEnum("ReportFormat", ["text", "json", "sarif", "junit", "github"])
+
+
+class CheckCommand(TyperCommand):
+    """Reads `-o FILE` as the file of the `--format` before it; a format without a file goes to stdout."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert `-o -` where a format has no file, because Typer forgets the order of different options."""
+        return super().parse_args(ctx, list(_fill_targets(args)))
+
+
+def _fill_targets(arguments: Iterable[str]) -> Iterator[str]:
+    is_waiting = False
+    for argument in arguments:
+        option = argument.partition("=")[0]
+        if option == "--format":
+            yield from ("-o", "-") if is_waiting else ()
+            is_waiting = True
+        elif option == "--output" or argument.startswith("-o"):
+            is_waiting = False
+        yield argument
 
 
 @command_in_panels(
@@ -32,10 +54,17 @@ def check_env(
     ] = False,
     form: Annotated[
         list[ReportFormat],
-        Option("Format of the report; several, each with its -o.", ("--format",), default_text="text"),
+        Option(
+            "Format of the report; of several, each but one with its -o FILE after it.",
+            ("--format",),
+            default_text="text",
+        ),
     ] = [],
     output: Annotated[
-        list[str], Option("File of the report.", ("--output", "-o"), metavar="FILE", default_text="stdout")
+        list[str],
+        Option(
+            "File of the report of the --format before it.", ("--output", "-o"), metavar="FILE", default_text="stdout"
+        ),
     ] = [],
     json: Json = None,
     baseline: Annotated[
@@ -81,6 +110,7 @@ def check_env(
     report = check(spec, rules=rules, strict=strict, env_timeout_s=env_timeout, budget_s=budget)
     report.subtract(known)
     formats.show_crashes(report)
+    formats.show_notes(report, [name for name, _ in targets])
     if json is not None:
         formats.show(report, "json", json)
     for name, target in targets if json != "-" else ():

@@ -1,5 +1,6 @@
-"""Finds the package that registers a Gymnasium id which is not registered in this process, without importing it."""
+"""Finds what registers a Gymnasium id, and the file of its class, in the text of packages: nothing is imported."""
 
+import ast
 import contextlib
 import itertools
 import re
@@ -16,6 +17,25 @@ _DEEPEST = 4  # folders below the current one
 def find_registering_module(name: str) -> str:
     """Return the module to write before an id, `module:Id-v0`; empty if none is found, or one is named already."""
     return "" if ":" in name else next(_list_modules(name), "")
+
+
+def find_class_file(name: str) -> Path | None:
+    """Return the file of the class of `module:Id-v0`; None where the module does not register the id with literals."""
+    module, _, identifier = name.rpartition(":")
+    file = installed.find_module_file(module, in_current_folder=True) if module else None
+    nodes: list[ast.AST] = []
+    with contextlib.suppress(OSError, SyntaxError, ValueError):
+        nodes = list(ast.walk(ast.parse(file.read_bytes()))) if file else []
+    own_classes = {node.name for node in nodes if isinstance(node, ast.ClassDef)}
+    for call in (node for node in nodes if isinstance(node, ast.Call)):
+        given = dict(zip(("id", "entry_point"), call.args, strict=False))
+        given |= {keyword.arg: keyword.value for keyword in call.keywords if keyword.arg is not None}
+        match given.get("id"), given.get("entry_point"):
+            case ast.Constant(value=registered), ast.Constant(value=str(place)) if registered == identifier:
+                return installed.find_module_file(place.partition(":")[0], in_current_folder=True)
+            case ast.Constant(value=registered), ast.Name(id=own) if registered == identifier and own in own_classes:
+                return file
+    return None
 
 
 def _list_modules(name: str) -> Iterator[str]:

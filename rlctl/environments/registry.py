@@ -100,8 +100,11 @@ def find_origin(task: str) -> dict[str, str]:
 
 
 def identify_task(task: str) -> dict[str, Any]:
-    """Return `origin` (distribution and version of an installed task) and `source_sha256` of the task's file."""
-    source = find_source_file(task)
+    """Return `origin` (distribution and version of an installed task) and `source_sha256` of the task's file.
+
+    Of a Gymnasium id it is the file of its class; None if it cannot be found without an import.
+    """
+    source = _find_hashed_file(task)
     digest = files.digest(source.read_bytes()) if source is not None and source.is_file() else None
     return {"origin": find_origin(task), "source_sha256": digest}
 
@@ -114,10 +117,14 @@ def describe_task_changes(before: Mapping[str, Any], task: str, since: str = "th
         names = (" ".join(map(str, origin.values())) or "no installed package" for origin in (earlier, later))
         return ["task {} came from {} when {since}, and comes from {} now".format(task, *names, since=since)]
     if before.get("source_sha256") != now["source_sha256"]:
-        file = find_source_file(task)
+        file = _find_hashed_file(task)
         gone = file is not None and not file.is_file()
         return [f"{file or task} {'no longer exists' if gone else f'has changed since {since}'}"]
     return []
+
+
+def _find_hashed_file(task: str) -> Path | None:
+    return own_ids.find_class_file(task) if is_gymnasium_id(task) else find_source_file(task)
 
 
 def find_git_commit() -> str | None:

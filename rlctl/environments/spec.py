@@ -332,7 +332,7 @@ def read_parameters(constructor: Any) -> Mapping[str, inspect.Parameter] | None:
         import gymnasium
         from gymnasium.envs.registration import load_env_creator
 
-        spec = gymnasium.registry.get(constructor.gymnasium_id)
+        spec = gymnasium.registry.get(constructor.gymnasium_id.rpartition(":")[2])
         if spec is None or spec.entry_point is None:
             return None
         constructor = spec.entry_point if callable(spec.entry_point) else load_env_creator(spec.entry_point)

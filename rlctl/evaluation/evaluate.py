@@ -15,7 +15,7 @@ from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.failures import FailurePattern, find_patterns
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, find_player, load_baseline
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
-from rlctl.evaluation.sequential import find_interval, is_decided, is_settled
+from rlctl.evaluation.sequential import EarlyGate, find_interval
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.players.player import Exploration
 from rlctl.policy.shipped import MeasuredScore
@@ -51,7 +51,16 @@ class Evaluation:
     unlimited: "Evaluation | None" = None  # the same episodes without limits
     action_change: float | None = None  # mean of |action - previous action|; None if it was not measured
     failure_patterns: list[FailurePattern] = dataclasses.field(default_factory=list)  # what failures have in common
-    planned: int | None = None  # episodes that would have been played to the end, if the gate could be decided early
+    planned: int = 0  # episodes that were to be played
+    early: EarlyGate | None = None  # what may have ended it before
+
+    @property
+    def end(self) -> str:
+        """Why it ended, as a sentence: the gate was decided early, or empty: all episodes were played."""
+        if self.early is None:
+            return ""
+        successes = sum(bool(episode.result.success) for episode in self.played)
+        return self.early.explain_end(successes, len(self.played), self.planned)
 
     @property
     def episodes(self) -> list[dict[str, Any]]:
@@ -118,9 +127,8 @@ def start_workers(spec: EnvSpec, request: EvalRequest) -> Workers:
 def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalRequest, gates: Gates) -> Evaluation:
     if (folder := request.record) is not None and (folder.is_file() or any(folder.glob("*"))):
         raise UsageError(f"--record {folder}: exists already; give a new folder, or remove this one")
-    if request.decide_early:
-        gates.check_early(request.limits is not None)
-    gates.check_reachable(request.episodes)
+    early = gates.choose_early(request.limits is not None) if request.decide_early else None
+    gates.check_reachable(request.episodes, decide_early=request.decide_early)
     with start_workers(spec, request) as workers:
         limits = None if request.limits is None else _read_limits(request.limits, workers.info)
         actor.give_to(workers)
@@ -128,11 +136,11 @@ def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalReques
             output.print_notes([f"warning: since the training {'; '.join(changes)}"])
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
-        episodes = _play_until_decided(workers, request, gates) if request.decide_early else _play(workers, request)
+        episodes = _play(workers, request) if early is None else _play_until_decided(workers, request, gates, early)
         if request.record is not None:
             for number, episode in enumerate(episodes):
                 save_episode(request.record / f"{number:06d}.npz", episode.describe(spec, workers.info, actor.name))
-        evaluation = _summarize(actor, workers, request, episodes)
+        evaluation = _summarize(actor, workers, request, episodes, early)
         if limits is not None:
             workers.limit_actions(limits)
             limited = _summarize(actor, workers, request, _play(workers, request))
@@ -165,10 +173,8 @@ def _play_seeds(
     return play_episodes(workers, seeds, exploration, record=record, watch=show)
 
 
-def _play_until_decided(workers: Workers, request: EvalRequest, gates: Gates) -> list[Episode]:
+def _play_until_decided(workers: Workers, request: EvalRequest, gates: Gates, early: EarlyGate) -> list[Episode]:
     """Play some episodes at a time; return those up to the one that decides the gate, whatever was played beyond."""
-    rate = gates.min_success
-    assert rate is not None  # `check_early` has seen to it
     seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
     episodes: list[Episode] = []
     successes = 0
@@ -178,8 +184,7 @@ def _play_until_decided(workers: Workers, request: EvalRequest, gates: Gates) ->
                 gates.check_possible(episode.result.success is not None)
                 episodes.append(episode)
                 successes += bool(episode.result.success)
-                count = len(episodes)
-                if is_decided(successes, count, rate) or is_settled(successes, count, len(seeds), rate):
+                if early.explain_end(successes, len(episodes), len(seeds)):
                     return episodes
     return episodes
 
@@ -189,7 +194,11 @@ def _show_more(show: Callable[[int], None], before: int, count: int) -> None:
 
 
 def _summarize(
-    actor: LoadedPolicy | Baseline, workers: Workers, request: EvalRequest, episodes: list[Episode]
+    actor: LoadedPolicy | Baseline,
+    workers: Workers,
+    request: EvalRequest,
+    episodes: list[Episode],
+    early: EarlyGate | None = None,
 ) -> Evaluation:
     results = [episode.result for episode in episodes]
     distances = [result.final_distance for result in results if result.final_distance is not None]
@@ -211,7 +220,8 @@ def _summarize(
         max_steps=workers.info.max_steps,
         action_change=episode_statistics.mean_action_change(episodes) if request.measure_actions else None,
         failure_patterns=find_patterns(episodes, workers.info),
-        planned=request.episodes if request.decide_early else None,
+        planned=request.episodes,
+        early=early,
     )
 
 

@@ -14,7 +14,7 @@ from rlctl.evaluation.evaluate import Evaluation
 from rlctl.evaluation.group_scores import GroupScore, SeedScore
 from rlctl.evaluation.request import NO_GATES, Gates
 from rlctl.evaluation.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
-from rlctl.evaluation.sequential import is_decided, is_settled
+from rlctl.evaluation.sequential import EarlyGate
 from rlctl.evaluation.vary import format_command
 from rlctl.policy.shipped import Interval, MeasuredScore
 from rlctl.version import collect_versions
@@ -26,8 +26,7 @@ _NOMINAL, _WORST = "*", "<"
 
 def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
     """Print the numbers, or JSON alone for `-`."""
-    missed = gates.list_missed(result.success_rate, result.success_interval, result.returns.mean)
-    if output.present(as_json(result) | {"gates": vars(gates), "gates_missed": missed}, json):
+    if output.present(as_json(result) | _judge(result, gates), json):
         return
     out, info = output.out(), result.policy
     mode = "" if result.deterministic else ", sampled actions"
@@ -41,8 +40,8 @@ def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
     if result.success_rate is not None and result.success_interval is not None:
         low, high = result.success_interval
         out.print(f"success rate {result.success_rate:.1%}  (95 % interval {low:.1%} to {high:.1%})")
-    if result.planned is not None and gates.min_success is not None:
-        out.print(_format_decision(result, result.planned, gates.min_success))
+    if result.early is not None:
+        out.print(_format_decision(result, result.early))
     for pattern in result.failure_patterns:
         out.print(f"  {pattern}")
     rows = [("return", *_format_spread(result.returns)), ("length", *_format_spread(result.lengths))]
@@ -59,17 +58,23 @@ def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
         _show_limits(result, result.unlimited)
 
 
-def _format_decision(result: Evaluation, planned: int, rate: float) -> str:
-    count = len(result.played)
-    successes = sum(bool(episode.result.success) for episode in result.played)
-    if count < planned and is_settled(successes, count, planned, rate):
-        kind = f"{successes} successes" if successes / planned >= rate else f"{count - successes} failures"
-        return f"decided after {count} of {planned} episodes: with {kind} the others cannot change the answer"
-    if not is_decided(successes, count, rate):
-        return (
-            f"not decided after {count} episodes: {rate:g} is in the interval, so the rate itself is compared with it"
-        )
-    return f"decided after {count} of {planned} episodes: {rate:g} is outside the interval, which is valid at any time"
+def _judge(result: Evaluation, gates: Gates) -> dict[str, Any]:
+    """Return what the JSON of the command has besides the numbers; `passed` is None without a gate."""
+    missed = gates.list_missed(result.success_rate, result.success_interval, result.returns.mean)
+    return {
+        "format": "rlctl eval 1",
+        "exit_code": int(bool(missed)),
+        "passed": not missed if gates != NO_GATES else None,
+        "gates": vars(gates),
+        "gates_missed": missed,
+    }
+
+
+def _format_decision(result: Evaluation, early: EarlyGate) -> str:
+    if result.end:
+        return f"decided after {len(result.played)} of {result.planned} episodes: {result.end}"
+    instead = "so the gate is missed" if early.on_lower_end else "so the rate itself is compared with it"
+    return f"not decided after {len(result.played)} episodes: {early.rate:g} is in the interval, {instead}"
 
 
 def _show_limits(result: Evaluation, unlimited: Evaluation) -> None:
@@ -120,6 +125,9 @@ def as_json(result: Evaluation) -> dict[str, Any]:
         "deterministic": result.deterministic,
         "success_rate": result.success_rate,
         "success_interval": result.success_interval,
+        "interval": "Clopper-Pearson, 95 %" if result.early is None else "valid at any time, 95 %",
+        "planned_episodes": result.planned,
+        "end": result.end or "all episodes were played",
         "return": result.returns,
         "length": result.lengths,
         "terms": result.terms,

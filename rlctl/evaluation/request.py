@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rlctl.errors import AnswerIsNo, UsageError
+from rlctl.evaluation.sequential import EarlyGate, find_interval, find_least_episodes
 from rlctl.options import Checkpoint, EnvTimeout, EpisodeSeed, Option, RunName
 
 if TYPE_CHECKING:
@@ -40,9 +41,7 @@ class EvalOptions:
     env_timeout_s: EnvTimeout = 60.0
     decide_early: Annotated[
         bool,
-        Option(
-            "End as soon as --min-success is decided; wrong in 5 % of the evaluations at most.", ("--decide-early",)
-        ),
+        Option("End when a 95 % interval that is valid at any time decides the success gate.", ("--decide-early",)),
     ] = False
 
 
@@ -75,8 +74,7 @@ class Gates:
         for name in ("min_success", "min_success_lower"):
             rate = getattr(self, name)
             if rate is not None and not 0 <= rate <= 1:
-                hint = f"; {rate:g} % is {rate / 100:g}" if 1 < rate <= 100 else ""
-                raise UsageError(f"--{name.replace('_', '-')} {rate:g}: a rate is between 0 and 1{hint}")
+                raise UsageError(f"--{name.replace('_', '-')} {rate:g}: {_explain_rate(rate)}")
         if self.min_return is not None and math.isnan(self.min_return):
             raise UsageError("--min-return nan: every return would pass; give a number")
 
@@ -85,20 +83,24 @@ class Gates:
         if not has_success and (self.min_success is not None or self.min_success_lower is not None):
             raise UsageError("--min-success: this task reports no success (no is_success); use --min-return")
 
-    def check_reachable(self, episodes: int) -> None:
+    def check_reachable(self, episodes: int, *, decide_early: bool = False) -> None:
         """Raise `UsageError` for a lower bound that so many episodes cannot reach, even if all succeed."""
-        lower, highest = self.min_success_lower or 0.0, 0.025 ** (1 / episodes)  # by Clopper and Pearson
+        lower = self.min_success_lower or 0.0
+        highest = find_interval(episodes, episodes)[0] if decide_early else 0.025 ** (1 / episodes)  # Clopper, Pearson
         if lower > highest:
-            enough = f"; {math.ceil(math.log(0.025) / math.log(lower)):,} can" if lower < 1 else ""
+            needed = find_least_episodes(lower) if decide_early else _count_successes(lower)
+            enough = f"; {needed:,} can" if needed else ""
             raise UsageError(f"--min-success-lower {lower:g}: {episodes} successes reach at most {highest:.3f}{enough}")
 
-    def check_early(self, has_limits: bool) -> None:
-        """Raise `UsageError` where an evaluation cannot end before its last episode."""
-        others = {"--min-success-lower": self.min_success_lower, "--min-return": self.min_return}
-        if self.min_success is None or has_limits or any(value is not None for value in others.values()):
+    def choose_early(self, has_limits: bool) -> EarlyGate:
+        """Return the gate that may end an evaluation; raises `UsageError` where there is not exactly one."""
+        rates = [rate for rate in (self.min_success, self.min_success_lower) if rate is not None]
+        if len(rates) != 1 or has_limits or self.min_return is not None:
             raise UsageError(
-                f"--decide-early needs --min-success and cannot be combined with {', '.join(others)} or --limits"
+                "--decide-early needs either --min-success or --min-success-lower, and cannot be combined with "
+                "--min-return or --limits"
             )
+        return EarlyGate(rates[0], on_lower_end=self.min_success is None)
 
     def check(self, result: Evaluation) -> None:
         """Raise `AnswerIsNo`, naming every gate that was missed."""
@@ -117,10 +119,30 @@ class Gates:
         return missed
 
 
+def _parse_rate(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        percent = text.strip().removesuffix("%")
+        number = float(percent) if percent.strip().replace(".", "", 1).isdecimal() else math.nan
+        raise UsageError(f"{text}: {_explain_rate(number)}") from None
+
+
+def _explain_rate(rate: float) -> str:
+    return f"a rate is between 0 and 1{f'; {rate:g} % is {rate / 100:g}' if 1 < rate <= 100 else ''}"
+
+
+def _count_successes(lower: float) -> int:
+    return math.ceil(math.log(0.025) / math.log(lower)) if lower < 1 else 0
+
+
 NO_GATES = Gates()
 
-MinSuccess = Annotated[float | None, Option("Gate: exit 1 below this success rate.", metavar="RATE")]
+MinSuccess = Annotated[
+    float | None, Option("Gate: exit 1 if the measured success rate is lower.", metavar="RATE", parse=_parse_rate)
+]
 MinSuccessLower = Annotated[
-    float | None, Option("Gate: exit 1 if the 95 % interval begins below this rate.", metavar="RATE")
+    float | None,
+    Option("Gate: exit 1 if the 95 % interval begins below this rate.", metavar="RATE", parse=_parse_rate),
 ]
 MinReturn = Annotated[float | None, Option("Gate: exit 1 below this mean return.", metavar="RETURN")]

@@ -16,30 +16,18 @@ from numpy.typing import NDArray
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.evaluate import Evaluation, run_evaluation
 from rlctl.evaluation.request import EvalRequest
-from rlctl.policy.numpy_policy import load_policy
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference, find_mixed
 from rlctl.run.directory import RunDirectory
 from rlctl.run.lookup import describe_source_change
 from rlctl.runs.listing import find_runs_of
+from rlctl.runs.margin import check_margin
+from rlctl.runs.policy_alone import PolicyAlone, find_same_policy, reports_success
 from rlctl.runs.significance import MeanDifference, Quantity, Verdict, compare_episodes, compare_seeds
 from rlctl.runs.summary import read_table, summarize
 
 THRESHOLD = 0.9  # the default threshold, a success rate
 _POLICIES = (".safetensors", ".onnx")
-
-
-class _PolicyAlone(RunDirectory):
-    """A policy file, such as the one that is in use, in the place of the run it comes from."""
-
-    def __init__(self, path: Path) -> None:
-        """Read it; raises `ArtifactError` if it is not a policy."""
-        super().__init__(path)
-        self._task = load_policy(path).info.spec.task
-
-    def status(self) -> dict[str, Any]:
-        """Return what is known of its training."""
-        return {"task": self._task, "status": "finished"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,6 +73,7 @@ class Candidate:
     differences: Mapping[Quantity, MeanDifference]  # `success`, where the task reports it, then `return`
     recipe_changes: dict[str, tuple[Any, Any]] | None
     """Per dotted key the value here and the baseline's; None where a recipe is not known."""
+    same_policy: str = ""  # sha256 of the policy file, if it is the baseline's too
 
     @property
     def verdict(self) -> Verdict:
@@ -115,44 +104,51 @@ class RunComparison:
         """The baseline, then the candidates' sides."""
         return [self.baseline, *(candidate.side for candidate in self.candidates)]
 
-    def check(self, margin: float | None = None) -> None:
-        """Raise `AnswerIsNo` if a candidate is worse than the baseline; with `margin` if it may be by more than that.
+    def list_missed(self, margin: float | None = None) -> list[str]:
+        """Return a phrase for each candidate that is worse than the baseline; with `margin`, that may be by more.
 
-        `margin` is a success rate, and only success counts then; or a return if the task reports no success.
+        `margin` is a success rate, and only success counts then; or a return if the task reports no success. A
+        candidate with the same policy is neither.
         """
-        worse = [candidate.side.name for candidate in self.candidates if candidate.verdict is Verdict.WORSE]
         if margin is None:
-            if worse:
-                raise AnswerIsNo(f"gate missed: {', '.join(worse)} worse than {self.baseline.name}")
-            return
+            worse = [candidate.side.name for candidate in self.candidates if candidate.verdict is Verdict.WORSE]
+            return [f"{', '.join(worse)} worse than {self.baseline.name}"] if worse else []
+        missed = []
         for candidate in self.candidates:
             (quantity, difference), *_ = candidate.differences.items()
-            if quantity == "success" and margin > 1:
-                raise UsageError(f"--margin {margin:g}: a success rate is at most 1; 5 points are 0.05")
-            if difference.low < -margin:
-                raise AnswerIsNo(
-                    f"gate missed: {candidate.side.name}: its {quantity} may be lower by {-difference.low:.3g}, "
-                    f"more than {margin:g}"
-                )
+            if difference.low < -margin and not candidate.same_policy:
+                loss = f"its {quantity} may be lower by {-difference.low:.3g}, more than {margin:g}"
+                missed.append(f"{candidate.side.name}: {loss}")
+        return missed
+
+    def check(self, margin: float | None = None) -> None:
+        """Raise `AnswerIsNo` for what `list_missed` returns."""
+        if missed := self.list_missed(margin):
+            raise AnswerIsNo(f"gate missed: {'; '.join(missed)}")
 
 
 def compare(
-    texts: Sequence[str], request: EvalRequest, threshold: float | None = None, *, force: bool = False
+    texts: Sequence[str],
+    request: EvalRequest,
+    threshold: float | None = None,
+    *,
+    force: bool = False,
+    margin: float | None = None,
 ) -> RunComparison:
     """Evaluate every run with the other fields of `request` than `run`, and compare each side with the first.
 
     `texts` are runs, policy files, groups, globs, or folders of runs; the first is the baseline. `threshold` is a
     success rate, or a return if the task reports no success; the result has the steps until an evaluation reached it.
     `force` compares even if the task has changed since a training or a seed has not finished its own. Raises
-    `UsageError` for sides that cannot be compared.
+    `UsageError` for sides that cannot be compared, and for a `margin` that so many episodes cannot show.
     """
     if len(texts) < 2:
         raise UsageError("give two or more to compare, the baseline first: rlctl runs compare A B")
-    groups = [[_PolicyAlone(Path(text))] if Path(text).suffix in _POLICIES else find_runs_of(text) for text in texts]
+    groups = [[PolicyAlone(Path(text))] if Path(text).suffix in _POLICIES else find_runs_of(text) for text in texts]
     names = [
         text.rstrip("/") if len(group) > 1 else str(group[0].path) for text, group in zip(texts, groups, strict=True)
     ]
-    return compare_runs(names, groups, request, threshold, force=force)
+    return compare_runs(names, groups, request, threshold, force=force, margin=margin)
 
 
 def compare_runs(
@@ -162,8 +158,11 @@ def compare_runs(
     threshold: float | None = None,
     *,
     force: bool = False,
+    margin: float | None = None,
 ) -> RunComparison:
     """Compare sides that have these names and runs; see `compare`."""
+    import scipy.stats  # noqa: F401 - which rlctl-core leaves out: say so before any episode is played
+
     _refuse_unequal(names, groups)
     runs = [run for group in groups for run in group]
     tasks = list(dict.fromkeys(str(run.status()["task"]) for run in runs))
@@ -181,23 +180,32 @@ def compare_runs(
             f"{unfinished.path}: this seed has not finished its training\n"
             "the comparison is not fair; --force compares anyway"
         )
-    recipes = [[] if isinstance(group[0], _PolicyAlone) else [run.recipe() for run in group] for group in groups]
+    recipes = [[] if isinstance(group[0], PolicyAlone) else [run.recipe() for run in group] for group in groups]
     for name, own in zip(names, recipes, strict=True):
         if any(one == two for one, two in itertools.combinations(own, 2)):
             raise UsageError(f"{name}: two of its runs have the same recipe and seed, which count as one training")
+    of_recipes = len(groups[0]) > 1
+    same = ["" if of_recipes else find_same_policy(group[0], groups[0][0]) for group in groups]
+    has_margin = margin is not None and not (of_recipes or all(same))
+    if margin is not None and has_margin and request.task is None:
+        check_margin(margin, request.episodes, of_success=reports_success(groups[0][0]))
     first = _evaluate(groups[0][0], request, threshold)
+    if margin is not None and has_margin:
+        check_margin(margin, request.episodes, of_success=first.evaluation.success_rate is not None)
     # All play in the same environment: an easier tolerance does not make a policy better.
     request = dataclasses.replace(request, spec=first.evaluation.spec)
     sides = [
         Side(
             name=name,
-            runs=[first if run is groups[0][0] else _evaluate(run, request, threshold) for run in group],
+            runs=[
+                first if run is groups[0][0] else _evaluate(run, request, threshold, first.evaluation if twin else None)
+                for run in group
+            ],
             mixed=find_mixed(own),
         )
-        for name, group, own in zip(names, groups, recipes, strict=True)
+        for name, group, own, twin in zip(names, groups, recipes, same, strict=True)
     ]
     baseline, *others = sides
-    of_recipes = len(groups[0]) > 1
     return RunComparison(
         of_recipes=of_recipes,
         task=request.task or tasks[0],
@@ -209,8 +217,9 @@ def compare_runs(
                 find_recipe_changes(recipe[0], recipes[0][0]) | _find_other_starts(group[0], groups[0][0])
                 if recipe and recipes[0]
                 else None,
+                twin,
             )
-            for side, group, recipe in zip(others, groups[1:], recipes[1:], strict=True)
+            for side, group, recipe, twin in zip(others, groups[1:], recipes[1:], same[1:], strict=True)
         ],
         episodes=request.episodes,
         threshold=_default_threshold(threshold, baseline.has_success),
@@ -252,8 +261,10 @@ def _refuse_unequal(names: Sequence[str], groups: Sequence[Sequence[RunDirectory
         raise UsageError(f"{twice}: given twice; a run cannot be compared with itself")
 
 
-def _evaluate(run: RunDirectory, request: EvalRequest, threshold: float | None) -> EvaluatedRun:
-    evaluation = run_evaluation(dataclasses.replace(request, run=str(run.path)))
+def _evaluate(
+    run: RunDirectory, request: EvalRequest, threshold: float | None, evaluation: Evaluation | None = None
+) -> EvaluatedRun:
+    evaluation = evaluation or run_evaluation(dataclasses.replace(request, run=str(run.path)))
     has_success = evaluation.success_rate is not None
     column, threshold = "success" if has_success else "return", _default_threshold(threshold, has_success)
     reached: dict[str, float | None] = {}
@@ -263,7 +274,7 @@ def _evaluate(run: RunDirectory, request: EvalRequest, threshold: float | None) 
     steps = reached.get("steps")
     return EvaluatedRun(
         path=run.path,
-        seed=None if isinstance(run, _PolicyAlone) else summarize(run.path).seed,
+        seed=None if isinstance(run, PolicyAlone) else summarize(run.path).seed,
         evaluation=evaluation,
         steps_to_threshold=None if steps is None else int(steps),
         seconds_to_threshold=reached.get("seconds"),

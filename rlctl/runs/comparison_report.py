@@ -9,11 +9,12 @@ from rlctl.evaluation.episode_statistics import Spread
 from rlctl.recipe.stages import format_value
 from rlctl.runs import significance
 from rlctl.runs.comparison import Candidate, EvaluatedRun, RunComparison, Side
+from rlctl.version import collect_versions
 
 
-def show(result: RunComparison, json: str | None) -> None:
+def show(result: RunComparison, json: str | None, gate: str | None = None, margin: float | None = None) -> None:
     """Print which question is answered, the scores, the differences and the verdicts; or JSON alone for `-`."""
-    if output.present(as_json(result), json):
+    if output.present(as_json(result) | _judge(result, gate, margin), json):
         return
     out = output.out()
     if result.of_recipes:
@@ -34,6 +35,20 @@ def show(result: RunComparison, json: str | None) -> None:
             lines.append(f"recipe: {key}: {format_value(key, before)} -> {format_value(key, value)}")
         for line in [*lines, "recipe: the same"] if candidate.recipe_changes == {} else lines:
             out.print(f"  {line}")
+
+
+def _judge(result: RunComparison, gate: str | None, margin: float | None) -> dict[str, Any]:
+    """Return what the JSON of the command has besides the numbers; `passed` is None without a gate."""
+    has_gate = gate is not None or margin is not None
+    missed = result.list_missed(margin) if has_gate else []
+    return {
+        "format": "rlctl runs compare 1",
+        "exit_code": int(bool(missed)),
+        "passed": not missed if has_gate else None,
+        "gate": "not-worse" if has_gate else None,
+        "margin": margin,
+        "gates_missed": missed,
+    }
 
 
 def _show_seeds(result: RunComparison) -> None:
@@ -79,6 +94,8 @@ def _format_aggregate(side: Side, quantity: significance.Quantity) -> str:
 def describe_candidate(result: RunComparison, candidate: Candidate) -> list[str]:
     """Return a line per difference, and if the verdict is `cannot tell`, how much data would decide."""
     lines = [_format_difference(quantity, difference) for quantity, difference in candidate.differences.items()]
+    if candidate.same_policy:
+        return [f"the same policy file (sha256 {candidate.same_policy[:12]}...): there is nothing to tell apart"]
     if candidate.verdict is significance.Verdict.CANNOT_TELL:
         lines.append(format_needed(candidate, len(result.candidates)))
     return lines
@@ -133,6 +150,7 @@ def as_json(result: RunComparison) -> dict[str, Any]:
         "question": "recipes" if result.of_recipes else "policies",
         "unit": "training seed" if result.of_recipes else "episode",
         "task": result.task,
+        "versions": collect_versions(),
         "episodes": result.episodes,
         "threshold": result.threshold,
         "tested": describe_tests(result),
@@ -141,6 +159,7 @@ def as_json(result: RunComparison) -> dict[str, Any]:
             {
                 **_side_as_json(candidate.side, result),
                 "verdict": str(candidate.verdict),
+                "same_policy": bool(candidate.same_policy),
                 "differences": {
                     quantity: {**vars(difference), "verdict": str(difference.verdict)}
                     for quantity, difference in candidate.differences.items()

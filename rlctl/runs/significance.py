@@ -183,6 +183,16 @@ def _success_interval(change: Array) -> tuple[float, float]:
     return max(-1.0, centre - half), min(1.0, centre + half)
 
 
+def find_smallest_loss(episodes: int) -> float:
+    """Return the loss of success that so many equal pairs of episodes do not exclude."""
+    return -_success_interval(np.zeros(episodes))[0]
+
+
+def find_least_pairs(margin: float) -> float:
+    """Return the fewest equal pairs of episodes that exclude a loss of success above `margin`; may be infinite."""
+    return max(2, math.ceil(_NORMAL.inv_cdf(1 - ALPHA / 2) / margin) - 2) if margin > 0 else math.inf
+
+
 def interquartile_mean_interval(scores: Array) -> tuple[float, float]:
     """Return the 95 % bootstrap interval of the interquartile mean over seeds, shape (seeds,)."""
     from scipy.stats import trim_mean

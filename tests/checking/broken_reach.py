@@ -76,3 +76,27 @@ class ArmFarGoals(Arm):
 class ArmGoalsInMillimetres(Arm):
     def draw_goal(self):
         return 1000 * super().draw_goal()
+
+
+class ArmByChance(Arm):
+    """Draws its goals from a generator without a seed: nothing can be paired with them."""
+
+    def draw_goal(self):
+        self._np_random = np.random.default_rng()
+        return super().draw_goal()
+
+
+class ArmUnclearReward(Arm):
+    """Observes its goal, whose difference to itself is where the base is; its reward does not tell the distance."""
+
+    def __init__(self):
+        global ARM
+        ARM = ARM.replace("0.5 0 0.2", "0 0 0")
+        super().__init__()
+
+    def observe(self):
+        rest = self.data.site("hand").xpos, self.goal
+        return np.concatenate([self.data.qpos, self.data.qvel, *rest]).astype(np.float32)
+
+    def reward(self, action):
+        return np.exp(-3 * self.distance()) + 0.1 * self.data.qvel[0]

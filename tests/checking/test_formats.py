@@ -12,13 +12,15 @@ import jsonschema
 import pydantic
 import pytest
 import sarif_pydantic
+import typer
 from gymnasium import spaces
 
+from rlctl import cli
 from rlctl.checking import families, tool_formats
 from rlctl.checking.check import CheckReport, CheckVerdict, judge
-from rlctl.checking.formats import FORMATS, pair_targets, to_text
+from rlctl.checking.formats import FORMATS, pair_targets, show_notes, to_text
 from rlctl.checking.records import Built, Finished, Records
-from rlctl.checking.rules import FAMILIES, RULES, Severity, choose_rules, find_rule
+from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, choose_rules, find_rule
 from rlctl.checking.values import find_leaves
 from rlctl.errors import UsageError
 from tests import fork_server
@@ -105,6 +107,7 @@ def test_every_report_is_valid_sarif(report):
     log = sarif_pydantic.Sarif.model_validate_json(tool_formats.to_sarif(report))
     assert extras(log) <= NOT_IN_THE_VALIDATOR
     assert log.version == "2.1.0"
+    assert json.loads(tool_formats.to_sarif(report))["runs"][0]["automationDetails"] == {"id": f"rlctl/{report.task}/"}
     (run,) = log.runs
     assert [result.rule_id for result in run.results or []] == [
         each.rule for each in (*report.verdict.findings, *report.verdict.waived)
@@ -288,22 +291,69 @@ def test_a_strict_check_fails_for_rules_without_time_to_judge_them(report):
     )
     assert "1 not for lack of time: --budget SECONDS" in late.summarize()
     assert "::warning title=1 rules not judged::time ran out for RL501" in FORMATS["github"](late)
+    assert "time ran out" not in [case.get("name") for case in junit_cases(late)]
+    (case,) = [
+        each for each in junit_cases(dataclasses.replace(late, strict=True)) if each.get("name") == "time ran out"
+    ]
+    assert case.find("failure").get("message") == "no time to judge RL501: --budget SECONDS"
 
 
 @pytest.mark.parametrize(
-    ("forms", "targets", "pairs"),
-    [([], [], [("text", None)]), (["sarif", "junit"], ["a", "b"], [("sarif", "a"), ("junit", "b")]),
-     (["junit", "text"], ["a"], [("junit", "a"), ("text", None)])],
-)  # fmt: skip
-def test_formats_and_their_files(forms, targets, pairs):
-    assert pair_targets(forms, targets) == pairs
-    with pytest.raises(UsageError, match="give each format its -o, in the same order"):
-        pair_targets(forms, [*targets, "c", "d"])
+    ("arguments", "pairs"),
+    [
+        ("", [("text", None)]),
+        ("-o a", [("text", "a")]),
+        ("--format sarif -o a --format junit --output=b", [("sarif", "a"), ("junit", "b")]),
+        ("--format junit -o a --format text", [("junit", "a"), ("text", None)]),
+        ("--format github --format junit -o a", [("github", "-"), ("junit", "a")]),
+        ("--format=sarif -oa --format github --format junit -o b", [("sarif", "a"), ("github", "-"), ("junit", "b")]),
+        ("-o a --format sarif", [("sarif", "a")]),
+        ("--format github --format sarif", None),
+        ("--format github -o a -o b", None),
+    ],
+)
+def test_a_file_belongs_to_the_format_before_it(arguments, pairs):
+    app = typer.main.get_command(cli.build_app(["check-env", "tasks"]))
+    command = app.commands["check-env"]
+    options = command.make_context("check-env", arguments.split()).params
+    if pairs is not None:
+        assert pair_targets(options["form"], options["output"]) == pairs
+        return
+    with pytest.raises(UsageError, match="give each --format its -o FILE after it"):
+        pair_targets(options["form"], options["output"])
+
+
+@pytest.mark.parametrize(("rule", "is_example"), [("RL816", True), ("RL301", True), ("RL115", False), ("RL818", False)])
+def test_a_baseline_knows_a_finding_whichever_element_it_shows(broken, rule, is_example):
+    one, other = (broken.fingerprint(RuleFinding(rule, "", {"element": f"action[{i}]"})) for i in range(2))
+    assert (one == other) is is_example
+
+
+def test_what_of_a_baseline_is_not_found_is_named_if_it_was_judged(waiving, capfd):
+    report = dataclasses.replace(waiving, verdict=dataclasses.replace(waiving.verdict))
+    report.verdict.judged = ["RL106", "RL115"]
+    report.subtract(
+        {*map(report.fingerprint, report.verdict.waived), *(f"{report.task} {x}" for x in ("RL115 a", "RL9"))}
+    )
+    show_notes(report, [])
+    assert capfd.readouterr().err == "1 finding of the baseline no longer found: RL115 a; write it again\n"
 
 
 def test_a_baseline_of_another_task_is_refused(report):
     with pytest.raises(UsageError, match=r"--baseline: its findings are of other:Env, not of "):
         report.subtract({"other:Env RL501"})
+
+
+def junit_cases(report):
+    return ElementTree.fromstring(FORMATS["junit"](report))[0].findall("testcase")
+
+
+def test_junit_names_the_task_and_what_the_baseline_knows(broken):
+    known = CheckVerdict(known=broken.verdict.findings, judged=["RL601", "RL602"])
+    cases = {case.get("name")[:5]: case for case in junit_cases(dataclasses.replace(broken, verdict=known))}
+    assert cases["RL601"].get("classname") == f"{broken.task}.reward"
+    assert cases["RL601"].find("skipped").get("message") == "known from the baseline"
+    assert list(cases["RL602"]) == []
 
 
 def test_in_junit_warnings_fail_with_strict_only(broken):

@@ -12,7 +12,7 @@ from rlctl.checking.transitions import Transitions
 from rlctl.checking.values import read_attributes
 from rlctl.checking.workspaces import find_chains, find_reach, measure_reach
 from rlctl.environments.spec import EnvSpec
-from tests.checking.judging import case, check_case, findings, mark_slow
+from tests.checking.judging import case, check_case, findings, mark_slow, shared_records_of
 
 MEANING, REACH = "broken_meaning.py", "broken_reach.py"
 
@@ -50,6 +50,17 @@ def test_finds_the_mistake_and_only_that(case):
 def test_goals_that_are_all_out_of_reach_are_an_error():
     others = ("RL603", "warning"), ("RL118", "info"), ("RL611", "info")
     check_case(case(f"{REACH}:ArmGoalsInMillimetres", ("RL619", "error"), *others))
+
+
+def test_goals_without_a_seed_are_not_judged():
+    with pytest.raises(NotJudged, match=r"the seed does not determine what reset draws \(RL301\)"):
+        shared_records_of(f"{REACH}:ArmByChance", "goals").require_fact("goals")
+
+
+def test_what_the_joints_do_not_move_is_not_the_hand():
+    goals = shared_records_of(f"{REACH}:ArmUnclearReward", "goals").require_fact("goals")
+    (reach,) = goals.reaches.values()  # where the goal itself is observed, its difference to itself is the base
+    assert reach.distance == pytest.approx(0.9, abs=0.001)  # 0.2 m up, 0.4 m, 0.3 m
 
 
 def test_the_reach_of_a_task_in_mujoco_is_measured_by_its_joints():

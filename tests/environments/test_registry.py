@@ -1,5 +1,6 @@
 """From what the user typed to an environment, and what is said when there is none."""
 
+import hashlib
 import subprocess
 import sys
 import textwrap
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 import rlctl
-from rlctl.environments import registry
+from rlctl.environments import own_ids, registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.environments.suggestions import find_only_class
 from rlctl.errors import NoDisplayError, RecipeError, TaskError, UsageError
@@ -278,6 +279,29 @@ def test_gymnasium_ids(write_module, monkeypatch):
     assert EnvSpec("Pendulum-v1", {"g": 1.0, "max_episode_steps": 7}).make().spec.max_episode_steps == 7
 
 
+def test_the_file_of_an_ids_class_is_hashed_without_an_import(write_module, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    write_module(
+        "team/__init__.py",
+        """
+        import gymnasium
+        class Own: pass
+        gymnasium.register("Dock-v0", entry_point="team.dock:Dock")
+        gymnasium.register(entry_point=Own, id="Own-v0")
+        raise SystemExit("imported")
+        """,
+    )
+    file = write_module("team/dock.py", "class Dock: pass\n")
+    before = registry.identify_task("team:Dock-v0")
+    assert before["source_sha256"] == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert registry.describe_task_changes(before, "team:Dock-v0") == []
+    file.write_text("class Dock: changed = True\n")
+    assert registry.describe_task_changes(before, "team:Dock-v0") == [f"{file} has changed since the run began"]
+    assert own_ids.find_class_file("team:Own-v0") == tmp_path / "team/__init__.py"
+    for unknown in ("team:Other-v0", "nopackage:Dock-v0", "Pendulum-v1"):
+        assert registry.identify_task(unknown)["source_sha256"] is None
+
+
 def test_a_gymnasium_id_whose_class_cannot_be_imported(write_module):
     write_module("registers.py", "import gymnasium\ngymnasium.register('Late-v0', entry_point='late:Late')\n")
     write_module("late.py", "1 / 0\n")
@@ -286,7 +310,7 @@ def test_a_gymnasium_id_whose_class_cannot_be_imported(write_module):
     )
 
 
-def test_parameters_that_are_not_there(my_env):
+def test_parameters_that_are_not_there(my_env, write_module):
     assert error(RecipeError, "my_env.py:MyEnv", {"gian": 1}) == (
         "task.gian: my_env.py:MyEnv has no parameter 'gian'. Did you mean 'gain'? It has: gain."
     )
@@ -296,6 +320,10 @@ def test_parameters_that_are_not_there(my_env):
     )
     assert error(RecipeError, "Pendulum-v1", {"gg": 1}).startswith(
         "task.gg: Pendulum-v1 has no parameter 'gg'. Did you mean 'g'?"
+    )
+    write_module("teams.py", f"{ENV}\n    gymnasium.register('Dock-v0', entry_point=MyEnv)\n")
+    assert error(RecipeError, "teams:Dock-v0", {"gian": 1}) == (
+        "task.gian: teams:Dock-v0 has no parameter 'gian'. Did you mean 'gain'? It has: gain."
     )
 
 

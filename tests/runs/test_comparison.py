@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -15,8 +16,9 @@ from rlctl.recipe.sources import resolve
 from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
 from rlctl.runs.comparison import Candidate, RunComparison, Side, compare, find_recipe_changes
-from rlctl.runs.comparison_report import as_json, format_needed
+from rlctl.runs.comparison_report import as_json, describe_candidate, format_needed
 from rlctl.runs.listing import find_runs_of
+from rlctl.runs.margin import check_margin
 from rlctl.runs.report.write import write_report
 from rlctl.runs.significance import Verdict
 from rlctl.training.request import run_training
@@ -161,8 +163,41 @@ def test_a_margin_must_be_excluded(root):
     result.check(margin=0.2)
     with pytest.raises(AnswerIsNo, match=r"its success may be lower by 0\.2, more than 0\.1$"):
         result.check(margin=0.1)
-    with pytest.raises(UsageError, match=r"--margin 5: a success rate is at most 1; 5 points are 0\.05"):
-        result.check(margin=5)
+
+
+@pytest.mark.parametrize(
+    ("margin", "message"),
+    [
+        # Of 20 equal pairs the interval begins at -1.96 / (20 + 2) = -0.0891; 1.96 / 0.05 - 2 = 37.2.
+        (
+            0.05,
+            r"--margin 0\.05: 20 episodes cannot exclude that success is lower by 0\.0891, .*; --episodes 38 or more",
+        ),
+        (0.0, r"no number of episodes can$"),
+        (5, r"--margin 5: a success rate is at most 1; 5 points are 0\.05"),
+    ],
+)
+def test_a_margin_that_cannot_be_shown_is_refused_before_playing(root, margin, message, monkeypatch):
+    one, two = sorted((root / "0.9/Line").iterdir())
+    monkeypatch.setattr("rlctl.runs.comparison.run_evaluation", lambda *_: pytest.fail("played"))
+    with pytest.raises(UsageError, match=message):
+        compare([str(one), str(two)], EvalRequest(None, episodes=20), margin=margin)
+
+
+def test_a_margin_of_enough_episodes_can_be_shown():
+    check_margin(0.05, 38, of_success=True)
+    with pytest.raises(UsageError):
+        check_margin(0.05, 37, of_success=True)
+    check_margin(0.05, 2, of_success=False)
+
+
+def test_a_copy_of_a_policy_passes_any_margin(root, tmp_path):
+    one, _ = sorted((root / "0.9/Line").iterdir())
+    copy = shutil.copy(one / "policies/best.safetensors", tmp_path / "copy.safetensors")
+    result = compare([str(one), str(copy)], EvalRequest(None, episodes=4), margin=0.05)
+    result.check(margin=0.05)
+    assert describe_candidate(result, result.candidates[0])[0].startswith("the same policy file (sha256 ")
+    assert result.candidates[0].side.runs[0].evaluation is result.baseline.runs[0].evaluation
 
 
 def test_gate(root):
@@ -194,3 +229,11 @@ def test_a_report_of_two_recipes_begins_with_the_verdict(root):
     assert (
         "- tested: success and return, p-values (not intervals) adjusted for all tests; if all are equal, 5% of" in text
     )
+
+
+def test_without_scipy_nothing_is_played(root, monkeypatch):
+    one, two = sorted((root / "0.9/Line").iterdir())
+    monkeypatch.setitem(sys.modules, "scipy.stats", None)
+    monkeypatch.setattr("rlctl.runs.comparison.run_evaluation", lambda *_: pytest.fail("played"))
+    with pytest.raises(ModuleNotFoundError):
+        compare([str(one), str(two)], EvalRequest(None, episodes=20))

@@ -42,7 +42,8 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
     instance = context.instance
     if not instance.accepts_seed:
         raise NotJudged("reset takes no seed (RL202)")
-    for name in _find_drawn(instance):
+    names, by_chance = _find_drawn(instance)
+    for name in names:
         if copies := _find_copies(instance, name):
             goals: dict[int, list[float]] = {}
             for seed in [*range(FIRST_SEED, FIRST_SEED + len(EPISODES)), *range(FIRST, FIRST + STARTS)]:
@@ -53,23 +54,30 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
             reaches = _find_reaches(instance, name, copies)
             yield Fact("goals", DrawnGoal(name, copies, goals, reaches))
             return
+    if by_chance:
+        raise NotJudged("the seed does not determine what reset draws (RL301)")
     raise NotApplicable("the observation follows no attribute that reset draws")
 
 
-def _find_drawn(instance: Instance) -> list[str]:
-    """Return the attributes of the size of a place that a reset draws, and that no step changes."""
-    drawn = []
-    for seed in (FIRST_SEED, SECOND_SEED):
-        EpisodePlayer(instance, seed, max_steps=0).reset()
-        drawn.append(read_attributes(instance.env))
+def _find_drawn(instance: Instance) -> tuple[list[str], list[str]]:
+    """Return the attributes of the size of a place that a reset draws by its seed and no step changes, and the others
+    that it draws."""
+    again, *drawn = (_read_after_reset(instance, seed) for seed in (FIRST_SEED, FIRST_SEED, SECOND_SEED))
     names = [name for name in drawn[0].keys() & drawn[1].keys() if _is_place(drawn[0][name], drawn[1][name])]
-    if not names:
-        return []
+    seeded = [name for name in names if name in again and np.array_equal(again[name].numbers, drawn[0][name].numbers)]
+    by_chance = sorted({*names} - {*seeded})
+    if not seeded:
+        return [], by_chance
     for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=STEPS):
         pass
     after = read_attributes(instance.env)
-    stays = [name for name in names if name in after and np.array_equal(after[name].numbers, drawn[1][name].numbers)]
-    return sorted(stays)[:MOST_CANDIDATES]
+    stays = [name for name in seeded if name in after and np.array_equal(after[name].numbers, drawn[1][name].numbers)]
+    return sorted(stays)[:MOST_CANDIDATES], by_chance
+
+
+def _read_after_reset(instance: Instance, seed: int) -> dict[str, Attribute]:
+    EpisodePlayer(instance, seed, max_steps=0).reset()
+    return read_attributes(instance.env)
 
 
 def _is_place(one: Attribute, two: Attribute) -> bool:
@@ -124,14 +132,16 @@ def _find_reaches(instance: Instance, name: str, copies: Sequence[Source]) -> di
             return {}
         links.append([chain.read() for chain in chains])
     observed, drawn = np.array(rows), np.array(goals)
-    reaches = {}
+    reaches: dict[Source, Reach] = {}
     for source in find_sources(copies, observed, drawn):
         places = read_place(source, observed, drawn)
         for number, chain in enumerate(chains):
             off = np.abs(np.array([one[number] for one in links])[:, :, : drawn.shape[1]] - places[:, None])
             link = int(off.max(axis=(0, 2)).argmin())
             if off[:, link].max() < NEAR and source not in reaches:
-                reaches[source] = measure_reach(chain, link, drawn.shape[1])
+                reach = measure_reach(chain, link, drawn.shape[1])
+                # A goal minus itself is the origin, where the base of many robots is.
+                reaches |= {source: reach} if reach.distance > NEAR else {}
     return reaches
 
 
