@@ -199,11 +199,10 @@ def check_name(
 
 
 def explain_missing_package(user: str, missing: str | None, extra: str) -> str:
-    """Return `USER needs MISSING: pip install ...` with the packages of the extra."""
-    requirements = _read_requirements("rlctl") or _read_requirements("rlctl-core") or []
-    suffix = re.compile(rf"""\s*;.*extra == ['"]{extra}['"].*""")
-    packages = [suffix.sub("", line) for line in requirements if suffix.search(line)]
-    return f"{user} needs {missing}: pip install {shlex.join(packages or [str(missing)])}"
+    """Return `USER needs MISSING: pip install 'rlctl[EXTRA]'`, for the distribution that is installed."""
+    is_core = _read_requirements("rlctl") is None and _read_requirements("rlctl-core") is not None
+    install = shlex.quote(f"{'rlctl-core' if is_core else 'rlctl'}[{extra}]")
+    return f"{user} needs {missing}: pip install {install}"
 
 
 def explain_left_out(module: str | None) -> str | None:

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from hatchling.builders.sdist import SdistBuilder
 
+from rlctl import errors
 from rlctl.errors import explain_missing_package
 
 ROOT = Path(__file__).parent.parent
@@ -78,11 +79,11 @@ def test_what_pins_the_packages_is_in_the_key_of_the_cache(file):
         assert "pyproject.toml" in cache["cache-dependency-path"]
 
 
-def test_what_an_extra_needs_is_named_without_an_index_that_has_rlctl():
-    text = explain_missing_package("rlctl serve", "aiohttp", "serve")
-    assert text.startswith("rlctl serve needs aiohttp: pip install 'aiohttp<4,>=3.11' 'msgpack>=1.1'")
-    assert ";" not in text
-    assert explain_missing_package("rlctl fly", "wings", "fly") == "rlctl fly needs wings: pip install wings"
+def test_the_extra_with_a_missing_package_is_named(monkeypatch):
+    expected = "rlctl serve needs aiohttp: pip install '{}[serve]'"
+    assert explain_missing_package("rlctl serve", "aiohttp", "serve") == expected.format("rlctl")
+    monkeypatch.setattr(errors, "_read_requirements", {"rlctl-core": []}.get)
+    assert explain_missing_package("rlctl serve", "aiohttp", "serve") == expected.format("rlctl-core")
 
 
 def make_environment(folder: Path, target: str = "bin/python", **programs: str) -> subprocess.CompletedProcess[str]:

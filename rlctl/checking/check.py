@@ -120,9 +120,15 @@ class CheckReport:
         counted = ", ".join(output.format_count(count, severity) for count, severity in counts if count)
         waived = f", {len(verdict.waived)} waived" if verdict.waived else ""
         waived += f", {len(verdict.known)} known from the baseline" if verdict.known else ""
-        rules = output.format_count(len(verdict.judged), "rule")
-        cut = f", {len(self.out_of_time)} not for lack of time: --budget SECONDS" if self.out_of_time else ""
-        return f"{self.task}: {counted or 'no findings'}{waived}; {rules} judged in {self.seconds:.1f} s{cut}"
+        judged = len(verdict.judged)
+        found, rules = f"{counted or 'no findings'}{waived}", output.format_count(judged, "rule")
+        if late := len(self.out_of_time):
+            open_rules = f"{late} of {output.format_count(judged + late, 'rule')} not judged for lack of time"
+            return (
+                f"{self.task}: not finished: {open_rules} (--budget SECONDS); {found} from the other {judged} "
+                f"in {self.seconds:.1f} s"
+            )
+        return f"{self.task}: {found}; {rules} judged in {self.seconds:.1f} s"
 
     def subtract(self, baseline: Collection[str]) -> None:
         """Take out the findings whose fingerprints a baseline has: they are known, and fail nothing.

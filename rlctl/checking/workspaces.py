@@ -89,9 +89,13 @@ def _mujoco_chain(mujoco: Any, model: Any, data: Any, joints: Sequence[int]) -> 
     def set_joints(values: Numbers) -> None:
         copy.qpos[model.jnt_qposadr[joints]] = values
 
-    # What is welded to the world gets nowhere.
-    bodies = [i for i in range(model.nbody) if model.body_weldid[i]]
-    sites = [i for i in range(model.nsite) if model.body_weldid[model.site_bodyid[i]]]
+    # Only what these joints move: other bodies, such as an object to push, also get elsewhere.
+    moving = set(model.jnt_bodyid[joints].tolist())
+    for body in range(model.nbody):  # parents come first
+        if int(model.body_parentid[body]) in moving:
+            moving.add(body)
+    bodies = sorted(moving)
+    sites = [i for i in range(model.nsite) if model.site_bodyid[i] in moving]
 
     def read() -> Numbers:
         mujoco.mj_kinematics(model, copy)

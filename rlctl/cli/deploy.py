@@ -36,10 +36,11 @@ def serve(
     if request.limits is None:
         output.print_notes(["warning: no --limits FILE: only the policy's own bounds of actions limit the robot"])
     if self_test:
+        # First: it explains a missing package, which the self-test imports.
+        server = make_server(policy.file, dataclasses.replace(request, port=0, watchdog=False))
         from rlctl.evaluation import self_test as test
         from rlctl.evaluation.request import EvalRequest
 
-        server = make_server(policy.file, dataclasses.replace(request, port=0, watchdog=False))
         result = test.run_self_test(
             server,
             EvalRequest(str(policy.file), episodes=episodes, limits=request.limits, changes=parse_changes([], sim)),

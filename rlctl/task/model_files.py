@@ -24,19 +24,22 @@ def find_model_file(file: str | Path) -> Path:
         if (folder / path).is_file():  # PyBullet crashes on a folder
             return folder / path
     if path.is_absolute() or (path.parent != Path() and path.parent.is_dir()):
-        raise TaskError(_explain_missing(path))
+        raise TaskError(explain_missing(path))
     own = ", ".join(sorted(model.name for model in MODELS.glob("*.urdf")))
     hint = f"for a file next to your module: Path(__file__).with_name({path.name!r})"
     if other_models is None:
-        raise TaskError(f"model file {str(file)!r} not found. If it is one of PyBullet's: {INSTALL_PYBULLET}; {hint}")
+        raise TaskError(
+            f"model file {str(file)!r} not found, and rlctl's models are {own}. If it is one of PyBullet's: "
+            f"{INSTALL_PYBULLET}; {hint}"
+        )
     raise TaskError(
         f"model file {str(file)!r} not found: neither under {Path.cwd()}, nor among rlctl's models ({own}), "
         f"nor in pybullet_data; {hint}"
     )
 
 
-def _explain_missing(path: Path) -> str:
-    """Return what to say of a file in a folder: the closest model files there."""
+def explain_missing(path: Path) -> str:
+    """Return the message for a missing file in a folder: the closest model files there."""
     if not path.parent.is_dir():
         return f"model file {str(path)!r} not found: there is no folder {path.parent}"
     names = sorted(file.name for file in path.parent.iterdir() if file.suffix in _SUFFIXES)

@@ -23,6 +23,7 @@ _FASTEST = {"rotates": 3.0, "slides": 0.5}  # [rad/s], [m/s] of a first task; mo
 _GUESSED_FORCE = 10.0  # [N m or N], of a joint without a limit
 _LOWEST_TIP = 0.03  # [m], above the floor, at the start
 _TRIES = 300
+_FLOOR = '        sim.load("floor", "plane.urdf", fixed=True)\n'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +44,8 @@ def make_planar_arm() -> StarterRobot:
         "robot": "planar arm",
         "robot_phrase": "a planar arm of two joints",
         "model": "arm.urdf",
+        "floor": _FLOOR,
+        "fixed": ", fixed=True",
         "tip": "tip",
         "joints": '["shoulder", "elbow"]',
         "all_joints": "# Of all joints of the model, in its order.",
@@ -82,12 +85,15 @@ def read_robot(model: str, link: str | None) -> StarterRobot:
 
     Raises `UsageError` for a file that is missing, cannot be loaded, has no joints, a free base or no such link.
     """
-    from rlctl.task.model_files import find_model_file
+    from rlctl.task.model_files import explain_missing, find_model_file
     from rlctl.task.mujoco.sim import MujocoSim
 
     sim = MujocoSim(control_dt=1 / 30, substeps=4)
     try:
         path = find_model_file(model)
+    except TaskError:
+        raise UsageError(f"--model: {explain_missing(Path(model))}") from None
+    try:
         body = sim.load("arm", path, fixed=True)
     except TaskError as error:
         raise UsageError(f"--model: {error}") from None
@@ -152,6 +158,8 @@ def _describe(body: MujocoBody, path: Path, tip: str, joints: list[str]) -> dict
         "robot": name,
         "robot_phrase": name,
         "model": path.name,
+        "floor": "" if _has_plane(body) else _FLOOR,
+        "fixed": ", fixed=True" if path.suffix == ".urdf" else "",  # other formats contain it
         "tip": json.dumps(tip)[1:-1],
         "joints": _write_list("JOINTS = ", [json.dumps(joint) for joint in joints]),
         "all_joints": textwrap.fill(
@@ -182,6 +190,13 @@ def _describe(body: MujocoBody, path: Path, tip: str, joints: list[str]) -> dict
         "total_timesteps": "200_000",
         "every_steps": "40_000",
     }
+
+
+def _has_plane(body: MujocoBody) -> bool:
+    """Return whether the model, which is all of the world, has a floor of its own."""
+    import mujoco
+
+    return int(mujoco.mjtGeom.mjGEOM_PLANE) in body._sim.model.geom_type.tolist()
 
 
 def _find_start(body: MujocoBody, tip: str) -> Any:

@@ -73,6 +73,20 @@ def test_the_reach_of_a_task_in_mujoco_is_measured_by_its_joints():
     assert reach.centre == pytest.approx([0, 0, 0.16], abs=0.01)
 
 
+def test_the_joints_of_an_arm_do_not_move_what_it_pushes(tmp_path):
+    # A cube's place may be observed as the hand's is, and the arm gets no nearer to goals of the cube by itself.
+    pushing = tmp_path / "pushing.py"
+    pushing.write_text(
+        "from rlctl_manipulation.reach import Reach\n\n\nclass Push(Reach):\n"
+        "    def build(self, sim):\n        super().build(sim)\n"
+        "        sim.load('cube', 'cube_4cm.urdf', position=(0.5, 0, 0.02))\n"
+    )
+    with contextlib.closing(EnvSpec(f"{pushing}:Push", sim="mujoco").make()) as env:
+        env.reset(seed=0)
+        *_, chain = find_chains(env)
+    assert {name.partition("/")[0] for name in chain.names} == {"arm"}
+
+
 def test_attributes_of_mixed_shapes_are_left_out():
     # gym_electric_motor keeps an array of one number next to a number.
     attributes = read_attributes(SimpleNamespace(mixed=[np.zeros(1), 0.5], goal=[0.1, 0.2]))

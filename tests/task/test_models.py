@@ -52,7 +52,8 @@ def test_without_pybullet_data_the_error_says_how_to_install_it(monkeypatch):
     with pytest.raises(TaskError) as caught:
         find_model_file("kuka_iiwa/model.urdf")
     assert str(caught.value).startswith(
-        "model file 'kuka_iiwa/model.urdf' not found. If it is one of PyBullet's: pip install "
+        "model file 'kuka_iiwa/model.urdf' not found, and rlctl's models are a1.urdf, cube_4cm.urdf, kuka_iiwa.urdf, "
+        "plane.urdf. If it is one of PyBullet's: pip install "
     )
     assert str(caught.value).endswith("; for a file next to your module: Path(__file__).with_name('model.urdf')")
 

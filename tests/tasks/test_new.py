@@ -171,6 +171,7 @@ def model(tmp_path, monkeypatch):
             f'effort="{effort}" velocity="1"/></joint>'
         )
     file = tmp_path / "given" / "arm.urdf"
+    file.with_suffix(".urdf.xacro").touch()
     file.write_text(ROBOT.format(links=links + '<link name="tool_frame"/>', joints=joints))
     return file
 
@@ -209,6 +210,7 @@ def test_an_mjcf_model_becomes_one_file(tmp_path, monkeypatch):
     (tmp_path / "given" / "parts.xml").write_text(parts)
     (tmp_path / "given" / "arm.xml").write_text(
         """<mujoco model="arm"><compiler meshdir="assets" angle="radian"/><include file="parts.xml"/><worldbody>
+        <geom type="plane" size="1 1 1"/>
         <body name="base"><geom size="0.1"/><body name="arm" pos="0 0 0.3"><joint name="lift" axis="0 1 0" range="-1 1"
         actuatorfrcrange="-5 5"/><geom type="mesh" mesh="part"/></body></body></worldbody></mujoco>"""
     )
@@ -218,6 +220,8 @@ def test_an_mjcf_model_becomes_one_file(tmp_path, monkeypatch):
         arm = sim.load("arm", plugin.folder / "lifter" / "arm.xml", fixed=True)
         assert (arm.joint_names, arm.joint_max_force.tolist(), arm.joint_low.tolist()) == (["lift"], [5.0], [-1.0])
         assert sim.model.nmesh == 1
+    with contextlib.closing(EnvSpec("lifter/lifter/task.py:Lifter", sim="mujoco").make()) as env:
+        assert list(env.unwrapped.sim.bodies) == ["arm"]  # the file has a floor
 
 
 @pytest.mark.slow
@@ -230,7 +234,12 @@ def test_the_plugin_of_a_model_reads_well_and_passes_its_tests(model, tmp_path):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"model": "arm.urdf"}, "--model: model file 'arm.urdf' not found"),
+        ({"model": "given/amr.urdf"}, "--model: model file 'given/amr.urdf' not found. That folder has: arm.urdf"),
+        (
+            {"model": "amr.urdf"},
+            "--model: model file 'amr.urdf' not found. That folder has: no file that ends in .urdf",
+        ),
+        ({"model": "given/arm.urdf.xacro"}, "reads URDF and MJCF (.xml) files; first: xacro arm.urdf.xacro > arm.urdf"),
         ({"model": "plane.urdf"}, "--model plane.urdf: it has no joints; this makes a task for an arm"),
         (
             {"model": "given/arm.urdf", "link": "tool"},

@@ -75,7 +75,7 @@ def expect_whole(points, steps: list[int], evaluated: list[int]) -> None:
 
 def test_the_tracker_must_be_installed(train, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "wandb", None)
-    with pytest.raises(UsageError, match=r"--track wandb needs wandb: pip install '?wandb"):
+    with pytest.raises(UsageError, match=r"--track wandb needs wandb: pip install 'rlctl\[wandb\]'"):
         train("Line", {"track": "wandb"})
     with pytest.raises(UsageError, match="pip install"):
         train_seeds(TrainRequest(f"{ENVS}:Line", settings={"track": "wandb"}, root=tmp_path / "runs"), "0-1")

@@ -349,7 +349,7 @@ def test_a_tuning_with_impossible_numbers_is_damaged(tmp_path, change):
 
 def test_without_optuna(monkeypatch, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "optuna", None)
-    with pytest.raises(UsageError, match="rlctl tune needs optuna: pip install 'optuna"):
+    with pytest.raises(UsageError, match=r"rlctl tune needs optuna: pip install 'rlctl\[tune\]'"):
         begin(tmp_path, RATES)
 
 

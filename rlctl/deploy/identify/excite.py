@@ -10,6 +10,7 @@ import numpy as np
 from rlctl import output
 from rlctl.deploy.identify.follow import describe_expected, find_joints, open_world
 from rlctl.deploy.identify.log import MIN_ROWS, Array, Log, write_log
+from rlctl.deploy.identify.targets import read_targets, remembers_targets
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.task.env import TaskEnv
@@ -91,13 +92,16 @@ def _play(env: TaskEnv, trajectory: Array, driven: tuple[str, ...]) -> tuple[str
     joints = {name: all_joints[name] for name in driven or all_joints}
     low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
     middle = np.clip(np.zeros_like(low), low, high)
+    steps_targets = remembers_targets(env)
     env.reset(seed=0)
-    actions, measured, share, reason = [], [], 0.0, ""
+    actions, measured, targets, share, reason = [], [], [], 0.0, ""
     for row in trajectory:
         side = row.reshape(low.shape)
         action = (middle + np.where(side > 0, side * (high - middle), side * (middle - low))).astype(low.dtype)
         actions.append(action.ravel())
         measured.append([(body.joint_positions[i], body.joint_velocities[i]) for body, i in joints.values()])
+        if steps_targets:
+            targets.append(read_targets(env))
         env.task.act(action)
         env.sim.step()
         reason, reached = _find_danger(env, joints)
@@ -105,7 +109,10 @@ def _play(env: TaskEnv, trajectory: Array, driven: tuple[str, ...]) -> tuple[str
         if reason:
             break
     arrays = np.array(measured, np.float64)
-    return reason, Log(tuple(joints), np.array(actions), arrays[:, :, 0], arrays[:, :, 1]), share
+    log = Log(
+        tuple(joints), np.array(actions), arrays[:, :, 0], arrays[:, :, 1], np.array(targets) if steps_targets else None
+    )
+    return reason, log, share
 
 
 def _find_danger(env: TaskEnv, joints: dict[str, tuple[Any, int]]) -> tuple[str, float]:

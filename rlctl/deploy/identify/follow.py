@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.deploy.identify.log import Array, Expected, Log
+from rlctl.deploy.identify.targets import lead_targets, remembers_targets
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.task.env import TaskEnv
@@ -15,7 +16,7 @@ from rlctl.task.events import Event, EventSettings, delay, set_color, shift_grav
 from rlctl.task.events.event import Widening
 
 WINDOW_S = 1.0
-"""The simulation restarts from the measured state after this time [s], so that small errors do not accumulate."""
+"""The joints return to the measured state after this time [s], so that small errors do not accumulate."""
 _SMOOTHING_ROWS = 9  # rows of the smoothing filter for start states
 _COMPARED_ROWS = 200  # rows at least, to compare smoothed with measured start states
 _WIDER = 2.0  # factor by which the search range is wider than the event's range
@@ -145,7 +146,8 @@ def describe_expected(env: TaskEnv, task: str) -> Expected:
             "free base; hang the robot in a frame to record the log, and give a task that loads it with fixed=True"
         )
     limits = {name: (float(body.joint_low[i]), float(body.joint_high[i])) for name, (body, i) in joints.items()}
-    return Expected(limits, driven, int(np.prod(env.action_space.shape or ())), env.task.control_dt)
+    actions = int(np.prod(env.action_space.shape or ()))
+    return Expected(limits, driven, actions, env.task.control_dt, remembers_targets(env))
 
 
 class Follower:
@@ -168,6 +170,7 @@ class Follower:
         low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
         self._resting = np.clip(np.zeros(shape), low, high)
         self._dtype = env.action_space.dtype
+        self._targets = log.targets
         rows = min(_SMOOTHING_ROWS, len(log.actions) // 2 * 2 - 1)
         self._begin = self._choose_begin(savgol_filter(self._measured, rows, 2, axis=0))
 
@@ -176,16 +179,20 @@ class Follower:
         """Standard deviation of each measured position and velocity, shape (2 * joints,)."""
         return np.maximum(self._measured.std(axis=0), 1e-9)
 
+    @property
+    def motion(self) -> Array:
+        """Measured positions and velocities minus those at their window's start, shape as of `compare`."""
+        begins = self._measured[np.repeat(self.starts, self.steps)[: len(self._measured) - 1]]
+        return np.asarray(self._measured[1:] - begins)
+
     def compare(self, positions: Array | None, delay: int) -> Array:
-        """Return simulated minus measured positions and velocities, shape (rows, 2 * joints), window by window.
+        """Return simulated minus measured positions and velocities of all rows but the first, (rows - 1, 2 * joints).
 
         `positions` are the unknowns' positions in their ranges, in [0, 1]; None is the world as the task builds it.
         """
         changes = {} if positions is None else self.unknowns.settings(positions.tolist())
         self._env.set_events(EventSettings(False, changes))
-        played = np.concatenate([self._play(start, delay, self.steps) for start in self.starts])
-        measured = np.concatenate([self._measured[start + 1 : start + 1 + self.steps] for start in self.starts])
-        return played - measured
+        return self._play(self.starts, delay) - self._measured[1:]
 
     def _choose_begin(self, smoothed: Array) -> Array:
         """Return the start states: each column smoothed, or measured where that predicts the next row better."""
@@ -195,30 +202,36 @@ class Follower:
         errors = []
         for begin in (self._measured, smoothed):
             self._begin = begin
-            played = np.concatenate([self._play(start, 0, 1) for start in starts])
-            errors.append(np.square(played - self._measured[np.array(starts) + 1]).sum(axis=0))
+            after = self._play(starts, 0)[starts] - self._measured[1:][starts]
+            errors.append(np.square(after).sum(axis=0))
         return np.where(errors[0] < errors[1], self._measured, smoothed)
 
-    def _play(self, start: int, delay: int, steps: int) -> Array:
+    def _play(self, starts: Collection[int], delay: int) -> Array:
+        """Return the simulated states of all rows but the first; the joints return to the measured ones at `starts`."""
+        # One episode for all windows: only the actions since its start tell where targets, filters and clocks are.
         env = self._env
         env.reset(seed=0)
-        for body in self._bodies.values():
-            angles, speeds = body.joint_positions.copy(), body.joint_velocities.copy()
-            for column, (owner, index) in enumerate(self._joints):
-                if owner is body:
-                    angles[index], speeds[index] = self._begin[start, column :: len(self._joints)]
-            body.set_joints(angles, speeds)
-        rows = min(steps, len(self._actions) - 1 - start)
-        played = np.empty((rows, self._measured.shape[1]))
-        for row in range(rows):
-            step = start + row - delay
-            action = self._actions[step] if step >= 0 else self._resting
+        played = np.empty((len(self._actions) - 1, self._measured.shape[1]))
+        for row in range(len(played)):
+            if row in starts:
+                self._set_joints(row)
+                if self._targets is not None and row < len(self._targets):
+                    lead_targets(env, self._targets[row])
+            action = self._actions[row - delay] if row >= delay else self._resting
             env.task.act(action.astype(self._dtype))
             env.sim.step()
             played[row] = self._read()
         if not np.isfinite(played).all():
             raise TaskError("the simulation of the log is not finite")
         return played
+
+    def _set_joints(self, row: int) -> None:
+        for body in self._bodies.values():
+            angles, speeds = body.joint_positions.copy(), body.joint_velocities.copy()
+            for column, (owner, index) in enumerate(self._joints):
+                if owner is body:
+                    angles[index], speeds[index] = self._begin[row, column :: len(self._joints)]
+            body.set_joints(angles, speeds)
 
     def _read(self) -> list[float]:
         states = {name: (body.joint_positions, body.joint_velocities) for name, body in self._bodies.items()}

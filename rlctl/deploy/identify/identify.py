@@ -26,6 +26,9 @@ _MIN_WIDTH = 0.02
 _MIN_MOTION = 1e-3  # [rad or m]
 _PLOT_SIZE = (100, 18)
 _PLOT_POINTS = 400
+_LARGEST_ERROR = 0.3
+"""Largest error of the positions, as a fraction of their motion in a window, with which values are worth printing."""
+_NOISE_RATIO = 3.0  # a larger error than this multiple of the measured noise is the model's
 _MIN_COST_RATIO = 1.05  # smallest ratio of two delays' costs that tells them apart
 
 
@@ -58,6 +61,7 @@ class Identification:
     position_error: tuple[float, float]
     """Root mean square of the positions' error [rad or m], with the task's own values and with the identified ones."""
     velocity_error: tuple[float, float]  # [rad/s or m/s]
+    motion: float  # root mean square of the positions' change since the start of their window [rad or m]
     curves: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Of the joint with the largest error: its name, its measured positions, and those simulated before and after."""
 
@@ -90,7 +94,7 @@ def identify(
     """Estimate the values of a task's events (all, or those in `events`) from a log.
 
     Raises `ArtifactError` for an invalid log, `UsageError` for an event or joint that the task does not have, and
-    `AnswerIsNo` if the log determines none of the values.
+    `AnswerIsNo` if the log determines none of the values, or no values make the simulation follow it.
     """
     with contextlib.closing(open_world(spec)) as env:
         unknowns = find_unknowns(env.task.events, events, spec.task)
@@ -108,6 +112,8 @@ def identify(
             fits = search(ask, unknowns, 1.0 / follower.spread, seed, report)
         best = min(fits.values(), key=lambda fit: fit.cost)
         values = _estimate_values(unknowns, best)
+        before, after = follower.compare(None, 0), follower.compare(best.at, best.delay)
+        _check_errors(log_file, follower, log, _root_mean_squares(before)[0], _root_mean_squares(after)[0])
         delay_known = all(fit.cost > _MIN_COST_RATIO * best.cost for fit in fits.values() if fit is not best)
         if not any(value.known for value in values) and not (unknowns.delay and delay_known):
             notes = "; ".join(dict.fromkeys(value.note for value in values))
@@ -115,34 +121,47 @@ def identify(
                 f"{log_file}: this log determines none of the values: {notes}\n"
                 f"to create a trajectory that moves more: rlctl identify {spec.task} --excite FILE"
             )
-        return _summarise(spec.task, log_file, follower, log, best, values, delay_known)
+        positions, velocities = zip(_root_mean_squares(before), _root_mean_squares(after), strict=True)
+        return Identification(
+            task=spec.task,
+            log=log_file,
+            rows=len(log.actions),
+            seconds=len(log.actions) * follower.control_dt,
+            values=values,
+            delay_event=unknowns.delay,
+            delay=best.delay,
+            delay_known=delay_known,
+            position_error=positions,
+            velocity_error=velocities,
+            motion=_root_mean_squares(follower.motion)[0],
+            curves=_make_curves(log, before, after),
+        )
 
 
-def _summarise(
-    task: str, file: Path, follower: Follower, log: Log, best: Fit, values: list[IdentifiedValue], delay_known: bool
-) -> Identification:
-    before, after = follower.compare(None, 0), follower.compare(best.at, best.delay)
+def _check_errors(file: Path, follower: Follower, log: Log, before: float, after: float) -> None:
+    """Raise `AnswerIsNo` where the simulation does not follow the log: its values are those of another motion."""
+    motion = _root_mean_squares(follower.motion)[0]
+    # Third differences remove the motion; they have 1 + 9 + 9 + 1 times the variance of the noise.
+    noise = float(np.sqrt(np.square(np.diff(log.positions, 3, axis=0)).mean() / 20))
+    if after > max(_LARGEST_ERROR * motion, _NOISE_RATIO * noise):
+        raise AnswerIsNo(
+            f"{file}: the task does not explain this log: the simulated positions are wrong by {after:.3g} rad "
+            f"(m if sliding) with the best values and by {before:.3g} with the task's own, where the joints move by "
+            f"{motion:.3g} and the noise is at most {noise:.2g}: no values\n"
+            "compare signs, order and scale of its actions and joints with the task's, and where the robot's "
+            "targets are in the first row: rlctl takes the measured positions"
+        )
+
+
+def _make_curves(log: Log, before: Array, after: Array) -> dict[str, Any]:
     worst = int(np.square(before[:, : len(log.joints)]).mean(axis=0).argmax())
-    positions, velocities = zip(_root_mean_squares(before), _root_mean_squares(after), strict=True)
-    measured = np.concatenate([log.positions[start + 1 :][: follower.steps] for start in follower.starts])[:, worst]
-    return Identification(
-        task=task,
-        log=file,
-        rows=len(log.actions),
-        seconds=len(log.actions) * follower.control_dt,
-        values=values,
-        delay_event=follower.unknowns.delay,
-        delay=best.delay,
-        delay_known=delay_known,
-        position_error=positions,
-        velocity_error=velocities,
-        curves={
-            "joint": log.joints[worst],
-            "measured": measured.tolist(),
-            "before": (measured + before[:, worst]).tolist(),
-            "after": (measured + after[:, worst]).tolist(),
-        },
-    )
+    measured = log.positions[1:, worst]
+    return {
+        "joint": log.joints[worst],
+        "measured": measured.tolist(),
+        "before": (measured + before[:, worst]).tolist(),
+        "after": (measured + after[:, worst]).tolist(),
+    }
 
 
 def _root_mean_squares(errors: Array) -> list[float]:
@@ -212,8 +231,14 @@ def show(result: Identification, json: str | None) -> None:
     if result.delay_event:
         note = "" if result.delay_known else "; one step more or less fits this log as well"
         rows.append((f"{result.delay_event}.steps", f"{result.delay}{note}"))
+    elif result.delay:
+        rows.append(("delay of actions", f"{result.delay} control steps in this log; the task has no event of it"))
     for name, (before, after) in (("position error", result.position_error), ("velocity error", result.velocity_error)):
         rows.append((name, f"{before:.3g} -> {after:.3g}, root mean square over windows of 1 s"))
+    share = result.position_error[1] / result.motion
+    rows.append(
+        ("motion", f"{result.motion:.3g} in the same windows; the remaining position error is {share:.2g} of it")
+    )
     output.print_table(("", ""), rows, left=("",))
     if sys.stdout.isatty():
         out.print(draw_curves(result))

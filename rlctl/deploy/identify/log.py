@@ -16,8 +16,8 @@ from rlctl.storage import files, untrusted
 Array = NDArray[np.float64]
 
 TIME = "time"
-_POSITION, _VELOCITY = "position_", "velocity_"
-_USED = (TIME, "action_", _POSITION, _VELOCITY)
+_POSITION, _VELOCITY, _TARGET = "position_", "velocity_", "target_"
+_USED = (TIME, "action_", _POSITION, _VELOCITY, _TARGET)
 _MAX_PERIODS = 1.5  # a longer time between two rows is a gap; in control periods
 _RATE_TOLERANCE = 0.1  # tolerated relative difference between the rows' period and the control period
 _MAX_SIZE = 200 * 2**20  # [bytes]
@@ -32,6 +32,9 @@ class Log:
     actions: Array  # shape (T, actions)
     positions: Array  # [rad or m], shape (T, joints)
     velocities: Array  # [rad/s or m/s], shape (T, joints)
+    targets: Array | None = None
+    """Last targets before the action [rad or m], where the task's actions are steps of them: shape (T, actions), or
+    (1, actions) if only the first ones are known."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +46,12 @@ class Expected:
     driven: tuple[str, ...]  # joints in the order of the action, where the task describes them
     actions: int
     control_dt: float  # [s]
+    steps_targets: bool = False  # whether actions are steps of targets that the task remembers
+
+    @property
+    def target_columns(self) -> list[str]:
+        """Names of the columns of the last targets; none for a task that remembers none."""
+        return [f"{_TARGET}{name}" for name in self.driven] if self.steps_targets else []
 
     @property
     def action_columns(self) -> list[str]:
@@ -56,8 +65,10 @@ def write_log(path: Path, log: Log, expected: Expected) -> None:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     measured = [f"{kind}{joint}" for kind in (_POSITION, _VELOCITY) for joint in log.joints]
-    writer.writerow([TIME, *expected.action_columns, *measured])
-    for step, row in enumerate(np.hstack([log.actions, log.positions, log.velocities])):
+    targets = np.empty((len(log.actions), 0)) if log.targets is None else log.targets
+    names = [] if log.targets is None else expected.target_columns
+    writer.writerow([TIME, *expected.action_columns, *measured, *names])
+    for step, row in enumerate(np.hstack([log.actions, log.positions, log.velocities, targets])):
         writer.writerow([f"{step * expected.control_dt:.6f}", *(f"{value:.8g}" for value in row)])
     files.write_text(path, text.getvalue())
 
@@ -80,7 +91,17 @@ def read_log(path: Path, expected: Expected) -> Log:
     )
     _check_units(path, joints, positions, expected)
     actions = np.column_stack([_take(path, columns, name) for name in expected.action_columns])
-    return Log(joints, actions, positions, velocities)
+    return Log(joints, actions, positions, velocities, _take_targets(path, columns, positions, expected))
+
+
+def _take_targets(path: Path, columns: Mapping[str, Array], positions: Array, expected: Expected) -> Array | None:
+    """Return the last targets; without such columns they begin where the robot is, and follow from the actions."""
+    names = expected.target_columns
+    if not names:
+        return None
+    if any(name.startswith(_TARGET) for name in columns):
+        return np.column_stack([_take(path, columns, name) for name in names])
+    return positions[:1, : len(names)]
 
 
 def _read_columns(path: Path) -> tuple[dict[str, Array], list[int]]:

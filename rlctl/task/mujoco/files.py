@@ -44,7 +44,8 @@ def read_model_file(
     Without it those of an MJCF file are left out, too, as far as nothing refers to them.
     """
     if path.suffix not in (".urdf", ".xml"):
-        raise TaskError(f"{path}: MuJoCo reads URDF and MJCF (.xml) files")
+        first = f"; first: xacro {path.name} > {path.name.split('.')[0]}.urdf" if path.suffix == ".xacro" else ""
+        raise TaskError(f"{path}: MuJoCo reads URDF and MJCF (.xml) files{first}")
     if path.suffix == ".xml":
         spec = _call_reader(path, lambda: import_mujoco().MjSpec.from_file(str(path)))
         described = _describe_mjcf(path, _prepare_mjcf(spec))

@@ -177,7 +177,7 @@ def test_udp_needs_no_package_for_websockets(monkeypatch, capsys):
     assert report.scores[0].outcome.success_rate == 1.0
     assert capsys.readouterr().err.splitlines()[0].startswith("only UDP: a WebSocket needs ")
     request = RobotRequest("CartPole-v1", port=0, episodes=1)
-    with pytest.raises(UsageError, match=r"^a WebSocket needs .*: pip install .*aiohttp.*; images and discrete"):
+    with pytest.raises(UsageError, match=r"^a WebSocket needs .*: pip install .rlctl.serve..; images and discrete"):
         run_robot(request, lambda addresses: None, changes=UNCHANGED, gates=NO_GATES)
 
 

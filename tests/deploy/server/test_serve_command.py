@@ -70,13 +70,14 @@ def test_errors(tmp_path, monkeypatch, settings, code, error):
     assert error in str(problem.value)
 
 
-def test_without_the_extra(rlctl, tmp_path):
+@pytest.mark.parametrize("options", [[], ["--self-test"]])
+def test_without_the_extra(rlctl, tmp_path, options):
     write_policy(tmp_path / "policy.safetensors")
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "aiohttp.py").write_text("raise ModuleNotFoundError(name='aiohttp')")
-    done = rlctl("serve", "policy.safetensors", path=tmp_path / "site")
+    done = rlctl("serve", "policy.safetensors", *options, path=tmp_path / "site")
     assert done.returncode == 2
-    assert "rlctl serve needs aiohttp: pip install 'aiohttp" in done.stderr
+    assert "rlctl serve needs aiohttp: pip install 'rlctl[serve]'\n" in done.stderr
 
 
 def test_starts_without_what_takes_long_to_import(tmp_path):
