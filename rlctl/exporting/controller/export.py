@@ -102,7 +102,8 @@ def _describe_controller(policy: PolicyFile) -> ControllerLayout:
 
 def _choose_spec(spec: EnvSpec, sim: str | None) -> EnvSpec:
     """Return the environment of the verification: without events, because noise acts on computed terms."""
-    return dataclasses.replace(spec, randomize=False, events={}, sim=spec.sim if sim is None else sim)
+    spec = spec.replace_missing_engine() if sim is None else dataclasses.replace(spec, sim=sim)
+    return dataclasses.replace(spec, randomize=False, events={})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
