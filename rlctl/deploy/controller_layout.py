@@ -258,15 +258,6 @@ class ControllerLayout:
         low, high = (np.array(ends or [0.0] * count) for ends in (joints.low, joints.high))
         return JointTarget(kind, factor, default, measured, name, clips, low, high, tracks=steps is not None)
 
-    def describe_inputs(self) -> list[str]:
-        """Return a line per input: its name, size and unit."""
-        lines = []
-        for part in self.quantities:
-            unit = f" [{part.unit}]" if part.unit else ", no unit declared"
-            lines.append(f"  {part.identifier}[{part.size}]{unit}")
-            lines[-1] += "" if part.name == part.identifier else f": {part.name}"
-        return lines
-
     def describe_internal(self) -> list[str]:
         """Return what the controller computes from the inputs, for people."""
         computed = [f"{part.name} ({_describe_term(part.term)})" for part in self.observed if part.term]

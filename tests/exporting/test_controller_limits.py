@@ -195,6 +195,7 @@ def test_default_ranges_of_orientations_and_commands(tmp_path):
     env = env.model_copy(update={"observation_sizes": {"command": 2, "goal": 3}})
     source, controller = build_controller(make_policy(env), tmp_path)
     header = source.write().header
+    assert " * Inputs older than 0.3 s (max_age_periods: 3) are a fault.\n" in header
     assert " *   command: -0.5 to 1, -0.7 to 0.7\n *   orientation: norm 0.9 to 1.1\n" in header
     safety = SafetyFilter(source.layout.inputs_info)
     for orientation, command, is_sound in [

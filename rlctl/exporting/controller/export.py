@@ -20,7 +20,6 @@ from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
 from rlctl.exporting.controller.example import ROWS, write_example
 from rlctl.exporting.controller.graph import build_graph
-from rlctl.exporting.controller.input_mapping import InputMaps, read_mapping
 from rlctl.exporting.controller.players import (
     CController,
     Controller,
@@ -28,6 +27,7 @@ from rlctl.exporting.controller.players import (
     OnnxController,
     compile_controller,
 )
+from rlctl.exporting.controller.program_mapping import NO_MAPPING, ProgramMapping, read_mapping
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.exporting.export import (
     ExportReport,
@@ -88,8 +88,8 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
         # Policies that were trained before their task declared its terms do not contain them.
         policy = torch_policy.file.with_info(env=built)
         layout = _describe_controller(policy)
-        maps = {} if request.mapping is None else read_mapping(request.mapping, layout)
-        export = _Export(torch_policy, policy, verify.TaskPlayer(layout, env, spec.task), limits, maps)
+        mapping = NO_MAPPING if request.mapping is None else read_mapping(request.mapping, layout)
+        export = _Export(torch_policy, policy, verify.TaskPlayer(layout, env, spec.task), limits, mapping)
         write = {"onnx": export.write_onnx, "c": export.write_c}
         return [write[form](target.with_suffix(f".{form}")) for form in request.formats]
     finally:
@@ -114,11 +114,11 @@ class _Export:
     policy: PolicyFile
     player: verify.TaskPlayer
     limits: Limits | None
-    maps: InputMaps
+    mapping: ProgramMapping
 
     def write_onnx(self, path: Path) -> ControllerReport:
         """Write and verify the ONNX file, which has no limits."""
-        model = build_graph(self.policy, self.maps)
+        model = build_graph(self.policy, self.mapping)
         content = encode(model)
         controller = OnnxController(content)
         target = _describe_controller(self.policy).find_target(None)
@@ -144,7 +144,7 @@ class _Export:
 
     def write_c(self, path: Path) -> ControllerReport:
         """Write and verify the C file and its header, with the limits."""
-        source = ControllerSource(self.policy, path.stem, self.limits, self.maps)
+        source = ControllerSource(self.policy, path.stem, self.limits, self.mapping)
         compiler, median, example = find_compiler(), None, None
         command = os.environ.get("CC") or "cc"
         fields: dict[str, Any] = {"not_verified": f"there is no C compiler {command!r}; set CC to one"}
@@ -171,7 +171,7 @@ class _Export:
 
     def _write_example(self, path: Path, controller: Controller, recorded: list[verify.Recorded]) -> Path:
         example = path.with_name(f"{path.name}.csv")
-        program = MappedController(controller, self.maps)  # whose values the file has
+        program = MappedController(controller, self.mapping)  # whose values the file has
         files.write_text(example, write_example(controller, [program.undo(inputs) for inputs in recorded[0].inputs]))
         return example
 
@@ -196,7 +196,7 @@ class _Export:
     ) -> tuple[dict[str, Any], list[verify.Recorded]]:
         """Return how a controller was verified, as fields of its report; raises `AnswerIsNo` if it acts differently."""
         recorded = self._record(is_limited)
-        result = verify.verify_controller(self.player, recorded, MappedController(controller, self.maps), target)
+        result = verify.verify_controller(self.player, recorded, MappedController(controller, self.mapping), target)
         agreement, loop = result.agreement, result.closed_loop
         if agreement.agrees and not loop.agrees:
             repeats, magnified = self._check_conclusive(is_limited)
@@ -215,8 +215,7 @@ class _Export:
         fields: dict[str, Any],
     ) -> ControllerReport:
         sizes = {part.name: part.size for part in _describe_controller(self.policy).quantities}
-        mapping = {name: one.describe() for name, one in self.maps.items()}
-        details = {**details, "input_sizes": sizes, "mapping": mapping}
+        details = {**details, "input_sizes": sizes, "mapping": self.mapping.describe()}
         details["target"] = "" if target is None else target.formula
         if median is not None:
             fields["latency"] = Latency(median, measure_sb3(self.torch_policy))

@@ -139,6 +139,12 @@ class LimitsSource:
         return write_number(np.float64(self.fitted.sensors.oldest), "double")
 
     @property
+    def age(self) -> str:
+        """Largest age of a measurement, for people; empty if any age will do."""
+        oldest, periods = self.fitted.sensors.oldest, self.limits.max_age_periods
+        return f"{oldest:.6g} s (max_age_periods: {periods:g})" if math.isfinite(oldest) else ""
+
+    @property
     def frozen(self) -> list[tuple[str, slice, int]]:
         """Name, place and largest number of equal steps of the quantities that must not freeze."""
         return self.fitted.sensors.frozen
