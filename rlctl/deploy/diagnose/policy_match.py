@@ -184,7 +184,8 @@ class Matcher:
         """Return corrections with fitted numbers: a factor of a term, an offset or a factor of one of its elements."""
         guesses = [*self._fit_actions(before, variant)]
         # With unknown observations there is no regression of the actions.
-        for name in [*self.signals.sizes, *([ACTIONS] if self._unknown else [])]:
+        terms = {one.term for one in self._candidates}
+        for name in [*(name for name in self.signals.sizes if name in terms), *([ACTIONS] if self._unknown else [])]:
             guesses += self._fit_term(name, before, variant)
         return guesses
 
