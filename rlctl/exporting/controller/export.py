@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from rlctl import output
 from rlctl.deploy.controller_layout import ControllerLayout, JointTarget
+from rlctl.deploy.filter.doubts import list_doubts
 from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
@@ -88,6 +90,7 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
         # Policies that were trained before their task declared its terms do not contain them.
         policy = torch_policy.file.with_info(env=built)
         layout = _describe_controller(policy)
+        output.print_notes([] if limits is None else list_doubts(limits, policy.info.env))
         mapping = NO_MAPPING if request.mapping is None else read_mapping(request.mapping, layout)
         export = _Export(torch_policy, policy, verify.TaskPlayer(layout, env, spec.task), limits, mapping)
         write = {"onnx": export.write_onnx, "c": export.write_c}
