@@ -42,6 +42,18 @@ def test_a_policy_of_pybullet_acts_in_mujoco_with_a_warning(rlctl_without):
     assert "4 episodes, seed 0, MuJoCo, not randomised" in done.stdout
 
 
+@pytest.mark.slow
+def test_its_controller_is_verified_in_mujoco(rlctl_without, tmp_path):
+    done = rlctl_without("export", "reach", "--pretrained", "--controller", "--onnx", "-o", "reach.onnx")
+    assert done.returncode == 0, done.stderr
+    assert "so MuJoCo simulates" in done.stderr
+    assert (tmp_path / "reach.onnx").exists()
+    assert (
+        rlctl_without("export", "reach", "--pretrained", "--policy", "reach.safetensors", "--episodes", "2").returncode
+        == 0
+    )
+
+
 def test_pybullet_that_was_asked_for_is_an_error_that_says_how_to_install_it(rlctl_without):
     done = rlctl_without("eval", "reach", "--pretrained", "--set", "sim=pybullet")
     assert done.returncode == 2

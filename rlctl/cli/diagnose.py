@@ -38,6 +38,7 @@ def diagnose(
         source.policy,
         source.spec,
         columns=request.columns,
+        limits=request.limits,
         seed=request.seed,
         others=source.others,
         report=lambda line: output.err().print(f"diagnose: {line}"),

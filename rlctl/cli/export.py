@@ -26,7 +26,9 @@ def export(
     ] = None,
     mapping: Annotated[
         Path | None,
-        Option("Mapping from the program's values to the controller's, as rlctl diagnose prints it.", metavar="FILE"),
+        Option(
+            "The program's units and order of inputs and targets (YAML), as rlctl diagnose prints them.", metavar="FILE"
+        ),
     ] = None,
     policy: Annotated[
         Path | None,

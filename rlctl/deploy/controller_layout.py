@@ -16,7 +16,7 @@ from rlctl.environments.info import AnyTerm, EnvInfo, space_to_json
 from rlctl.errors import RecipeError, UsageError
 from rlctl.policy.c_policy import observation_type
 from rlctl.task.joints import Command
-from rlctl.task.terms import Internal, Scaled
+from rlctl.task.terms import Gravity, Internal, Scaled
 
 _UNITS = {"position": "rad or m", "step": "rad or m", "speed": "rad/s or m/s", "torque": "N m or N"}
 Clips = Literal["", "exact", "towards"]
@@ -171,11 +171,13 @@ class ControllerLayout:
                 size = part.size if term is None else env.quantity_sizes[name]
                 if sizes.setdefault(name, size) != size:
                     raise UsageError(f"--controller: two quantities are named {name!r}, of different sizes")
+        quaternions = {part.term.orientation for part in self.observed if isinstance(part.term, Gravity)}
         quantities: list[Quantity] = []
         for name, size in sizes.items():
             identifier = _make_identifier(name, {quantity.identifier for quantity in quantities})
             start = sum(quantity.size for quantity in quantities)
-            quantities.append(Quantity(name, size, start, env.observation_units.get(name, ""), identifier))
+            unit = env.observation_units.get(name) or ("quaternion x, y, z, w" if name in quaternions else "")
+            quantities.append(Quantity(name, size, start, unit, identifier))
         return quantities
 
     @property
@@ -197,9 +199,10 @@ class ControllerLayout:
         """The environment as limits see it: its observation are the quantities."""
         box = spaces.Box(-np.inf, np.inf, (self.input_size,), self.dtype.type)
         sizes = {quantity.name: quantity.size for quantity in self.quantities}
+        units = {quantity.name: quantity.unit for quantity in self.quantities}
         no_terms: dict[str, Any] = {"observation_history": {}, "observation_terms": {}, "quantity_sizes": {}}
-        changes = {"observation_space": space_to_json(box), "observation_sizes": sizes, **no_terms}
-        return self.env.model_copy(update=changes)
+        changes = {"observation_space": space_to_json(box), "observation_sizes": sizes, "observation_units": units}
+        return self.env.model_copy(update=changes | no_terms)
 
     def measure(self, observation: Any, terms: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
         """Return the quantities behind an observation, in the order of the inputs.
@@ -254,15 +257,6 @@ class ControllerLayout:
         )
         low, high = (np.array(ends or [0.0] * count) for ends in (joints.low, joints.high))
         return JointTarget(kind, factor, default, measured, name, clips, low, high, tracks=steps is not None)
-
-    def describe_inputs(self) -> list[str]:
-        """Return a line per input: its name, size and unit."""
-        lines = []
-        for part in self.quantities:
-            unit = f" [{part.unit}]" if part.unit else ", no unit declared"
-            lines.append(f"  {part.identifier}[{part.size}]{unit}")
-            lines[-1] += "" if part.name == part.identifier else f": {part.name}"
-        return lines
 
     def describe_internal(self) -> list[str]:
         """Return what the controller computes from the inputs, for people."""

@@ -17,6 +17,7 @@ from rlctl.environments.dict_spaces import LARGEST_SPACE, format_space
 from rlctl.environments.driven_joints import describe_driven_joints, joint_name
 from rlctl.errors import ArtifactError, OldGymError, TaskError, UsageError, short_repr
 from rlctl.storage import validation
+from rlctl.task.commands import CommandTerm
 from rlctl.task.history import Start
 from rlctl.task.joints import Joints
 from rlctl.task.terms import Displacement, Distance, Gravity, LastAction, PhaseClock, Scaled, find_quantity_sizes
@@ -45,6 +46,7 @@ class EnvInfo(pydantic.BaseModel):
     observation_terms: dict[str, AnyTerm] = {}  # observations that are computed from measured quantities
     quantity_sizes: dict[str, int] = {}
     """Size per measured quantity of the terms, in the order of the terms and of their inputs."""
+    command_ranges: dict[str, tuple[float, float]] = {}  # lowest and highest value of what a person may command
     action_meaning: str = ""
     control_dt: float | None = None  # time between two actions [s]
     reward_weights: dict[str, float] = {}
@@ -118,6 +120,7 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
             "history_start": task.history_start,
             "observation_terms": terms,
             "quantity_sizes": find_quantity_sizes(terms, inner.measured),
+            "command_ranges": _find_command_ranges(task.commands()),
             "action_meaning": task.action_meaning,
             "control_dt": task.control_dt,
             "reward_weights": inner.reward_weights,
@@ -130,6 +133,11 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
         return validation.build(EnvInfo, values, TaskError, type(task).__name__)
     values = {**common, **describe_model(env), "max_steps": find_time_limit(env)}
     return validation.build(EnvInfo, values, TaskError, type(inner).__name__)
+
+
+def _find_command_ranges(commands: Mapping[str, CommandTerm]) -> dict[str, tuple[float, float]]:
+    ranges = {name: (float(term.low), float(term.high)) for name, term in commands.items()}
+    return {name: ends for name, ends in ranges.items() if math.isfinite(sum(ends)) and ends[0] < ends[1]}
 
 
 def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.MjData] | None:

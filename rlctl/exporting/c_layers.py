@@ -59,7 +59,7 @@ class CWriter:
         if isinstance(layer, Normalize):
             # In float64, as `Normalize` computes it.
             deviation = self.constant("deviation", np.sqrt(layer.variance + layer.epsilon), "double")
-            value = f"({value} - {self.constant('mean', layer.mean, 'double')}) / {deviation}"
+            value = f"((double){value} - {self.constant('mean', layer.mean, 'double')}) / {deviation}"
             if np.isfinite(layer.clip):
                 value = f"bound({value}, {write_number(-layer.clip, 'double')}, {write_number(layer.clip, 'double')})"
             value = f"(float)({value})"

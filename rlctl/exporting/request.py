@@ -26,7 +26,7 @@ class ExportRequest:
     controller: bool = False  # write the controller: from what a robot measures to joint targets within limits
     limits: Path | None = None  # of the controller
     sim: str | None = None  # engine of the episodes that are compared; default: that of the training
-    mapping: Path | None = None  # of the controller's inputs, as `rlctl diagnose` prints it
+    mapping: Path | None = None  # between a program's values and the controller's
 
     def __post_init__(self) -> None:
         if self.limits is not None and not self.controller:

@@ -94,6 +94,7 @@ def test_a_task_is_described_with_its_names():
     assert info.observation_units["joint_positions"] == "rad"
     assert info.spaces() == (env.observation_space, env.action_space)
     assert info.control_dt == task.control_dt
+    assert info.command_ranges["goal_z"] == (task.goal_low[2], task.goal_high[2])
     assert info.max_steps == task.max_steps
     assert info.has_success
     assert list(info.reward_weights) == list(task.reward_weights)

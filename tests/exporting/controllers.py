@@ -45,5 +45,6 @@ def make_arm(low=-10.0, high=10.0, dtype=np.float32, **fields):
 def build_controller(policy, folder, limits=None, name="controller"):
     """Write a controller and compile it; warnings are errors. Return its source and what acts."""
     source = ControllerSource(policy, name, limits)
-    library = compile_controller(source.write(), folder, [*find_compiler(), "-Werror"])
+    strict = [*find_compiler(), "-Werror", "-Wdouble-promotion"]
+    library = compile_controller(source.write(), folder, strict)
     return source, CController(source.layout, library, has_target=source.target is not None)

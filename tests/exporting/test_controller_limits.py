@@ -11,6 +11,7 @@ from rlctl.deploy import Limits, SafetyFilter
 from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.players import STATUS
 from rlctl.exporting.controller.source import ControllerSource
+from rlctl.task import terms
 from tests.exporting.controllers import build_controller, make_arm, make_policy
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler (cc, or $CC) on this machine")
@@ -183,3 +184,32 @@ def test_a_million_steps(case, tmp_path):
     arm, options = (CASES | MORE_CASES)[case]
     seen = compare(arm, options, STEPS // len(CASES | MORE_CASES) + 1, 2, tmp_path)
     assert sum(seen[state] for state in STATUS) == STEPS // len(CASES | MORE_CASES) + 1
+
+
+def test_default_ranges_of_orientations_and_commands(tmp_path):
+    env = make_arm(
+        observation_terms={"goal": terms.Gravity("orientation")},
+        quantity_sizes={"orientation": 4},
+        command_ranges={"lin_vel_x": (-0.5, 1.0), "ang_vel_z": (-0.7, 0.7)},
+    )
+    env = env.model_copy(update={"observation_sizes": {"command": 2, "goal": 3}})
+    source, controller = build_controller(make_policy(env), tmp_path)
+    header = source.write().header
+    assert " * Inputs older than 0.3 s (max_age_periods: 3) are a fault.\n" in header
+    assert " *   command: -0.5 to 1, -0.7 to 0.7\n *   orientation: norm 0.9 to 1.1\n" in header
+    safety = SafetyFilter(source.layout.inputs_info)
+    for orientation, command, is_sound in [
+        ([0, 0, 0, 1], [1.0, -0.7], True),  # -0.7 is lower in float32
+        ([0, 0, 0, 0], [0, 0], False),  # a sensor that has not started
+        ([0, 0, 0.7, 0.7], [0, 0], True),  # norm 0.99
+        ([0, 0, 0, 1.11], [0, 0], False),
+        ([50, 50, 50, 50], [0, 0], False),
+        ([0, 0, 0, -1], [1e6, 0], False),
+        ([0, 0, 0, -1], [0, 0.71], False),
+    ]:
+        inputs = {"command": np.array(command), "orientation": np.array(orientation)}
+        controller.step(inputs)
+        assert controller.status == (("running", "") if is_sound else ("holding", "out of range"))
+        assert safety.observe(np.concatenate([*inputs.values()]).astype(np.float32)) == is_sound
+    assert safety.events[0].name == "orientation out of range"
+    assert (safety.events[0].value, safety.events[0].limit) == (0.0, 0.9)

@@ -9,6 +9,7 @@ import numpy as np
 
 from rlctl.deploy.diagnose.correction import EVERYTHING, Correction
 from rlctl.deploy.diagnose.signals import ACTIONS, MAX_DELAY, Array
+from rlctl.deploy.filter.observation import find_command_ranges
 from rlctl.environments.info import EnvInfo
 from rlctl.policy.layers import Normalize
 
@@ -43,7 +44,11 @@ def list_candidates(
 ) -> list[Correction]:
     """Return all single mistakes of the observations and of the actions; `normalize` is the policy's."""
     found = [] if normalize is None else [make_normalised(normalize)]
+    slices = {name: slice(0, len(values.mean)) for name, values in statistics.items()}
+    commands = {"command", *find_command_ranges(info, slices)}  # the program sets them itself
     for name, values in statistics.items():
+        if name in commands:
+            continue
         found += _list_of_term(name, values, info, statistics)
     return found
 

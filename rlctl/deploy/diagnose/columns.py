@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.deploy.diagnose.signals import ACTIONS
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError, check_name
@@ -53,6 +54,7 @@ class ColumnAssignment:
     time: str | None
     episode: str | None
     notes: tuple[str, ...]  # what was assigned other than by its exact name
+    is_of_controller: bool = False  # whether the observations are the inputs of a controller
 
     @property
     def used(self) -> set[str]:
@@ -72,11 +74,15 @@ def assign_columns(path: Path, names: Sequence[str], info: EnvInfo, size: int, g
     for name in column_map.observations:
         check_name(name, terms, f"{given}: the policy has no observation", ArtifactError)
     finder = _Finder(path, names, info)
+    inputs = {} if column_map.observations else _find_inputs(finder, info, size)
     found: dict[str, tuple[str, ...]] = {}
     flat = finder.find_indexed(("observation", "observations", "obs"), size) if not column_map.observations else None
     if flat is not None:
         ends = iter(flat)
         found = {name: tuple(next(ends) for _ in range(count)) for name, count in terms.items()}
+    if inputs and flat is None:
+        found, terms = inputs, {}
+        finder.notes.append(f"{path}: its columns are what an exported controller takes: {', '.join(inputs)}")
     for name, count in {**terms, ACTIONS: actions}.items():
         explicit = column_map.actions if name == ACTIONS else column_map.observations.get(name, [])
         if explicit:
@@ -90,7 +96,17 @@ def assign_columns(path: Path, names: Sequence[str], info: EnvInfo, size: int, g
         if column is not None:
             check_name(column, names, f"{given}: {path} has no column", ArtifactError)
     chosen = found.pop(ACTIONS)
-    return ColumnAssignment(found, chosen, time, episode, tuple(finder.notes))
+    return ColumnAssignment(found, chosen, time, episode, tuple(finder.notes), bool(inputs) and flat is None)
+
+
+def _find_inputs(finder: "_Finder", info: EnvInfo, size: int) -> dict[str, tuple[str, ...]]:
+    """Return the columns of a controller's inputs; empty unless all are there and a computed term is not."""
+    sizes = info.observation_sizes
+    computed = [name for name, term in info.observation_terms.items() if name not in term.inputs and name in sizes]
+    if sum(sizes.values()) != size or all(finder.find_exact(name, sizes[name]) for name in computed):
+        return {}
+    columns = {part.name: finder.find_exact(part.name, part.size) for part in ControllerLayout(info).quantities}
+    return {name: some for name, some in columns.items() if some} if all(columns.values()) else {}
 
 
 def _count_actions(info: EnvInfo) -> int:
@@ -166,6 +182,10 @@ class _Finder:
             if all(f"{text}_{suffix}" in self._by_text for suffix in some):
                 return tuple(self._by_text[f"{text}_{suffix}"] for suffix in some)
         return None
+
+    def find_exact(self, term: str, count: int) -> tuple[str, ...] | None:
+        """Return the columns with exactly the name of a term; None if they are not there."""
+        return self._find_by_text(_simplify(term), count)
 
     def _find_closest(self, term: str, count: int) -> tuple[str, ...]:
         groups = {re.sub(r"_\d+$", "", text) for text in self._by_text}

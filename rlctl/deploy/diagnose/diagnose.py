@@ -12,13 +12,15 @@ from rlctl.deploy.diagnose.candidates import list_candidates, make_normalised
 from rlctl.deploy.diagnose.correction import Correction, correct
 from rlctl.deploy.diagnose.evidence import Likelihood, Scorer
 from rlctl.deploy.diagnose.frozen import Frozen, find_frozen
+from rlctl.deploy.diagnose.limited import find_limited_rows
 from rlctl.deploy.diagnose.log import RobotLog, read_robot_log
 from rlctl.deploy.diagnose.mapping import CorrectedMapping, build_mapping
-from rlctl.deploy.diagnose.policy_match import SAME, Matcher, PolicyMatch
+from rlctl.deploy.diagnose.policy_match import SAME, Matcher, PolicyMatch, describe_in_log
 from rlctl.deploy.diagnose.reference import record_mistakes, record_reference
 from rlctl.deploy.diagnose.rows import ChosenRows, choose_rows
 from rlctl.deploy.diagnose.search import Found, Search
-from rlctl.deploy.diagnose.signals import ACTIONS, LoggedSignals
+from rlctl.deploy.diagnose.signals import ACTIONS, Array, LoggedSignals
+from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError
 from rlctl.policy.file import PolicyFile
@@ -104,14 +106,22 @@ class Doctor:
         self.candidates = list_candidates(policy.info.env, statistics, self.actor.normalize)
         self.likelihood.learn_chances(self.candidates)
 
-    def diagnose(self, signals: LoggedSignals) -> tuple[list[MappingFinding], Answers, CorrectedMapping]:
-        """Return the mistakes, the one with the most evidence first, the answers in numbers and the mapping."""
+    def diagnose(
+        self, signals: LoggedSignals, limits: Limits | None = None
+    ) -> tuple[list[MappingFinding], Answers, CorrectedMapping]:
+        """Return the mistakes, the one with the most evidence first, the answers in numbers and the mapping.
+
+        Actions that `limits` have changed are not compared with those of the policy.
+        """
         if not len(signals.inner_rows(self.likelihood.margin)):
             longest, needed = max(signals.lengths), 2 * self.likelihood.margin + 1
             raise ArtifactError(f"the longest part without gaps has {longest} rows; diagnose needs {needed}")
         reference = self.likelihood.reference
         frozen = find_frozen(signals, (reference.sound, reference.varied))
-        match = self._match(signals, frozen)
+        limited = (
+            None if limits is None else find_limited_rows(limits, self.policy.info.env, signals, self.likelihood.margin)
+        )
+        match = self._match(signals, frozen, limited)
         findings = [*self._describe_frozen(frozen, signals), *self._describe_match(match, signals, bool(frozen))]
         corrected = correct(signals, match.corrections)
         stuck = [(one.term, element) for one in frozen for element in one.elements]
@@ -152,16 +162,17 @@ class Doctor:
         recordings = record_mistakes(self.spec, self.actor, mistakes, _GUESS_STEPS * len(mistakes), self._seed)
         return Search(self.likelihood.learn_more(recordings), signals, self.candidates, stuck).find(most) or found
 
-    def _match(self, signals: LoggedSignals, frozen: Sequence[Frozen]) -> PolicyMatch:
+    def _match(self, signals: LoggedSignals, frozen: Sequence[Frozen], limited: Array | None) -> PolicyMatch:
         std = self.likelihood.reference.statistics[ACTIONS].std
         if self.actor.in_rows:
-            match = Matcher(self.actor, signals, std, self.candidates).match(pairs=not frozen)
+            match = Matcher(self.actor, signals, std, self.candidates, None, limited).match(pairs=not frozen)
             if frozen and not match.is_explained:  # the policy may have received what the log does not hold
                 unknown = self._list_unknown(frozen, signals)
                 if len(unknown) < len(std):
-                    match = Matcher(self.actor, signals, std, self.candidates, unknown).match(pairs=False)
+                    match = Matcher(self.actor, signals, std, self.candidates, unknown, limited).match(pairs=False)
             return self._decide_normalisation(match, signals)
         difference = np.minimum(np.abs(signals.actions - self.actor.act_all(signals)) / std, 1.0)
+        difference = difference if limited is None else difference[~limited]
         return PolicyMatch(float(difference.mean()), float(difference.mean()))
 
     def _list_unknown(self, frozen: Sequence[Frozen], signals: LoggedSignals) -> dict[int, float]:
@@ -209,7 +220,7 @@ class Doctor:
                 return []
             text = self._find_other_policy(signals) or (
                 "actions: the policy does not produce the logged actions from the logged observations, and no "
-                "correction explains it: they may be of another policy file, sampled, or filtered"
+                "correction explains it: they may be of another policy file, sampled, or limited (--limits FILE)"
             )
             return [MappingFinding(1, "policy", "policy", text, _CERTAIN, 1.0 if "of the policy" in text else 0.0)]
         found = []
@@ -246,21 +257,13 @@ class Doctor:
         return Answers(match.difference, match.corrected, terms, step)
 
 
-def describe_in_log(one: Correction) -> str:
-    """Return what a correction with which the policy produces the logged actions says."""
-    if one.term == ACTIONS and one.kind == "delay":
-        return f"{ACTIONS}: the log holds each action {one.delay} control step{'s' if one.delay > 1 else ''} late"
-    if one.term == ACTIONS and one.kind == "scale" and "acts" in one.text:
-        return f"{ACTIONS}: in the log they are {1 / min(one.factor, key=lambda x: x):.3g} times as large"
-    return f"{one.describe()} (in the log, not in what the policy received)"
-
-
 def diagnose_log(
     path: Path,
     policy: PolicyFile,
     spec: EnvSpec,
     *,
     columns: Path | None = None,
+    limits: Path | None = None,
     seed: int = 0,
     others: Sequence[PolicyFile] = (),
     report: Callable[[str], None] = lambda _: None,
@@ -272,12 +275,13 @@ def diagnose_log(
     """
     from threadpoolctl import threadpool_limits
 
+    bounds = None if limits is None else read_limits(limits)
     log: RobotLog = read_robot_log(path, policy.info.env, columns)
     report(f"{len(log.signals.actions):,} rows; rollouts in simulation")
     with threadpool_limits(1, "blas"):  # with other programs on the same cores, threads wait for each other
         doctor = Doctor(policy, spec, seed, others)
         report("comparing the log with the policy and the simulation")
-        findings, answers, mapping = doctor.diagnose(log.signals)
+        findings, answers, mapping = doctor.diagnose(log.signals, bounds)
     rows = len(log.signals.actions)
     return Diagnosis(
         log=path,

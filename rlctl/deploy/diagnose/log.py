@@ -1,10 +1,13 @@
 """From the columns of a log to segments of signals: time, rate, gaps and episodes are checked."""
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from rlctl.deploy.controller_layout import ControllerLayout
+from rlctl.deploy.controller_observation import ControllerObservation
 from rlctl.deploy.diagnose.columns import ColumnAssignment, assign_columns
 from rlctl.deploy.diagnose.recording import read_recording
 from rlctl.deploy.diagnose.signals import Array, LoggedSignals
@@ -49,8 +52,11 @@ def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> Ro
     names = [name for columns_of in assigned.observations.values() for name in columns_of]
     observations = np.column_stack([table.columns[name] for name in names])
     actions = np.column_stack([table.columns[name] for name in assigned.actions])
-    keep = np.repeat(np.array(lengths) >= _LEAST_SEGMENT, lengths)
     sizes = {name: len(some) for name, some in assigned.observations.items()}
+    if assigned.is_of_controller:
+        observations = _compute_observations(info, sizes, observations, actions, lengths)
+        sizes = dict(info.observation_sizes)
+    keep = np.repeat(np.array(lengths) >= _LEAST_SEGMENT, lengths)
     kept_lengths = tuple(length for length in lengths if length >= _LEAST_SEGMENT)
     signals = LoggedSignals(observations[keep], actions[keep], kept_lengths, sizes)
     if sum(kept_lengths) < _LEAST_ROWS:
@@ -60,6 +66,23 @@ def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> Ro
         )
     all_notes = [*([table.note] if table.note else []), *assigned.notes, *notes]
     return RobotLog(signals, table, tuple(all_notes), np.flatnonzero(keep))
+
+
+def _compute_observations(
+    info: EnvInfo, sizes: Mapping[str, int], inputs: Array, actions: Array, lengths: Sequence[int]
+) -> Array:
+    """Return what the policy observes for the inputs of a controller, a row per step."""
+    observation, ends = ControllerObservation(ControllerLayout(info)), np.cumsum(list(sizes.values()))[:-1]
+    rows = []
+    for start, length in zip(np.cumsum([0, *lengths[:-1]]).tolist(), lengths, strict=True):
+        observation.begin()
+        for step in range(length):
+            row = start + step
+            last_action = actions[row - 1] if step else np.zeros_like(actions[row])
+            measured = dict(zip(sizes, np.split(inputs[row], ends), strict=True))
+            parts = observation.observe(measured, step, last_action)
+            rows.append(np.concatenate([np.ravel(parts[name]) for name in info.observation_sizes]))
+    return np.array(rows)
 
 
 def _split(table: LogTable, assigned: ColumnAssignment, control_dt: float | None) -> tuple[list[int], list[str]]:

@@ -70,16 +70,19 @@ class Matcher:
         std: Array,
         candidates: Sequence[Correction],
         unknown: Mapping[int, float] | None = None,
+        limited: Array | None = None,
     ) -> None:
         """`unknown`: usual values of elements that the log does not hold, such as of a frozen sensor, by their column.
 
-        For each row the values are used with which the policy comes nearest to the logged action.
+        For each row the values are used with which the policy comes nearest to the logged action. Rows are left out
+        where `limited`, shape (T,), is true.
         """
         self._actor, self._std = actor, np.maximum(std, 1e-6)
         self._unknown = dict(unknown or {})
         self.signals = signals
         self._candidates = candidates
         rows = signals.inner_rows(MAX_DELAY + 1)
+        rows = rows if limited is None else rows[~limited[rows]]
         self._rows = rows if len(rows) <= _ROWS else rows[np.linspace(0, len(rows) - 1, _ROWS).astype(int)]
         # Only the windows around these rows are corrected.
         around = np.arange(-MAX_DELAY, MAX_DELAY + 1)
@@ -181,7 +184,8 @@ class Matcher:
         """Return corrections with fitted numbers: a factor of a term, an offset or a factor of one of its elements."""
         guesses = [*self._fit_actions(before, variant)]
         # With unknown observations there is no regression of the actions.
-        for name in [*self.signals.sizes, *([ACTIONS] if self._unknown else [])]:
+        terms = {one.term for one in self._candidates}
+        for name in [*(name for name in self.signals.sizes if name in terms), *([ACTIONS] if self._unknown else [])]:
             guesses += self._fit_term(name, before, variant)
         return guesses
 
@@ -241,6 +245,15 @@ class Matcher:
             options={"maxiter": 25, "xatol": 1e-4},
         )
         return [guess(float(np.exp(found.x)))]
+
+
+def describe_in_log(one: Correction) -> str:
+    """Return what a correction with which the policy produces the logged actions says."""
+    if one.term == ACTIONS and one.kind == "delay":
+        return f"{ACTIONS}: the log holds each action {one.delay} control step{'s' if one.delay > 1 else ''} late"
+    if one.term == ACTIONS and one.kind == "scale" and "acts" in one.text:
+        return f"{ACTIONS}: in the log they are {1 / min(one.factor, key=lambda x: x):.3g} times as large"
+    return f"{one.describe()} (in the log, not in what the policy received)"
 
 
 def make_log_scale(size: int, elements: Sequence[int], factor: float) -> Correction:

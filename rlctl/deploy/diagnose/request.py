@@ -27,4 +27,7 @@ class DiagnoseRequest:
         Path | None,
         Option("Columns of each observation and of the actions (YAML); default: by their names.", metavar="FILE"),
     ] = None
+    limits: Annotated[Path | None, Option("Limits with which the program has run (limits.yaml).", metavar="FILE")] = (
+        None
+    )
     seed: Annotated[int, Option("Seed of the rollouts in simulation.", min=0)] = 0

@@ -63,6 +63,7 @@ class Search:
         self._likelihood = likelihood
         allowed = likelihood.reference.allowed_delay
         self._candidates = [one for one in candidates if one.term != ACTIONS or one.kind in ("order", "sign", "scale")]
+        self._terms = {one.term for one in candidates}  # the others are not corrected
         self._late = [make_delay(steps) for steps in range(allowed + 1, allowed + MAX_DELAY + 1)]
         self._allowed: list[list[Correction]] = [[], *([make_delay(steps)] for steps in range(1, allowed + 1))]
 
@@ -152,6 +153,8 @@ class Search:
     def _fit_offsets(self) -> list[tuple[float, Correction]]:
         fitted = []
         for name, size in self._likelihood.windows.sizes.items():
+            if name not in self._terms:
+                continue
             std = self._likelihood.windows.statistics[name].std
             offset = self._search.fit_offset(name)
             large = np.flatnonzero(np.abs(offset) > _LEAST_OFFSET * std).tolist()

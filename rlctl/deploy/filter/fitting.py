@@ -90,7 +90,7 @@ def _fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     _check_measured(limits, bounds, measured, layout)
     safe = _make_safe_command(limits, bounds, count)
     positions = measured or _find_measured(find_positions(info, layout), layout, info, count)
-    sensors = SensorChecks(limits, layout, control_dt, positions, info.joints)
+    sensors = SensorChecks(limits, layout, control_dt, info, positions)
     return FittedLimits(limits, layout, space, control_dt, steps, bounds, measured, sensors, home, safe)
 
 

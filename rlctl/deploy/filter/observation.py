@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ from rlctl.deploy.filter.limits import Limits
 from rlctl.environments.dict_spaces import SINGLE, split, split_space
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RecipeError, check_name, did_you_mean, short_repr
-from rlctl.task.joints import Joints
 
 Array = NDArray[Any]
 
@@ -154,6 +154,34 @@ class MeasuredPositions:
         return shifted if self.scale is None else shifted * self.scale
 
 
+UNIT_SQUARES = 0.81, 1.21  # of the norm of a quaternion: from 0.9 to 1.1
+_ROUNDING = 1e-6
+_SIZE = 4  # of a quaternion
+
+
+def find_quaternions(info: EnvInfo, slices: Mapping[str, slice]) -> list[str]:
+    """Return the observations that are orientations as quaternions, by their units."""
+    sizes = {name: part.stop - part.start for name, part in slices.items() if name not in info.observation_terms}
+    units = info.observation_units
+    return [name for name, size in sizes.items() if size == _SIZE and "quaternion" in units.get(name, "").lower()]
+
+
+def find_command_ranges(info: EnvInfo, slices: Mapping[str, slice]) -> dict[str, list[tuple[float, float]]]:
+    """Return the range of each element of the observations that hold what a person may command.
+
+    They are those called `command`, with all commands, and those after which their elements are called: `goal` for
+    `goal_x`, `goal_y` and `goal_z`.
+    """
+    found = {}
+    for name in slices.keys() - info.observation_terms.keys():
+        commands = [
+            ends for key, ends in info.command_ranges.items() if name == "command" or key.startswith(f"{name}_")
+        ]
+        if commands and len(commands) == slices[name].stop - slices[name].start:
+            found[name] = commands
+    return found
+
+
 Fault = tuple[str, float, float]  # kind and name of the observation, value and limit
 
 
@@ -165,8 +193,8 @@ class SensorChecks:
         limits: Limits,
         layout: ObservationLayout,
         control_dt: float | None,
+        info: EnvInfo,
         measured: MeasuredPositions | None = None,
-        joints: Joints | None = None,
     ) -> None:
         for name in limits.sensors:
             check_name(name, layout.slices, "limits: sensors: no observation", RecipeError, listed="Known")
@@ -174,25 +202,42 @@ class SensorChecks:
         self.oldest = math.inf if control_dt is None else limits.max_age_periods * control_dt
         self.low, self.high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
         self.frozen: list[tuple[str, slice, int]] = []
+        self._defaults: dict[str, str] = {}  # ranges by the name of the observation, for people
+        for name, ranges in find_command_ranges(info, layout.slices).items():
+            low, high = np.array(ranges).T
+            slack = _ROUNDING * (high - low)  # float32 rounds the ends, too
+            self.low[layout.slices[name]], self.high[layout.slices[name]] = low - slack, high + slack
+            self._defaults[name] = ", ".join(f"{least:g} to {most:g}" for least, most in ranges)
+        joints = info.joints
         if measured is not None and joints is not None and joints.low and joints.high:
             # One range more to each side: no joint gets there, but one that is measured in degrees does.
             low, high = np.array(joints.low), np.array(joints.high)
             width = np.where(low < high, high - low, np.inf)  # model files write a missing limit as 0
             ends = np.array([measured.write(low - width), measured.write(high + width)])
             self.low[measured.part], self.high[measured.part] = ends.min(axis=0), ends.max(axis=0)
+            positions = self._name(measured.part.start).partition("[")[0]
+            self._defaults[positions] = "the joints' range and as much again to each side, so that degrees are a fault"
         for name, sensor in limits.sensors.items():
             part = layout.slices[name]
             if sensor.range is not None:
                 self.low[part], self.high[part] = sensor.range
+                self._defaults.pop(name, None)
             if sensor.frozen_s is not None:
                 if control_dt is None:
                     raise RecipeError(
                         f"limits: sensors.{name}.frozen_s: this policy has no control_dt; write control_dt: SECONDS"
                     )
                 self.frozen.append((name, part, max(2, round(min(sensor.frozen_s / control_dt, 1e9)))))
+        quaternions = find_quaternions(info, layout.slices)
+        self.quaternions = [layout.slices[name] for name in quaternions]
+        self._norms = dict.fromkeys(quaternions, "norm 0.9 to 1.1")
         self._all_finite = b"\x01" * layout.size
         self.has_range = bool(np.isfinite(self.low).any())
         self.reset()
+
+    def describe_defaults(self) -> list[str]:
+        """Return a line for each range that no limits file has given."""
+        return [f"{name}: {text}" for some in (self._defaults, self._norms) for name, text in some.items()]
 
     def reset(self) -> None:
         """Begin an episode."""
@@ -209,6 +254,8 @@ class SensorChecks:
         elif self.has_range and (outside := self._find_outside(values)) is not None:
             value, low, high = (float(array[outside]) for array in (values, self.low, self.high))
             fault = (f"{self._name(outside)} out of range", value, low if value < low else high)
+        elif self.quaternions and (odd := self._find_no_unit(values)) is not None:
+            fault = odd
         elif not abs(age_s) <= self.oldest:  # from the future: the clocks differ, so its age is unknown
             fault = ("observation too old", age_s, self.oldest)
         if self.frozen:
@@ -220,6 +267,15 @@ class SensorChecks:
             return None
         outside = (values < self.low) | (values > self.high)
         return int(outside.argmax()) if outside.any() else None  # zeros may differ by their sign
+
+    def _find_no_unit(self, values: Array) -> Fault | None:
+        for part in self.quaternions:
+            x, y, z, w = values[part].tolist()
+            if not UNIT_SQUARES[0] <= (square := x * x + y * y + z * z + w * w) <= UNIT_SQUARES[1]:
+                end = UNIT_SQUARES[square > 1.0]
+                name = self._name(part.start).partition("[")[0]
+                return f"{name} out of range", math.sqrt(square), math.sqrt(end)
+        return None
 
     def _check_frozen(self, values: Array) -> Fault | None:
         fault: Fault | None = None

@@ -10,11 +10,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.deploy.controller_layout import ControllerLayout
+from rlctl.deploy.controller_observation import ControllerObservation
 from rlctl.deploy.filter.observation import ObservationLayout
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import short_repr
 from rlctl.policy.players.named import ZeroPlayer
-from rlctl.task.history import TermHistory
 
 Array = NDArray[Any]
 Parts = Mapping[str, Array]
@@ -108,7 +108,7 @@ class ControllerInterface(Interface):
         self.units = {part.name: part.unit for part in self._controller.quantities if part.unit}
         if self._target is not None:
             self.answer = f"joint {self._target.interface} [{self._target.unit}]"
-        self._history = TermHistory(info.observation_history, info.history_start)
+        self._observation = ControllerObservation(self._controller)
         self._last_action = np.zeros(math.prod(self._space.shape or ()))
 
     def measure(self, observation: Any) -> dict[str, Array]:
@@ -132,23 +132,13 @@ class ControllerInterface(Interface):
 
     def begin(self) -> None:
         """Empty the histories."""
-        self._history.begin()
+        self._observation.begin()
         self._last_action = np.zeros_like(self._last_action)
 
     def observe(self, sent: Parts, step: int) -> Any:
         """Return the observation as a controller computes it; the last action is the policy's own."""
-        newest = {}
-        for part in self._controller.observed:
-            if part.term is None:
-                newest[part.name] = sent[part.name]
-            elif part.term.internal == "last_action":
-                newest[part.name] = self._last_action
-            elif part.term.internal == "time":
-                newest[part.name] = part.term(np.array([step * (self._info.control_dt or 0.0)]))
-            else:
-                newest[part.name] = part.term(tuple(sent[name] for name in part.term.inputs))
-        parts = self._history.add(newest)
-        return self._layout.read({name: np.asarray(parts[name]) for name in self._layout.shapes})
+        parts = self._observation.observe(sent, step, self._last_action)
+        return self._layout.read({name: parts[name] for name in self._layout.shapes})
 
     def find_command(self, action: Array, sent: Parts) -> Array:
         """Return the joints' targets for an action."""

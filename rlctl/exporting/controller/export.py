@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from rlctl import output
 from rlctl.deploy.controller_layout import ControllerLayout, JointTarget
+from rlctl.deploy.filter.doubts import list_doubts
 from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
@@ -20,7 +22,6 @@ from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
 from rlctl.exporting.controller.example import ROWS, write_example
 from rlctl.exporting.controller.graph import build_graph
-from rlctl.exporting.controller.input_mapping import InputMaps, read_mapping
 from rlctl.exporting.controller.players import (
     CController,
     Controller,
@@ -28,6 +29,7 @@ from rlctl.exporting.controller.players import (
     OnnxController,
     compile_controller,
 )
+from rlctl.exporting.controller.program_mapping import NO_MAPPING, ProgramMapping, read_mapping
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.exporting.export import (
     ExportReport,
@@ -88,8 +90,9 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
         # Policies that were trained before their task declared its terms do not contain them.
         policy = torch_policy.file.with_info(env=built)
         layout = _describe_controller(policy)
-        maps = {} if request.mapping is None else read_mapping(request.mapping, layout)
-        export = _Export(torch_policy, policy, verify.TaskPlayer(layout, env, spec.task), limits, maps)
+        output.print_notes([] if limits is None else list_doubts(limits, policy.info.env))
+        mapping = NO_MAPPING if request.mapping is None else read_mapping(request.mapping, layout)
+        export = _Export(torch_policy, policy, verify.TaskPlayer(layout, env, spec.task), limits, mapping)
         write = {"onnx": export.write_onnx, "c": export.write_c}
         return [write[form](target.with_suffix(f".{form}")) for form in request.formats]
     finally:
@@ -102,7 +105,8 @@ def _describe_controller(policy: PolicyFile) -> ControllerLayout:
 
 def _choose_spec(spec: EnvSpec, sim: str | None) -> EnvSpec:
     """Return the environment of the verification: without events, because noise acts on computed terms."""
-    return dataclasses.replace(spec, randomize=False, events={}, sim=spec.sim if sim is None else sim)
+    spec = spec.replace_missing_engine() if sim is None else dataclasses.replace(spec, sim=sim)
+    return dataclasses.replace(spec, randomize=False, events={})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -113,11 +117,11 @@ class _Export:
     policy: PolicyFile
     player: verify.TaskPlayer
     limits: Limits | None
-    maps: InputMaps
+    mapping: ProgramMapping
 
     def write_onnx(self, path: Path) -> ControllerReport:
         """Write and verify the ONNX file, which has no limits."""
-        model = build_graph(self.policy, self.maps)
+        model = build_graph(self.policy, self.mapping)
         content = encode(model)
         controller = OnnxController(content)
         target = _describe_controller(self.policy).find_target(None)
@@ -143,7 +147,7 @@ class _Export:
 
     def write_c(self, path: Path) -> ControllerReport:
         """Write and verify the C file and its header, with the limits."""
-        source = ControllerSource(self.policy, path.stem, self.limits, self.maps)
+        source = ControllerSource(self.policy, path.stem, self.limits, self.mapping)
         compiler, median, example = find_compiler(), None, None
         command = os.environ.get("CC") or "cc"
         fields: dict[str, Any] = {"not_verified": f"there is no C compiler {command!r}; set CC to one"}
@@ -170,7 +174,7 @@ class _Export:
 
     def _write_example(self, path: Path, controller: Controller, recorded: list[verify.Recorded]) -> Path:
         example = path.with_name(f"{path.name}.csv")
-        program = MappedController(controller, self.maps)  # whose values the file has
+        program = MappedController(controller, self.mapping)  # whose values the file has
         files.write_text(example, write_example(controller, [program.undo(inputs) for inputs in recorded[0].inputs]))
         return example
 
@@ -195,7 +199,7 @@ class _Export:
     ) -> tuple[dict[str, Any], list[verify.Recorded]]:
         """Return how a controller was verified, as fields of its report; raises `AnswerIsNo` if it acts differently."""
         recorded = self._record(is_limited)
-        result = verify.verify_controller(self.player, recorded, MappedController(controller, self.maps), target)
+        result = verify.verify_controller(self.player, recorded, MappedController(controller, self.mapping), target)
         agreement, loop = result.agreement, result.closed_loop
         if agreement.agrees and not loop.agrees:
             repeats, magnified = self._check_conclusive(is_limited)
@@ -214,8 +218,7 @@ class _Export:
         fields: dict[str, Any],
     ) -> ControllerReport:
         sizes = {part.name: part.size for part in _describe_controller(self.policy).quantities}
-        mapping = {name: one.describe() for name, one in self.maps.items()}
-        details = {**details, "input_sizes": sizes, "mapping": mapping}
+        details = {**details, "input_sizes": sizes, "mapping": self.mapping.describe()}
         details["target"] = "" if target is None else target.formula
         if median is not None:
             fields["latency"] = Latency(median, measure_sb3(self.torch_policy))

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import onnx
 
-from rlctl.deploy.controller_layout import ControllerLayout, JointTarget, Observed, Stack
+from rlctl.deploy.controller_layout import ControllerLayout, JointTarget, Observed, Quantity, Stack
 from rlctl.exporting.actor import emit_actor, make_metadata
-from rlctl.exporting.controller.input_mapping import InputMap, InputMaps
+from rlctl.exporting.controller.program_mapping import NO_MAPPING, ElementMap, ProgramMapping
 from rlctl.exporting.controller.symbols import GraphSymbol
 from rlctl.exporting.layers import BATCH, Graph, concatenate
 from rlctl.policy import onnx_policy
@@ -20,9 +20,9 @@ _TAKEN = {onnx_policy.ACTION, TARGET, *onnx_policy.STATE_INPUTS, OBSERVATION, LA
 _ZEROS = "zeros when an episode begins, then the output of the step before"
 
 
-def build_graph(policy: PolicyFile, maps: InputMaps | None = None) -> onnx.ModelProto:
+def build_graph(policy: PolicyFile, mapping: ProgramMapping = NO_MAPPING) -> onnx.ModelProto:
     """Write a policy's controller, without limits, as ONNX. Raises `UsageError` for one that cannot be written."""
-    return _Writer(policy, maps or {}).write()
+    return _Writer(policy, mapping).write()
 
 
 def name_input(quantity: str) -> str:
@@ -32,29 +32,34 @@ def name_input(quantity: str) -> str:
 
 
 class _Writer:
-    def __init__(self, policy: PolicyFile, maps: InputMaps) -> None:
-        self._policy, self._graph = policy, Graph()
+    def __init__(self, policy: PolicyFile, mapping: ProgramMapping) -> None:
+        self._policy, self._graph, self._mapping = policy, Graph(), mapping
         self._layout = ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
         self._target = self._layout.find_target(None)
-        self._inputs = {part.name: self._add_input(part.name, part.size, part.unit) for part in self._layout.quantities}
-        self._inputs |= {name: self._map_input(name, one) for name, one in maps.items()}
+        self._inputs = {part.name: self._add_input(part) for part in self._layout.quantities}
+        self._inputs |= {name: self._map_input(name, one) for name, one in mapping.inputs.items()}
         self._states: list[str] = []
         self._steps = ""
         layout = self._layout
         if "time" in layout.internal or (layout.stacks and layout.repeats_first):
             self._steps = self._graph.input(STEPS, np.int64, (BATCH, 1), f"steps of the episode; {_ZEROS}")
 
-    def _add_input(self, name: str, size: int, unit: str) -> str:
-        graph, shape = self._graph, (BATCH, size)
-        return graph.input(name_input(name), self._layout.dtype, shape, f"[{unit}]" if unit else "")
+    def _add_input(self, part: Quantity) -> str:
+        graph, shape, unit = self._graph, (BATCH, part.size), part.unit
+        text = f"[{unit}]" if unit else ""
+        if part.name in self._mapping.inputs:
+            text = self._mapping.inputs[part.name].of_program
+        return graph.input(name_input(part.name), self._layout.dtype, shape, text)
 
-    def _map_input(self, name: str, one: InputMap) -> str:
+    def _map_input(self, name: str, one: ElementMap) -> str:
         """Add the mapping from the program's values of an input to the policy's."""
+        return self._graph.cast(self._map(f"mapping/{name}", self._inputs[name], one), self._layout.dtype)
+
+    def _map(self, name: str, given: str, one: ElementMap) -> str:
         graph = self._graph
-        value = graph.add("Gather", self._inputs[name], graph.constant(f"mapping/{name}/order", one.order), axis=1)
-        value = graph.add("Mul", self._read(value), graph.constant(f"mapping/{name}/factor", one.factor))
-        value = graph.add("Add", value, graph.constant(f"mapping/{name}/offset", one.offset))
-        return graph.cast(value, self._layout.dtype)
+        value = graph.add("Gather", given, graph.constant(f"{name}/order", one.order), axis=1)
+        value = graph.add("Mul", self._read(value), graph.constant(f"{name}/factor", one.factor))
+        return graph.add("Add", value, graph.constant(f"{name}/offset", one.offset))
 
     def write(self) -> onnx.ModelProto:
         graph, layout, info = self._graph, self._layout, self._policy.info
@@ -87,8 +92,8 @@ class _Writer:
             onnx_policy.CONTROLLER_KEY: "1",
             "input_names": ",".join(name_input(part.name) for part in quantities),
             "input_sizes": ",".join(str(part.size) for part in quantities),
-            "input_units": ",".join(part.unit.replace(",", ";") for part in quantities),
-            **({"target": target.formula} if target is not None else {}),
+            "input_units": ",".join(self._mapping.find_unit(part).replace(",", ";") for part in quantities),
+            **({"target": self._describe_target(target)} if target is not None else {}),
             **({"state": f"{states}: {_ZEROS}, NAME_out"} if states else {}),
         }
 
@@ -162,7 +167,13 @@ class _Writer:
         if target.clips:
             value = graph.add("Max", value, graph.constant("target/low", target.low))
             value = graph.add("Min", value, graph.constant("target/high", target.high))
-        graph.output(value, TARGET, np.float64, (BATCH, self._layout.action_size), target.formula)
+        if (one := self._mapping.targets) is not None:
+            value = self._map("mapping/target", value, one)
+        graph.output(value, TARGET, np.float64, (BATCH, self._layout.action_size), self._describe_target(target))
+
+    def _describe_target(self, target: JointTarget) -> str:
+        one = self._mapping.targets
+        return target.formula if one is None else f"{one.of_program}; mapped ({one.describe()}) from {target.formula}"
 
     def _add_state(self, value: str, name: str, dtype: Any, shape: tuple[int | str, ...]) -> None:
         self._states.append(name)

@@ -12,6 +12,7 @@ from rlctl.deploy.filter.bounds import Bounds
 from rlctl.deploy.filter.command import Command
 from rlctl.deploy.filter.fitting import FittedLimits
 from rlctl.deploy.filter.limits import Limits
+from rlctl.deploy.filter.observation import UNIT_SQUARES
 from rlctl.exporting.c_layers import write_array, write_number
 
 
@@ -118,9 +119,30 @@ class LimitsSource:
         return self.fitted.sensors.has_range
 
     @property
+    def quaternions(self) -> list[int]:
+        """Where quantities that must have norm 1 begin."""
+        return [part.start for part in self.fitted.sensors.quaternions]
+
+    @property
+    def unit_squares(self) -> tuple[float, float]:
+        """Bounds of the square of such a norm."""
+        return UNIT_SQUARES
+
+    @property
+    def checks(self) -> list[str]:
+        """The ranges that quantities have by default, for the header."""
+        return self.fitted.sensors.describe_defaults()
+
+    @property
     def oldest(self) -> str:
         """Largest age of a measurement [s]."""
         return write_number(np.float64(self.fitted.sensors.oldest), "double")
+
+    @property
+    def age(self) -> str:
+        """Largest age of a measurement, for people; empty if any age will do."""
+        oldest, periods = self.fitted.sensors.oldest, self.limits.max_age_periods
+        return f"{oldest:.6g} s (max_age_periods: {periods:g})" if math.isfinite(oldest) else ""
 
     @property
     def frozen(self) -> list[tuple[str, slice, int]]:

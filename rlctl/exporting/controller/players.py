@@ -14,7 +14,7 @@ from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.errors import AnswerIsNo, short_repr
 from rlctl.exporting.c_source import FLAGS, CSource
 from rlctl.exporting.controller.graph import LAST_ACTION, TARGET, name_input
-from rlctl.exporting.controller.input_mapping import InputMaps
+from rlctl.exporting.controller.program_mapping import ProgramMapping
 from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type
 from rlctl.policy.onnx_policy import ACTION, open_session
 
@@ -152,10 +152,10 @@ class OnnxController(Controller):
 
 
 class MappedController(Controller):
-    """A controller with a mapping, which a program with the wrong mapping gives its values."""
+    """A controller with a mapping, in a program that has other values than the policy: it takes and returns these."""
 
-    def __init__(self, controller: Controller, maps: InputMaps) -> None:
-        self._controller, self._maps = controller, maps
+    def __init__(self, controller: Controller, mapping: ProgramMapping) -> None:
+        self._controller, self._mapping = controller, mapping
 
     def begin(self) -> None:
         """Begin an episode."""
@@ -163,17 +163,24 @@ class MappedController(Controller):
 
     def step(self, inputs: Inputs) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
         """Return the action and the targets for the robot's quantities, as the policy expects them."""
-        return self._controller.step(self.undo(inputs))
+        action, target = self._controller.step(self.undo(inputs))
+        return action, self._read_target(target)
 
     def follow(
         self, inputs: Inputs, requested: NDArray[Any]
     ) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.float64] | None]:
         """Take a step of a recorded episode."""
-        return self._controller.follow(self.undo(inputs), requested)
+        own, action, target = self._controller.follow(self.undo(inputs), requested)
+        return own, action, self._read_target(target)
 
     def undo(self, inputs: Inputs) -> Inputs:
-        """Return what a program with the wrong mapping measures where the robot's quantities are these."""
-        return {name: self._maps[name].undo(value) if name in self._maps else value for name, value in inputs.items()}
+        """Return what the program has where the robot's quantities are these."""
+        maps = self._mapping.inputs
+        return {name: maps[name].undo(value) if name in maps else value for name, value in inputs.items()}
+
+    def _read_target(self, target: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        """Return the policy's targets for the program's."""
+        return target if target is None or self._mapping.targets is None else self._mapping.targets.undo(target)
 
 
 _DTYPES: dict[str, np.dtype[Any]] = {

@@ -12,8 +12,8 @@ from rlctl.deploy.filter.limits import NO_LIMITS, Limits
 from rlctl.exporting import c_source
 from rlctl.exporting.c_layers import CWriter, write_number
 from rlctl.exporting.c_source import CSource, Layout
-from rlctl.exporting.controller.input_mapping import InputMaps
 from rlctl.exporting.controller.limits_source import LimitsSource
+from rlctl.exporting.controller.program_mapping import NO_MAPPING, ElementMap, ProgramMapping
 from rlctl.exporting.controller.symbols import CSymbol
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.network import Network
@@ -46,11 +46,11 @@ class ControllerSource:
     """
 
     def __init__(
-        self, policy: PolicyFile, file_name: str, limits: Limits | None, maps: InputMaps | None = None
+        self, policy: PolicyFile, file_name: str, limits: Limits | None, mapping: ProgramMapping = NO_MAPPING
     ) -> None:
         c_source.check_can_be_written(policy)
         self.layout = layout = ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
-        self._maps = maps or {}
+        self._mapping = mapping
         fitted = fit_limits(limits or NO_LIMITS, layout.inputs_info)
         self.limits = fitted.limits
         assert fitted.bounds is not None  # the actions are in a Box
@@ -91,7 +91,10 @@ class ControllerSource:
             "arrays": self._list_arrays(described),
             "target": None if self.target is None else self._describe_target(self.target),
             "read_lines": [line for quantity in layout.quantities for line in self._write_reading(quantity)],
-            "mapped": [f"{name}: {one.describe()}" for name, one in self._maps.items()],
+            "mapped": [f"{name}: {text}" for name, text in self._mapping.describe().items()],
+            "members": {part.name: self._describe_input(part) for part in layout.quantities},
+            "program_target": self._mapping.targets,
+            "target_lines": [] if (one := self._mapping.targets) is None else self._write_targets(one),
             "term_lines": [line for part in layout.observed for line in self._write_term(part, described.type)],
             "constants": writer.constants,
             "functions": writer.find_functions(),
@@ -109,7 +112,7 @@ class ControllerSource:
     def _write_reading(self, quantity: Quantity) -> list[str]:
         """Return statements that read an input; with a mapping from the program's values to the policy's."""
         name, start = quantity.identifier, quantity.start
-        if (one := self._maps.get(quantity.name)) is None:
+        if (one := self._mapping.inputs.get(quantity.name)) is None:
             loop = f"for (int i = 0; i < {quantity.size}; ++i) {{"
             return [loop, f"    values[{start} + i] = inputs->{name}[i];", "}"]
         rows = zip(one.order.tolist(), one.factor, one.offset, strict=True)
@@ -118,6 +121,21 @@ class ControllerSource:
             f"{write_number(offset, 'double')};"
             for index, (element, factor, offset) in enumerate(rows)
         ]
+
+    def _write_targets(self, one: ElementMap) -> list[str]:
+        """Return statements that write the program's targets for the policy's."""
+        rows = zip(one.order.tolist(), one.factor, one.offset, strict=True)
+        return [
+            f"outputs->target[{index}] = {write_number(factor, 'double')} * state->target[{element}] + "
+            f"{write_number(offset, 'double')};"
+            for index, (element, factor, offset) in enumerate(rows)
+        ]
+
+    def _describe_input(self, part: Quantity) -> str:
+        """Return the unit of an input as the program gives it, for people; empty if it is unknown."""
+        if part.name in self._mapping.inputs:
+            return self._mapping.inputs[part.name].of_program
+        return f"[{part.unit}]" if part.unit else ""
 
     def _write_term(self, part: Observed, kind: str) -> list[str]:
         """Return statements that compute the newest values of a part of the observation."""
@@ -158,10 +176,17 @@ class ControllerSource:
         quantities = self.layout.quantities
         arrays: list[tuple[str, str, str, list[str]]] = [
             ("char *const", "input_names", "INPUTS", [quote(quantity.name) for quantity in quantities]),
-            ("char *const", "input_units", "INPUTS", [quote(quantity.unit) for quantity in quantities]),
+            (
+                "char *const",
+                "input_units",
+                "INPUTS",
+                [quote(self._mapping.find_unit(quantity)) for quantity in quantities],
+            ),
             ("int", "input_sizes", "INPUTS", [str(quantity.size) for quantity in quantities]),
             *(array for array in described.list_arrays() if array[2] == "ACTION_SIZE"),
         ]
+        if (one := self._mapping.targets) is not None and one.names:
+            arrays.append(("char *const", "target_names", "ACTION_SIZE", [quote(name) for name in one.names]))
         numbers: dict[str, Any] = {}
         if target is not None:
             numbers["target_factor"] = target.factor
@@ -173,6 +198,9 @@ class ControllerSource:
             numbers.setdefault("default_positions", np.array(env.joints.default_positions))
         if env.joints is not None and env.joints.low and env.joints.high:
             numbers |= {"joint_low": np.array(env.joints.low), "joint_high": np.array(env.joints.high)}
+        if env.joints is not None:
+            gains = {"joint_stiffness": env.joints.stiffness, "joint_damping": env.joints.damping}
+            numbers |= {name: np.array(values) for name, values in gains.items() if values}
         for name, array in numbers.items():
             arrays.append(("double", name, "ACTION_SIZE", [write_number(value, "double") for value in array]))
         return arrays

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from rlctl.deploy.diagnose import table
+from rlctl.deploy.diagnose.candidates import TermStatistics, list_candidates
 from rlctl.deploy.diagnose.log import read_robot_log
 from rlctl.errors import ArtifactError
 from rlctl.task.joints import Joints
+from rlctl.task.terms import Distance, LastAction
 from tests.deploy.conftest import make_arm
 
 NAMES = ["time", "positions_0", "positions_1", "goal_x", "goal_y", "goal_z", "action_0", "action_1"]
@@ -158,3 +160,25 @@ def test_neither_csv_nor_npz(tmp_path, info):
     (tmp_path / "log.mcap").write_bytes(b"x")
     with pytest.raises(ArtifactError, match=r"not a log that diagnose reads: give a \.csv, \.npz or \.rrd file"):
         read_robot_log(tmp_path / "log.mcap", info)
+
+
+def test_what_a_controller_takes(tmp_path, info, rows):
+    info = info.model_copy(
+        update={
+            "observation_sizes": {"positions": 2, "last_action": 2, "goal": 1},
+            "observation_terms": {"last_action": LastAction(), "goal": Distance("to", "from")},
+            "quantity_sizes": {"to": 1, "from": 1},
+        }
+    )
+    names = ["time", "positions_0", "positions_1", "to", "from", "spare", "action_0", "action_1"]
+    log = read_robot_log(write(tmp_path / "log.csv", rows, names), info)
+    assert "its columns are what an exported controller takes: positions, to, from" in log.notes[0]
+    assert log.signals.sizes == {"positions": 2, "last_action": 2, "goal": 1}
+    assert log.signals.observations[0] == pytest.approx([0.0, 0.1, 0.0, 0.0, 0.1])
+    assert log.signals.observations[3] == pytest.approx([3.0, 3.1, 2.5, 2.6, 0.1])  # the action of the row before
+
+
+def test_a_command_is_not_corrected(info):
+    statistics = {name: TermStatistics(np.zeros(3), np.ones(3)) for name in ("command", "goal", "hand")}
+    info = info.model_copy(update={"command_ranges": {f"goal_{axis}": (0.0, 1.0) for axis in "xyz"}})
+    assert {one.term for one in list_candidates(info, statistics)} == {"hand"}

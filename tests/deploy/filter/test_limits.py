@@ -3,7 +3,8 @@
 import pytest
 from gymnasium import spaces
 
-from rlctl.deploy import SafetyFilter, read_limits
+from rlctl.deploy import Limits, SafetyFilter, read_limits
+from rlctl.deploy.filter.doubts import list_doubts
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.errors import ArtifactError, RecipeError
 from rlctl.task import terms
@@ -208,3 +209,12 @@ def test_positions_that_the_policy_observes_scaled_and_from_a_default_pose(write
     gravity = arm.model_copy(update={"observation_terms": {"positions": terms.Gravity()}})
     with pytest.raises(RecipeError, match=r"measured\.position: positions is computed; positions cannot be read"):
         SafetyFilter(gravity, write(text))
+
+
+def test_a_speed_in_degrees_is_doubted():
+    info = make_arm().model_copy(update={"joints": Joints(["shoulder", "elbow"], max_speed=[28.6, 52.4])})
+    limits = Limits.model_validate({"limits": {"all": {"speed": 687.0}, "elbow": {"speed": 60.0}}})
+    [doubt] = list_doubts(limits, info)
+    assert doubt.startswith(
+        "warning: limits: all.speed: 687 is more than 5 times the top speed of the fastest joint, 52"
+    )
