@@ -134,9 +134,23 @@ def is_limits(block) -> bool:
     return block.text.startswith(("command:", "limits:"))
 
 
-@pytest.mark.parametrize("block", [each for each in find_blocks("yaml") if not is_limits(each)], ids=str)
+def is_mapping(block) -> bool:
+    return block.text.startswith("observations:")
+
+
+RECIPES = [each for each in find_blocks("yaml") if not is_limits(each) and not is_mapping(each)]
+
+
+@pytest.mark.parametrize("block", RECIPES, ids=str)
 def test_recipes_are_recipes(block):
     recipe.validate(yaml_text.load(block.text, str(block)), str(block))
+
+
+def test_mappings_have_known_keys():
+    from rlctl.exporting.controller.program_mapping import MappingFile
+
+    (block,) = [each for each in find_blocks("yaml") if is_mapping(each)]
+    MappingFile.model_validate(yaml_text.load(block.text, str(block)))
 
 
 def test_limits_are_limits_of_reach():
