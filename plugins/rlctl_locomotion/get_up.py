@@ -29,7 +29,8 @@ class GetUp(Driven):
     still: np.ndarray = field(init=False, repr=False)  # steps since which it stands still
     limp: np.ndarray = field(init=False, repr=False)  # [s] at the start, in which the motors are off
 
-    control_dt, substeps = 0.04, 8  # [s], -: random actions of 20 ms each do not roll it over
+    # Random actions of 40 ms move it farther than those of 20. With three iterations of the solver it could leap two metres.
+    control_dt, substeps, solver_iterations = 0.04, 8, 10  # [s], -, -
     reach: ClassVar[np.ndarray] = np.array([0.3, 0.6, 0.3] * 4)  # [rad]; a foot reaches the ground behind the back
     action_meaning = "joint angles from the stance; 1 is 0.6 rad of an upper leg, 0.3 of a hip or a lower leg"
     reward_weights = {
@@ -37,6 +38,7 @@ class GetUp(Driven):
         "height": 0.15,
         "stance": 0.15,
         "still": 0.1,
+        "idle": -0.2,
         "rest": -0.01,
         "smoothness": -0.002,
         "motion": -0.0001,
@@ -106,13 +108,14 @@ class GetUp(Driven):
         return np.zeros(self.worlds, bool)
 
     def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
-        """Return how upright, high, near its stance and still it is; while it lies, effort costs nothing."""
+        """Return how upright, high, near its stance and still it is; while it lies, effort is free and rest costs."""
         up = np.maximum(-self.gravity[:, 2], 0.0) ** 2  # 1 upright, 0 on its side
         return {
             "upright": 1.0 - self.tilt / np.pi,
             "height": up * np.clip(self.height / self.target_height, 0.0, 1.0),
             "stance": up * rewards.closeness(self.distance, 0.5),
             "still": up * rewards.closeness(self.distance, 0.3) * rewards.closeness(self.speed, 0.2),
+            "idle": (1.0 - up) * rewards.closeness(self.speed, 0.3),
             "rest": up * rewards.squared(action),
             "smoothness": up * rewards.squared(self.action_change),
             "motion": up * rewards.squared(self.body.joint_velocities),

@@ -21,6 +21,7 @@ class WalkStairs(WalkRough, Clocked):
     """Follow velocity commands up and down stairs that it does not see, with pushes, noise and delay."""
 
     step: float = 0.1  # [m], height of a step
+    must_step: bool = False  # a foot that meets an edge is low
     rough: float = 0.0
     episode_s: float = 10.0
 
@@ -36,7 +37,7 @@ class WalkStairs(WalkRough, Clocked):
     observation_units = Clocked.observation_units
     per_world = Clocked.per_world
     mirror = {**Clocked.mirror, **WalkRough.mirror}
-    reward_weights = {**WalkRough.reward_weights, "tracking": 0.3, "turning": 0.15, "gait": 0.3}
+    reward_weights = {**WalkRough.reward_weights, "tracking": 0.3, "turning": 0.15, "gait": 0.3, "velocity_error": -0.2}
     events = {
         **WalkRough.events,
         "friction": Event("reset", events.set_friction, body="ground", friction=(0.5, 1.3), enabled=True),

@@ -1,8 +1,11 @@
-"""Stairs: their heights, and where they are how high."""
+"""Stairs: their heights, where they are how high, and the steps that the robot must take in training."""
+
+from contextlib import closing
 
 import numpy as np
 import pytest
 
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl_locomotion.walk_stairs import WalkStairs
 
@@ -26,3 +29,14 @@ def test_steps_are_low_where_episodes_of_a_low_level_begin():
 def test_steps_that_are_too_high(settings):
     with pytest.raises(TaskError, match=r"step: steps of -?0\.\d m; give a height from 0 to 0\.15 m"):
         WalkStairs(**settings).draw_heights()
+
+
+@pytest.mark.parametrize("must_step", [False, True])
+def test_a_missed_step_ends_the_episode_if_it_must_step(must_step):
+    with closing(EnvSpec("walk-stairs", {"must_step": must_step}).make()) as env:
+        env.unwrapped.set_level(0.0)
+        env.reset(seed=0)
+        # It stands. Wanted is more than 90 % of the swing from asin(0.9) / (2 pi) of the period on: 0.107 s, the sixth step.
+        ended = [env.step(np.zeros(12, np.float32))[2] for _ in range(6)]
+        assert ended == [False] * 5 + [must_step]
+        assert (env.unwrapped.task.batch.foot_heights < 0.01).all()
