@@ -29,7 +29,7 @@ class GetUp(Driven):
     still: np.ndarray = field(init=False, repr=False)  # steps since which it stands still
     limp: np.ndarray = field(init=False, repr=False)  # [s] at the start, in which the motors are off
 
-    # Random actions of 40 ms move it farther than those of 20. With 3 iterations of the solver it could leap two metres.
+    # Random actions of 40 ms move it farther than those of 20. With 3 iterations of the solver it could leap 2 metres.
     control_dt, substeps, solver_iterations = 0.04, 8, 10  # [s], -, -
     reach: ClassVar[np.ndarray] = np.array([0.3, 0.6, 0.3] * 4)  # [rad]; a foot reaches the ground behind the back
     action_meaning = "joint angles from the stance; 1 is 0.6 rad of an upper leg, 0.3 of a hip or a lower leg"
