@@ -37,7 +37,7 @@ class GetUp(Driven):
         "upright": 0.2,
         "height": 0.15,
         "stance": 0.15,
-        "still": 0.1,
+        "still": 0.3,
         "idle": -0.2,
         "rest": -0.01,
         "smoothness": -0.002,
