@@ -85,13 +85,17 @@ class WalkRough(Walk):
         forward, left = SCANNED.T
         around = np.stack([np.cos(yaw) * forward - np.sin(yaw) * left, np.sin(yaw) * forward + np.cos(yaw) * left], -1)
         ground = self.find_heights(position[:, :2])
-        feet = np.stack([self.body.link_position(foot) for foot in FEET], 1)
         return {
             "velocity": rotate_inverse(orientation, self.body.base_velocity),
             "height": (position[:, 2] - ground)[:, None],
-            "foot_heights": feet[..., 2] - self.find_heights(feet[..., :2]),
+            "foot_heights": self.measure_feet(),
             "ground": self.find_heights(position[:, None, :2] + around) - ground[:, None],
         }
+
+    def measure_feet(self) -> np.ndarray:
+        """Return the heights of the toes' centres above the ground [m], shape (worlds, 4)."""
+        feet = np.stack([self.body.link_position(foot) for foot in FEET], 1)
+        return feet[..., 2] - self.find_heights(feet[..., :2])
 
     def find_heights(self, places: np.ndarray) -> np.ndarray:
         """Return the heights of the ground [m] at places (..., 2) [m], between the points of the grid bilinearly."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rlctl.environments.spec import EnvSpec
-from rlctl_locomotion.humanoid_walk import JOINTS, PERIOD_S, SWING
+from rlctl_locomotion.humanoid_walk import JOINTS
 
 pytest.importorskip("mujoco")
 
@@ -50,7 +50,7 @@ def test_the_clock(env, task):
         firsts.add(tuple(task.phase[0]))
     assert firsts == {(0.0, 1.0), (0.0, -1.0)}  # about to lift the left or the right foot
     first = task.phase[0].copy()
-    for _ in range(round(PERIOD_S / task.control_dt)):
+    for _ in range(round(task.period_s / task.control_dt)):
         task.act(np.zeros((1, 16)))
     np.testing.assert_allclose(task.phase[0], first, atol=1e-9)
 
@@ -60,10 +60,10 @@ def test_a_foot_is_wanted_in_the_air_while_the_clock_says_so(env, task):
     action = np.zeros((1, 16))
     task.phase[:] = (1.0, 0.0)  # the left foot is at its highest
     task.measure()
-    task.foot_heights[:] = (SWING, 0.0)
+    task.foot_heights[:] = (task.swing, 0.0)
     assert task.rewards(action)["gait"] == pytest.approx(1.0)
     task.phase[:] = (-1.0, 0.0)
     task.measure()
-    task.foot_heights[:] = (SWING, 0.0)
+    task.foot_heights[:] = (task.swing, 0.0)
     # Both feet are as far off as they are lifted.
     assert task.rewards(action)["gait"] == pytest.approx(0.0)
