@@ -34,7 +34,9 @@ class StarterRobot:
     files: Mapping[Path, bytes]
     """The model and its meshes, relative to the package."""
     summary: str
-    """A line that says what was chosen."""
+    """What was chosen, a line or several."""
+    template: Path | None = None
+    """Folder with files that replace those of an arm."""
 
 
 def make_planar_arm() -> StarterRobot:
