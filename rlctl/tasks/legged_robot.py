@@ -32,6 +32,7 @@ _STEPS = 100  # that it must stand with zero actions
 _TINY = 1e-3  # [rad], of rounding
 _DROP = 0.05  # of the leg length: height above the stance at the start of an episode
 _SUNK = 0.65  # of the space under the trunk
+_ENDLESS_FORCE = 20.0  # of weight x leg length
 _LEVEL = 0.03  # of the leg length: how much the feet's heights may differ
 _KEYED = (0.55, 0.97)  # of the longest leg: legs of a keyframe that is a stance
 _UPRIGHT = -0.9  # component z of the direction of gravity, in the trunk's frame
@@ -185,6 +186,12 @@ def _limit_forces(legged: _Legged) -> tuple[list[float], str]:
     return [limit or guess for limit in limits], "; CHANGE: a guess where the model has no limit"
 
 
+def _write_forces(forces: list[float]) -> str:
+    if len(set(forces)) == 1:
+        return f"[{_write(forces[0])}] * {len(forces)}"
+    return _write_list("MAX_FORCE = ", map(_write, forces))
+
+
 def _list_notes(legged: _Legged, *, facing_y: bool) -> list[str]:
     """Return what a user should know, a sentence each."""
     stance, notes = legged.stance, []
@@ -197,8 +204,9 @@ def _list_notes(legged: _Legged, *, facing_y: bool) -> list[str]:
         notes.append(
             f"Found no stance with level feet: their heights differ by {stance.unevenness:.2g} m; write your own STANCE"
         )
-    if not all(legged.body.joint_max_force):
-        notes.append("The file has no torque limit for some joints: write those of your motors into MAX_FORCE")
+    limits = legged.body.joint_max_force
+    if not all(limits) or min(limits) > _ENDLESS_FORCE * _derive(legged).stiffness:
+        notes.append("The file has no useful torque limits for all joints: write those of your motors into MAX_FORCE")
     if legged.steps_up < _STEPS:
         notes.append(
             f"With zero actions it falls after {legged.steps_up * _CONTROL_DT:.1f} s: look at it with the first "
@@ -221,8 +229,10 @@ def _remove_floor(files: dict[Path, bytes], model: Path) -> list[str]:
         for geom in world.findall("geom"):
             world.remove(geom)
             removed += 1
+    if not removed:
+        return []
     files[model] = ElementTree.tostring(root)
-    return [f"The copy of {model.name} has no floor, since the task loads one"] if removed else []
+    return [f"The copy of {model.name} has no floor, since the task loads one"]
 
 
 def _summarize(legged: _Legged, notes: Sequence[str]) -> str:
@@ -271,7 +281,7 @@ def _describe(legged: _Legged) -> dict[str, str]:
         "damping": f"{numbers.damping:g}",
         "armature": f"{numbers.armature:g}",
         "gear_damping": f"{numbers.gear_damping:g}",
-        "max_force": _write_list("MAX_FORCE = ", map(_write, forces)),
+        "max_force": _write_forces(forces),
         "force_comment": force_comment,
         "lowest": lowest,
         "highest": highest,
