@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -56,6 +57,7 @@ class _Legged:
     stance: Stance
     keyframe: str  # from which the stance is; empty if it was searched
     steps_up: int  # for which it stands with zero actions, at most `_STEPS`
+    height: float  # of the trunk's centre of mass above the ground when it stands [m]
 
     @property
     def joints(self) -> list[int]:
@@ -71,14 +73,7 @@ def read_legged_robot(model: str) -> StarterRobot:
 
     Raises `UsageError` for a file that is missing, cannot be loaded, has no joints, a fixed base or no legs.
     """
-    from rlctl.task.model_files import find_model_file
-    from rlctl.task.mujoco.sim import MujocoSim
-
-    try:
-        path = find_model_file(model)
-        body = MujocoSim(control_dt=_CONTROL_DT, substeps=4).load("robot", path)
-    except TaskError as error:
-        raise UsageError(f"--model: {error}") from None
+    path, body = _load(model)
     if not body.joint_names:
         raise UsageError(f"--model {model}: it has no joints; --walk makes a task for a robot with legs")
     if body.fixed:
@@ -89,11 +84,31 @@ def read_legged_robot(model: str) -> StarterRobot:
         raise UsageError(f"--model {model}: joint {slides[0]!r} slides; --walk needs legs whose joints rotate")
     search = StanceSearch(skeleton, legs, mirror)
     keyframe, stance = _find_keyframe(skeleton, legs, search.longest)
-    legged = _Legged(body, path, legs, stance or search.find(), keyframe, 0)
-    legged = dataclasses.replace(legged, steps_up=_count_steps_up(legged))
+    stance = stance or search.find()
+    legged = _Legged(body, path, legs, stance, keyframe, 0, stance.height)
+    steps_up, height = _stand(legged)
+    legged = dataclasses.replace(legged, steps_up=steps_up, height=height)
     files = copy_model(path)
     notes = [*_list_notes(legged, facing_y=bool(mirror[0] < 0)), *_remove_floor(files, Path(path.name))]
     return StarterRobot(_describe(legged), files, _summarize(legged, notes), template=TEMPLATE)
+
+
+def _load(model: str) -> tuple[Path, MujocoBody]:
+    """Load a model with a free base; raises `UsageError`."""
+    from rlctl.task.model_files import find_model_file
+    from rlctl.task.mujoco.sim import MujocoSim
+
+    path = Path(model)
+    try:
+        path = find_model_file(model)
+        return path, MujocoSim(control_dt=_CONTROL_DT, substeps=4).load("robot", path)
+    except TaskError as error:
+        problem = str(error)
+    if path.is_file():
+        with contextlib.suppress(TaskError):
+            base = MujocoSim(control_dt=_CONTROL_DT, substeps=4).load("robot", path, fixed=True).base_name
+            problem = f"the base {base!r} of {path.name} cannot be free without mass; for an arm leave out --walk"
+    raise UsageError(f"--model: {problem}")
 
 
 def _slides(body: MujocoBody, joint: int) -> bool:
@@ -123,8 +138,11 @@ def _find_keyframe(skeleton: Skeleton, legs: Sequence[Leg], longest: float) -> t
     return "", None
 
 
-def _count_steps_up(legged: _Legged) -> int:
-    """Return how many steps the robot stands with zero actions in a simulation, at most `_STEPS`."""
+def _stand(legged: _Legged) -> tuple[int, float]:
+    """Return how many steps the robot stands with zero actions, at most `_STEPS`, and how high its trunk then is [m].
+
+    The joints, which are springs, give way a little. The height of a robot that falls is that of its stance.
+    """
     from rlctl.task.mujoco.sim import MujocoSim
 
     sim = MujocoSim(control_dt=_CONTROL_DT, substeps=4, visuals=False)
@@ -140,8 +158,8 @@ def _count_steps_up(legged: _Legged) -> int:
         sim.step()
         down = rotate_inverse(body.base_orientation, (0.0, 0.0, -1.0))
         if down[2] > _UPRIGHT or body.base_position[2] < numbers.fallen_height:
-            return step
-    return _STEPS
+            return step, legged.stance.height
+    return _STEPS, float(body.base_position[2])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -272,7 +290,7 @@ def _describe(legged: _Legged) -> dict[str, str]:
         "all_joints": _list_all_joints(legged),
         "stance": _write_list("STANCE = np.array(", map(_write, stance.positions), ")"),
         "stance_comment": f"{found}; CHANGE: a pose in which it stands well",
-        "height": f"{stance.height:.3f}",
+        "height": f"{legged.height:.3f}",
         "fallen_height": f"{numbers.fallen_height:.3f}",
         "start_height": f"{numbers.start_height:.3f}",
         "weight": f"{body.total_mass() * _GRAVITY:.3g}",

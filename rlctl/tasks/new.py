@@ -12,8 +12,7 @@ from rlctl.environments import installed
 from rlctl.errors import UsageError
 from rlctl.recipe.recipe import SCHEMA_FILE
 from rlctl.storage import files as storage_files
-from rlctl.tasks.legged_robot import read_legged_robot
-from rlctl.tasks.starter_robot import make_planar_arm, read_robot
+from rlctl.tasks.starter_robot import StarterRobot, make_planar_arm, read_robot
 
 TEMPLATE = Path(__file__).with_name("template")
 """Templates of the files: `$name`, `$package`, `$cls` and the values of a `StarterRobot`; `package/` gets its name."""
@@ -57,7 +56,7 @@ def create(name: str, *, model: str | None = None, link: str | None = None, walk
     folder = Path(name)
     if os.path.lexists(folder):
         raise UsageError(f"{folder} already exists; choose another name or another folder")
-    robot = make_planar_arm() if model is None else read_legged_robot(model) if walk else read_robot(model, link)
+    robot = _read_robot(model, link, walk=walk)
     sources = _read_templates(TEMPLATE) | (_read_templates(robot.template) if robot.template else {})
     cls = _make_class_name(name, "".join(sources.values()))
     values = {**robot.values, "name": name, "package": package, "cls": cls}
@@ -75,6 +74,16 @@ def create(name: str, *, model: str | None = None, link: str | None = None, walk
             (temporary / path).parent.mkdir(parents=True, exist_ok=True)
             storage_files.write_new(temporary / path, data)
     return NewPlugin(name, folder, package, cls, sorted(content), robot.summary)
+
+
+def _read_robot(model: str | None, link: str | None, *, walk: bool) -> StarterRobot:
+    if model is None:
+        return make_planar_arm()
+    if not walk:
+        return read_robot(model, link)
+    from rlctl.tasks.legged_robot import read_legged_robot  # it loads NumPy
+
+    return read_legged_robot(model)
 
 
 def _read_templates(folder: Path) -> dict[Path, str]:
