@@ -145,21 +145,24 @@ def _stand(legged: _Legged) -> tuple[int, float]:
     """
     from rlctl.task.mujoco.sim import MujocoSim
 
-    sim = MujocoSim(control_dt=_CONTROL_DT, substeps=4, visuals=False)
+    # As the task simulates it.
+    sim = MujocoSim(control_dt=_CONTROL_DT, substeps=4, iterations=6, worlds=1)
     sim.load("ground", "plane.urdf", fixed=True).set_friction(0.8)
     body, numbers = sim.load("robot", legged.path), _derive(legged)
     body.set_friction(1.0)
     body.set_drives(numbers.stiffness, numbers.damping, armature=numbers.armature)
     body.set_joint_damping(numbers.gear_damping)
-    body.set_base((0.0, 0.0, numbers.start_height))
-    body.set_joints(legged.stance.positions)
+    sim.save()
+    stance, world = legged.stance.positions[None], np.zeros(1, np.int64)
+    body.set_base(np.array([[0.0, 0.0, numbers.start_height]]), worlds=world)
+    body.set_joints(stance, worlds=world)
     for step in range(_STEPS):
-        body.drive_to(legged.stance.positions, max_force=_limit_forces(legged)[0])
+        body.drive_to(stance, max_force=_limit_forces(legged)[0])
         sim.step()
-        down = rotate_inverse(body.base_orientation, (0.0, 0.0, -1.0))
-        if down[2] > _UPRIGHT or body.base_position[2] < numbers.fallen_height:
+        down, height = rotate_inverse(body.base_orientation[0], (0.0, 0.0, -1.0)), float(body.base_position[0, 2])
+        if down[2] > _UPRIGHT or height < numbers.fallen_height:
             return step, legged.stance.height
-    return _STEPS, float(body.base_position[2])
+    return _STEPS, height
 
 
 @dataclasses.dataclass(frozen=True)

@@ -122,7 +122,8 @@ def test_sprawled_legs_stand_to_the_sides():
             {"model": "kuka_iiwa.urdf"},
             "--model: the base 'lbr_iiwa_link_0' of kuka_iiwa.urdf cannot be free without mass",
         ),
-        ({"model": "arm.urdf"}, "--model arm.urdf: found no legs: --walk needs pairs of chains of joints"),
+        ({"model": "arm.urdf"}, "--model arm.urdf: no link that a joint moves has a collision shape"),
+        ({"model": "one.xml"}, "--model one.xml: found no legs: --walk needs pairs of chains of joints"),
         ({"model": "dog.xml"}, "--model dog.xml: its base is fixed; add <freejoint/> to the body 'trunk'"),
         ({"model": "dog.xml", "link": "head"}, "--walk and --link exclude each other"),
         ({}, "--walk needs --model"),
@@ -131,6 +132,7 @@ def test_sprawled_legs_stand_to_the_sides():
 def test_models_that_cannot_be(tmp_path, monkeypatch, given, message):
     monkeypatch.chdir(tmp_path)
     write_dog(tmp_path, free="")
+    Path("one.xml").write_text(DOG.format(free="<freejoint/>", legs=LEG.format(leg="only", x=0, y=0.1), keyframe=""))
     Path("arm.urdf").write_text((Path(new.__file__).with_name("arm.urdf")).read_text())
     with pytest.raises(UsageError) as caught:
         new.create("other-dog", **given, walk=True)
