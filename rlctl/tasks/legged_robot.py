@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import math
 import re
 import textwrap
 import xml.etree.ElementTree as ElementTree
@@ -19,6 +18,7 @@ from rlctl.errors import TaskError, UsageError
 from rlctl.task.rotations import rotate_inverse
 from rlctl.tasks.legs import Leg, Skeleton, find_legs
 from rlctl.tasks.model_copy import copy_model
+from rlctl.tasks.scaling import GRAVITY, ScaledA1, scale_a1
 from rlctl.tasks.stance import Stance, StanceSearch, measure_stance
 from rlctl.tasks.starter_robot import _WIDTH, StarterRobot, _write, _write_list
 
@@ -27,26 +27,13 @@ if TYPE_CHECKING:
 
 TEMPLATE = Path(__file__).with_name("template_walk")
 """Templates of the files that differ from those of an arm."""
-_GRAVITY = 9.81  # [m/s^2]
 _CONTROL_DT = 0.02  # [s]
 _STEPS = 100  # that it must stand with zero actions
 _TINY = 1e-3  # [rad], of rounding
-_DROP = 0.05  # of the leg length: height above the stance at the start of an episode
-_SUNK = 0.65  # of the space under the trunk
 _ENDLESS_FORCE = 20.0  # of weight x leg length
 _LEVEL = 0.03  # of the leg length: how much the feet's heights may differ
 _KEYED = (0.55, 0.97)  # of the longest leg: legs of a keyframe that is a stance
 _UPRIGHT = -0.9  # component z of the direction of gravity, in the trunk's frame
-# Of Unitree's A1, 12.5 kg with legs of 0.28 m, as the task `walk` of rlctl has them, without their units: divided by
-# mass, leg length and gravity.
-_DAMPING = 0.12  # 0.7 N m s/rad
-_GEAR_DAMPING = 0.05  # 0.3 N m s/rad
-_ARMATURE = 0.01  # 0.01 kg m^2
-_LOWEST, _HIGHEST = (-0.3, -0.24, -0.135), (0.6, 0.24, 0.135)  # 0.5, 0.4 m/s, 0.8 rad/s; 1 m/s
-_SPEED_SCALE, _TURN_SCALE = 0.3, 0.085  # 0.5 m/s, 0.5 rad/s
-_TOLERANCE = 0.12  # 0.2 m/s
-_PUSH = 0.42  # 0.7 m/s
-_BOUNCE, _SWAY, _HEIGHT = -0.082, -0.175, -0.157  # weights of squares of speed, turning and height
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +45,10 @@ class _Legged:
     keyframe: str  # from which the stance is; empty if it was searched
     steps_up: int  # for which it stands with zero actions, at most `_STEPS`
     height: float  # of the trunk's centre of mass above the ground when it stands [m]
+
+    @property
+    def scaled(self) -> ScaledA1:
+        return scale_a1(self.body.total_mass(), self.stance)
 
     @property
     def joints(self) -> list[int]:
@@ -148,7 +139,7 @@ def _stand(legged: _Legged) -> tuple[int, float]:
     # As the task simulates it.
     sim = MujocoSim(control_dt=_CONTROL_DT, substeps=4, iterations=6, worlds=1)
     sim.load("ground", "plane.urdf", fixed=True).set_friction(0.8)
-    body, numbers = sim.load("robot", legged.path), _derive(legged)
+    body, numbers = sim.load("robot", legged.path), legged.scaled
     body.set_friction(1.0)
     body.set_drives(numbers.stiffness, numbers.damping, armature=numbers.armature)
     body.set_joint_damping(numbers.gear_damping)
@@ -165,43 +156,8 @@ def _stand(legged: _Legged) -> tuple[int, float]:
     return _STEPS, height
 
 
-@dataclasses.dataclass(frozen=True)
-class _Numbers:
-    """What scales with mass and leg length."""
-
-    speed: float  # [m/s], of Froude number 1
-    turning: float  # [rad/s]
-    stiffness: float  # [N m/rad]
-    damping: float  # [N m s/rad]
-    gear_damping: float  # [N m s/rad]
-    armature: float  # [kg m^2]
-    start_height: float  # [m]
-    fallen_height: float  # [m]
-
-
-def _derive(legged: _Legged) -> _Numbers:
-    mass, stance = legged.body.total_mass(), legged.stance
-    length = stance.leg_length
-    stiffness, period = mass * _GRAVITY * length, math.sqrt(length / _GRAVITY)
-    return _Numbers(
-        speed=math.sqrt(_GRAVITY * length),
-        turning=1 / period,
-        stiffness=_round(stiffness),
-        damping=_round(_DAMPING * stiffness * period),
-        gear_damping=_round(_GEAR_DAMPING * stiffness * period),
-        armature=_round(_ARMATURE * mass * length**2),
-        start_height=round(stance.height + _DROP * length, 3),
-        # It has lost most of the space under its trunk.
-        fallen_height=round(stance.height - _SUNK * stance.clearance, 3),
-    )
-
-
-def _round(value: float) -> float:
-    return float(f"{value:.2g}")
-
-
 def _limit_forces(legged: _Legged) -> tuple[list[float], str]:
-    limits, guess = legged.body.joint_max_force.tolist(), _derive(legged).stiffness
+    limits, guess = legged.body.joint_max_force.tolist(), legged.scaled.stiffness
     if all(limits):
         return limits, ", as in the model; CHANGE: those of your motors"
     return [limit or guess for limit in limits], "; CHANGE: a guess where the model has no limit"
@@ -226,7 +182,7 @@ def _list_notes(legged: _Legged, *, facing_y: bool) -> list[str]:
             f"Found no stance with level feet: their heights differ by {stance.unevenness:.2g} m; write your own STANCE"
         )
     limits = legged.body.joint_max_force
-    if not all(limits) or min(limits) > _ENDLESS_FORCE * _derive(legged).stiffness:
+    if not all(limits) or min(limits) > _ENDLESS_FORCE * legged.scaled.stiffness:
         notes.append("The file has no useful torque limits for all joints: write those of your motors into MAX_FORCE")
     if legged.steps_up < _STEPS:
         notes.append(
@@ -274,17 +230,11 @@ def _list_all_joints(legged: _Legged) -> str:
 
 
 def _describe(legged: _Legged) -> dict[str, str]:
-    body, stance, numbers = legged.body, legged.stance, _derive(legged)
+    body, stance, numbers = legged.body, legged.stance, legged.scaled
     name = re.sub(r"[^\w .-]", "", body._sim._scene.parts["robot"].file.path.stem)
     forces, force_comment = _limit_forces(legged)
-    units = (numbers.speed, numbers.speed, numbers.turning)
-    lowest, highest = (
-        ", ".join(f"{value * unit:.2g}" for value, unit in zip(froude, units, strict=True))
-        for froude in (_LOWEST, _HIGHEST)
-    )
-    tolerance = _round(_TOLERANCE * numbers.speed)
     found = f", keyframe {legged.keyframe!r} of the file" if legged.keyframe else ", knees bent"
-    steps = legged.steps_up // 2
+    steps = max(1, legged.steps_up // 2)
     return {
         "robot": name,
         "robot_phrase": name,
@@ -296,7 +246,7 @@ def _describe(legged: _Legged) -> dict[str, str]:
         "height": f"{legged.height:.3f}",
         "fallen_height": f"{numbers.fallen_height:.3f}",
         "start_height": f"{numbers.start_height:.3f}",
-        "weight": f"{body.total_mass() * _GRAVITY:.3g}",
+        "weight": f"{body.total_mass() * GRAVITY:.3g}",
         "leg": f"{stance.leg_length:.2g}",
         "stiffness": f"{numbers.stiffness:g}",
         "damping": f"{numbers.damping:g}",
@@ -304,17 +254,17 @@ def _describe(legged: _Legged) -> dict[str, str]:
         "gear_damping": f"{numbers.gear_damping:g}",
         "max_force": _write_forces(forces),
         "force_comment": force_comment,
-        "lowest": lowest,
-        "highest": highest,
-        "speed_scale": f"{_SPEED_SCALE * numbers.speed:.2g}",
-        "turn_scale": f"{_TURN_SCALE * numbers.turning:.2g}",
-        "tolerance": f"{tolerance:g}",
-        "smaller": f"{tolerance / 2:g}",
-        "push": f"{_PUSH * numbers.speed:.2g}",
-        "bounce_weight": f"{_BOUNCE / numbers.speed**2:.2g}",
-        "sway_weight": f"{_SWAY / numbers.turning**2:.2g}",
+        "lowest": ", ".join(f"{value:g}" for value in numbers.lowest),
+        "highest": ", ".join(f"{value:g}" for value in numbers.highest),
+        "speed_scale": f"{numbers.speed_scale:g}",
+        "turn_scale": f"{numbers.turn_scale:g}",
+        "tolerance": f"{numbers.tolerance:g}",
+        "smaller": f"{numbers.tolerance / 2:g}",
+        "push": f"{numbers.push:g}",
+        "bounce_weight": f"{numbers.bounce:g}",
+        "sway_weight": f"{numbers.sway:g}",
         "smoothness_weight": "-0.012",
-        "height_weight": f"{_HEIGHT / stance.leg_length**2:.2g}",
+        "height_weight": f"{numbers.height:g}",
         "feet": _write_list("FEET = ", map(json.dumps, sorted(set(legged.feet)))),
         "steps_up": str(steps),
         "steps_comment": "" if steps == _STEPS // 2 else "  # CHANGE: it fell later when this plugin was written",
