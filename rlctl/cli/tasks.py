@@ -156,12 +156,15 @@ def new_task(
         str | None, Option("Your robot: a URDF or MJCF file, copied with its meshes.", metavar="FILE")
     ] = None,
     link: Annotated[str | None, Option("Link of --model that is to reach the goal.", metavar="LINK")] = None,
+    walk: Annotated[
+        bool, Option("--model has legs and is free: a task in which it follows velocity commands.", ("--walk",))
+    ] = False,
     json: Json = None,
 ) -> None:
-    """Create a starter plugin in a folder NAME: a reach task that trains as it is, its recipe and tests."""
+    """Create a starter plugin in a folder NAME: a reach or walk task that trains as it is, its recipe and tests."""
     from rlctl.tasks.new import create, show
 
-    show(create(name, model=model, link=link), json)
+    show(create(name, model=model, link=link, walk=walk), json)
 
 
 @command

@@ -12,7 +12,7 @@ from rlctl.environments import installed
 from rlctl.errors import UsageError
 from rlctl.recipe.recipe import SCHEMA_FILE
 from rlctl.storage import files as storage_files
-from rlctl.tasks.starter_robot import make_planar_arm, read_robot
+from rlctl.tasks.starter_robot import StarterRobot, make_planar_arm, read_robot
 
 TEMPLATE = Path(__file__).with_name("template")
 """Templates of the files: `$name`, `$package`, `$cls` and the values of a `StarterRobot`; `package/` gets its name."""
@@ -41,22 +41,23 @@ class NewPlugin:
         return f"{self.folder / self.package / 'task.py'}:{self.cls}"
 
 
-def create(name: str, *, model: str | None = None, link: str | None = None) -> NewPlugin:
+def create(name: str, *, model: str | None = None, link: str | None = None, walk: bool = False) -> NewPlugin:
     """Write the plugin `name` atomically into the current folder.
 
-    `model` is the user's own robot, of which `link` is to reach. Raises `UsageError` for a name in use, and for a model
-    that is missing or no arm.
+    `model` is the user's own robot, of which `link` is to reach, or which is to `walk`. Raises `UsageError` for a name
+    in use, and for a model that is missing, or no arm or no robot with legs.
     """
-    if link is not None and model is None:
-        raise UsageError("--link needs --model")
+    if model is None and (walk or link is not None):
+        raise UsageError(f"{'--walk' if walk else '--link'} needs --model")
+    if walk and link is not None:
+        raise UsageError("--walk and --link exclude each other: --link is the tip of an arm")
     package = name.replace("-", "_").lower()
     _check(name, package)
     folder = Path(name)
     if os.path.lexists(folder):
         raise UsageError(f"{folder} already exists; choose another name or another folder")
-    robot = make_planar_arm() if model is None else read_robot(model, link)
-    templates = sorted(TEMPLATE.rglob(f"*{_SUFFIX}"))
-    sources = {file.relative_to(TEMPLATE).with_suffix(""): file.read_text(encoding="utf-8") for file in templates}
+    robot = _read_robot(model, link, walk=walk)
+    sources = _read_templates(TEMPLATE) | (_read_templates(robot.template) if robot.template else {})
     cls = _make_class_name(name, "".join(sources.values()))
     values = {**robot.values, "name": name, "package": package, "cls": cls}
     content = {
@@ -73,6 +74,21 @@ def create(name: str, *, model: str | None = None, link: str | None = None) -> N
             (temporary / path).parent.mkdir(parents=True, exist_ok=True)
             storage_files.write_new(temporary / path, data)
     return NewPlugin(name, folder, package, cls, sorted(content), robot.summary)
+
+
+def _read_robot(model: str | None, link: str | None, *, walk: bool) -> StarterRobot:
+    if model is None:
+        return make_planar_arm()
+    if not walk:
+        return read_robot(model, link)
+    from rlctl.tasks.legged_robot import read_legged_robot  # it loads NumPy
+
+    return read_legged_robot(model)
+
+
+def _read_templates(folder: Path) -> dict[Path, str]:
+    files = sorted(folder.rglob(f"*{_SUFFIX}"))
+    return {file.relative_to(folder).with_suffix(""): file.read_text(encoding="utf-8") for file in files}
 
 
 def show(plugin: NewPlugin, json: str | None) -> None:

@@ -35,7 +35,9 @@ class StarterRobot:
     files: Mapping[Path, bytes]
     """The model and its meshes, relative to the package."""
     summary: str
-    """A line that says what was chosen."""
+    """What was chosen, a line or several."""
+    template: Path | None = None
+    """Folder with files that replace those of an arm."""
 
 
 def make_planar_arm() -> StarterRobot:
@@ -99,7 +101,8 @@ def read_robot(model: str, link: str | None) -> StarterRobot:
         raise UsageError(f"--model: {error}") from None
     if not body.fixed or not body.joint_names:
         what = "its base is free" if not body.fixed else "it has no joints"
-        raise UsageError(f"--model {model}: {what}; this makes a task for an arm that is mounted")
+        legs = "" if body.fixed else "; for a robot with legs add --walk"
+        raise UsageError(f"--model {model}: {what}; this makes a task for an arm that is mounted{legs}")
     tip = link if link is not None else _find_tip(body)
     check_name(tip, [body.base_name, *body.link_names], f"--link: {path.name} has no link", UsageError)
     joints = [body.joint_names[joint] for joint in _list_joints_to(body, tip)]

@@ -1,0 +1,271 @@
+"""The legged robot of a starter plugin that walks: stance, gains and commands from a user's model."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import re
+import textwrap
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rlctl.errors import TaskError, UsageError
+from rlctl.task.rotations import rotate_inverse
+from rlctl.tasks.legs import Leg, Skeleton, find_legs
+from rlctl.tasks.model_copy import copy_model
+from rlctl.tasks.scaling import GRAVITY, ScaledA1, scale_a1
+from rlctl.tasks.stance import Stance, StanceSearch, measure_stance
+from rlctl.tasks.starter_robot import _WIDTH, StarterRobot, _write, _write_list
+
+if TYPE_CHECKING:
+    from rlctl.task.mujoco.body import MujocoBody
+
+TEMPLATE = Path(__file__).with_name("template_walk")
+"""Templates of the files that differ from those of an arm."""
+_CONTROL_DT = 0.02  # [s]
+_STEPS = 100  # that it must stand with zero actions
+_TINY = 1e-3  # [rad], of rounding
+_ENDLESS_FORCE = 20.0  # of weight x leg length
+_LEVEL = 0.03  # of the leg length: how much the feet's heights may differ
+_KEYED = (0.55, 0.97)  # of the longest leg: legs of a keyframe that is a stance
+_UPRIGHT = -0.9  # component z of the direction of gravity, in the trunk's frame
+
+
+@dataclasses.dataclass(frozen=True)
+class _Legged:
+    body: MujocoBody
+    path: Path
+    legs: list[Leg]
+    stance: Stance
+    keyframe: str  # from which the stance is; empty if it was searched
+    steps_up: int  # for which it stands with zero actions, at most `_STEPS`
+    height: float  # of the trunk's centre of mass above the ground when it stands [m]
+
+    @property
+    def scaled(self) -> ScaledA1:
+        return scale_a1(self.body.total_mass(), self.stance)
+
+    @property
+    def joints(self) -> list[int]:
+        return sorted(joint for leg in self.legs for joint in leg.joints)
+
+    @property
+    def feet(self) -> list[str]:
+        return [leg.foot.link for leg in self.legs]
+
+
+def read_legged_robot(model: str) -> StarterRobot:
+    """Read a user's URDF or MJCF file of a robot with legs, which is free to move.
+
+    Raises `UsageError` for a file that is missing, cannot be loaded, has no joints, a fixed base or no legs.
+    """
+    path, body = _load(model)
+    if not body.joint_names:
+        raise UsageError(f"--model {model}: it has no joints; --walk makes a task for a robot with legs")
+    if body.fixed:
+        raise UsageError(f"--model {model}: its base is fixed; add <freejoint/> to the body {body.base_name!r}")
+    skeleton = Skeleton(body)
+    legs, mirror = find_legs(skeleton)
+    if slides := [body.joint_names[joint] for leg in legs for joint in leg.joints if _slides(body, joint)]:
+        raise UsageError(f"--model {model}: joint {slides[0]!r} slides; --walk needs legs whose joints rotate")
+    search = StanceSearch(skeleton, legs, mirror)
+    keyframe, stance = _find_keyframe(skeleton, legs, search.longest)
+    stance = stance or search.find()
+    legged = _Legged(body, path, legs, stance, keyframe, 0, stance.height)
+    steps_up, height = _stand(legged)
+    legged = dataclasses.replace(legged, steps_up=steps_up, height=height)
+    files = copy_model(path)
+    notes = [*_list_notes(legged, facing_y=bool(mirror[0] < 0)), *_remove_floor(files, Path(path.name))]
+    return StarterRobot(_describe(legged), files, _summarize(legged, notes), template=TEMPLATE)
+
+
+def _load(model: str) -> tuple[Path, MujocoBody]:
+    """Load a model with a free base; raises `UsageError`."""
+    from rlctl.task.model_files import find_model_file
+    from rlctl.task.mujoco.sim import MujocoSim
+
+    path = Path(model)
+    try:
+        path = find_model_file(model)
+        return path, MujocoSim(control_dt=_CONTROL_DT, substeps=4).load("robot", path)
+    except TaskError as error:
+        problem = str(error)
+    if path.is_file():
+        with contextlib.suppress(TaskError):
+            base = MujocoSim(control_dt=_CONTROL_DT, substeps=4).load("robot", path, fixed=True).base_name
+            problem = f"the base {base!r} of {path.name} cannot be free without mass; for an arm leave out --walk"
+    raise UsageError(f"--model: {problem}")
+
+
+def _slides(body: MujocoBody, joint: int) -> bool:
+    return int(body._sim.model.jnt_type[body.parts.joints[joint]]) == 2
+
+
+def _find_keyframe(skeleton: Skeleton, legs: Sequence[Leg], longest: float) -> tuple[str, Stance | None]:
+    """Return the keyframe `home` of an MJCF file, or its first, if it is a stance for legs of `longest` [m]."""
+    import mujoco
+
+    body = skeleton.body
+    if body.file.suffix != ".xml":
+        return "", None
+    spec = mujoco.MjSpec.from_file(str(body.file))
+    keys = sorted(spec.keys, key=lambda key: str(key.name) != "home")  # the order of the others stays
+    sizes = {0: 7, 1: 4}  # free and ball joints
+    starts = np.cumsum([0, *(sizes.get(int(joint.type), 1) for joint in spec.joints)]).tolist()
+    places = [start for start, joint in zip(starts, spec.joints, strict=False) if int(joint.type) >= 2]
+    if not keys or len(keys[0].qpos) != starts[-1]:
+        return "", None
+    positions = np.asarray(keys[0].qpos, float)[places]
+    stance = measure_stance(skeleton, legs, positions)
+    low, high = (factor * longest for factor in _KEYED)
+    inside = (positions >= body.joint_low - _TINY) & (positions <= body.joint_high + _TINY)
+    if inside.all() and low <= stance.leg_length <= high and stance.unevenness <= _LEVEL * longest:
+        return str(keys[0].name) or "0", stance
+    return "", None
+
+
+def _stand(legged: _Legged) -> tuple[int, float]:
+    """Return how many steps the robot stands with zero actions, at most `_STEPS`, and how high its trunk then is [m].
+
+    The joints, which are springs, give way a little. The height of a robot that falls is that of its stance.
+    """
+    from rlctl.task.mujoco.sim import MujocoSim
+
+    # As the task simulates it.
+    sim = MujocoSim(control_dt=_CONTROL_DT, substeps=4, iterations=6, worlds=1)
+    sim.load("ground", "plane.urdf", fixed=True).set_friction(0.8)
+    body, numbers = sim.load("robot", legged.path), legged.scaled
+    body.set_friction(1.0)
+    body.set_drives(numbers.stiffness, numbers.damping, armature=numbers.armature)
+    body.set_joint_damping(numbers.gear_damping)
+    sim.save()
+    stance, world = legged.stance.positions[None], np.zeros(1, np.int64)
+    body.set_base(np.array([[0.0, 0.0, numbers.start_height]]), worlds=world)
+    body.set_joints(stance, worlds=world)
+    for step in range(_STEPS):
+        body.drive_to(stance, max_force=_limit_forces(legged)[0])
+        sim.step()
+        down, height = rotate_inverse(body.base_orientation[0], (0.0, 0.0, -1.0)), float(body.base_position[0, 2])
+        if down[2] > _UPRIGHT or height < numbers.fallen_height:
+            return step, legged.stance.height
+    return _STEPS, height
+
+
+def _limit_forces(legged: _Legged) -> tuple[list[float], str]:
+    limits, guess = legged.body.joint_max_force.tolist(), legged.scaled.stiffness
+    if all(limits):
+        return limits, ", as in the model; CHANGE: those of your motors"
+    return [limit or guess for limit in limits], "; CHANGE: a guess where the model has no limit"
+
+
+def _write_forces(forces: list[float]) -> str:
+    if len(set(forces)) == 1:
+        return f"[{_write(forces[0])}] * {len(forces)}"
+    return _write_list("MAX_FORCE = ", map(_write, forces))
+
+
+def _list_notes(legged: _Legged, *, facing_y: bool) -> list[str]:
+    """Return what a user should know, a sentence each."""
+    stance, notes = legged.stance, []
+    others = [name for index, name in enumerate(legged.body.joint_names) if index not in legged.joints]
+    if others:
+        notes.append(f"{', '.join(others)} {'keep' if len(others) > 1 else 'keeps'} STANCE")
+    if facing_y:
+        notes.append("Its legs are in pairs along x, so it may face along y; the commanded lin_vel_x is along x")
+    if stance.unevenness > _LEVEL * stance.leg_length:
+        notes.append(
+            f"Found no stance with level feet: their heights differ by {stance.unevenness:.2g} m; write your own STANCE"
+        )
+    limits = legged.body.joint_max_force
+    if not all(limits) or min(limits) > _ENDLESS_FORCE * legged.scaled.stiffness:
+        notes.append("The file has no useful torque limits for all joints: write those of your motors into MAX_FORCE")
+    if legged.steps_up < _STEPS:
+        notes.append(
+            f"With zero actions it falls after {legged.steps_up * _CONTROL_DT:.1f} s: look at it with the first "
+            "command below, and change STANCE, STIFFNESS or MAX_FORCE"
+        )
+    if len(legged.legs) == 2:
+        notes.append(
+            "Walking on two legs usually needs more than this task has: see the clock in rlctl's humanoid-walk"
+        )
+    return notes
+
+
+def _remove_floor(files: dict[Path, bytes], model: Path) -> list[str]:
+    """Remove shapes of the world, such as a floor, from the copy of an MJCF file; return a sentence if there were."""
+    if model.suffix != ".xml":
+        return []
+    root = ElementTree.fromstring(files[model])
+    removed = 0
+    for world in root.iterfind("worldbody"):
+        for geom in world.findall("geom"):
+            world.remove(geom)
+            removed += 1
+    if not removed:
+        return []
+    files[model] = ElementTree.tostring(root)
+    return [f"The copy of {model.name} has no floor, since the task loads one"]
+
+
+def _summarize(legged: _Legged, notes: Sequence[str]) -> str:
+    start = f"keyframe {legged.keyframe!r}" if legged.keyframe else "a search"
+    first = (
+        f"{legged.path.name}: {legged.body.total_mass():.3g} kg on {len(legged.legs)} legs, "
+        f"{', '.join(legged.feet)}; {legged.stance.leg_length:.2g} m from hip to foot in STANCE, which is from {start}"
+    )
+    return ".\n".join([first, *notes, "Comments with CHANGE in task.py mark what to adapt"])
+
+
+def _list_all_joints(legged: _Legged) -> str:
+    names = legged.body.joint_names
+    if len(legged.joints) == len(names):
+        return "# Of all joints of the model, in its order."
+    text = f"Of all joints of the model: {', '.join(names)}."
+    return textwrap.fill(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
+
+
+def _describe(legged: _Legged) -> dict[str, str]:
+    body, stance, numbers = legged.body, legged.stance, legged.scaled
+    name = re.sub(r"[^\w .-]", "", body._sim._scene.parts["robot"].file.path.stem)
+    forces, force_comment = _limit_forces(legged)
+    found = f", keyframe {legged.keyframe!r} of the file" if legged.keyframe else ", knees bent"
+    steps = max(1, legged.steps_up // 2)
+    return {
+        "robot": name,
+        "robot_phrase": name,
+        "model": legged.path.name,
+        "joints": _write_list("JOINTS = ", [json.dumps(body.joint_names[joint]) for joint in legged.joints]),
+        "all_joints": _list_all_joints(legged),
+        "stance": _write_list("STANCE = np.array(", map(_write, stance.positions), ")"),
+        "stance_comment": f"{found}; CHANGE: a pose in which it stands well",
+        "height": f"{legged.height:.3f}",
+        "fallen_height": f"{numbers.fallen_height:.3f}",
+        "start_height": f"{numbers.start_height:.3f}",
+        "weight": f"{body.total_mass() * GRAVITY:.3g}",
+        "leg": f"{stance.leg_length:.2g}",
+        "stiffness": f"{numbers.stiffness:g}",
+        "damping": f"{numbers.damping:g}",
+        "armature": f"{numbers.armature:g}",
+        "gear_damping": f"{numbers.gear_damping:g}",
+        "max_force": _write_forces(forces),
+        "force_comment": force_comment,
+        "lowest": ", ".join(f"{value:g}" for value in numbers.lowest),
+        "highest": ", ".join(f"{value:g}" for value in numbers.highest),
+        "speed_scale": f"{numbers.speed_scale:g}",
+        "turn_scale": f"{numbers.turn_scale:g}",
+        "tolerance": f"{numbers.tolerance:g}",
+        "smaller": f"{numbers.tolerance / 2:g}",
+        "push": f"{numbers.push:g}",
+        "bounce_weight": f"{numbers.bounce:g}",
+        "sway_weight": f"{numbers.sway:g}",
+        "smoothness_weight": "-0.012",
+        "height_weight": f"{numbers.height:g}",
+        "feet": _write_list("FEET = ", map(json.dumps, sorted(set(legged.feet)))),
+        "steps_up": str(steps),
+        "steps_comment": "" if steps == _STEPS // 2 else "  # CHANGE: it fell later when this plugin was written",
+    }

@@ -1,0 +1,243 @@
+"""The legs of a robot model: chains of joints that leave its trunk in pairs, left and right, down to the ground."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import UsageError
+
+if TYPE_CHECKING:
+    from rlctl.task.mujoco.body import MujocoBody
+
+Array = NDArray[np.float64]
+MIRRORS = (np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0]))
+"""Left and right exchanged, for a robot that faces along x and along y."""
+ENDLESS = np.pi  # [rad], to each side, of a joint that can turn around
+_SAMPLES = 300
+_SAME_PLACE = 0.1  # of the distance of the farthest hip: how far from its mirror image the other hip may be
+_DEPTH = 0.6  # of the deepest reach: arms do not get as far down as legs
+_POINTS = 200  # of a foot's shapes
+
+
+@dataclasses.dataclass(frozen=True)
+class Foot:
+    """Points of the shapes that a leg ends in, each with a radius around it [m]."""
+
+    link: str
+    bodies: list[int]  # MuJoCo's number of the link of each point
+    points: Array  # (n, 3), in the frame of its link
+    radii: Array  # (n,)
+
+
+@dataclasses.dataclass(frozen=True)
+class Leg:
+    """A chain of joints and what it ends in."""
+
+    joints: list[int]  # indices in `joint_names`, from the trunk on
+    foot: Foot
+    other: int  # index of the leg on the other side
+
+
+class Skeleton:
+    """A free body in MuJoCo, with its trunk's centre of mass at the origin, of which only the joints are moved."""
+
+    def __init__(self, body: MujocoBody) -> None:
+        self.body, self.model, self.data = body, body._sim.model, body._sim.data
+        self._mujoco = body._sim.mujoco
+        body.set_base((0.0, 0.0, 0.0))
+        self.joints = np.array(body.parts.joints, int)  # MuJoCo's numbers
+        self._places = self.model.jnt_qposadr[self.joints]
+        bounded = body.joint_high - body.joint_low < 2 * ENDLESS
+        self.low = np.where(bounded, body.joint_low, -ENDLESS)
+        self.high = np.where(bounded, body.joint_high, ENDLESS)
+        middle = (self.low + self.high) / 2
+        self.rest: Array = np.where((self.low <= 0) & (self.high >= 0), 0.0, middle)
+        """Positions of all joints: 0, or the middle of a range without 0."""
+        self.trunk = body.find_link(body.base_name)
+        self._find_parts()
+
+    def _find_parts(self) -> None:
+        """Join links without joints between them to one part, whose number is that of its first link."""
+        model = self.model
+        self.part_of = {self.trunk: self.trunk}
+        for link in sorted(self.body.parts.link_names):
+            above = self.part_of.get(int(model.body_parentid[link]))
+            if link != self.trunk and above is not None:
+                self.part_of[link] = link if model.body_jntnum[link] else above
+        self.above = {part: self.part_of.get(int(model.body_parentid[part]), -1) for part in self.part_of.values()}
+        self.above[self.trunk] = -1
+
+    def place(self, positions: Array) -> None:
+        """Set all joints."""
+        self.data.qpos[self._places] = positions
+        self._mujoco.mj_kinematics(self.model, self.data)
+
+    def anchors(self, joints: Sequence[int]) -> Array:
+        """Return where joints are [m], shape (joints, 3)."""
+        found: Array = self.data.xanchor[self.joints[list(joints)]].copy()
+        return found
+
+    def axes(self, joints: Sequence[int]) -> Array:
+        """Return the axes of joints, shape (joints, 3)."""
+        found: Array = self.data.xaxis[self.joints[list(joints)]].copy()
+        return found
+
+    def touch(self, foot: Foot) -> Array:
+        """Return where a foot would touch the ground [m]: the middle of its lowest points, shape (3,)."""
+        frames = self.data.xmat[foot.bodies].reshape(-1, 3, 3)
+        places = self.data.xpos[foot.bodies] + np.einsum("nij,nj->ni", frames, foot.points)
+        places[:, 2] -= foot.radii
+        lowest = places[places[:, 2] < places[:, 2].min() + self.thickness(foot)]
+        return np.array([*((lowest.min(axis=0) + lowest.max(axis=0)) / 2)[:2], places[:, 2].min()])
+
+    def thickness(self, foot: Foot) -> float:
+        """Return within which height [m] of its lowest one points of a foot count as its sole."""
+        return 0.05 * float(np.ptp(foot.points, axis=0).max()) + 1e-4
+
+    def chain(self, part: int) -> list[int]:
+        """Return the indices of the joints from the trunk to a part."""
+        numbers: list[int] = []
+        while part != self.trunk:
+            own = [index for index, joint in enumerate(self.joints) if self.model.jnt_bodyid[joint] == part]
+            numbers, part = own + numbers, self.above[part]
+        return numbers
+
+    def centre_of_mass(self) -> Array:
+        """Return the centre of mass of all links [m], shape (3,)."""
+        self._mujoco.mj_comPos(self.model, self.data)
+        centre: Array = self.data.subtree_com[self.trunk].copy()
+        return centre
+
+    def lowest_of_trunk(self) -> float:
+        """Return the height of the trunk's lowest point, 0 or less [m]."""
+        geoms = [geom for geom in self.body.parts.geoms if self.part_of.get(self._owner(geom)) == self.trunk]
+        if not geoms:
+            return 0.0
+        return min(0.0, float(self.touch(_make_foot(self, self.trunk, geoms))[2]))
+
+    def _owner(self, geom: int) -> int:
+        return int(self.model.geom_bodyid[geom])
+
+
+def find_legs(skeleton: Skeleton) -> tuple[list[Leg], Array]:
+    """Return the legs, and the mirror of `MIRRORS` by which they are in pairs; raises `UsageError` without any."""
+    chains = _find_chains(skeleton)
+    name = skeleton.body.file.name
+    skeleton.place(skeleton.rest)
+    for mirror in MIRRORS:
+        pairs = _find_pairs(skeleton, [joints for joints, _ in chains], mirror)
+        legs = [Leg(*chains[index], other) for index, other in pairs.items()]
+        if legs:
+            return _keep_deepest(skeleton, legs, list(pairs)), mirror
+    if not chains:
+        raise UsageError(f"--model {name}: no link that a joint moves has a collision shape, so it cannot stand")
+    raise UsageError(
+        f"--model {name}: found no legs: --walk needs pairs of chains of joints, left and right of the trunk "
+        f"{skeleton.body.base_name!r}; for an arm leave out --walk"
+    )
+
+
+def _find_chains(skeleton: Skeleton) -> list[tuple[list[int], Foot]]:
+    """Return the joints that only this chain has, and the end, of each chain with a shape at its end."""
+    geoms: dict[int, list[int]] = {}
+    for geom in skeleton.body.parts.geoms:
+        part = skeleton.part_of.get(skeleton._owner(geom))
+        if part is not None:
+            geoms.setdefault(part, []).append(geom)
+    inner: set[int] = set()
+    for part in geoms:
+        while part != -1 and (part := skeleton.above[part]) != -1:
+            inner.add(part)
+    ends: dict[int, list[int]] = {}
+    for end in (part for part in geoms if part not in inner):
+        chain = skeleton.chain(end)
+        # Fingers of one hand, or toes of one foot, are one end.
+        if chain and not any(len(set(chain) & set(known)) > len(chain) / 2 for known in ends.values()):
+            ends[end] = chain
+    shared = [joint for chain in ends.values() for joint in chain]
+    own = {end: [joint for joint in chain if shared.count(joint) == 1] for end, chain in ends.items()}
+    return [(joints, _make_foot(skeleton, end, geoms[end])) for end, joints in own.items() if joints]
+
+
+def _find_pairs(skeleton: Skeleton, chains: list[list[int]], mirror: Array) -> dict[int, int]:
+    """Return the index of the chain on the other side, for all that have one."""
+    hips = np.array([skeleton.anchors(joints)[0] for joints in chains]).reshape(-1, 3)
+    centre = (hips.min(axis=0) + hips.max(axis=0)) / 2 if len(hips) else np.zeros(3)
+    tolerance = _SAME_PLACE * float(np.linalg.norm(hips - centre, axis=1).max(initial=0.0))
+    found: dict[int, int] = {}
+    for index, hip in enumerate(hips):
+        distances = np.linalg.norm(hips - centre - (hip - centre) * mirror, axis=1)
+        other = int(distances.argmin())
+        if other != index and distances[other] < tolerance and len(chains[other]) == len(chains[index]):
+            found[index] = other
+    return {index: other for index, other in found.items() if found.get(other) == index}
+
+
+def _keep_deepest(skeleton: Skeleton, legs: list[Leg], numbers: list[int]) -> list[Leg]:
+    """Return the legs that reach down about as far as any, in the order of their joints, with `other` adapted."""
+    rng, depths = np.random.default_rng(0), np.zeros(len(legs))
+    moved = [joint for leg in legs for joint in leg.joints]
+    for _ in range(_SAMPLES):
+        positions = skeleton.rest.copy()
+        positions[moved] = rng.uniform(skeleton.low[moved], skeleton.high[moved])
+        skeleton.place(positions)
+        depths = np.minimum(depths, [skeleton.touch(leg.foot)[2] for leg in legs])
+    deep = {numbers[index]: leg for index, leg in enumerate(legs) if depths[index] <= _DEPTH * depths.min()}
+    kept = {number: leg for number, leg in deep.items() if leg.other in deep}
+    order = sorted(kept, key=lambda number: kept[number].joints)
+    return [dataclasses.replace(kept[number], other=order.index(kept[number].other)) for number in order]
+
+
+def _make_foot(skeleton: Skeleton, part: int, geoms: list[int]) -> Foot:
+    clouds = [_list_points(skeleton.model, geom) for geom in geoms]
+    bodies = [skeleton._owner(geom) for geom, (points, _) in zip(geoms, clouds, strict=True) for _ in points]
+    points, radii = (np.concatenate(column) for column in zip(*clouds, strict=True))
+    names = [skeleton.body.parts.link_names[body] for body in bodies]
+    # The link farthest down the tree, such as a foot that is fixed to a shank.
+    return Foot(names[int(np.argmax(bodies))] if names else skeleton.body.base_name, bodies, points, radii)
+
+
+def _list_points(model: Any, geom: int) -> tuple[Array, Array]:
+    """Return points on a shape in the frame of its link, shape (n, 3), and a radius around each [m], shape (n,)."""
+    import mujoco
+
+    kinds, kind, size = mujoco.mjtGeom, int(model.geom_type[geom]), model.geom_size[geom]
+    radius = 0.0
+    if kind == kinds.mjGEOM_SPHERE:
+        points, radius = np.zeros((1, 3)), float(size[0])
+    elif kind == kinds.mjGEOM_CAPSULE:
+        points, radius = np.array([[0, 0, size[1]], [0, 0, -size[1]]]), float(size[0])
+    elif kind == kinds.mjGEOM_MESH:
+        points = _list_vertices(model, int(model.geom_dataid[geom]))
+    elif kind == kinds.mjGEOM_CYLINDER:
+        turns = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+        circle = np.stack([size[0] * np.cos(turns), size[0] * np.sin(turns)], axis=1)
+        points = np.concatenate([np.column_stack([circle, np.full(32, end)]) for end in (-size[1], size[1])])
+    elif kind == kinds.mjGEOM_ELLIPSOID:
+        points = _list_directions() * size
+    else:
+        points = size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    frame = np.zeros(9)
+    mujoco.mju_quat2Mat(frame, model.geom_quat[geom])
+    return points @ frame.reshape(3, 3).T + model.geom_pos[geom], np.full(len(points), radius)
+
+
+def _list_vertices(model: Any, mesh: int) -> Array:
+    """Return vertices of a mesh: those that are farthest in some direction."""
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    vertices = np.asarray(model.mesh_vert[first : first + count], float)
+    farthest: Array = vertices[np.unique((vertices @ _list_directions().T).argmax(axis=0))]
+    return farthest
+
+
+def _list_directions() -> Array:
+    """Return directions that are spread evenly: a spiral around the sphere."""
+    heights = 1 - (2 * np.arange(_POINTS) + 1) / _POINTS
+    turns = np.arange(_POINTS) * np.pi * (3 - np.sqrt(5))
+    around = np.sqrt(1 - heights**2)
+    return np.stack([around * np.cos(turns), around * np.sin(turns), heights], axis=1)
