@@ -19,8 +19,9 @@ from rlctl.task.rotations import rotate_inverse
 from rlctl.tasks.legs import Leg, Skeleton, find_legs
 from rlctl.tasks.model_copy import copy_model
 from rlctl.tasks.scaling import GRAVITY, ScaledA1, scale_a1
+from rlctl.tasks.source_text import LINE_WIDTH, write_list, write_number
 from rlctl.tasks.stance import Stance, StanceSearch, measure_stance
-from rlctl.tasks.starter_robot import _WIDTH, StarterRobot, _write, _write_list
+from rlctl.tasks.starter_robot import StarterRobot
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.body import MujocoBody
@@ -165,8 +166,8 @@ def _limit_forces(legged: _Legged) -> tuple[list[float], str]:
 
 def _write_forces(forces: list[float]) -> str:
     if len(set(forces)) == 1:
-        return f"[{_write(forces[0])}] * {len(forces)}"
-    return _write_list("MAX_FORCE = ", map(_write, forces))
+        return f"[{write_number(forces[0])}] * {len(forces)}"
+    return write_list("MAX_FORCE = ", map(write_number, forces))
 
 
 def _list_notes(legged: _Legged, *, facing_y: bool) -> list[str]:
@@ -226,7 +227,7 @@ def _list_all_joints(legged: _Legged) -> str:
     if len(legged.joints) == len(names):
         return "# Of all joints of the model, in its order."
     text = f"Of all joints of the model: {', '.join(names)}."
-    return textwrap.fill(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
+    return textwrap.fill(text, LINE_WIDTH, initial_indent="# ", subsequent_indent="# ")
 
 
 def _describe(legged: _Legged) -> dict[str, str]:
@@ -239,9 +240,9 @@ def _describe(legged: _Legged) -> dict[str, str]:
         "robot": name,
         "robot_phrase": name,
         "model": legged.path.name,
-        "joints": _write_list("JOINTS = ", [json.dumps(body.joint_names[joint]) for joint in legged.joints]),
+        "joints": write_list("JOINTS = ", [json.dumps(body.joint_names[joint]) for joint in legged.joints]),
         "all_joints": _list_all_joints(legged),
-        "stance": _write_list("STANCE = np.array(", map(_write, stance.positions), ")"),
+        "stance": write_list("STANCE = np.array(", map(write_number, stance.positions), ")"),
         "stance_comment": f"{found}; CHANGE: a pose in which it stands well",
         "height": f"{legged.height:.3f}",
         "fallen_height": f"{numbers.fallen_height:.3f}",
@@ -265,7 +266,7 @@ def _describe(legged: _Legged) -> dict[str, str]:
         "sway_weight": f"{numbers.sway:g}",
         "smoothness_weight": "-0.012",
         "height_weight": f"{numbers.height:g}",
-        "feet": _write_list("FEET = ", map(json.dumps, sorted(set(legged.feet)))),
+        "feet": write_list("FEET = ", map(json.dumps, sorted(set(legged.feet)))),
         "steps_up": str(steps),
         "steps_comment": "" if steps == _STEPS // 2 else "  # CHANGE: it fell later when this plugin was written",
     }

@@ -7,18 +7,18 @@ import json
 import math
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.tasks.model_copy import copy_model
+from rlctl.tasks.source_text import LINE_WIDTH, write_list, write_number
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.body import MujocoBody
 
 _PLANAR_ARM = Path(__file__).with_name("arm.urdf")
-_WIDTH = 120  # of a line
 _FASTEST = {"rotates": 3.0, "slides": 0.5}  # [rad/s], [m/s] of a first task; models often have no useful limit
 _GUESSED_FORCE = 10.0  # [N m or N], of a joint without a limit
 _LOWEST_TIP = 0.03  # [m], above the floor, at the start
@@ -164,18 +164,18 @@ def _describe(body: MujocoBody, path: Path, tip: str, joints: list[str]) -> dict
         "floor": "" if _has_plane(body) else _FLOOR,
         "fixed": ", fixed=True" if path.suffix == ".urdf" else "",  # other formats contain it
         "tip": json.dumps(tip)[1:-1],
-        "joints": _write_list("JOINTS = ", [json.dumps(joint) for joint in joints]),
+        "joints": write_list("JOINTS = ", [json.dumps(joint) for joint in joints]),
         "all_joints": textwrap.fill(
             f"Of all joints of the model: {', '.join(body.joint_names)}.",
-            _WIDTH,
+            LINE_WIDTH,
             initial_indent="# ",
             subsequent_indent="# ",
         ),
-        "start": _write_list("START = np.array(", map(_write, start)),
+        "start": write_list("START = np.array(", map(write_number, start)),
         "start_comment": "; CHANGE: a pose from which the arm gets everywhere",
-        "max_speed": _write_list("MAX_SPEED = ", map(_write, speeds)),
+        "max_speed": write_list("MAX_SPEED = ", map(write_number, speeds)),
         "speed_comment": speed_comment,
-        "max_force": _write_list("MAX_FORCE = ", map(_write, forces)),
+        "max_force": write_list("MAX_FORCE = ", map(write_number, forces)),
         "force_comment": force_comment,
         "start_noise": "0.1",
         "tolerance": f"{tolerance:g}",
@@ -186,7 +186,7 @@ def _describe(body: MujocoBody, path: Path, tip: str, joints: list[str]) -> dict
         "tip_to_goal": "self.goal - self.arm.link_position(TIP)",
         "axes": "",
         "clips_target": str(is_bounded),
-        "pose": _write_list("    task.arm.set_joints(np.array(", map(_write, start), "))"),
+        "pose": write_list("    task.arm.set_joints(np.array(", map(write_number, start), "))"),
         "pose_comment": "START, and where MuJoCo placed the tip when this plugin was written: has the model changed?",
         "pose_tip": f"[{', '.join(f'{value:.4f}' for value in place)}]",
         "reach": f"{math.ceil(100 * reach) / 100:g}",
@@ -235,17 +235,3 @@ def _limit_forces(body: MujocoBody) -> tuple[list[float], str]:
     if all(limits):
         return limits, ", as in the model; CHANGE: those of your motors"
     return [limit or _GUESSED_FORCE for limit in limits], "; CHANGE: a guess where the model has no limit"
-
-
-def _write(number: float) -> str:
-    return repr(round(float(number), 4))
-
-
-def _write_list(before: str, items: Any, after: str = "") -> str:
-    """Return a list as code, an item per line where it does not fit behind `before`."""
-    texts: Sequence[str] = list(items)
-    line = f"[{', '.join(texts)}]"
-    if len(before) + len(line) + len(after) <= _WIDTH:
-        return line
-    indent = " " * (len(before) - len(before.lstrip()) + 4)
-    return "[\n" + "".join(f"{indent}{text},\n" for text in texts) + indent[:-4] + "]"
