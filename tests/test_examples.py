@@ -177,6 +177,11 @@ def test_the_check_env_action_runs(tmp_path: Path) -> None:
     assert json.loads(Path(outputs["report"]).read_text())["findings"] == []
 
 
+def test_arguments_of_the_action_may_have_several_lines(tmp_path: Path) -> None:
+    assert run_action(tmp_path, "pointmass.py:Nobody", "--select RL99")[0] == 2
+    assert run_action(tmp_path, "pointmass.py:Nobody", "--select RL99\n--help")[0] == 0
+
+
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 def test_the_action_comments_on_the_check_that_it_ran(tmp_path: Path) -> None:
     report = tmp_path / "check-env-pointmass.py-Nobody.json"

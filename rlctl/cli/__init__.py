@@ -3,6 +3,8 @@
 Each command imports what it needs when it runs, so that help, lists and completion start fast.
 """
 
+import contextlib
+import itertools
 import sys
 from collections.abc import Callable, Iterable
 from typing import Annotated
@@ -10,7 +12,7 @@ from typing import Annotated
 import typer
 
 from rlctl.cli import demo, deploy, diagnose, eval, export, runs, tasks, train
-from rlctl.errors import UsageError
+from rlctl.errors import AnswerIsNo, RlctlError, UsageError
 from rlctl.processes import error_boundary
 from rlctl.version import __version__
 
@@ -98,6 +100,11 @@ def _call(arguments: list[str]) -> int:
         code = app(arguments, standalone_mode=False)
     except typer.Abort:  # the user cancelled a question
         raise KeyboardInterrupt from None
+    except AnswerIsNo:  # the command has written its result
+        raise
+    except RlctlError as error:
+        _present_failure(arguments, error)
+        raise
     except Exception as error:
         option = getattr(error, "option_name", None)  # of Typer's error for an option that does not exist
         if (
@@ -110,3 +117,14 @@ def _call(arguments: list[str]) -> int:
     if code == error_boundary.INTERRUPTED:
         raise KeyboardInterrupt  # Typer has caught it
     return code if isinstance(code, int) else 0
+
+
+def _present_failure(arguments: list[str], error: RlctlError) -> None:
+    """Write exit code and error to the target of `--json`: its reader must not find the result of an earlier call."""
+    following = dict(itertools.pairwise(arguments))
+    joined = (argument.removeprefix("--json=") for argument in arguments if argument.startswith("--json="))
+    if (target := following.get("--json", next(joined, None))) is not None:
+        from rlctl import output
+
+        with contextlib.suppress(RlctlError, OSError):  # the first error is the one to tell
+            output.present({"format": "rlctl error 1", "exit_code": error.exit_code, "error": str(error)}, target)

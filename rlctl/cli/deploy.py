@@ -126,7 +126,7 @@ def identify(
     events: Annotated[
         list[str], Option("Estimate the values of this event only; repeatable.", ("--event",), metavar="NAME")
     ] = [],
-    seconds: Annotated[float, Option("Length of the trajectory of --excite [s].", min=1.0, max=3600.0)] = 10.0,
+    seconds: Annotated[float, Option("Length of the trajectory of --excite, in seconds.", min=1.0, max=3600.0)] = 10.0,
     settings: Settings = [],
     sim: Sim = None,
     seed: Annotated[int, Option("Seed of the search, or of the trajectory.", min=0)] = 0,

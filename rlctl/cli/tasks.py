@@ -72,7 +72,7 @@ def check_env(
     ] = None,
     env_timeout: EnvTimeout = 10.0,
     budget: Annotated[
-        float, Option("Computing time of each process of the check [s]; slow environments need more.", min=1)
+        float, Option("Computing time in seconds of each process of the check; slow environments need more.", min=1)
     ] = 18.0,
     list_rules: Annotated[bool, Option("List all rules and exit.", ("--list",))] = False,
     explain: Annotated[

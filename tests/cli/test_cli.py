@@ -186,6 +186,15 @@ def test_json_goes_to_a_file_besides(rlctl, tmp_path):
     assert (reach["algo"], reach["problem"]) == ("ppo", None)
 
 
+def test_a_failure_replaces_the_result_of_an_earlier_call(rlctl, tmp_path):
+    file = tmp_path / "result.json"
+    file.write_text('{"success_rate": 1.0}')
+    assert rlctl("eval", "nowhere", "--json", str(file)).returncode == 5
+    failure = json.loads(file.read_text())
+    assert (failure["format"], failure["exit_code"]) == ("rlctl error 1", 5)
+    assert failure["error"].startswith("no run 'nowhere'")
+
+
 def test_stdout_is_nothing_but_the_json(rlctl, printing, policy):
     result = rlctl("eval", policy, "--episodes", "3", "--n-envs", "2", "--json", "-")
     assert result.returncode == 0, result.stderr
