@@ -188,7 +188,9 @@ def test_the_action_comments_on_the_check_that_it_ran(tmp_path: Path) -> None:
     report.write_text('{"findings": []}')  # of an earlier use in the same job
     code, outputs = run_action(tmp_path, "pointmass.py:Nobody", "--select RL99")
     assert (code, outputs) == (2, {"report": str(report), "exit-code": "2"})
-    assert "The check did not run (exit code 2)." in comment(tmp_path, outputs, code)
+    said = comment(tmp_path, outputs, code)
+    assert "The check did not run (exit code 2)." in said
+    assert "RL99" in said  # the error
     report.write_text('{"findings": []}')
     assert "No findings, but exit code 70" in comment(tmp_path, outputs, 70)
 

@@ -199,7 +199,7 @@ def test_what_cannot_be_shown(rlctl, write_module, task, code, message):
     )
     write_module("halves.py", "class Half:\n    action_space = 1\n    def reset(self): ...\n    def step(self, a): ...")
     result = rlctl("tasks", "show", task, "--json", "-")
-    assert (result.returncode, result.stdout) == (code, "")
+    assert (result.returncode, json.loads(result.stdout)["exit_code"]) == (code, code)
     assert any(line.startswith(message) for line in result.stderr.splitlines()), result.stderr
 
 
