@@ -83,8 +83,6 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) -c constraints.txt -e '.[dev]'
-	@# Once, and not in each of the tests' many processes; some packages contain files that are no Python.
-	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib > /dev/null 2>&1 || true
 	touch $(VENV)/.installed $@
 
 $(VENV)/.docs: pyproject.toml constraints.txt | $(BIN)/python
