@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from rlctl.task import BatchTask, Body, Box, Joints, Sim, terms
+from rlctl.task import BatchTask, Body, Box, Event, Joints, Sim, events, terms
 from rlctl.task.rotations import rotate_inverse
 from rlctl_locomotion.quadruped import JOINTS
 
@@ -51,6 +51,15 @@ class Driven(BatchTask):
         "last_action": terms.LastAction(),
     }
     per_world = {"last_action": (12,), "action_change": (12,), "steps": ()}
+    events = {  # with `randomize: true`
+        "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
+        "friction": Event("reset", events.set_friction, body="ground", friction=(0.4, 1.2)),
+        "motor_strength": Event("reset", events.scale_motor_strength, body="robot", factor=(0.8, 1.0)),
+        "gyroscope_noise": Event("observation", events.noise, of="gyroscope", std=(0.0, 0.2)),  # [rad/s]
+        "position_noise": Event("observation", events.noise, of="joint_positions", std=(0.0, 0.01)),  # [rad]
+        "velocity_noise": Event("observation", events.noise, of="joint_velocities", std=(0.0, 1.0)),  # [rad/s]
+        "action_delay": Event("action", events.delay, steps=(0, 1)),  # of one action
+    }
     mirror = {
         "gyroscope": (-1, 2, -3),
         "gravity": (1, -2, 3),

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from rlctl.task import Event, Sim, WorldRngs, events, rewards
+from rlctl.task import Sim, WorldRngs, rewards
 from rlctl.task.rotations import from_axis, multiply, rotate
 from rlctl_locomotion.driven import Driven
 from rlctl_locomotion.quadruped import FEET, LEGS
@@ -45,15 +45,6 @@ class GetUp(Driven):
         "is_up": 0.0,  # a metric
     }
     per_world = {**Driven.per_world, "still": (), "limp": ()}
-    events = {  # with `randomize: true`
-        "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
-        "friction": Event("reset", events.set_friction, body="ground", friction=(0.4, 1.2)),
-        "motor_strength": Event("reset", events.scale_motor_strength, body="robot", factor=(0.8, 1.0)),
-        "gyroscope_noise": Event("observation", events.noise, of="gyroscope", std=(0.0, 0.2)),  # [rad/s]
-        "position_noise": Event("observation", events.noise, of="joint_positions", std=(0.0, 0.01)),  # [rad]
-        "velocity_noise": Event("observation", events.noise, of="joint_velocities", std=(0.0, 1.0)),  # [rad/s]
-        "action_delay": Event("action", events.delay, steps=(0, 1)),  # of 40 ms
-    }
 
     rlctl_ignore = {
         "RL106": "action 1 is 0.3 or 0.6 rad; up to 4 it may target angles out of reach, for force",

@@ -42,14 +42,8 @@ class Walk(Driven):
     }
     per_world = {**Driven.per_world, "command": (3,), "error_sum": ()}
     mirror = {**Driven.mirror, "command": (1, -2, -3)}
-    events = {  # with `randomize: true`
-        "mass": Event("reset", events.scale_mass, body="robot", factor=(0.8, 1.2)),
-        "friction": Event("reset", events.set_friction, body="ground", friction=(0.4, 1.2)),
-        "motor_strength": Event("reset", events.scale_motor_strength, body="robot", factor=(0.8, 1.0)),
-        "gyroscope_noise": Event("observation", events.noise, of="gyroscope", std=(0.0, 0.2)),  # [rad/s]
-        "position_noise": Event("observation", events.noise, of="joint_positions", std=(0.0, 0.01)),  # [rad]
-        "velocity_noise": Event("observation", events.noise, of="joint_velocities", std=(0.0, 1.0)),  # [rad/s]
-        "action_delay": Event("action", events.delay, steps=(0, 1)),  # of 20 ms
+    events = {
+        **Driven.events,
         "push": Event("interval", events.kick, every_s=4.0, body="robot", speed=(0.0, 0.7)),  # [m/s]
     }
     rlctl_ignore = {
