@@ -11,10 +11,10 @@ from rlctl.environments.info import EnvInfo
 from rlctl.rollout.collect import Episode
 
 _RELABELLED = 2000  # random relabellings of the episodes
+_AT_ONCE = 100  # of them, so that 100,000 episodes need no gigabytes
 _LARGEST_P = 0.01
 _FEWEST = 5  # failures, and successes
 _MOST_SHOWN = 3
-_MOST_ELEMENTS = 200  # of an observation; pictures have more
 
 Array = NDArray[np.float64]
 
@@ -95,10 +95,8 @@ def _read_conditions(episode: Episode, info: EnvInfo) -> dict[str, float]:
 
 
 def _name(key: str, row: NDArray[Any], info: EnvInfo) -> list[tuple[str, float]]:
-    """Name the elements of an observation: `command[0]`; those of a small one without names `observation[3]`."""
+    """Name the elements of an observation: `command[0]`; of one without names `observation[3]`."""
     values = np.ravel(row).tolist()
-    if len(values) > _MOST_ELEMENTS:
-        return []
     sizes: Mapping[str, int] = info.observation_sizes if not key else {key: len(values)}
     if sum(sizes.values()) != len(values):
         sizes = {"observation": len(values)}
@@ -122,8 +120,10 @@ def _compare(ranks: Array, failed: NDArray[np.bool_]) -> tuple[Array, Array]:
     standard = (ranks - ranks.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
     score = standard[failed].mean(axis=0)
     rng = np.random.default_rng(0)
-    labels = rng.permuted(np.tile(failed, (_RELABELLED, 1)), axis=1).astype(float) / failed.sum()
-    largest = np.abs(labels @ standard).max(axis=1)
+    largest = np.empty(_RELABELLED)
+    for chosen in np.array_split(np.arange(_RELABELLED), _RELABELLED // _AT_ONCE):
+        labels = rng.permuted(np.tile(failed, (len(chosen), 1)), axis=1).astype(float) / failed.sum()
+        largest[chosen] = np.abs(labels @ standard).max(axis=1)
     as_large = (largest[:, None] >= np.abs(score) - 1e-12).sum(axis=0)
     return score, (1 + as_large) / (1 + _RELABELLED)
 

@@ -12,7 +12,7 @@ from rlctl.environments.info import describe_randomization
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.evaluate import Evaluation
 from rlctl.evaluation.group_scores import GroupScore, SeedScore
-from rlctl.evaluation.request import NO_GATES, Gates
+from rlctl.evaluation.request import NO_GATES, Gates, judge
 from rlctl.evaluation.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
 from rlctl.evaluation.sequential import EarlyGate
 from rlctl.evaluation.vary import format_command
@@ -26,7 +26,9 @@ _NOMINAL, _WORST = "*", "<"
 
 def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
     """Print the numbers, or JSON alone for `-`."""
-    if output.present(as_json(result) | _judge(result, gates), json):
+    missed = gates.list_missed(result.success_rate, result.success_interval, result.returns.mean)
+    verdict = judge("eval", missed, has_gate=gates != NO_GATES)
+    if output.present(as_json(result) | verdict | {"gates": vars(gates)}, json):
         return
     out, info = output.out(), result.policy
     mode = "" if result.deterministic else ", sampled actions"
@@ -56,18 +58,6 @@ def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
         out.print(f"for {stopped:,} of {answers:,} answers the server held or stopped instead of running the policy")
     if result.unlimited is not None:
         _show_limits(result, result.unlimited)
-
-
-def _judge(result: Evaluation, gates: Gates) -> dict[str, Any]:
-    """Return what the JSON of the command has besides the numbers; `passed` is None without a gate."""
-    missed = gates.list_missed(result.success_rate, result.success_interval, result.returns.mean)
-    return {
-        "format": "rlctl eval 1",
-        "exit_code": int(bool(missed)),
-        "passed": not missed if gates != NO_GATES else None,
-        "gates": vars(gates),
-        "gates_missed": missed,
-    }
 
 
 def _format_decision(result: Evaluation, early: EarlyGate) -> str:

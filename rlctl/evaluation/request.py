@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.sequential import EarlyGate, find_interval, find_least_episodes
@@ -137,6 +137,17 @@ def _count_successes(lower: float) -> int:
 
 
 NO_GATES = Gates()
+
+
+def judge(command: str, missed: list[str], *, has_gate: bool) -> dict[str, Any]:
+    """Return what the JSON of a command with gates says of them; `passed` is None without a gate."""
+    return {
+        "format": f"rlctl {command} 1",
+        "exit_code": int(bool(missed)),
+        "passed": not missed if has_gate else None,
+        "gates_missed": missed,
+    }
+
 
 MinSuccess = Annotated[
     float | None, Option("Gate: exit 1 if the measured success rate is lower.", metavar="RATE", parse=_parse_rate)

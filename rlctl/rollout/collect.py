@@ -19,6 +19,7 @@ from rlctl.version import collect_versions
 
 _CONTACTS_MEASURED = 10  # the first recorded episodes, in which contacts are measured; it takes about 3 % of a step
 MOST_STEPS = 20_000  # steps after which an episode without a time limit is an error: it may never end
+MOST_ELEMENTS = 200  # of a part of the first observation that is kept with an episode; pictures have more
 _SEGMENT = 1000  # steps after which the main process copies the recorded part of a long episode
 
 
@@ -29,7 +30,8 @@ class Episode:
     result: EpisodeResult
     trajectory: Trajectory | None = None
     terminated: bool = False  # whether its last step terminated it; else it was truncated
-    first: dict[str, NDArray[Any]] = dataclasses.field(default_factory=dict)  # its first observation, as it is stored
+    first: dict[str, NDArray[Any]] = dataclasses.field(default_factory=dict)
+    """Its first observation, by key, without the parts of more than `MOST_ELEMENTS`."""
 
     @property
     def recorded(self) -> Trajectory:
@@ -131,7 +133,8 @@ class _Recorder:
     def add(self, workers: Workers, env: int, steps: int) -> None:
         """Copy the first steps of an environment's segment."""
         if not self.steps:
-            self.first = {key: rows[env, 0].copy() for key, rows in workers.arrays.segment.observation.items()}
+            rows = {key: every[env, 0] for key, every in workers.arrays.segment.observation.items()}
+            self.first = {key: row.copy() for key, row in rows.items() if row.size <= MOST_ELEMENTS}
         self.steps += steps
         if self._record:
             segment = workers.arrays.segment

@@ -6,6 +6,7 @@ from rich.text import Text
 
 from rlctl import output
 from rlctl.evaluation.episode_statistics import Spread
+from rlctl.evaluation.request import judge
 from rlctl.recipe.stages import format_value
 from rlctl.runs import significance
 from rlctl.runs.comparison import Candidate, EvaluatedRun, RunComparison, Side
@@ -14,7 +15,10 @@ from rlctl.version import collect_versions
 
 def show(result: RunComparison, json: str | None, gate: str | None = None, margin: float | None = None) -> None:
     """Print which question is answered, the scores, the differences and the verdicts; or JSON alone for `-`."""
-    if output.present(as_json(result) | _judge(result, gate, margin), json):
+    has_gate = gate is not None or margin is not None
+    verdict = judge("runs compare", result.list_missed(margin) if has_gate else [], has_gate=has_gate)
+    gates = {"gate": "not-worse" if has_gate else None, "margin": margin}
+    if output.present(as_json(result) | verdict | gates, json):
         return
     out = output.out()
     if result.of_recipes:
@@ -35,20 +39,6 @@ def show(result: RunComparison, json: str | None, gate: str | None = None, margi
             lines.append(f"recipe: {key}: {format_value(key, before)} -> {format_value(key, value)}")
         for line in [*lines, "recipe: the same"] if candidate.recipe_changes == {} else lines:
             out.print(f"  {line}")
-
-
-def _judge(result: RunComparison, gate: str | None, margin: float | None) -> dict[str, Any]:
-    """Return what the JSON of the command has besides the numbers; `passed` is None without a gate."""
-    has_gate = gate is not None or margin is not None
-    missed = result.list_missed(margin) if has_gate else []
-    return {
-        "format": "rlctl runs compare 1",
-        "exit_code": int(bool(missed)),
-        "passed": not missed if has_gate else None,
-        "gate": "not-worse" if has_gate else None,
-        "margin": margin,
-        "gates_missed": missed,
-    }
 
 
 def _show_seeds(result: RunComparison) -> None:
