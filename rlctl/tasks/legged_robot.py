@@ -17,7 +17,7 @@ import numpy as np
 from rlctl.errors import TaskError, UsageError
 from rlctl.task.rotations import rotate_inverse
 from rlctl.tasks.legs import Leg, Skeleton, find_legs
-from rlctl.tasks.model_copy import copy_model
+from rlctl.tasks.model_copy import copy_model, find_own_model
 from rlctl.tasks.scaling import GRAVITY, ScaledA1, scale_a1
 from rlctl.tasks.source_text import LINE_WIDTH, write_list, write_number
 from rlctl.tasks.stance import Stance, StanceSearch, measure_stance
@@ -87,19 +87,16 @@ def read_legged_robot(model: str) -> StarterRobot:
 
 def _load(model: str) -> tuple[Path, MujocoBody]:
     """Load a model with a free base; raises `UsageError`."""
-    from rlctl.task.model_files import find_model_file
     from rlctl.task.mujoco.sim import MujocoSim
 
-    path = Path(model)
+    path = find_own_model(model)
     try:
-        path = find_model_file(model)
         return path, MujocoSim(control_dt=_CONTROL_DT, substeps=4).load("robot", path)
     except TaskError as error:
         problem = str(error)
-    if path.is_file():
-        with contextlib.suppress(TaskError):
-            base = MujocoSim(control_dt=_CONTROL_DT, substeps=4).load("robot", path, fixed=True).base_name
-            problem = f"the base {base!r} of {path.name} cannot be free without mass; for an arm leave out --walk"
+    with contextlib.suppress(TaskError):
+        base = MujocoSim(control_dt=_CONTROL_DT, substeps=4).load("robot", path, fixed=True).base_name
+        problem = f"the base {base!r} of {path.name} cannot be free without mass; for an arm leave out --walk"
     raise UsageError(f"--model: {problem}")
 
 

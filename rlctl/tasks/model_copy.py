@@ -1,13 +1,23 @@
-"""Copies a robot model with its meshes into one folder."""
+"""Finds a user's robot model, and copies it with its meshes into one folder."""
 
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-from rlctl.errors import UsageError
+from rlctl.errors import TaskError, UsageError
 
 _MESHES = Path("meshes")
 _FILENAME = re.compile(r"""(\bfilename\s*=\s*)(["'])(.*?)\2""")
+
+
+def find_own_model(model: str) -> Path:
+    """Return the file of `--model`: a path, or one of rlctl's or PyBullet's models; raises `UsageError`."""
+    from rlctl.task.model_files import explain_missing, find_model_file
+
+    try:
+        return find_model_file(model)
+    except TaskError:
+        raise UsageError(f"--model: {explain_missing(Path(model))}") from None
 
 
 def copy_model(model: Path) -> dict[Path, bytes]:

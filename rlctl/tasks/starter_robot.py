@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl.errors import TaskError, UsageError, check_name
-from rlctl.tasks.model_copy import copy_model
+from rlctl.tasks.model_copy import copy_model, find_own_model
 from rlctl.tasks.source_text import LINE_WIDTH, write_list, write_number
 
 if TYPE_CHECKING:
@@ -87,14 +87,9 @@ def read_robot(model: str, link: str | None) -> StarterRobot:
 
     Raises `UsageError` for a file that is missing, cannot be loaded, has no joints, a free base or no such link.
     """
-    from rlctl.task.model_files import explain_missing, find_model_file
     from rlctl.task.mujoco.sim import MujocoSim
 
-    sim = MujocoSim(control_dt=1 / 30, substeps=4)
-    try:
-        path = find_model_file(model)
-    except TaskError:
-        raise UsageError(f"--model: {explain_missing(Path(model))}") from None
+    sim, path = MujocoSim(control_dt=1 / 30, substeps=4), find_own_model(model)
     try:
         body = sim.load("arm", path, fixed=True)
     except TaskError as error:
