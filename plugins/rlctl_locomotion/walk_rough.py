@@ -7,10 +7,11 @@ import numpy as np
 
 from rlctl.task import Body, Event, Sim, TaskError, WorldRngs, events, rough_heights
 from rlctl.task.rotations import rotate_inverse
+from rlctl_locomotion.clocked import Clocked
 from rlctl_locomotion.quadruped import FEET
-from rlctl_locomotion.walk import Walk
 
 HIGHEST_BUMPS = 0.1  # [m]; above, the legs are too short
+SOLE = 0.02  # [m], from the centre of a toe to the ground
 START = 2.0  # [m], half of the length of the square in which episodes begin
 PUSH = {"from": (0.0, 0.3), "to": (0.0, 1.0)}  # [m/s], at level 0 and at level 1
 SCANNED = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.2, 0.2, 3), indexing="ij"), -1).reshape(-1, 2)
@@ -18,23 +19,27 @@ SCANNED = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.2, 0.2,
 
 
 @dataclass
-class WalkRough(Walk):
+class WalkRough(Clocked):
     """Follow velocity commands over bumps that it does not see, on slippery ground, with pushes, noise and delay."""
 
+    must_step: bool = False  # a foot that meets a bump is low
     rough: float = 0.05  # [m], height of the bumps
     terrain_seed: int = 0
     episode_s: float = 20.0
 
+    period_s: ClassVar[float] = 0.5
+    swing: ClassVar[float] = 0.09
+    first_half: ClassVar[tuple[float, ...]] = (1.0, -1.0, -1.0, 1.0)  # the right front foot with the left hind one
     cell: ClassVar[float] = 0.2  # [m], between the points of the ground
     size: ClassVar[tuple[float, float]] = (50.0, 80.0)  # [m], along x and y: in an episode at most 22 m are walked
     flat_y: ClassVar[float] = -30.0  # [m], where episodes of level 0 begin
     hardest_y: ClassVar[float] = 15.0  # [m], where those of level 1 begin
     scale = 0.4
     # Lower than on flat ground, for quick corrections after pushes; what -0.012 does here was not measured.
-    reward_weights = {**Walk.reward_weights, "smoothness": -0.005}
+    reward_weights = {**Clocked.reward_weights, "smoothness": -0.005, "tracking": 0.3, "turning": 0.15, "gait": 0.3}
 
     mirror = {
-        **Walk.mirror,
+        **Clocked.mirror,
         "velocity": (1, -2, 3),
         "height": (1,),
         "foot_heights": (2, 1, 4, 3),
@@ -93,9 +98,9 @@ class WalkRough(Walk):
         }
 
     def measure_feet(self) -> np.ndarray:
-        """Return the heights of the toes' centres above the ground [m], shape (worlds, 4)."""
+        """Return the heights of the soles above the ground [m], shape (worlds, 4)."""
         feet = np.stack([self.body.link_position(foot) for foot in FEET], 1)
-        return feet[..., 2] - self.find_heights(feet[..., :2])
+        return feet[..., 2] - SOLE - self.find_heights(feet[..., :2])
 
     def find_heights(self, places: np.ndarray) -> np.ndarray:
         """Return the heights of the ground [m] at places (..., 2) [m], between the points of the grid bilinearly."""

@@ -6,38 +6,31 @@ from typing import ClassVar
 import numpy as np
 
 from rlctl.task import Event, TaskError, events
-from rlctl_locomotion.clocked import Clocked
 from rlctl_locomotion.walk_rough import WalkRough
 
 HIGHEST_STEP = 0.15  # [m]; above, the legs are too short
 TREAD = 0.3  # [m], from edge to edge
-SOLE = 0.02  # [m], from the centre of a toe to the ground
 FLIGHT = 5  # steps up; then as many down
 PUSH = {"from": (0.0, 0.2), "to": (0.0, 0.5)}  # [m/s], at level 0 and at level 1
 
 
 @dataclass
-class WalkStairs(WalkRough, Clocked):
+class WalkStairs(WalkRough):
     """Follow velocity commands up and down stairs that it does not see, with pushes, noise and delay."""
 
     step: float = 0.1  # [m], height of a step
-    must_step: bool = False  # a foot that meets an edge is low
     rough: float = 0.0
     episode_s: float = 10.0
 
     period_s: ClassVar[float] = 0.6
     swing: ClassVar[float] = 0.12
-    first_half: ClassVar[tuple[float, ...]] = (1.0, -1.0, -1.0, 1.0)  # the right front foot with the left hind one
     lowest: ClassVar[np.ndarray] = np.array([-0.4, -0.3, -0.6])
     highest: ClassVar[np.ndarray] = np.array([0.7, 0.3, 0.6])
     cell: ClassVar[float] = 0.05  # [m]; an edge is as steep as two points of the ground are close
     size: ClassVar[tuple[float, float]] = (24.0, 44.0)  # [m]: in an episode at most 11 m are walked
     flat_y: ClassVar[float] = -18.0
     hardest_y: ClassVar[float] = 0.0
-    observation_units = Clocked.observation_units
-    per_world = Clocked.per_world
-    mirror = {**Clocked.mirror, **WalkRough.mirror}
-    reward_weights = {**WalkRough.reward_weights, "tracking": 0.3, "turning": 0.15, "gait": 0.3, "velocity_error": -0.2}
+    reward_weights = {**WalkRough.reward_weights, "velocity_error": -0.2}
     events = {
         **WalkRough.events,
         "friction": Event("reset", events.set_friction, body="ground", friction=(0.5, 1.3), enabled=True),
@@ -55,7 +48,3 @@ class WalkStairs(WalkRough, Clocked):
     def find_roughness(self, y: np.ndarray) -> np.ndarray:
         """Return how high steps are at y: of full height within 6 m of y = 0, as on the other side of it."""
         return (self.flat_y + np.abs(y)) / (self.flat_y + 6.0)
-
-    def measure_feet(self) -> np.ndarray:
-        """Return the heights of the soles above the ground [m], shape (worlds, 4)."""
-        return super().measure_feet() - SOLE
