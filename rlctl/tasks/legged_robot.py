@@ -16,11 +16,11 @@ import numpy as np
 
 from rlctl.errors import TaskError, UsageError
 from rlctl.task.rotations import rotate_inverse
-from rlctl.tasks.legs import Leg, Skeleton, find_legs
+from rlctl.tasks.legs import Array, Leg, Skeleton, find_legs
 from rlctl.tasks.model_copy import copy_model, find_own_model
-from rlctl.tasks.scaling import GRAVITY, ScaledA1, scale_a1
+from rlctl.tasks.scaling import GRAVITY, Scaled, scale
 from rlctl.tasks.source_text import LINE_WIDTH, write_list, write_number
-from rlctl.tasks.stance import Stance, StanceSearch, measure_stance
+from rlctl.tasks.stance import VERTICAL, Stance, StanceSearch, compare_turns, measure_stance
 from rlctl.tasks.starter_robot import StarterRobot
 
 if TYPE_CHECKING:
@@ -38,6 +38,16 @@ _UPRIGHT = -0.9  # component z of the direction of gravity, in the trunk's frame
 
 
 @dataclasses.dataclass(frozen=True)
+class Gait:
+    """What a robot needs to know of its legs to step, and to learn from mirror images."""
+
+    other_side: list[int]  # as `BatchTask.mirror` has it, of the legs' joints; empty if its sides are not alike
+    faces_y: bool
+    soles: list[float]  # heights of the feet's origins above the ground in the stance [m]
+    aside: list[int]  # joints near the hip that do not turn about y
+
+
+@dataclasses.dataclass(frozen=True)
 class _Legged:
     body: MujocoBody
     path: Path
@@ -46,10 +56,11 @@ class _Legged:
     keyframe: str  # from which the stance is; empty if it was searched
     steps_up: int  # for which it stands with zero actions, at most `_STEPS`
     height: float  # of the trunk's centre of mass above the ground when it stands [m]
+    gait: Gait
 
     @property
-    def scaled(self) -> ScaledA1:
-        return scale_a1(self.body.total_mass(), self.stance)
+    def scaled(self) -> Scaled:
+        return scale(self.body.total_mass(), self.stance, len(self.legs))
 
     @property
     def joints(self) -> list[int]:
@@ -77,12 +88,43 @@ def read_legged_robot(model: str) -> StarterRobot:
     search = StanceSearch(skeleton, legs, mirror)
     keyframe, stance = _find_keyframe(skeleton, legs, search.longest)
     stance = stance or search.find()
-    legged = _Legged(body, path, legs, stance, keyframe, 0, stance.height)
+    gait = _describe_gait(skeleton, legs, stance, mirror)
+    legged = _Legged(body, path, legs, stance, keyframe, 0, stance.height, gait)
     steps_up, height = _stand(legged)
     legged = dataclasses.replace(legged, steps_up=steps_up, height=height)
     files = copy_model(path)
-    notes = [*_list_notes(legged, facing_y=bool(mirror[0] < 0)), *_remove_floor(files, Path(path.name))]
-    return StarterRobot(_describe(legged), files, _summarize(legged, notes), template=TEMPLATE)
+    notes = [*_list_notes(legged), *_remove_floor(files, Path(path.name))]
+    return StarterRobot(
+        _describe(legged), files, _summarize(legged, notes), template=TEMPLATE, kept=_choose_lines(legged)
+    )
+
+
+def _describe_gait(skeleton: Skeleton, legs: Sequence[Leg], stance: Stance, mirror: Array) -> Gait:
+    joints = sorted(joint for leg in legs for joint in leg.joints)
+    number = {joint: index for index, joint in enumerate(joints, 1)}
+    other_side = dict.fromkeys(joints, 0)
+    for leg in legs:
+        other = legs[leg.other]
+        for own, far, sign in zip(leg.joints, other.joints, compare_turns(skeleton, leg, other, mirror), strict=True):
+            if abs(stance.positions[far] - sign * stance.positions[own]) < _TINY:
+                other_side[own] = int(sign) * number[far]
+    skeleton.place(skeleton.rest)
+    across = np.abs(skeleton.axes(range(len(stance.positions)))[:, 1]) > VERTICAL
+    skeleton.place(stance.positions)
+    soles, aside = [], []
+    for leg in legs:
+        touch, anchors = skeleton.touch(leg.foot), skeleton.anchors(leg.joints)
+        soles.append(float(skeleton.data.xpos[skeleton.body.find_link(leg.foot.link), 2] - touch[2]))
+        near = anchors[:, 2] - touch[2] > stance.leg_length / 2
+        aside += np.array(leg.joints)[near & ~across[leg.joints]].tolist()
+    alike = list(other_side.values()) if all(other_side.values()) else []
+    return Gait(alike, bool(mirror[0] < 0), soles, sorted(aside))
+
+
+def _choose_lines(legged: _Legged) -> frozenset[str]:
+    """Return which optional lines of the template the plugin has: those of a clock, and of a mirror image."""
+    kind = "clock" if len(legged.legs) == 2 else "walk"
+    return frozenset([kind, "mirror", f"mirror_{kind}"] if legged.gait.other_side else [kind])
 
 
 def _load(model: str) -> tuple[Path, MujocoBody]:
@@ -167,13 +209,13 @@ def _write_forces(forces: list[float]) -> str:
     return write_list("MAX_FORCE = ", map(write_number, forces))
 
 
-def _list_notes(legged: _Legged, *, facing_y: bool) -> list[str]:
+def _list_notes(legged: _Legged) -> list[str]:
     """Return what a user should know, a sentence each."""
     stance, notes = legged.stance, []
     others = [name for index, name in enumerate(legged.body.joint_names) if index not in legged.joints]
     if others:
         notes.append(f"{', '.join(others)} {'keep' if len(others) > 1 else 'keeps'} STANCE")
-    if facing_y:
+    if legged.gait.faces_y:
         notes.append("Its legs are in pairs along x, so it may face along y; the commanded lin_vel_x is along x")
     if stance.unevenness > _LEVEL * stance.leg_length:
         notes.append(
@@ -182,15 +224,14 @@ def _list_notes(legged: _Legged, *, facing_y: bool) -> list[str]:
     limits = legged.body.joint_max_force
     if not all(limits) or min(limits) > _ENDLESS_FORCE * legged.scaled.stiffness:
         notes.append("The file has no useful torque limits for all joints: write those of your motors into MAX_FORCE")
-    if legged.steps_up < _STEPS:
+    # Two legs that are springs hold no robot for long.
+    if legged.steps_up < (_STEPS if len(legged.legs) > 2 else _STEPS // 4):
         notes.append(
             f"With zero actions it falls after {legged.steps_up * _CONTROL_DT:.1f} s: look at it with the first "
             "command below, and change STANCE, STIFFNESS or MAX_FORCE"
         )
     if len(legged.legs) == 2:
-        notes.append(
-            "Walking on two legs usually needs more than this task has: see the clock in rlctl's humanoid-walk"
-        )
+        notes.append("It steps in time with a clock, which PERIOD and SWING describe")
     return notes
 
 
@@ -262,8 +303,30 @@ def _describe(legged: _Legged) -> dict[str, str]:
         "bounce_weight": f"{numbers.bounce:g}",
         "sway_weight": f"{numbers.sway:g}",
         "smoothness_weight": "-0.012",
+        "start_noise": "0.05" if len(legged.legs) == 2 else "0.1",
+        **_describe_steps(legged),
         "height_weight": f"{numbers.height:g}",
         "feet": write_list("FEET = ", map(json.dumps, sorted(set(legged.feet)))),
         "steps_up": str(steps),
         "steps_comment": "" if steps == _STEPS // 2 else "  # CHANGE: it fell later when this plugin was written",
+    }
+
+
+def _describe_steps(legged: _Legged) -> dict[str, str]:
+    names, numbers, gait = legged.body.joint_names, legged.scaled, legged.gait
+    vector, turn = ("(-1, 2, 3)", "(1, -2, -3)") if gait.faces_y else ("(1, -2, 3)", "(-1, 2, -3)")
+    command = "(-1, 2, -3)" if gait.faces_y else "(1, -2, -3)"
+    return {
+        "model_robot": "a humanoid" if len(legged.legs) == 2 else "the A1",
+        "other_side": f"({', '.join(map(str, gait.other_side))})",
+        "mirror_vector": vector,
+        "mirror_turn": turn,
+        "mirror_command": command,
+        "period": f"{numbers.period:g}",
+        "swing": f"{numbers.swing:g}",
+        "least_swing": f"{numbers.swing / 7:.2g}",
+        "feet_in_order": write_list("FEET = ", map(json.dumps, legged.feet)),
+        "soles": f"[{', '.join(f'{height:.3f}' for height in gait.soles)}]",
+        "aside": write_list("ASIDE = ", [json.dumps(names[joint]) for joint in gait.aside]),
+        "total_timesteps": "4_000_000" if len(legged.legs) == 2 else "3_000_000",
     }

@@ -61,7 +61,9 @@ def create(name: str, *, model: str | None = None, link: str | None = None, walk
     cls = _make_class_name(name, "".join(sources.values()))
     values = {**robot.values, "name": name, "package": package, "cls": cls}
     content = {
-        Path(*(package if part == "package" else part for part in path.parts)): string.Template(text)
+        Path(*(package if part == "package" else part for part in path.parts)): string.Template(
+            _choose_lines(text, robot.kept)
+        )
         .substitute(values)
         .encode()
         for path, text in sources.items()
@@ -84,6 +86,11 @@ def _read_robot(model: str | None, link: str | None, *, walk: bool) -> StarterRo
     from rlctl.tasks.legged_robot import read_legged_robot  # it loads NumPy
 
     return read_legged_robot(model)
+
+
+def _choose_lines(text: str, kept: frozenset[str]) -> str:
+    """Return the text of a template without the lines that begin with ?NAME: of other names than `kept`."""
+    return re.sub(r"^\?(\w+):(.*\n)", lambda line: line[2] if line[1] in kept else "", text, flags=re.MULTILINE)
 
 
 def _read_templates(folder: Path) -> dict[Path, str]:

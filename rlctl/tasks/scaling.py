@@ -1,4 +1,4 @@
-"""What a robot with legs needs to walk, scaled from Unitree's A1 to its mass and leg length.
+"""What a robot with legs needs to walk, scaled from robots that do to its mass and leg length.
 
 Robots of equal shape move alike if lengths scale with the leg length, masses with the mass, and times with the root of
 leg length / gravity: then speed^2 / (gravity x leg length), the Froude number, is the same.
@@ -15,8 +15,27 @@ _SUNK = 0.65  # of the space under the trunk that it has lost when it has fallen
 
 
 @dataclasses.dataclass(frozen=True)
-class ScaledA1:
-    """Values as the task `walk` of rlctl has them for the A1: 12.5 kg with legs of 0.28 m."""
+class _Speeds:
+    """Speeds by the root of gravity x leg length, turns by the root of gravity / leg length."""
+
+    backwards: float
+    forwards: float
+    sideways: float
+    turn: float
+    scale: float
+    turn_scale: float
+    tolerance: float
+    push: float
+
+
+# As the tasks `walk` (12.5 kg, legs of 0.28 m) and `humanoid-walk` (26 kg, 0.6 m) of rlctl have them.
+_A1 = _Speeds(0.3, 0.6, 0.24, 0.135, scale=0.3, turn_scale=0.085, tolerance=0.12, push=0.42)
+_HUMANOID = _Speeds(0.12, 0.33, 0.12, 0.148, scale=0.2, turn_scale=0.12, tolerance=0.08, push=0.2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scaled:
+    """Values of a robot with legs, and those of the A1."""
 
     stiffness: float  # [N m/rad]; 35 of the A1
     damping: float  # [N m s/rad]; 0.7
@@ -33,29 +52,33 @@ class ScaledA1:
     height: float  # weight of squares of [m]; -2
     start_height: float  # [m], of the trunk's centre of mass
     fallen_height: float  # [m]
+    period: float  # [s], of two steps in time with a clock; 0.7 of the humanoid
+    swing: float  # [m], how high a foot is lifted; 0.07 of the humanoid
 
 
-def scale_a1(mass: float, stance: Stance) -> ScaledA1:
+def scale(mass: float, stance: Stance, legs: int) -> Scaled:
     """Return the values of a robot of `mass` [kg] in its stance. Numbers in the code have no unit."""
-    length = stance.leg_length
+    length, of = stance.leg_length, _HUMANOID if legs == 2 else _A1
     time = math.sqrt(length / GRAVITY)
     speed, torque = length / time, mass * GRAVITY * length
-    return ScaledA1(
+    return Scaled(
         stiffness=_round(torque),
         damping=_round(0.12 * torque * time),
         gear_damping=_round(0.05 * torque * time),
         armature=_round(0.01 * mass * length**2),
-        lowest=(_round(-0.3 * speed), _round(-0.24 * speed), _round(-0.135 / time)),
-        highest=(_round(0.6 * speed), _round(0.24 * speed), _round(0.135 / time)),
-        speed_scale=_round(0.3 * speed),
-        turn_scale=_round(0.085 / time),
-        tolerance=_round(0.12 * speed),
-        push=_round(0.42 * speed),
+        lowest=(_round(-of.backwards * speed), _round(-of.sideways * speed), _round(-of.turn / time)),
+        highest=(_round(of.forwards * speed), _round(of.sideways * speed), _round(of.turn / time)),
+        speed_scale=_round(of.scale * speed),
+        turn_scale=_round(of.turn_scale / time),
+        tolerance=_round(of.tolerance * speed),
+        push=_round(of.push * speed),
         bounce=_round(-0.082 / speed**2),
         sway=_round(-0.175 * time**2),
         height=_round(-0.157 / length**2),
         start_height=round(stance.height + _DROP * length, 3),
         fallen_height=round(stance.height - _SUNK * stance.clearance, 3),
+        period=_round(2.8 * time),
+        swing=_round(0.12 * length),
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rlctl.tasks.legs import Array, Leg, Skeleton
 
-_BENT, _BENT_OF_TWO = 0.77, 0.92  # of the longest leg: height of the hip in the stance; on two legs
+_BENT, _BENT_OF_TWO = 0.77, 0.88  # of the longest leg: height of the hip in the stance; on two legs
 _SPRAWLED = (0.5, 0.55)  # of the longest leg: height of the hip, distance of the foot to its side
 _LONGEST = 0.95  # of the longest leg, where legs differ
 _MARGIN = 0.05  # of a joint's range, to its limits
@@ -19,7 +19,7 @@ _SMALL = 0.005  # [rad], from a joint's rest
 _ASIDE = 0.3  # of the longest leg: how far a foot may be to the side of its hip
 _SAMPLES = 300
 _STARTS = 2
-_VERTICAL = 0.8  # of an axis' length: how much of it is along z
+VERTICAL = 0.8  # of an axis' length: how much of it is along z, or y
 _LEAST_KNEE = 0.1  # of the longest leg: height of a knee above the ground
 
 
@@ -46,11 +46,20 @@ def measure_stance(skeleton: Skeleton, legs: Sequence[Leg], positions: Array) ->
 
 def _find_hip(skeleton: Skeleton, leg: Leg) -> int:
     """Return which joint of a leg is where the thigh begins: the first that turns about y, else about x, else any."""
-    across = np.abs(skeleton.axes(leg.joints)) > _VERTICAL
+    across = np.abs(skeleton.axes(leg.joints)) > VERTICAL
     for axis in (1, 0):
         if across[:, axis].any() and len(across) - across[:, axis].argmax() > 1:
             return int(across[:, axis].argmax())
     return 0
+
+
+def compare_turns(skeleton: Skeleton, leg: Leg, other: Leg, mirror: Array) -> Array:
+    """Return 1 for each joint of a leg that turns as the mirror image of that of the other leg, -1 for the others."""
+    skeleton.place(skeleton.rest)
+    own, others = skeleton.axes(leg.joints), skeleton.axes(other.joints)
+    # The mirror image of a rotation turns the other way.
+    signs: Array = np.sign(-np.sum(own * others * mirror, axis=1))
+    return signs
 
 
 class StanceSearch:
@@ -62,8 +71,10 @@ class StanceSearch:
         self.low, self.high = skeleton.low + margin, skeleton.high - margin
         self.pose = skeleton.rest.copy()
         skeleton.place(self.pose)
-        self.sprawled = [len(legs) > 2 and abs(skeleton.axes(leg.joints)[0, 2]) > _VERTICAL for leg in legs]
+        self.sprawled = [len(legs) > 2 and abs(skeleton.axes(leg.joints)[0, 2]) > VERTICAL for leg in legs]
         self.hips = [0 if flat else _find_hip(skeleton, leg) for flat, leg in zip(self.sprawled, legs, strict=True)]
+        self.across = [np.abs(skeleton.axes(leg.joints)[:, 1]) > VERTICAL for leg in legs]
+        self.rest_frames = [self._find_frame(leg).copy() for leg in legs]
         self.soles = [self._has_sole(leg) for leg in legs]
         self.samples = [self._sample(leg) for leg in legs]
         self.lengths = [self._measure_longest(index) for index in range(len(legs))]
@@ -96,6 +107,10 @@ class StanceSearch:
         heights = places[:, 2] - foot.radii
         lowest = places[heights < heights.min() + skeleton.thickness(foot)]
         return len(leg.joints) > 3 and bool(np.ptp(lowest[:, 0]) > 0.5 * np.ptp(places[:, 0]) > 0)
+
+    def _find_frame(self, leg: Leg) -> Array:
+        frame: Array = self.skeleton.data.xmat[leg.foot.bodies[-1]].reshape(3, 3)
+        return frame
 
     def _sample(self, leg: Leg) -> Array:
         return np.random.default_rng(0).uniform(
@@ -144,10 +159,7 @@ class StanceSearch:
     def _reflect(self, index: int, angles: Array, image: Array) -> Array:
         """Return the angles of a leg for those of the other one, whose joints' and foot's mirror `image` is known."""
         leg = self.legs[index]
-        self.skeleton.place(self.skeleton.rest)
-        own, others = self.skeleton.axes(leg.joints), self.skeleton.axes(self.legs[leg.other].joints)
-        # The mirror image of a rotation turns the other way.
-        same = np.sign(-np.sum(own * others * self.mirror, axis=1)) * angles
+        same = compare_turns(self.skeleton, leg, self.legs[leg.other], self.mirror) * angles
         inside = (self.low[leg.joints] <= same) & (same <= self.high[leg.joints])
         if inside.all() and np.abs(self._compare(index, same, image)).max() < 10 * _ALIKE:
             return same
@@ -186,11 +198,14 @@ class StanceSearch:
         bend = 0.3 * np.maximum(0.0, -forwards * (knees[:, 0] - anchors[self.hips[index], 0]) / length)
         # Sideways it may be where it is while the joints above the thigh are at rest.
         effort[: self.hips[index]] *= 20.0
-        aside = 0.05 * to_foot[1] + 3 * max(0.0, abs(to_foot[1]) - _ASIDE)
+        if len(self.legs) == 2:
+            effort[~self.across[index]] *= 5.0  # legs that are not twisted
+        aside = (0.2 if len(self.legs) == 2 else 0.05) * to_foot[1] + 3 * max(0.0, abs(to_foot[1]) - _ASIDE)
         below = 3 * (to_foot[0] - self.shift / length), aside
-        frame = self.skeleton.data.xmat[leg.foot.bodies[-1]].reshape(3, 3)
+        frame = self._find_frame(leg)
         tilt = 3 * frame[2, :2] if self.soles[index] else np.zeros(2)
-        return np.array([level, *below, *tilt, *buried, *bend, *effort])
+        toe_out = (frame @ self.rest_frames[index].T)[1, 0] if len(self.legs) == 2 else 0.0
+        return np.array([level, *below, *tilt, toe_out, *buried, *bend, *effort])
 
     def _compare(self, index: int, angles: Array, image: Array) -> Array:
         """Return by how much a leg differs from the mirror image of the other one."""

@@ -38,6 +38,8 @@ class StarterRobot:
     """What was chosen, a line or several."""
     template: Path | None = None
     """Folder with files that replace those of an arm."""
+    kept: frozenset[str] = frozenset()
+    """Names of the templates' optional lines that the plugin has."""
 
 
 def make_planar_arm() -> StarterRobot:

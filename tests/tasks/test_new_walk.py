@@ -14,6 +14,7 @@ from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.tasks import new
 from rlctl.tasks.legs import Skeleton, find_legs
 from rlctl.tasks.stance import StanceSearch
+from rlctl_locomotion.humanoid_walk import SOLE, HumanoidWalk
 from tests.tasks.test_new import run
 
 LEG = """<body name="{leg}_hip" pos="{x} {y} 0"><joint name="{leg}_hip" axis="1 0 0" range="-0.8 0.8"
@@ -30,9 +31,11 @@ KEY = '<keyframe><key name="down" qpos="{0} 0.3"/><key name="home" qpos="{1} 0.3
 FEET = ["front_left", "front_right", "rear_left", "rear_right"]
 
 
-def write_dog(folder: Path, *, free: str = "<freejoint/>", keyframe: str = "") -> Path:
-    places = [(x, y) for x in (0.15, -0.15) for y in (0.08, -0.08)]
-    legs = "".join(LEG.format(leg=leg, x=x, y=y) for leg, (x, y) in zip(FEET, places, strict=True))
+def write_dog(
+    folder: Path, *, free: str = "<freejoint/>", keyframe: str = "", pairs: tuple[float, ...] = (0.15, -0.15)
+) -> Path:
+    places = [(x, y) for x in pairs for y in (0.08, -0.08)]
+    legs = "".join(LEG.format(leg=leg, x=x, y=y) for leg, (x, y) in zip(FEET, places, strict=False))
     file = folder / "dog.xml"
     file.write_text(DOG.format(free=free, legs=legs, keyframe=keyframe))
     return file
@@ -78,10 +81,35 @@ def test_a_plugin_of_a_users_dog(tmp_path, monkeypatch):
     # 4.2 kg x 9.81 x 0.24 m.
     assert task.stiffness == pytest.approx(9.9, abs=0.5)
     assert task.highest[0] == pytest.approx(0.6 * np.sqrt(9.81 * 0.24), abs=0.05)
+    assert task.other_side == (-4, 5, 6, -1, 2, 3, -10, 11, 12, -7, 8, 9)
+    assert "steps in time" not in plugin.summary
     assert "neck keeps STANCE" in plugin.summary
     assert "dog.xml has no floor" in plugin.summary
     assert b"plane" not in (plugin.folder / "my_dog" / "dog.xml").read_bytes()
     check_that_it_stands(plugin, [f"{leg}_shank" for leg in FEET], task.height)
+
+
+def test_two_legs_step_in_time_with_a_clock(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_dog(tmp_path, pairs=(0.0,))
+    plugin = new.create("my-bird", model="dog.xml", walk=True)
+    task = read_task(plugin)
+    assert "steps in time with a clock" in plugin.summary
+    assert task.feet == ["front_left_shank", "front_right_shank"]
+    assert task.aside == ["front_left_hip", "front_right_hip"]
+    assert task.other_side == (-4, 5, 6, -1, 2, 3)
+    with contextlib.closing(EnvSpec(plugin.target, {"start_noise": 0.0}, sim="mujoco").make()) as env:
+        env.reset(seed=0)
+        batch = env.unwrapped.task.batch
+        first, terminated, steps = int(batch.phase[0, 1] < 0), False, 0
+        while not terminated:
+            _, _, terminated, _, _ = env.step(np.zeros(6, np.float32))
+            steps += 1
+        wanted = batch.wanted[0]
+    # Near the top of its first step, at a quarter of the period, it has not lifted that foot.
+    assert 0.6 * task.period / 4 < 0.02 * steps < task.period / 4
+    assert wanted[first] > 0.9 * task.swing
+    assert wanted[1 - first] == 0
 
 
 @pytest.mark.parametrize(
@@ -148,6 +176,15 @@ def test_an_arm_that_is_free_may_have_legs(tmp_path, monkeypatch):
         new.create("other-dog", model="dog.xml")
 
 
+def check_the_plugins_files(plugin: new.NewPlugin, rlctl, *, strict: bool) -> None:
+    assert "4 passed" in run("pytest", "-q", "-p", "no:cacheprovider", plugin.folder.name, cwd=plugin.folder.parent)
+    run("ruff", "format", "--check", "--isolated", "--line-length", "120", cwd=plugin.folder)
+    rules = "E,F,W,I,UP,B,SIM,C4,PT,RET,PIE,NPY"
+    run("ruff", "check", "--isolated", "--line-length", "120", "--select", rules, cwd=plugin.folder)
+    result = rlctl("check-env", plugin.target, *(["--strict"] if strict else []))
+    assert result.returncode == 0, result.stdout
+
+
 @pytest.mark.slow
 def test_the_plugin_of_the_a1(tmp_path, monkeypatch, rlctl):
     monkeypatch.chdir(tmp_path)
@@ -157,9 +194,19 @@ def test_the_plugin_of_the_a1(tmp_path, monkeypatch, rlctl):
     assert (task.stiffness, task.damping, task.armature) == pytest.approx((35.0, 0.7, 0.01), rel=0.05)
     assert task.highest == pytest.approx([1.0, 0.4, 0.8], rel=0.05)
     check_that_it_stands(plugin, [f"{leg}_toe" for leg in ("FR", "FL", "RR", "RL")], task.height)
-    assert "4 passed" in run("pytest", "-q", "-p", "no:cacheprovider", "my-a1", cwd=tmp_path)
-    run("ruff", "format", "--check", "--isolated", "--line-length", "120", cwd=plugin.folder)
-    rules = "E,F,W,I,UP,B,SIM,C4,PT,RET,PIE,NPY"
-    run("ruff", "check", "--isolated", "--line-length", "120", "--select", rules, cwd=plugin.folder)
-    result = rlctl("check-env", plugin.target, "--strict")
-    assert result.returncode == 0, result.stdout
+    check_the_plugins_files(plugin, rlctl, strict=True)
+
+
+@pytest.mark.slow
+def test_the_plugin_of_a_humanoid(tmp_path, monkeypatch, rlctl):
+    monkeypatch.chdir(tmp_path)
+    plugin = new.create("my-humanoid", model=str(HumanoidWalk.model), walk=True)
+    task = read_task(plugin)
+    # The values that the task `humanoid-walk` has.
+    assert task.other_side == HumanoidWalk.mirror["action"][:12]
+    assert task.highest == pytest.approx(HumanoidWalk.highest, rel=0.05)
+    assert task.lowest == pytest.approx(HumanoidWalk.lowest, rel=0.05)
+    assert (task.period, task.swing) == pytest.approx((HumanoidWalk.period_s, HumanoidWalk.swing), rel=0.05)
+    assert task.soles == pytest.approx([SOLE, SOLE], abs=3e-3)
+    assert task.aside == [f"{side}_hip_{axis}" for side in ("left", "right") for axis in ("yaw", "roll")]
+    check_the_plugins_files(plugin, rlctl, strict=True)
