@@ -59,6 +59,7 @@ class HumanoidWalk(Clocked):
         "velocity": (1, -2, 3),
         "height": (1,),
         "foot_heights": (2, 1),
+        "events/push": (1, -2),  # speed and direction
     }
     rlctl_ignore = {**Clocked.rlctl_ignore, "RL610": "whoever is commanded to stand does so at first, and then falls"}
 
