@@ -188,6 +188,18 @@ def test_markers_are_drawn_where_they_are_moved():
 
 
 @needs_egl
+def test_a_near_body_is_drawn_whole_on_wide_ground():
+    with closing(MujocoSim(control_dt=0.02, substeps=4)) as sim:
+        sim.add_height_field("ground", np.tile([0.0, 0.01], (20, 10)), cell=5.0)  # 100 m x 100 m
+        cube = sim.load("cube", "cube_small.urdf", position=(0.0, 0.0, 0.5))
+        looking = {"eye": (0.5, 0.0, 0.5), "target": (0.0, 0.0, 0.5)}
+        seen = sim.render(64, 48, **looking)
+        cube.set_base((0.0, 0.0, 5.0))
+        without = sim.render(64, 48, **looking)
+    assert (seen != without).any(axis=2).sum() > 30
+
+
+@needs_egl
 def test_a_task_draws_without_a_display(monkeypatch):
     # In a process of its own: MuJoCo chooses at its import how to draw, and GLFW would end the process.
     for name in ("DISPLAY", "MUJOCO_GL"):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rlctl.errors import UsageError, describe_exception
 from rlctl.task.mujoco.world import import_mujoco
 
+_NEAREST = 0.05  # of the distance from the eye to the target
 _HINT = "without a display set MUJOCO_GL=egl (Debian: libegl1) or MUJOCO_GL=osmesa"
 
 
@@ -47,6 +48,8 @@ def draw(
     camera.azimuth = float(np.degrees(np.arctan2(way[1], way[0])))
     camera.elevation = float(np.degrees(np.arctan2(way[2], np.hypot(way[0], way[1]))))
     model.vis.global_.fovy = field_of_view
+    # Nothing nearer is drawn. By default it is a hundredth of the world, on wide ground half of a robot.
+    model.vis.map.znear = min(model.vis.map.znear, _NEAREST * camera.distance / model.stat.extent)
     model.vis.global_.offwidth, model.vis.global_.offheight = (
         max(wanted, present)
         for wanted, present in zip(size, (model.vis.global_.offwidth, model.vis.global_.offheight), strict=True)
