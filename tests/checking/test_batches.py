@@ -1,7 +1,9 @@
 """What goes wrong only when a task in batches has several worlds."""
 
+import numpy as np
 import pytest
 
+from rlctl.checking.families.batches import describe_difference
 from tests.checking.judging import case, check_case, findings, found
 
 pytest.importorskip("mujoco")
@@ -58,6 +60,12 @@ def test_a_sound_task_has_no_finding_of_batches(task):
 def test_the_message_names_what_is_wrong(name, rule, message):
     (finding,) = findings(f"{FILE}:{name}", rule)
     assert finding.message.startswith(message)
+
+
+def test_a_difference_by_rounding_is_named():
+    assert describe_difference(0.5, 0.25) == "is 0.5, then 0.25"
+    rounded = describe_difference(0.5, float(np.nextafter(0.5, 1.0)))
+    assert rounded.startswith("is 0.5, then 1.1e-16 more: a @ b rounds")
 
 
 def test_any_other_environment_has_no_worlds():

@@ -139,6 +139,15 @@ def _find_difference(worlds: _Worlds, one: Sequence[Rows], two: Sequence[Rows]) 
     return None
 
 
+def describe_difference(value: float, expected: float) -> str:
+    """Return a sentence's end for two values; where their digits are alike, it is about rounding."""
+    if f"{value:.9g}" != f"{expected:.9g}":
+        return f"is {value:.9g}, then {expected:.9g}"
+    more = "less" if expected < value else "more"
+    difference = f"{abs(value - expected):.1e} {more}"
+    return f"is {value:.9g}, then {difference}: a @ b rounds as the number of rows says, a * b does not"
+
+
 def _find_influence(worlds: _Worlds, alone: Rows) -> Iterator[ChildMessage]:
     first, again, other = (worlds.play(others=others) for others in (0, 0, 100))
     ours, repeated, changed = ([rows[COMPARED] for rows in play.rows] for play in (first, again, other))
@@ -151,7 +160,8 @@ def _find_influence(worlds: _Worlds, alone: Rows) -> Iterator[ChildMessage]:
             step, element, value, expected = difference
             at = "at reset" if step == 0 else f"at step {step}"
             is_small = abs(value - expected) <= NEARLY * max(abs(value), abs(expected), 1.0)
-            message = f"the episode of a world differs with {what}: {at} {element} is {value:.9g}, then {expected:.9g}"
+            shown = describe_difference(value, expected)
+            message = f"the episode of a world differs with {what}: {at} {element} {shown}"
             evidence = {"element": element, "step": step, "seed": FIRST_SEED + COMPARED, "value": value}
             yield RuleFinding(
                 "RL406", message, {**evidence, "expected": expected}, Severity.WARNING if is_small else None
