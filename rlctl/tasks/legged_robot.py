@@ -18,7 +18,7 @@ from rlctl.errors import TaskError, UsageError
 from rlctl.task.rotations import rotate_inverse
 from rlctl.tasks.legs import Array, Leg, Skeleton, find_legs
 from rlctl.tasks.model_copy import copy_model, find_own_model
-from rlctl.tasks.scaling import GRAVITY, Scaled, scale
+from rlctl.tasks.scaling import GRAVITY, ScaledRobot, scale
 from rlctl.tasks.source_text import LINE_WIDTH, write_list, write_number
 from rlctl.tasks.stance import VERTICAL, Stance, StanceSearch, compare_turns, measure_stance
 from rlctl.tasks.starter_robot import StarterRobot
@@ -59,7 +59,7 @@ class _Legged:
     gait: Gait
 
     @property
-    def scaled(self) -> Scaled:
+    def scaled(self) -> ScaledRobot:
         return scale(self.body.total_mass(), self.stance, len(self.legs))
 
     @property

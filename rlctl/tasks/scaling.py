@@ -34,7 +34,7 @@ _HUMANOID = _Speeds(0.12, 0.33, 0.12, 0.148, scale=0.2, turn_scale=0.12, toleran
 
 
 @dataclasses.dataclass(frozen=True)
-class Scaled:
+class ScaledRobot:
     """Values of a robot with legs, and those of the A1."""
 
     stiffness: float  # [N m/rad]; 35 of the A1
@@ -56,12 +56,12 @@ class Scaled:
     swing: float  # [m], how high a foot is lifted; 0.07 of the humanoid
 
 
-def scale(mass: float, stance: Stance, legs: int) -> Scaled:
+def scale(mass: float, stance: Stance, legs: int) -> ScaledRobot:
     """Return the values of a robot of `mass` [kg] in its stance. Numbers in the code have no unit."""
     length, of = stance.leg_length, _HUMANOID if legs == 2 else _A1
     time = math.sqrt(length / GRAVITY)
     speed, torque = length / time, mass * GRAVITY * length
-    return Scaled(
+    return ScaledRobot(
         stiffness=_round(torque),
         damping=_round(0.12 * torque * time),
         gear_damping=_round(0.05 * torque * time),
