@@ -114,6 +114,8 @@ class Recipe(Section):
     """A critic that sees more than the actor, for tasks with flat observations; null: it sees the same."""
     mirror: Switch = False
     """PPO: whether to learn from the mirror image of every step too, for tasks that declare their symmetry."""
+    mirror_loss: float = Field(0.0, ge=0, le=1e6)
+    """PPO: weight of the squared difference between a mirror image's mean action and the mirrored mean action."""
     normalize: NormalizeSettings | None = Field(
         None, json_schema_extra=decide_by("both for ppo, a2c, recurrent_ppo; else neither")
     )

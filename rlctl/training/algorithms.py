@@ -96,8 +96,8 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         if isinstance(model, OffPolicyAlgorithm):
             start = env.workers.info.history_start if env.workers.info.observation_history else "first"
             store_once(model.replay_buffer, find_layout(env.workers, model.observation_space), start)
-        if recipe.mirror:
-            add_mirror(model, env.workers)
+        if recipe.mirror or recipe.mirror_loss:
+            add_mirror(model, env.workers, images=recipe.mirror, loss=recipe.mirror_loss)
         write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # reports faults of a user's network
         if own_policy is not None and not has_privileged_critic(model.policy):
             use_sde = {"use_sde": True} if getattr(model, "use_sde", False) else {}
@@ -113,15 +113,15 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
         raise RecipeError(f"{recipe.algo} cannot be used here: {short_repr(str(error) or error, 300)}") from error
 
 
-def add_mirror(model: Any, workers: Workers) -> None:
-    """Let a PPO model learn from mirror images too; raises `RecipeError` where it cannot."""
-    task, info = workers.spec.task, workers.info
+def add_mirror(model: Any, workers: Workers, *, images: bool, loss: float) -> None:
+    """Let a PPO model learn from mirror images too, or with a mirror loss; raises `RecipeError` where it cannot."""
+    task, info, key = workers.spec.task, workers.info, "mirror" if images else "mirror_loss"
     if not workers.mirror:
-        raise RecipeError(f"mirror: {task} declares no mirror symmetry; leave the key out")
+        raise RecipeError(f"{key}: {task} declares no mirror symmetry; leave the key out")
     if workers.spec.frame_stack > 1 or workers.spec.time_feature:
-        raise RecipeError("mirror: observations with frame_stack or time_feature cannot be mirrored; leave them out")
+        raise RecipeError(f"{key}: observations with frame_stack or time_feature cannot be mirrored; leave them out")
     if not PpoUpdate.supports(model):
-        raise RecipeError("mirror: supported only for PPO with multi-layer perceptrons with tanh or ReLU on the CPU")
+        raise RecipeError(f"{key}: supported only for PPO with multi-layer perceptrons with tanh or ReLU on the CPU")
     frames = {name: info.observation_history.get(name, 1) for name in info.observation_sizes}
     newest = [
         (name, size // frames[name]) for name, size in info.observation_sizes.items() for _ in range(frames[name])
@@ -129,6 +129,7 @@ def add_mirror(model: Any, workers: Workers) -> None:
     action = [(ACTION, len(workers.mirror[ACTION]))]
     observed = [*newest, *workers.privileged_sizes.items()]
     model.mirror = join_places(workers.mirror, observed), join_places(workers.mirror, action)
+    model.mirror_images, model.mirror_loss = images, loss
 
 
 def keep_compiler_out() -> None:

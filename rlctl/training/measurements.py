@@ -31,8 +31,8 @@ _AT_LIMIT = 0.99  # an action counts as saturated from this fraction of half its
 
 
 _LOSSES = (
-    "learning_rate", "loss", "policy_gradient_loss", "policy_loss", "value_loss", "entropy_loss", "approx_kl",
-    "clip_fraction", "clip_range", "explained_variance", "std", "actor_loss", "critic_loss", "ent_coef",
+    "learning_rate", "loss", "policy_gradient_loss", "policy_loss", "value_loss", "mirror_loss", "entropy_loss",
+    "approx_kl", "clip_fraction", "clip_range", "explained_variance", "std", "actor_loss", "critic_loss", "ent_coef",
     "ent_coef_loss", "n_updates",
 )  # fmt: skip
 

@@ -167,6 +167,7 @@ def test_a_policy_with_a_privileged_critic_starts_another_training(train, tmp_pa
             "mirror: supp",
         ),
         ({"mirror": True, "algo": "sac"}, "walk", "mirror: supported only for PPO"),
+        ({"mirror_loss": 0.5}, STOOL, "mirror_loss: tests.task.batches:Stool declares no mirror symmetry"),
         (
             {"algo": "recurrent_ppo", "policy_kwargs": {"shared_lstm": True, "enable_critic_lstm": False}},
             STOOL,

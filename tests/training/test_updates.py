@@ -121,6 +121,37 @@ def test_mirror_images_are_learned_from_as_if_they_had_been_played():
     assert dict(logged) == pytest.approx(dict(expected), rel=1e-3, abs=1e-4)
 
 
+@pytest.mark.parametrize("images", [True, False])
+def test_the_mirror_loss_has_the_gradient_of_autograd(images):
+    places, weight = ((-2, -1, 3, 5, 4), (1, -3, -2)), 0.5
+    without, with_loss, model = (
+        make_ppo(batch_size=100, n_epochs=1, normalize_advantage=False, max_grad_norm=1e9) for _ in range(3)
+    )
+    if images:
+        without.mirror = places
+    with_loss.mirror, with_loss.mirror_images, with_loss.mirror_loss = places, images, weight
+    gradients = []
+    for each in (without, with_loss):
+        update = PpoUpdate(each)
+        update.train()
+        gradients.append(update._arrays["gradient"].copy())
+
+    def compute_means(rows):
+        return model.policy.get_distribution(torch.from_numpy(rows)).distribution.mean
+
+    rows = split_rows(model.rollout_buffer.observations)
+    mirror_action = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
+    differences = compute_means(rows) - compute_means(Mirror(places[0])(rows)) @ mirror_action
+    loss = differences.square().sum(1).mean()
+    actor = [*model.policy.mlp_extractor.policy_net.parameters(), *model.policy.action_net.parameters()]
+    expected = torch.cat([part.ravel() for part in torch.autograd.grad(weight * loss, actor)]).numpy()
+    difference = gradients[1] - gradients[0]
+    np.testing.assert_allclose(difference[: len(expected)], expected, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(difference[len(expected) :], 0.0, atol=1e-6)
+    assert with_loss.logger.name_to_value["train/mirror_loss"] == pytest.approx(loss.item(), rel=1e-4)
+    assert "train/mirror_loss" not in without.logger.name_to_value
+
+
 @pytest.mark.parametrize("name", ["tanh", "gSDE, relu, no hidden layer of the critic", "dict"])
 def test_ppo_evaluates_as_sb3(name):
     model = make_ppo(**PPO_CASES[name])

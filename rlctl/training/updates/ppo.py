@@ -41,7 +41,10 @@ class PpoUpdate:
             ent_coef=model.ent_coef,
             vf_coef=model.vf_coef,
             mirror=getattr(model, "mirror", None),
+            mirror_images=getattr(model, "mirror_images", True),
+            mirror_loss=getattr(model, "mirror_loss", 0.0),
         )
+        self._mirror_loss = settings.mirror_loss
         shapes = settings.list_shapes()
         self._weights = sum(math.prod(shape) for shape in shapes)
         largest = min(model.batch_size, settings.rows)
@@ -130,10 +133,14 @@ class PpoUpdate:
         self._arrays["minibatch"][:] = first, size, count
         self._blocks.run(DIFFERENTIATE, 2 * count)
         losses = dict(zip(LOSSES, (self._arrays["losses"][:count].sum(0) / size).tolist(), strict=True))
+        if not self._mirror_loss:
+            del losses["mirror_loss"]
         for name, loss in losses.items():
             logged[name].append(loss)
         entropy_loss = model.ent_coef * losses["entropy_loss"]
-        logged["loss"] = [losses["policy_gradient_loss"] + entropy_loss + model.vf_coef * losses["value_loss"]]
+        mirror_loss = self._mirror_loss * losses.get("mirror_loss", 0.0)
+        loss = losses["policy_gradient_loss"] + entropy_loss + model.vf_coef * losses["value_loss"] + mirror_loss
+        logged["loss"] = [loss]
         if model.target_kl is not None and losses["approx_kl"] > 1.5 * model.target_kl:
             return False
         gradient = self._blocks.add_gradients(count, slice(0, len(self._arrays["gradient"])))

@@ -13,7 +13,7 @@ from rlctl.training.updates.blocks import MAX_BLOCKS, Arrays, BlockWork, select_
 from rlctl.training.updates.perceptrons import LOG_SQRT_TAU, Floats, MlpStack, Shapes, list_shapes, split_vector
 
 DIFFERENTIATE, EVALUATE = 0, 1  # phases
-LOSSES = ("policy_gradient_loss", "entropy_loss", "clip_fraction", "approx_kl", "value_loss")
+LOSSES = ("policy_gradient_loss", "entropy_loss", "clip_fraction", "approx_kl", "value_loss", "mirror_loss")
 _ROWS = 1024  # of one forward pass in an evaluation
 
 
@@ -31,6 +31,8 @@ class PpoSettings:
     ent_coef: float
     vf_coef: float
     mirror: tuple[tuple[int, ...], tuple[int, ...]] | None = None  # the places of features and actions; see `Mirror`
+    mirror_images: bool = True  # whether they are learned from as if they had been played
+    mirror_loss: float = 0.0  # weight
 
     def list_shapes(self) -> Shapes:
         """Return the shapes of the parameters: of the actor, of the critic, of the deviation."""
@@ -63,7 +65,7 @@ class PpoGradients(BlockWork):
         gradients = [split_vector(row, shapes) for row in arrays["gradients"]]
         places = settings.mirror
         self._mirrors = {} if places is None else {"features": Mirror(places[0]), "actions": Mirror(places[1])}
-        self._copies = 1 if places is None else 2
+        self._copies = 2 if places is not None and settings.mirror_images else 1
         """How often each row of a minibatch is learned from: a second time as its mirror image."""
         self._gradients = [(parts[:layers], parts[layers:-1], parts[-1]) for parts in gradients]
 
@@ -105,7 +107,12 @@ class PpoGradients(BlockWork):
         """Set a block's gradients of the minibatch's mean loss, and its sums of what is logged."""
         size *= self._copies
         clip_range = float(self._arrays["clip_ranges"][0])
-        actor = self._actor.run(self._take("features", rows)[None, :, : self._settings.actor[0]], "actor")
+        features = self._take("features", rows)
+        learned = len(features)
+        if self._settings.mirror_loss and self._copies == 1:
+            features = np.concatenate([features, self._mirrors["features"](features)])
+        everything = self._actor.run(features[None, :, : self._settings.actor[0]], "actor")
+        actor = [layer[:, :learned] for layer in everything]
         std = self._compute_std(actor)
         z = self._take("actions", rows) - actor[-1][0]
         z /= std
@@ -123,7 +130,14 @@ class PpoGradients(BlockWork):
         self._differentiate_std(actor, std, squared, to_log_std)
         z /= std
         z *= to_log_prob
-        self._actor.backpropagate(actor, z[None], to_actor)
+        to_mean = z
+        if self._settings.mirror_loss:
+            differences = self._compare_with_images(everything[-1][0])
+            to_mean = differences * np.float32(2 * self._settings.mirror_loss * self._copies / size)
+            to_mean[:learned] += z
+            first = differences[: len(differences) // 2]
+            self._arrays["losses"][block, 5] = np.vdot(first, first)
+        self._actor.backpropagate(everything, to_mean[None], to_actor)
         entropy = float(log_std.sum()) * (1 if log_std.ndim > 1 else len(z)) + (0.5 + LOG_SQRT_TAU) * z.size
         self._arrays["losses"][block, :4] = (
             -float(np.minimum(unclipped, clipped).sum()),
@@ -132,6 +146,15 @@ class PpoGradients(BlockWork):
             float((ratio - 1 - log_ratio).sum()),
         )
         self._arrays["losses"][block, :4] /= self._copies
+
+    def _compare_with_images(self, means: Floats) -> Floats:
+        """Return the differences of means from the mirrored means of their images, which are in the other half.
+
+        W. Yu et al., Learning symmetric and low-energy locomotion, 2018, https://arxiv.org/abs/1801.08093, equation 4.
+        """
+        rows = len(means) // 2
+        differences: Floats = means - self._mirrors["actions"](np.concatenate([means[rows:], means[:rows]]))
+        return differences
 
     def _differentiate_critic(self, block: int, rows: slice, size: int) -> None:
         size *= self._copies
