@@ -7,7 +7,6 @@ import dataclasses
 import json
 import re
 import textwrap
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,11 +15,12 @@ import numpy as np
 
 from rlctl.errors import TaskError, UsageError
 from rlctl.task.rotations import rotate_inverse
-from rlctl.tasks.legs import Array, Leg, Skeleton, find_legs
-from rlctl.tasks.model_copy import copy_model, find_own_model
+from rlctl.tasks.gait import Gait, describe_gait
+from rlctl.tasks.legs import Leg, Skeleton, find_legs
+from rlctl.tasks.model_copy import copy_model, find_own_model, remove_floor
 from rlctl.tasks.scaling import GRAVITY, ScaledRobot, scale
 from rlctl.tasks.source_text import LINE_WIDTH, write_list, write_number
-from rlctl.tasks.stance import VERTICAL, Stance, StanceSearch, compare_turns, measure_stance
+from rlctl.tasks.stance import Stance, StanceSearch, measure_stance
 from rlctl.tasks.starter_robot import StarterRobot
 
 if TYPE_CHECKING:
@@ -35,16 +35,6 @@ _ENDLESS_FORCE = 20.0  # of weight x leg length
 _LEVEL = 0.03  # of the leg length: how much the feet's heights may differ
 _KEYED = (0.55, 0.97)  # of the longest leg: legs of a keyframe that is a stance
 _UPRIGHT = -0.9  # component z of the direction of gravity, in the trunk's frame
-
-
-@dataclasses.dataclass(frozen=True)
-class Gait:
-    """What a robot needs to know of its legs to step, and to learn from mirror images."""
-
-    other_side: list[int]  # as `BatchTask.mirror` has it, of the legs' joints; empty if its sides are not alike
-    faces_y: bool
-    soles: list[float]  # heights of the feet's origins above the ground in the stance [m]
-    aside: list[int]  # joints near the hip that do not turn about y
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,43 +78,27 @@ def read_legged_robot(model: str) -> StarterRobot:
     search = StanceSearch(skeleton, legs, mirror)
     keyframe, stance = _find_keyframe(skeleton, legs, search.longest)
     stance = stance or search.find()
-    gait = _describe_gait(skeleton, legs, stance, mirror)
+    gait = describe_gait(skeleton, legs, stance, mirror)
     legged = _Legged(body, path, legs, stance, keyframe, 0, stance.height, gait)
     steps_up, height = _stand(legged)
     legged = dataclasses.replace(legged, steps_up=steps_up, height=height)
     files = copy_model(path)
-    notes = [*_list_notes(legged), *_remove_floor(files, Path(path.name))]
+    notes = [*_list_notes(legged), *remove_floor(files, Path(path.name))]
     return StarterRobot(
         _describe(legged), files, _summarize(legged, notes), template=TEMPLATE, kept=_choose_lines(legged)
     )
 
 
-def _describe_gait(skeleton: Skeleton, legs: Sequence[Leg], stance: Stance, mirror: Array) -> Gait:
-    joints = sorted(joint for leg in legs for joint in leg.joints)
-    number = {joint: index for index, joint in enumerate(joints, 1)}
-    other_side = dict.fromkeys(joints, 0)
-    for leg in legs:
-        other = legs[leg.other]
-        for own, far, sign in zip(leg.joints, other.joints, compare_turns(skeleton, leg, other, mirror), strict=True):
-            if abs(stance.positions[far] - sign * stance.positions[own]) < _TINY:
-                other_side[own] = int(sign) * number[far]
-    skeleton.place(skeleton.rest)
-    across = np.abs(skeleton.axes(range(len(stance.positions)))[:, 1]) > VERTICAL
-    skeleton.place(stance.positions)
-    soles, aside = [], []
-    for leg in legs:
-        touch, anchors = skeleton.touch(leg.foot), skeleton.anchors(leg.joints)
-        soles.append(float(skeleton.data.xpos[skeleton.body.find_link(leg.foot.link), 2] - touch[2]))
-        near = anchors[:, 2] - touch[2] > stance.leg_length / 2
-        aside += np.array(leg.joints)[near & ~across[leg.joints]].tolist()
-    alike = list(other_side.values()) if all(other_side.values()) else []
-    return Gait(alike, bool(mirror[0] < 0), soles, sorted(aside))
-
-
 def _choose_lines(legged: _Legged) -> frozenset[str]:
     """Return which optional lines of the template the plugin has: those of a clock, and of a mirror image."""
     kind = "clock" if len(legged.legs) == 2 else "walk"
-    return frozenset([kind, "mirror", f"mirror_{kind}"] if legged.gait.other_side else [kind])
+    chosen = {
+        kind: True,
+        "aside": kind == "clock" and bool(legged.gait.aside),
+        "mirror": bool(legged.gait.other_side),
+        f"mirror_{kind}": bool(legged.gait.other_side),
+    }
+    return frozenset(name for name, is_kept in chosen.items() if is_kept)
 
 
 def _load(model: str) -> tuple[Path, MujocoBody]:
@@ -233,22 +207,6 @@ def _list_notes(legged: _Legged) -> list[str]:
     if len(legged.legs) == 2:
         notes.append("It steps in time with a clock, which PERIOD and SWING describe")
     return notes
-
-
-def _remove_floor(files: dict[Path, bytes], model: Path) -> list[str]:
-    """Remove shapes of the world, such as a floor, from the copy of an MJCF file; return a sentence if there were."""
-    if model.suffix != ".xml":
-        return []
-    root = ElementTree.fromstring(files[model])
-    removed = 0
-    for world in root.iterfind("worldbody"):
-        for geom in world.findall("geom"):
-            world.remove(geom)
-            removed += 1
-    if not removed:
-        return []
-    files[model] = ElementTree.tostring(root)
-    return [f"The copy of {model.name} has no floor, since the task loads one"]
 
 
 def _summarize(legged: _Legged, notes: Sequence[str]) -> str:

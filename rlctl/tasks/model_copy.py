@@ -76,3 +76,19 @@ def _add(files: dict[Path, bytes], source: Path) -> str:
     except OSError as error:
         raise UsageError(f"--model: {source}: {error.strerror or error}") from None
     return path.as_posix()
+
+
+def remove_floor(files: dict[Path, bytes], model: Path) -> list[str]:
+    """Remove shapes of the world, such as a floor, from the copy of an MJCF file; return a sentence if there were."""
+    if model.suffix != ".xml":
+        return []
+    root = ElementTree.fromstring(files[model])
+    removed = 0
+    for world in root.iterfind("worldbody"):
+        for geom in world.findall("geom"):
+            world.remove(geom)
+            removed += 1
+    if not removed:
+        return []
+    files[model] = ElementTree.tostring(root)
+    return [f"The copy of {model.name} has no floor, since the task loads one"]

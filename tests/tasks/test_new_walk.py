@@ -1,6 +1,7 @@
 """`rlctl tasks new --walk`: the plugin of a legged robot stands in a stance that was found in its model."""
 
 import contextlib
+import re
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
@@ -123,6 +124,19 @@ def test_the_stance_of_a_keyframe(tmp_path, monkeypatch, legs, stance):
     task = read_task(plugin)
     assert ("keyframe 'home'" in plugin.summary) == (stance is not None)
     assert (list(task.stance[:3]) == stance) == (stance is not None)
+
+
+def test_two_legs_that_only_turn_about_y(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = write_dog(tmp_path, pairs=(0.0,))
+    hips = re.sub(r'<joint name="\w+_hip" axis="1 0 0" [^>]*/>', "", file.read_text().replace("\n", " "))
+    file.write_text(hips)
+    plugin = new.create("flat-bird", model="dog.xml", walk=True)
+    assert not hasattr(read_task(plugin), "aside")
+    with contextlib.closing(EnvSpec(plugin.target, sim="mujoco").make()) as env:
+        env.reset(seed=0)
+        _, reward, _, _, _ = env.step(np.zeros(4, np.float32))
+    assert np.isfinite(reward)
 
 
 def test_sprawled_legs_stand_to_the_sides():
