@@ -53,6 +53,10 @@ class _Legged:
         return scale(self.body.total_mass(), self.stance, len(self.legs))
 
     @property
+    def is_biped(self) -> bool:
+        return len(self.legs) == 2
+
+    @property
     def joints(self) -> list[int]:
         return sorted(joint for leg in self.legs for joint in leg.joints)
 
@@ -91,7 +95,7 @@ def read_legged_robot(model: str) -> StarterRobot:
 
 def _choose_lines(legged: _Legged) -> frozenset[str]:
     """Return which optional lines of the template the plugin has: those of a clock, and of a mirror image."""
-    kind = "clock" if len(legged.legs) == 2 else "walk"
+    kind = "clock" if legged.is_biped else "walk"
     chosen = {
         kind: True,
         "aside": kind == "clock" and bool(legged.gait.aside),
@@ -161,8 +165,9 @@ def _stand(legged: _Legged) -> tuple[int, float]:
     stance, world = legged.stance.positions[None], np.zeros(1, np.int64)
     body.set_base(np.array([[0.0, 0.0, numbers.start_height]]), worlds=world)
     body.set_joints(stance, worlds=world)
+    forces, _ = _limit_forces(legged)
     for step in range(_STEPS):
-        body.drive_to(stance, max_force=_limit_forces(legged)[0])
+        body.drive_to(stance, max_force=forces)
         sim.step()
         down, height = rotate_inverse(body.base_orientation[0], (0.0, 0.0, -1.0)), float(body.base_position[0, 2])
         if down[2] > _UPRIGHT or height < numbers.fallen_height:
@@ -199,12 +204,12 @@ def _list_notes(legged: _Legged) -> list[str]:
     if not all(limits) or min(limits) > _ENDLESS_FORCE * legged.scaled.stiffness:
         notes.append("The file has no useful torque limits for all joints: write those of your motors into MAX_FORCE")
     # Two legs that are springs hold no robot for long.
-    if legged.steps_up < (_STEPS if len(legged.legs) > 2 else _STEPS // 4):
+    if legged.steps_up < (_STEPS // 4 if legged.is_biped else _STEPS):
         notes.append(
             f"With zero actions it falls after {legged.steps_up * _CONTROL_DT:.1f} s: look at it with the first "
             "command below, and change STANCE, STIFFNESS or MAX_FORCE"
         )
-    if len(legged.legs) == 2:
+    if legged.is_biped:
         notes.append("It steps in time with a clock, which PERIOD and SWING describe")
     return notes
 
@@ -260,8 +265,7 @@ def _describe(legged: _Legged) -> dict[str, str]:
         "push": f"{numbers.push:g}",
         "bounce_weight": f"{numbers.bounce:g}",
         "sway_weight": f"{numbers.sway:g}",
-        "smoothness_weight": "-0.012",
-        "start_noise": "0.05" if len(legged.legs) == 2 else "0.1",
+        "start_noise": "0.05" if legged.is_biped else "0.1",
         **_describe_steps(legged),
         "height_weight": f"{numbers.height:g}",
         "feet": write_list("FEET = ", map(json.dumps, sorted(set(legged.feet)))),
@@ -275,7 +279,7 @@ def _describe_steps(legged: _Legged) -> dict[str, str]:
     vector, turn = ("(-1, 2, 3)", "(1, -2, -3)") if gait.faces_y else ("(1, -2, 3)", "(-1, 2, -3)")
     command = "(-1, 2, -3)" if gait.faces_y else "(1, -2, -3)"
     return {
-        "model_robot": "a humanoid" if len(legged.legs) == 2 else "the A1",
+        "model_robot": "a humanoid" if legged.is_biped else "the A1",
         "other_side": f"({', '.join(map(str, gait.other_side))})",
         "mirror_vector": vector,
         "mirror_turn": turn,
@@ -286,5 +290,5 @@ def _describe_steps(legged: _Legged) -> dict[str, str]:
         "feet_in_order": write_list("FEET = ", map(json.dumps, legged.feet)),
         "soles": f"[{', '.join(f'{height:.3f}' for height in gait.soles)}]",
         "aside": write_list("ASIDE = ", [json.dumps(names[joint]) for joint in gait.aside]),
-        "total_timesteps": "4_000_000" if len(legged.legs) == 2 else "3_000_000",
+        "total_timesteps": "4_000_000" if legged.is_biped else "3_000_000",
     }
