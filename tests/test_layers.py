@@ -25,7 +25,7 @@ LAYERS = [
     {"exporting", "replaying", "tasks", "importing", "deploy.robot"},
     {"checking", "evaluation"},
     {"deploy.identify", "deploy.diagnose"},
-    {"rollout"},
+    {"play"},
     {"deploy.server"},
     {"deploy"},
     {"deploy.filter"},
@@ -173,7 +173,7 @@ def test_environments_come_without_learning_libraries():
     loaded = loaded_after(
         "import rlctl; rlctl.make('reach').close()",
         "from rlctl.environments.spec import EnvSpec; EnvSpec('Pendulum-v1').make()",
-        "from rlctl.rollout import collect, worker, workers",
+        "from rlctl.play import collect, worker, workers",
         "from rlctl.deploy import SafetyFilter",
     )
     assert {line: modules & TORCH for line, modules in loaded.items() if modules & TORCH} == {}

@@ -60,7 +60,7 @@ def test_the_life_of_a_run(tmp_path):
     )
     assert codes == [0] * 7
     assert events == []
-    assert modules == ["rlctl.environments.info", "rlctl.rollout.messages"]
+    assert modules == ["rlctl.environments.info", "rlctl.play.messages"]
 
 
 class Bait:

@@ -25,7 +25,7 @@ from typing import Any
 from rlctl.cluster.work import PREEMPTED, TAKEN, ClusterSettings, Work, execute, make_work, mark_shared_folder
 from rlctl.environments import registry
 from rlctl.errors import TaskError, UsageError, explain_missing_package
-from rlctl.rollout.workers import available_cores
+from rlctl.play.workers import available_cores
 from rlctl.run.group import Job, read_job, write_job
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.trainings import NextSignal, Trainings

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from rlctl.evaluation.robustness import Outcome
-from rlctl.rollout.collect import Episode
-from rlctl.rollout.messages import EpisodeResult
+from rlctl.play.collect import Episode
+from rlctl.play.messages import EpisodeResult
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,13 +16,13 @@ from rlctl.evaluation.failures import FailurePattern, find_patterns
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, find_player, load_baseline
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.evaluation.sequential import EarlyGate, find_interval
+from rlctl.play.collect import Episode, play_episodes
+from rlctl.play.messages import EpisodeResult
+from rlctl.play.seeds import Stream, episode_seeds
+from rlctl.play.workers import Workers, count_envs
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.players.player import Exploration
 from rlctl.policy.shipped import MeasuredScore
-from rlctl.rollout.collect import Episode, play_episodes
-from rlctl.rollout.messages import EpisodeResult
-from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import Workers, count_envs
 from rlctl.run.episode import save_episode
 
 _PLAYED_TOGETHER = 10  # episodes, before it is asked whether the gate is decided

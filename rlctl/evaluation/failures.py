@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.environments.info import EnvInfo
-from rlctl.rollout.collect import Episode
+from rlctl.play.collect import Episode
 
 _RELABELLED = 2000  # random relabellings of the episodes
 _AT_ONCE = 100  # of them, so that 100,000 episodes need no gigabytes

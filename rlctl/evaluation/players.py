@@ -9,11 +9,11 @@ from rlctl import output
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, explain_missing_package
 from rlctl.evaluation.request import EvalRequest
+from rlctl.play.workers import Workers
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import check_playable, load_policy
 from rlctl.policy.players.named import BASELINES, SERVER, load_function
 from rlctl.policy.players.player import Player
-from rlctl.rollout.workers import Workers
 from rlctl.run import lookup
 
 
@@ -86,7 +86,7 @@ class Baseline:
 
     def make_player(self, env: Any) -> Player:
         """Return a player for an environment in this process."""
-        from rlctl.rollout.worker import make_player_of
+        from rlctl.play.worker import make_player_of
 
         return make_player_of(self.name, env)
 

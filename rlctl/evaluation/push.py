@@ -12,8 +12,8 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.evaluation.episode_statistics import summarize
 from rlctl.evaluation.robustness import PushLevel, PushTest
+from rlctl.play.messages import EpisodeResult
 from rlctl.policy.shipped import Interval
-from rlctl.rollout.messages import EpisodeResult
 
 _DURATION_S = 0.1
 _FIRST_SPEED = 0.25  # [m/s], the change of the whole robot's speed by the smallest push

@@ -16,7 +16,7 @@ from rlctl.errors import AnswerIsNo
 from rlctl.evaluation import report
 from rlctl.evaluation.evaluate import Evaluation, run_evaluation
 from rlctl.evaluation.request import EvalRequest
-from rlctl.rollout.workers import available_cores
+from rlctl.play.workers import available_cores
 
 _LATE_SHARE = 0.001  # so many late answers are the computer's: 99.9 % are in time
 

@@ -23,11 +23,11 @@ from rlctl.evaluation.players import LoadedPolicy, find_player
 from rlctl.evaluation.push import measure_push
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.evaluation.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
+from rlctl.play.collect import play_episodes
+from rlctl.play.messages import EpisodeResult
+from rlctl.play.seeds import Stream, episode_seeds
+from rlctl.play.workers import Workers
 from rlctl.policy.players.player import Exploration
-from rlctl.rollout.collect import play_episodes
-from rlctl.rollout.messages import EpisodeResult
-from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import Workers
 from rlctl.storage import files
 from rlctl.version import collect_versions
 

@@ -17,8 +17,8 @@ from rlctl.evaluation.evaluate import start_workers
 from rlctl.evaluation.players import find_player
 from rlctl.evaluation.request import EvalRequest
 from rlctl.exporting.request import ExportRequest
-from rlctl.rollout.collect import Episode, play_episodes
-from rlctl.rollout.seeds import Stream, episode_seeds
+from rlctl.play.collect import Episode, play_episodes
+from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.storage import files
 
 _PACKAGES = {"minari": ("minari", "h5py"), "lerobot": ("pyarrow",)}

@@ -17,12 +17,12 @@ from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.exporting.request import ExportRequest
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, Latency, measure_latency, verify
 from rlctl.hub import store
+from rlctl.play.workers import Workers, count_envs
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import check_playable
 from rlctl.policy.own_modules import KEYS, import_named
 from rlctl.policy.policy import Policy
 from rlctl.policy.shipped import PRETRAINED
-from rlctl.rollout.workers import Workers, count_envs
 from rlctl.run import lookup
 from rlctl.run.directory import refuse_links_out
 from rlctl.run.lookup import FoundPolicy

@@ -15,13 +15,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import map_parts, stack, take_row
+from rlctl.play.collect import Episode, play_episodes
+from rlctl.play.seeds import Stream, episode_seeds
+from rlctl.play.workers import Workers
 from rlctl.policy.c_policy import CPolicy
 from rlctl.policy.file import PolicyFile, Tensors
 from rlctl.policy.onnx_policy import OnnxPolicy
 from rlctl.policy.policy import Policy
-from rlctl.rollout.collect import Episode, play_episodes
-from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import Workers
 
 if TYPE_CHECKING:
     from rlctl.policy.torch_policy import TorchPolicy

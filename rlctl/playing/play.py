@@ -17,6 +17,7 @@ from rlctl import output
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, explain_missing_package
+from rlctl.play.seeds import Stream, episode_seed
 from rlctl.playing.controls import Controls, PageMessage
 from rlctl.playing.drawing import describe_shapes, list_poses
 from rlctl.playing.request import PlayRequest
@@ -27,7 +28,6 @@ from rlctl.replaying.reproduce import print_warning
 from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.scene import Env
 from rlctl.replaying.sources import PolicySource
-from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.run.episode import save_episode
 
 if TYPE_CHECKING:

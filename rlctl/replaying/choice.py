@@ -6,11 +6,11 @@ from rlctl import output
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.evaluation.players import Baseline, LoadedPolicy
+from rlctl.play.collect import play_episodes
+from rlctl.play.messages import EpisodeResult
+from rlctl.play.seeds import Stream, episode_seeds
+from rlctl.play.workers import Workers, count_envs
 from rlctl.replaying.request import Choice
-from rlctl.rollout.collect import play_episodes
-from rlctl.rollout.messages import EpisodeResult
-from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import Workers, count_envs
 
 
 def choose_episodes(

@@ -18,11 +18,11 @@ from rlctl.environments import dict_spaces, registry
 from rlctl.environments.info import EnvInfo, describe, find_mujoco
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
+from rlctl.play.messages import format_hint
 from rlctl.replaying.bullet_scene import TaskReader, WorldsReader
 from rlctl.replaying.drawable import DrawableEnv
 from rlctl.replaying.mujoco_scene import MujocoReader
 from rlctl.replaying.scene import Camera, Env, Scene, Warn
-from rlctl.rollout.messages import format_hint
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode
 from rlctl.task.env import TaskEnv
 from rlctl.version import collect_versions

@@ -12,6 +12,7 @@ from rlctl.environments.registry import make_slug
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import UsageError
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, load_baseline, load_player
+from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.policy.players.named import SERVER
 from rlctl.policy.players.player import Player
@@ -32,7 +33,6 @@ from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.scene import Env
 from rlctl.replaying.world import WorldWatch
 from rlctl.replaying.world_readers import make_world_reader
-from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.run.directory import RunDirectory, refuse_links_out
 from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
 from rlctl.run.lookup import find_owner, find_policy, locate_task

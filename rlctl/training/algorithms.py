@@ -15,10 +15,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from rlctl.environments.dict_spaces import split_space
 from rlctl.errors import RecipeError, RlctlError, UsageError, short_repr
+from rlctl.play.workers import Workers
 from rlctl.policy.own_modules import import_named
 from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
 from rlctl.recipe.recipe import ON_POLICY, NormalizeSettings, Recipe
-from rlctl.rollout.workers import Workers
 from rlctl.storage.untrusted import measure_free_memory
 from rlctl.task.mirror import ACTION, join_places
 from rlctl.training.device import describe_device, find_fastest

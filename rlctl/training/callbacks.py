@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from rlctl.environments.dict_spaces import join
 from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError
-from rlctl.rollout.messages import EpisodeResult
-from rlctl.rollout.shared_arrays import SegmentArrays
+from rlctl.play.messages import EpisodeResult
+from rlctl.play.shared_arrays import SegmentArrays
 
 if TYPE_CHECKING:
     from rlctl.training.learner import Learner

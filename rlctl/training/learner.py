@@ -16,11 +16,11 @@ from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError, RlctlError
 from rlctl.output import format_count
+from rlctl.play.messages import EpisodeResult, LevelRule
+from rlctl.play.workers import Workers
 from rlctl.policy.file import PolicyFile
 from rlctl.recipe.recipe import Recipe
 from rlctl.recipe.stages import FollowingLevel, Promotion, Stage, format_title
-from rlctl.rollout.messages import EpisodeResult, LevelRule
-from rlctl.rollout.workers import Workers
 from rlctl.training.display import percent
 from rlctl.training.rollouts import Rollouts
 from rlctl.training.snapshot import pack

@@ -20,7 +20,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from rlctl.environments.dict_spaces import join, split, split_names
 from rlctl.environments.info import EnvInfo
 from rlctl.evaluation.episode_statistics import mean_metrics, mean_return, mean_terms, success_rate
-from rlctl.rollout.messages import EpisodeResult
+from rlctl.play.messages import EpisodeResult
 from rlctl.training.rollouts import WorkerVecEnv
 
 HISTOGRAMS = 20  # number of times per training that histograms are written; they take more time than numbers

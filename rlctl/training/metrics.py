@@ -17,8 +17,8 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 from torch.utils.tensorboard.summary import histogram, hparams
 
+from rlctl.play.messages import EpisodeResult
 from rlctl.recipe.recipe import ON_POLICY, Recipe
-from rlctl.rollout.messages import EpisodeResult
 from rlctl.training import measurements
 from rlctl.training.checkpoints import Checkpoints
 from rlctl.training.display import Display

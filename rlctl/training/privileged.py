@@ -19,7 +19,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
 from stable_baselines3.sac.policies import SACPolicy
 
-from rlctl.rollout.shared_arrays import CRITIC
+from rlctl.play.shared_arrays import CRITIC
 
 Parts = dict[str, NDArray[Any]]
 

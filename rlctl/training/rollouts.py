@@ -16,13 +16,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from rlctl.environments.dict_spaces import Observations, count_outside, join
 from rlctl.errors import EpisodeFailed
+from rlctl.play.messages import EpisodeResult, LevelRule, Play
+from rlctl.play.seeds import Stream, episode_seed
+from rlctl.play.shared_arrays import SegmentArrays
+from rlctl.play.workers import Workers
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import Recipe
-from rlctl.rollout.messages import EpisodeResult, LevelRule, Play
-from rlctl.rollout.seeds import Stream, episode_seed
-from rlctl.rollout.shared_arrays import SegmentArrays
-from rlctl.rollout.workers import Workers
 from rlctl.task.mirror import Mirror
 from rlctl.training.own_networks import write_graph
 from rlctl.training.privileged import name_as_sb3, widen, widen_space

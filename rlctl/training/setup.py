@@ -23,12 +23,12 @@ from rlctl.environments.registrations import describe_registrations
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, RecipeError, TaskError
 from rlctl.output import format_count
+from rlctl.play.shared_world import explain_processes
+from rlctl.play.workers import Workers, count_envs
 from rlctl.printed_lines import PrintedLines
 from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import ON_POLICY, Recipe
 from rlctl.recipe.stages import FollowingLevel
-from rlctl.rollout.shared_world import explain_processes
-from rlctl.rollout.workers import Workers, count_envs
 from rlctl.run import directory
 from rlctl.run.directory import RunDirectory
 from rlctl.training import status

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rlctl.rollout.workers import Workers
+from rlctl.play.workers import Workers
 from rlctl.training.rollouts import to_network_layout
 from rlctl.training.stacked_replay import StackLayout
 

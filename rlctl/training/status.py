@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from rlctl.environments.registry import find_git_commit, identify_task
 from rlctl.errors import DivergedError, Interrupted, RlctlError, RunTaken
+from rlctl.play.messages import EpisodeResult
 from rlctl.recipe.recipe import Recipe, find_difference
 from rlctl.recipe.sources import resolve_with_stages
-from rlctl.rollout.messages import EpisodeResult
 from rlctl.run.directory import RunDirectory
 from rlctl.version import collect_versions
 

@@ -17,9 +17,9 @@ from types import FrameType
 from typing import TypeVar
 
 from rlctl.errors import Interrupted
+from rlctl.play.workers import available_cores
 from rlctl.printed_lines import LineReader
 from rlctl.processes.child_process import ChildEndedError, ChildProcess
-from rlctl.rollout.workers import available_cores
 from rlctl.run.train_request import TrainRequest
 from rlctl.training.signals import HandledSignals
 

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.environments.spec import EnvSpec
+from rlctl.play.collect import play_episodes
+from rlctl.play.messages import Play
+from rlctl.play.seeds import Stream, episode_seed
+from rlctl.play.workers import Workers, available_cores
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.players.player import Exploration
-from rlctl.rollout.collect import play_episodes
-from rlctl.rollout.messages import Play
-from rlctl.rollout.seeds import Stream, episode_seed
-from rlctl.rollout.workers import Workers, available_cores
 from tests.benchmarks.row import Row, side_by_side
 
 MANY = 64

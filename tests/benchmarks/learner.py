@@ -17,8 +17,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from rlctl.play.workers import available_cores
 from rlctl.policy.torch_policy import pin_threads
-from rlctl.rollout.workers import available_cores
 from rlctl.training.updates.blocks import MAX_BLOCKS, OFF_POLICY_BLOCKS
 from rlctl.training.updates.choice import choose_learner
 from tests.benchmarks.row import Row, side_by_side

@@ -13,9 +13,9 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import rlctl
 from rlctl.environments.spec import EnvSpec
+from rlctl.play.messages import Play
+from rlctl.play.workers import Workers, available_cores
 from rlctl.policy.players.player import Exploration
-from rlctl.rollout.messages import Play
-from rlctl.rollout.workers import Workers, available_cores
 from rlctl.task.model_files import MODELS
 from rlctl.task.pybullet.library import pybullet
 from tests.benchmarks.acting import make_policy

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from rlctl.rollout.workers import Workers
+from rlctl.play.workers import Workers
 
 EnvSpec: Any = importlib.import_module("rlctl.env_spec").EnvSpec  # where it was in that commit
 

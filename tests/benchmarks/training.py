@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 
-from rlctl.rollout.workers import available_cores
+from rlctl.play.workers import available_cores
 from tests.benchmarks import shipped
 from tests.benchmarks.row import Row, side_by_side
 from tests.benchmarks.tutorial_env import check_same_task

@@ -6,7 +6,7 @@ import signal
 
 import psutil
 
-import rlctl.rollout.workers
+import rlctl.play.workers
 import rlctl.storage.files
 import rlctl.training.evaluator
 import rlctl.training.loop
@@ -16,7 +16,7 @@ from rlctl.processes import child_process
 
 PHASES = {
     "workers start": (child_process, "start_process", 1),
-    "workers build": (rlctl.rollout.workers.Workers, "info", 1),
+    "workers build": (rlctl.play.workers.Workers, "info", 1),
     "run folder": (rlctl.training.status, "write_start", 1),
     "first rollout": (rlctl.training.rollouts.WorkerVecEnv, "finish", 1),
     "boundary": (rlctl.training.loop.TrainingLoop, "boundary", 2),

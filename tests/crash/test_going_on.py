@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from rlctl.rollout.seeds import Stream, episode_seed
+from rlctl.play.seeds import Stream, episode_seed
 from tests.crash.contract import assert_quiet, assert_same_end
 from tests.crash.trials import ARGUMENTS, only_run, resume
 

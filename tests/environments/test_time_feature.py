@@ -15,10 +15,10 @@ from rlctl.evaluation.request import EvalRequest
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.request import ExportRequest
 from rlctl.importing.import_model import import_model
+from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.recipe import recipe
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.request import ReplayRequest
-from rlctl.rollout.seeds import Stream, episode_seeds
 from tests.evaluation.conftest import ENVS
 
 BLOCK = f"{ENVS}:Block"

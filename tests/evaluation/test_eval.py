@@ -12,7 +12,7 @@ from rlctl.evaluation.evaluate import measure_score, run_evaluation
 from rlctl.evaluation.group_scores import GroupScore, SeedScore
 from rlctl.evaluation.report import as_json
 from rlctl.evaluation.request import EvalRequest, Gates
-from rlctl.rollout.messages import EpisodeResult
+from rlctl.play.messages import EpisodeResult
 from rlctl.run.train_request import TrainRequest
 from rlctl.runs.summary import read_table
 from rlctl.training.request import run_training

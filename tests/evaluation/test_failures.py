@@ -6,8 +6,8 @@ import pytest
 from rlctl.environments.info import EnvInfo
 from rlctl.evaluation import failures
 from rlctl.evaluation.failures import find_patterns
-from rlctl.rollout.collect import Episode
-from rlctl.rollout.messages import EpisodeResult
+from rlctl.play.collect import Episode
+from rlctl.play.messages import EpisodeResult
 
 INFO = EnvInfo(observation_space={}, action_space={}, observation_sizes={"goal": 2, "speed": 1})
 

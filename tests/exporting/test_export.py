@@ -13,11 +13,11 @@ from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.exporting.export import export_policy, format_closed_loop, show
 from rlctl.exporting.request import ExportRequest
 from rlctl.exporting.verify import Comparison, compare_episodes, verify
+from rlctl.play.collect import Episode
+from rlctl.play.messages import EpisodeResult
+from rlctl.play.workers import Workers
 from rlctl.policy.onnx_policy import OnnxPolicy
 from rlctl.policy.torch_policy import TorchPolicy
-from rlctl.rollout.collect import Episode
-from rlctl.rollout.messages import EpisodeResult
-from rlctl.rollout.workers import Workers
 
 
 def export(path, output=None, formats=("onnx",)):

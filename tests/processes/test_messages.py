@@ -14,10 +14,10 @@ from rlctl.checking.records import Fact, Series
 from rlctl.checking.rules import RuleFinding, Severity
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
+from rlctl.play import messages
 from rlctl.policy.file import PolicyInfo
 from rlctl.processes.messages import UnreadableMessageError, decode, encode
 from rlctl.processes.pool import WorkerException
-from rlctl.rollout import messages
 
 ENV = EnvInfo(observation_space={"type": "Discrete", "n": 2}, action_space={}, control_dt=math.inf)
 SPEC = EnvSpec("reach", {"limit": math.inf, "range": (0.5, 1)}, named_by="run")

@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 
 from rlctl.errors import TaskError
+from rlctl.play.seeds import Stream, episode_seed
 from rlctl.recipe import recipe
-from rlctl.rollout.seeds import Stream, episode_seed
 from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
 from rlctl.training import checkpoints

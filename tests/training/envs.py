@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from rlctl.rollout.seeds import Stream, episode_seeds
+from rlctl.play.seeds import Stream, episode_seeds
 
 
 class Line(gymnasium.Env):

@@ -32,7 +32,7 @@ CASES = {
 def test_equal_on_any_number_of_workers(train, monkeypatch, case):
     runs = []
     for count in (1, 2, 3):
-        monkeypatch.setattr("rlctl.rollout.workers.available_cores", lambda count=count: count)
+        monkeypatch.setattr("rlctl.play.workers.available_cores", lambda count=count: count)
         runs.append(train(STOOL, CASES[case]).run)
     for run in runs[1:]:
         assert_same_run(runs[0], run)

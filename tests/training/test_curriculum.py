@@ -10,9 +10,9 @@ from rlctl import load_policy
 from rlctl.errors import RecipeError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
+from rlctl.play.workers import available_cores
 from rlctl.policy.file import PolicyFile
 from rlctl.replaying.reproduce import verify_episode
-from rlctl.rollout.workers import available_cores
 from rlctl.run.episode import load_episode
 from rlctl.run.train_request import TrainRequest
 from rlctl.training import checkpoint

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from rlctl.errors import UsageError
+from rlctl.play.workers import Workers
 from rlctl.recipe import sources
 from rlctl.recipe.recipe import validate
-from rlctl.rollout.workers import Workers
 from rlctl.training.algorithms import build_on_device
 from rlctl.training.device import MOST_WEIGHTS, describe_device, find_fastest
 from rlctl.training.rollouts import WorkerVecEnv

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from rlctl.play.workers import available_cores
 from rlctl.recipe import recipe as recipes
-from rlctl.rollout.workers import available_cores
 from rlctl.training import checkpoints
 from tests.training.comparing import Killed, assert_same_run, rows
 from tests.training.conftest import FAULTY, SMALL

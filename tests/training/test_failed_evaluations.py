@@ -3,9 +3,9 @@
 import pytest
 
 from rlctl.errors import ArtifactError, TaskError, UsageError
+from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.request import ReplayRequest
-from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.run import lookup
 from rlctl.run.episode import load_episode
 from tests.training.comparing import Killed, rows

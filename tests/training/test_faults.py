@@ -8,7 +8,7 @@ import psutil
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.rollout import workers
+from rlctl.play import workers
 from rlctl.training import checkpoint, checkpoints
 from tests.training import faulty_envs
 from tests.training.comparing import assert_same_run
@@ -44,7 +44,7 @@ def whole(tmp_path_factory):
         ).run
 
 
-# The same faults without a training, and many more, are in tests/rollout/test_returned_values.py.
+# The same faults without a training, and many more, are in tests/play/test_returned_values.py.
 ENDS = {
     "raise": "RuntimeError: the gripper fell off",
     "unprintable": "Unprintable: (message unavailable: ZeroDivisionError)",

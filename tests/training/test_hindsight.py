@@ -10,9 +10,9 @@ import pytest
 from rlctl import load_policy
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.errors import RecipeError, TaskError
+from rlctl.play.workers import Workers
 from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
-from rlctl.rollout.workers import Workers
 from rlctl.run.train_request import TrainRequest
 from rlctl.training import checkpoint
 from rlctl.training.algorithms import build_model

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import RecipeError, TaskError
-from rlctl.rollout.messages import LevelRule
+from rlctl.play.messages import LevelRule
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from rlctl.training import checkpoint

@@ -10,12 +10,12 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError, TaskError, UsageError
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.request import ExportRequest
+from rlctl.play.messages import Play
+from rlctl.play.shared_arrays import CRITIC
+from rlctl.play.workers import Workers
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.recipe.recipe import merge
-from rlctl.rollout.messages import Play
-from rlctl.rollout.shared_arrays import CRITIC
-from rlctl.rollout.workers import Workers
 from rlctl.task.privileged import PrivilegedFormat
 from tests.training.comparing import assert_same_run
 

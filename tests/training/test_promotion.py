@@ -1,7 +1,7 @@
 """When a stage of a curriculum is left: by the episodes that ended in it, and its steps."""
 
+from rlctl.play.messages import EpisodeResult
 from rlctl.recipe.recipe import validate
-from rlctl.rollout.messages import EpisodeResult
 from rlctl.training.learner import Curriculum
 from rlctl.training.status import Progress
 

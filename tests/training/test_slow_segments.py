@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rlctl.environments.spec import EnvSpec
+from rlctl.play.workers import Workers
 from rlctl.policy.players.player import Exploration
-from rlctl.rollout.workers import Workers
 from rlctl.run.directory import RunDirectory
 from rlctl.training import display
 from rlctl.training.checkpoint import environment_tensors

@@ -16,7 +16,7 @@ from rlctl.deploy.identify.log import Array, Log, check_actions, read_log
 from rlctl.deploy.identify.search import Fit, search, start_search_workers
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo
-from rlctl.rollout.workers import available_cores
+from rlctl.play.workers import available_cores
 
 CONFIDENCE = 1.96  # standard deviations of a 95 % interval
 WIDEST = 0.3  # a value is unknown if its interval is wider than this fraction of it, to each side

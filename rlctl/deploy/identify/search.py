@@ -12,8 +12,8 @@ from rlctl.deploy.identify.follow import Follower, Unknowns, open_world
 from rlctl.deploy.identify.log import Array, Log
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
+from rlctl.play.messages import describe_failure, make_error
 from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault, answer_messages
-from rlctl.rollout.messages import describe_failure, make_error
 
 _TRIALS = 12  # per unknown, and for one unknown more
 _STARTS = 3

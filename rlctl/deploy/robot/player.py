@@ -14,8 +14,8 @@ from rlctl.deploy.robot.interface import Interface, Parts
 from rlctl.deploy.robot.program import Arrival, ControlProgram, SentObservation
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import AnswerIsNo
-from rlctl.rollout.messages import EpisodeResult, FailedInEpisode, describe_failure, make_error
-from rlctl.rollout.running_episode import RunningEpisode
+from rlctl.play.messages import EpisodeResult, FailedInEpisode, describe_failure, make_error
+from rlctl.play.running_episode import RunningEpisode
 
 _RESEND_S = 0.25  # after which an observation that is not answered is sent again: a UDP packet may be lost
 

@@ -29,11 +29,11 @@ from rlctl.evaluation.episode_statistics import summarize
 from rlctl.evaluation.players import resolve_task
 from rlctl.evaluation.request import Gates
 from rlctl.evaluation.robustness import Outcome
+from rlctl.play.messages import EpisodeResult
+from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.policy.policy import Policy
 from rlctl.policy.shipped import PRETRAINED
-from rlctl.rollout.messages import EpisodeResult
-from rlctl.rollout.seeds import Stream, episode_seeds
 from rlctl.run import lookup
 from rlctl.version import __version__
 

@@ -16,10 +16,10 @@ from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError
 from rlctl.exporting.controller.players import CController, Controller, Inputs
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, compare_episodes
+from rlctl.play.collect import MOST_STEPS, Episode
+from rlctl.play.messages import EpisodeResult
+from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.policy.policy import Policy
-from rlctl.rollout.collect import MOST_STEPS, Episode
-from rlctl.rollout.messages import EpisodeResult
-from rlctl.rollout.seeds import Stream, episode_seeds
 
 _MIN_OBSERVATIONS = 2000
 _TIMED_STEPS, _MEAN_OF = 3000, 10

@@ -10,13 +10,13 @@ from rlctl import output
 from rlctl.environments.spec import EnvSpec, merge
 from rlctl.errors import RecipeError
 from rlctl.evaluation.episode_statistics import mean_return, success_interval, success_rate
+from rlctl.play.collect import Episode, play_episodes
+from rlctl.play.seeds import Stream, episode_seeds
+from rlctl.play.workers import Workers, count_envs
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import ON_POLICY
 from rlctl.recipe.sources import resolve_with_stages
-from rlctl.rollout.collect import Episode, play_episodes
-from rlctl.rollout.seeds import Stream, episode_seeds
-from rlctl.rollout.workers import Workers, count_envs
 from rlctl.run import lookup
 from rlctl.run.train_request import TrainRequest
 from rlctl.training import request as training

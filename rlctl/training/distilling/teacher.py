@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.errors import ArtifactError
+from rlctl.play import messages
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.numpy_policy import load_policy
-from rlctl.rollout import messages
 from rlctl.run.directory import RunDirectory
 from rlctl.storage import files
 

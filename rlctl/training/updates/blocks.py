@@ -18,10 +18,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.play.shared_arrays import Layout, map_arrays
+from rlctl.play.workers import available_cores
 from rlctl.printed_lines import print_line
 from rlctl.processes.child_process import ChildProcess, anonymous_file
-from rlctl.rollout.shared_arrays import Layout, map_arrays
-from rlctl.rollout.workers import available_cores
 from rlctl.training.updates.perceptrons import Floats, Shapes, count_floats
 
 MAX_BLOCKS = 8

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 from sb3_contrib import CrossQ
 
-from rlctl.rollout.workers import available_cores
+from rlctl.play.workers import available_cores
 from rlctl.training.updates.batch_norm import NormalizedMlpStack, is_normalized
 from rlctl.training.updates.perceptrons import Floats, MlpStack, list_shapes
 from rlctl.training.updates.sac import SacUpdate, list_actor_modules

@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 
-from rlctl.rollout.shared_arrays import Layout
+from rlctl.play.shared_arrays import Layout
 from rlctl.task.mirror import Mirror
 from rlctl.training.updates.blocks import MAX_BLOCKS, Arrays, BlockWork, select_block
 from rlctl.training.updates.perceptrons import LOG_SQRT_TAU, Floats, MlpStack, Shapes, list_shapes, split_vector

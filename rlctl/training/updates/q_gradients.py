@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from rlctl.rollout.shared_arrays import Layout
+from rlctl.play.shared_arrays import Layout
 from rlctl.training.updates.blocks import MAX_BLOCKS, Arrays, BlockWork, select_block
 from rlctl.training.updates.perceptrons import Floats, MlpStack, Shapes, count_floats, list_shapes, split_vector
 

@@ -22,7 +22,7 @@ from rlctl.errors import AnswerIsNo, EpisodeFailed, UsageError
 from rlctl.evaluation.request import NO_GATES, Gates
 from tests.deploy.robot.programs import Answers, Started, control_by_udp, control_by_websocket
 from tests.exporting import controlled
-from tests.rollout.policies import linear
+from tests.play.policies import linear
 from tests.task import tasks
 
 SLIDER = f"{Path(tasks.__file__)}:Slider"  # 5 steps of 0.1 s; moves by the first element of the action

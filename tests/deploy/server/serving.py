@@ -16,7 +16,7 @@ from rlctl.deploy.server.serve import make_loop, make_server, serve_until
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from tests.rollout.policies import linear
+from tests.play.policies import linear
 
 OBSERVATION = {"positions": [0.1, 0.2], "goal": [1.0, 2.0, 3.0]}
 FLAT = np.array([0.1, 0.2, 1.0, 2.0, 3.0], np.float32)

@@ -5,10 +5,10 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import DivergedError, EpisodeFailed, TaskError
+from rlctl.play import collect
+from rlctl.play.collect import play_episodes
 from rlctl.policy.players.player import Exploration
-from rlctl.rollout import collect
-from rlctl.rollout.collect import play_episodes
-from tests.rollout.policies import linear
+from tests.play.policies import linear
 
 pytestmark = pytest.mark.usefixtures("no_child_left")
 
@@ -26,7 +26,7 @@ def play(workers, **options):
 @pytest.fixture(scope="module")
 def expected():
     """The episodes, played one after the other without workers."""
-    from tests.rollout.conftest import ENVS
+    from tests.play.conftest import ENVS
 
     env = EnvSpec(f"{ENVS}:Walk").make()
     episodes = []

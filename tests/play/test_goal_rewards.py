@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.rollout.messages import Play
-from tests.rollout.conftest import ENVS
+from rlctl.play.messages import Play
+from tests.play.conftest import ENVS
 
 pytestmark = pytest.mark.usefixtures("no_child_left")
 

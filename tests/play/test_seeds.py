@@ -2,7 +2,7 @@
 
 import itertools
 
-from rlctl.rollout.seeds import Stream, episode_seed, episode_seeds
+from rlctl.play.seeds import Stream, episode_seed, episode_seeds
 
 
 def test_seeds_stay_what_they_are():

@@ -21,6 +21,20 @@ from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.teacher_view import strip_teacher_view
 from rlctl.errors import describe_exception
 from rlctl.library_output import print_whole_lines
+from rlctl.play import messages
+from rlctl.play.batch_episodes import BatchEpisodes, Players
+from rlctl.play.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
+from rlctl.play.running_episode import (
+    CriticWriter,
+    ObservationWriter,
+    RunningEpisode,
+    compute_rewards,
+    show_critic,
+)
+from rlctl.play.seeds import list_training_seeds
+from rlctl.play.shared_arrays import SharedArrays, map_arrays
+from rlctl.play.shared_world import make_watched
+from rlctl.play.teaching import BatchTeacher, EpisodeTeacher, check_teacher
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.policy.players.named import SERVER, make_player
@@ -28,20 +42,6 @@ from rlctl.policy.players.player import Player
 from rlctl.policy.rows import RowsPolicy
 from rlctl.printed_lines import print_line
 from rlctl.processes.pool import answer_messages
-from rlctl.rollout import messages
-from rlctl.rollout.batch_episodes import BatchEpisodes, Players
-from rlctl.rollout.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
-from rlctl.rollout.running_episode import (
-    CriticWriter,
-    ObservationWriter,
-    RunningEpisode,
-    compute_rewards,
-    show_critic,
-)
-from rlctl.rollout.seeds import list_training_seeds
-from rlctl.rollout.shared_arrays import SharedArrays, map_arrays
-from rlctl.rollout.shared_world import make_watched
-from rlctl.rollout.teaching import BatchTeacher, EpisodeTeacher, check_teacher
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import Event, EventSettings, push
 

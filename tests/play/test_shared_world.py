@@ -5,9 +5,9 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.rollout.messages import Play, SharedWorld
-from rlctl.rollout.shared_world import check_memory
-from tests.rollout.conftest import ENVS
+from rlctl.play.messages import Play, SharedWorld
+from rlctl.play.shared_world import check_memory
+from tests.play.conftest import ENVS
 
 pytestmark = [pytest.mark.usefixtures("no_child_left"), pytest.mark.pybullet]
 

@@ -7,13 +7,13 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import DivergedError, EpisodeFailed, PolicyError
+from rlctl.play.collect import play_episodes
+from rlctl.play.messages import Play
+from rlctl.play.seeds import Stream, episode_seed
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.policy.players.player import Exploration
-from rlctl.rollout.collect import play_episodes
-from rlctl.rollout.messages import Play
-from rlctl.rollout.seeds import Stream, episode_seed
-from tests.rollout.policies import linear
+from tests.play.policies import linear
 
 pytest.importorskip("mujoco")
 pytestmark = pytest.mark.usefixtures("no_child_left")

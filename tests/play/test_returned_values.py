@@ -3,9 +3,7 @@
 import pytest
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.processes.child_process import anonymous_file
-from rlctl.processes.pool import WorkerException
-from rlctl.rollout.messages import (
+from rlctl.play.messages import (
     Attach,
     Build,
     FailedInEpisode,
@@ -15,7 +13,9 @@ from rlctl.rollout.messages import (
     describe_failure,
     format_hint,
 )
-from rlctl.rollout.worker import Worker
+from rlctl.play.worker import Worker
+from rlctl.processes.child_process import anonymous_file
+from rlctl.processes.pool import WorkerException
 from tests.training import faulty_envs
 
 ENVS = faulty_envs.__file__
@@ -85,7 +85,7 @@ def test_what_is_raised(fault, message, at_reset):
     assert found.message == message
     assert found.where == (0, 7, 0 if at_reset else 7)
     assert found.details.splitlines()[1].startswith(f'  File "{ENVS}"')
-    assert "/rlctl/rollout/" not in found.details
+    assert "/rlctl/play/" not in found.details
 
 
 def test_a_path_with_spaces_can_be_typed_as_it_is_shown():

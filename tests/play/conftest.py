@@ -5,8 +5,8 @@ import psutil
 import pytest
 
 from rlctl.environments.spec import EnvSpec
+from rlctl.play.workers import Workers
 from rlctl.processes import child_process
-from rlctl.rollout.workers import Workers
 from tests import fork_server
 
 ENVS = Path(__file__).with_name("envs.py")

@@ -15,8 +15,8 @@ from rlctl.environments.bullet_calls import BulletCall, record_calls
 from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.rollout.messages import SharedWorld
-from rlctl.rollout.seeds import Stream, episode_seed
+from rlctl.play.messages import SharedWorld
+from rlctl.play.seeds import Stream, episode_seed
 
 _HARMLESS = re.compile(r"setAdditionalSearchPath|\w*Debug\w*|get(Keyboard|Mouse)Events")
 """Functions that neither change nor read what a world simulates."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import split_space
 from rlctl.environments.info import EnvInfo
+from rlctl.play.messages import EpisodeResult
 from rlctl.policy.file import PolicyFile
-from rlctl.rollout.messages import EpisodeResult
 
 Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]  # shape and dtype per name
 

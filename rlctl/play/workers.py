@@ -18,14 +18,14 @@ from rlctl.environments.dict_spaces import Observations, join
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import EpisodeFailed, RlctlError, TaskError
+from rlctl.play import messages
+from rlctl.play.messages import Answer, EpisodeResult, Message, format_hint, make_error
+from rlctl.play.shared_arrays import PolicyNumbers, SharedArrays
+from rlctl.play.shared_world import check_memory
 from rlctl.policy.file import PolicyFile
 from rlctl.printed_lines import PrintedLines
 from rlctl.processes.child_process import anonymous_file
 from rlctl.processes.pool import ProcessPool, WorkerException, WorkerFault
-from rlctl.rollout import messages
-from rlctl.rollout.messages import Answer, EpisodeResult, Message, format_hint, make_error
-from rlctl.rollout.shared_arrays import PolicyNumbers, SharedArrays
-from rlctl.rollout.shared_world import check_memory
 
 BUILD_TIMEOUT_S = 300.0
 DEFAULT_TIMEOUT_S = 60.0
@@ -75,7 +75,7 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         arrays, numbers = self._memories
         ranges = [(low, high - low, self.n_envs) for low, high in self._ranges]
         jobs = [{"job": messages.WorkerJob(arrays, numbers, *environments)} for environments in ranges]
-        main = "rlctl.rollout.worker:main"
+        main = "rlctl.play.worker:main"
         try:
             self._pool = ProcessPool(main, jobs, self._printed, self._read_progress, self._memories)
         except BaseException as error:

@@ -11,8 +11,8 @@ import psutil
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.rollout.messages import Play
-from tests.rollout.conftest import ENVS
+from rlctl.play.messages import Play
+from tests.play.conftest import ENVS
 
 pytestmark = pytest.mark.usefixtures("no_child_left")
 
@@ -82,7 +82,7 @@ def test_a_worker_that_is_killed_while_idle(spec, start, children):
 def test_an_environment_that_cannot_be_built(spec, start):
     workers = start(spec("FailsToStart"), 4)
     with pytest.raises(
-        TaskError, match=r"^task '.*:FailsToStart': RuntimeError: no licence for this robot \(tests/rollout/envs.py:"
+        TaskError, match=r"^task '.*:FailsToStart': RuntimeError: no licence for this robot \(tests/play/envs.py:"
     ):
         workers.reset({0: 1})
 
@@ -100,8 +100,8 @@ PARENT = textwrap.dedent(
     """
     import sys
     from rlctl.environments.spec import EnvSpec
-    from rlctl.rollout.messages import Play
-    from rlctl.rollout.workers import Workers
+    from rlctl.play.messages import Play
+    from rlctl.play.workers import Workers
     workers = Workers(EnvSpec(sys.argv[1], {"fault": "hang"}), 4, n_workers=2)
     workers.set_other_policy("zero")
     envs, first = range(4), int(sys.argv[2])

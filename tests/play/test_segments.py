@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from rlctl.errors import EpisodeFailed
+from rlctl.play.messages import Play
+from rlctl.play.seeds import Stream, episode_seed
 from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.policy.players.player import Exploration
-from rlctl.rollout.messages import Play
-from rlctl.rollout.seeds import Stream, episode_seed
-from tests.rollout.policies import linear
+from tests.play.policies import linear
 
 pytestmark = pytest.mark.usefixtures("no_child_left")
 

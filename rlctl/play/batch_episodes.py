@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import SINGLE
 from rlctl.errors import in_world
+from rlctl.play import messages
+from rlctl.play.messages import EpisodeResult, FailedInEpisode
+from rlctl.play.seeds import list_training_seeds
+from rlctl.play.shared_arrays import CRITIC, SharedArrays
+from rlctl.play.teaching import BatchTeacher
 from rlctl.policy.players.player import Player
 from rlctl.policy.rows import RowsPolicy
 from rlctl.printed_lines import print_line
-from rlctl.rollout import messages
-from rlctl.rollout.messages import EpisodeResult, FailedInEpisode
-from rlctl.rollout.seeds import list_training_seeds
-from rlctl.rollout.shared_arrays import CRITIC, SharedArrays
-from rlctl.rollout.teaching import BatchTeacher
 from rlctl.task.batch_env import BatchEnv, BatchStep
 
 Worlds = NDArray[np.int64]

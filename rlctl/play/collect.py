@@ -11,9 +11,9 @@ from rlctl.environments.dict_spaces import join, split
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import EpisodeFailed, TaskError
+from rlctl.play.messages import EpisodeResult, Play
+from rlctl.play.workers import Workers
 from rlctl.policy.players.player import Exploration
-from rlctl.rollout.messages import EpisodeResult, Play
-from rlctl.rollout.workers import Workers
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, Trajectory
 from rlctl.version import collect_versions
 

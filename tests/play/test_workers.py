@@ -13,11 +13,11 @@ import pytest
 from rlctl.environments.dict_spaces import join
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError
+from rlctl.play.messages import Play
+from rlctl.play.workers import Workers
 from rlctl.printed_lines import PrintedLines
-from rlctl.rollout.messages import Play
-from rlctl.rollout.workers import Workers
 from rlctl.training.measurements import evaluation_row, training_row
-from tests.rollout.policies import linear
+from tests.play.policies import linear
 
 pytestmark = pytest.mark.usefixtures("no_child_left")
 
@@ -170,7 +170,7 @@ def test_a_misspelt_parameter_keeps_its_kind_of_error(spec, start):
 
 @pytest.mark.usefixtures("fresh_interpreters")
 def test_paths_of_this_process_are_those_of_its_workers(start, tmp_path, monkeypatch):
-    (tmp_path / "only_here.py").write_text("from tests.rollout.envs import Walk as Here\n")
+    (tmp_path / "only_here.py").write_text("from tests.play.envs import Walk as Here\n")
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     workers = start(EnvSpec("only_here:Here"), 1)
     workers.reset({0: 0})

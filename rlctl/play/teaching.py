@@ -10,12 +10,12 @@ from rlctl.environments.dict_spaces import format_space
 from rlctl.environments.teacher_view import TeacherView, find_teacher_view
 from rlctl.environments.wrappers import NAME as TIME_LEFT
 from rlctl.errors import ArtifactError
+from rlctl.play import messages
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.policy.players.named import ExportedPlayer
 from rlctl.policy.players.player import Exploration
 from rlctl.policy.rows import RowsPolicy
-from rlctl.rollout import messages
 from rlctl.task.batch_env import BatchEnv
 
 Worlds = NDArray[np.int64]

@@ -13,9 +13,9 @@ from rlctl.environments.dict_spaces import SINGLE, split, split_space
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.output import format_count
-from rlctl.rollout.messages import EpisodeResult
-from rlctl.rollout.shared_arrays import CRITIC, observation_fields
-from rlctl.rollout.teaching import EpisodeTeacher
+from rlctl.play.messages import EpisodeResult
+from rlctl.play.shared_arrays import CRITIC, observation_fields
+from rlctl.play.teaching import EpisodeTeacher
 from rlctl.task.env import TaskEnv
 
 _STEP = ("observation", "reward", "terminated", "truncated", "info")
