@@ -145,14 +145,14 @@ def find_author(env: Any) -> Any:
     """Return the object whose class the environment's author wrote: not rlctl's environment of a task, but the task."""
     if not is_task(env):
         return getattr(env, "unwrapped", env)
-    return find_batch(env) or env.unwrapped.task
+    return env.unwrapped.task
 
 
 def find_batch(env: Any) -> Any:
     """Return the `BatchTask` of an environment; None for any other."""
     batches = sys.modules.get("rlctl.task.batch")
     task = env.unwrapped.task if is_task(env) else None
-    return task.batch if batches is not None and isinstance(task, batches.OneWorld) else None
+    return task if batches is not None and isinstance(task, batches.BatchTask) else None
 
 
 def is_task(env: Any) -> bool:

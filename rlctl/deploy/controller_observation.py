@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.deploy.controller_layout import ControllerLayout
-from rlctl.task.history import TermHistory
+from rlctl.task.history import History
 
 
 class ControllerObservation:
@@ -15,11 +15,11 @@ class ControllerObservation:
 
     def __init__(self, layout: ControllerLayout) -> None:
         self._layout = layout
-        self._history = TermHistory(layout.env.observation_history, layout.env.history_start)
+        self._history = History(1, layout.env.observation_history, layout.env.history_start)
 
     def begin(self) -> None:
         """Begin an episode: the histories are empty."""
-        self._history.begin()
+        self._history.begin(slice(None))
 
     def observe(
         self, inputs: Mapping[str, NDArray[Any]], step: int, last_action: NDArray[Any]
@@ -35,4 +35,5 @@ class ControllerObservation:
                 newest[part.name] = part.term(np.array([step * (self._layout.env.control_dt or 0.0)]))
             else:
                 newest[part.name] = part.term(tuple(inputs[name] for name in part.term.inputs))
-        return {name: np.asarray(value) for name, value in self._history.add(newest).items()}
+        rows = {name: np.asarray(value)[None] for name, value in newest.items()}
+        return {name: value[0] for name, value in self._history.add(rows, slice(None)).items()}

@@ -25,6 +25,10 @@ from rlctl.task.terms import Displacement, Distance, Gravity, LastAction, PhaseC
 if TYPE_CHECKING:
     import mujoco
 
+    from rlctl.environments.gym_worlds import GymWorlds
+    from rlctl.environments.wrappers import TimeFeature
+    from rlctl.task.worlds import TaskWorlds
+
 AnyTerm = Annotated[
     Scaled | Gravity | Displacement | Distance | LastAction | PhaseClock, pydantic.Field(discriminator="kind")
 ]
@@ -107,32 +111,50 @@ def describe(env: gymnasium.Env[Any, Any]) -> EnvInfo:
         "has_compute_reward": callable(getattr(inner, "compute_reward", None)),
     }
     if isinstance(inner, TaskEnv):
-        task, time = inner.task, find_time_feature(env)
-        sizes = inner.observation_sizes
-        terms = {name: term for name, term in task.observation_terms.items() if name in sizes}
-        quantities = {name for term in terms.values() for name in term.inputs}
-        units = {name: unit for name, unit in task.observation_units.items() if name in sizes or name in quantities}
-        values = {
-            **common,
-            "observation_sizes": sizes if time is None else time.extend_sizes(sizes),
-            "observation_units": units,
-            "observation_history": inner.view.format.frames,
-            "history_start": task.history_start,
-            "observation_terms": terms,
-            "quantity_sizes": find_quantity_sizes(terms, inner.measured),
-            "command_ranges": _find_command_ranges(task.commands()),
-            "action_meaning": task.action_meaning,
-            "control_dt": task.control_dt,
-            "reward_weights": inner.reward_weights,
-            "events": {name: name in inner.events for name in task.events},
-            "has_success": inner.has_success,
-            "max_steps": inner.max_steps,
-            "robot": type(task).robot,
-            "joints": task.describe_joints(),
-        }
-        return validation.build(EnvInfo, values, TaskError, type(task).__name__)
+        return _describe_task(inner.worlds, common, find_time_feature(env))
     values = {**common, **describe_model(env), "max_steps": find_time_limit(env)}
     return validation.build(EnvInfo, values, TaskError, type(inner).__name__)
+
+
+def describe_worlds(worlds: TaskWorlds | GymWorlds) -> EnvInfo:
+    """Describe one world of several; see `describe`."""
+    from rlctl.environments.gym_worlds import GymWorlds
+
+    if isinstance(worlds, GymWorlds):
+        return describe(worlds.env)
+    common = {
+        "observation_space": space_to_json(worlds.observation_space),
+        "action_space": space_to_json(worlds.action_space),
+        "has_compute_reward": worlds.compute_reward is not None,
+    }
+    return _describe_task(worlds, common, None)
+
+
+def _describe_task(worlds: TaskWorlds, common: Mapping[str, Any], time: TimeFeature | None) -> EnvInfo:
+    task = worlds.task
+    sizes = worlds.view.sizes
+    terms = {name: term for name, term in task.observation_terms.items() if name in sizes}
+    quantities = {name for term in terms.values() for name in term.inputs}
+    units = {name: unit for name, unit in task.observation_units.items() if name in sizes or name in quantities}
+    values = {
+        **common,
+        "observation_sizes": sizes if time is None else time.extend_sizes(sizes),
+        "observation_units": units,
+        "observation_history": worlds.view.frames,
+        "history_start": task.history_start,
+        "observation_terms": terms,
+        "quantity_sizes": find_quantity_sizes(terms, worlds.measured_of(0)),
+        "command_ranges": _find_command_ranges(task.commands()),
+        "action_meaning": task.action_meaning,
+        "control_dt": task.control_dt,
+        "reward_weights": worlds.weights,
+        "events": {name: name in worlds.events for name in task.events},
+        "has_success": worlds.has_success,
+        "max_steps": worlds.max_steps,
+        "robot": type(task).robot,
+        "joints": task.describe_joints(),
+    }
+    return validation.build(EnvInfo, values, TaskError, type(task).__name__)
 
 
 def _find_command_ranges(commands: Mapping[str, CommandTerm]) -> dict[str, tuple[float, float]]:

@@ -22,8 +22,9 @@ from rlctl.storage import validation
 if TYPE_CHECKING:
     import gymnasium
 
-    from rlctl.task.batch_env import BatchEnv
+    from rlctl.environments.gym_worlds import GymWorlds
     from rlctl.task.observation import Observing
+    from rlctl.task.worlds import TaskWorlds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +80,7 @@ class EnvSpec:
         constructor = self.constructor()
         print_mujoco_warnings()
         if is_task(constructor):
-            env = self._make_task_env(constructor, render_mode, visuals=visuals)
+            env = self._make_task_env(render_mode, visuals=visuals)
         else:
             for key in ("reward_weights", "randomize", "events", "level", "sim", "observation_history"):
                 # Files of plain environments that were written before engines could be chosen name PyBullet.
@@ -134,7 +135,7 @@ class EnvSpec:
         """Return the spec with its engine: PyBullet if it is installed, for a `BatchTask` and otherwise MuJoCo."""
         if self.sim or not is_task(self.constructor()):
             return self
-        from rlctl.task.env import choose_engine
+        from rlctl.task.worlds import choose_engine
 
         task: Any = self.constructor()
         return dataclasses.replace(self, sim=choose_engine(task))
@@ -161,47 +162,53 @@ class EnvSpec:
         constructor = self.constructor()
         return isinstance(constructor, type) and issubclass(constructor, BatchTask)
 
-    def make_batch(self, env: gymnasium.Env[Any, Any], worlds: int) -> BatchEnv | None:
-        """Return so many worlds of a `BatchTask`, of which `env` is one; None for any other environment."""
-        from rlctl.environments.teacher_view import strip_teacher_view
-        from rlctl.task.batch import OneWorld
-        from rlctl.task.batch_env import BatchEnv
-        from rlctl.task.env import TaskEnv
+    def make_worlds(self, count: int, teacher: EnvSpec | None = None) -> TaskWorlds | GymWorlds:
+        """Build so many worlds without visual shapes, one unless the task is a `BatchTask`; raises as `make` does.
 
-        single: Any = env.unwrapped
-        if not isinstance(single, TaskEnv) or not isinstance(single.task, OneWorld):
-            return None
-        described: TaskEnv = single
-        if strip_teacher_view(env) is not described:
+        With a `teacher` they also observe what a policy of that spec sees.
+        """
+        from rlctl.environments.gym_worlds import GymWorlds
+        from rlctl.task.worlds import TaskWorlds
+
+        is_wrapped = self.has_wrappers or (teacher is not None and teacher.has_wrappers)
+        if self.is_batch and is_wrapped:
             raise RecipeError(f"{self.task} is a BatchTask, whose worlds have no frame_stack and no time_feature")
-        constructor: Any = self.constructor()
-        parameters, sim = check_fields(constructor, self.parameters), self.resolve().sim
-        batch: BatchEnv = call_plugin(self.task, lambda: BatchEnv(constructor(**parameters), worlds, described, sim))
-        return batch
+        if is_wrapped or not is_task(self.constructor()):
+            return GymWorlds(self.make(teacher=teacher, visuals=False), self.level)
+        print_mujoco_warnings()
+        worlds: TaskWorlds = self._build_task(TaskWorlds, count=count, visuals=False)
+        worlds.level = self.level
+        if teacher is not None:
+            from rlctl.task.events import EventSettings
 
-    def _make_task_env(self, constructor: Any, render_mode: Any, *, visuals: bool) -> gymnasium.Env[Any, Any]:
-        from rlctl.task.env import TaskEnv
+            worlds.show_teacher(teacher.observing, EventSettings(teacher.randomize, teacher.events))
+        return worlds
+
+    @property
+    def has_wrappers(self) -> bool:
+        """Whether wrappers around the environment change what is observed."""
+        return self.frame_stack > 1 or self.time_feature
+
+    def _build_task(self, build: Callable[..., Any], **options: Any) -> Any:
+        """Return what `build` makes of an instance of the task and the settings of this spec."""
         from rlctl.task.events import EventSettings
         from rlctl.task.task import check_parameters
 
+        constructor: Any = self.constructor()
         check_parameters(constructor)
         parameters = check_fields(constructor, self.parameters)
-        weights, events, sim = self.reward_weights, EventSettings(self.randomize, self.events), self.resolve().sim
-        observing = self.observing
+        settings = {
+            "reward_weights": self.reward_weights,
+            "events": EventSettings(self.randomize, self.events),
+            "sim": self.resolve().sim,
+            "observing": self.observing,
+        }
+        return call_plugin(self.task, lambda: build(constructor(**parameters), **settings, **options))
 
-        def build() -> TaskEnv:
-            task = constructor(**parameters)
-            return TaskEnv(
-                task,
-                render_mode=render_mode,
-                reward_weights=weights,
-                events=events,
-                sim=sim,
-                visuals=visuals,
-                observing=observing,
-            )
+    def _make_task_env(self, render_mode: Any, *, visuals: bool) -> gymnasium.Env[Any, Any]:
+        from rlctl.task.env import TaskEnv
 
-        env: TaskEnv = call_plugin(self.task, build)
+        env: TaskEnv = self._build_task(TaskEnv, render_mode=render_mode, visuals=visuals)
         env.set_level(self.level)
         return env
 

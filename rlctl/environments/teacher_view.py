@@ -9,6 +9,7 @@ import gymnasium
 
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
+from rlctl.task.worlds import take_row
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -26,10 +27,10 @@ class TeacherView(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         inner = env.unwrapped
         if isinstance(inner, TaskEnv):
-            sight = inner.show_teacher(teacher.observing, EventSettings(teacher.randomize, teacher.events))
-            self.sizes = sight.view.format.sizes
+            sight = inner.worlds.show_teacher(teacher.observing, EventSettings(teacher.randomize, teacher.events))
+            self.sizes = sight.view.sizes
             """Elements per name of what the teacher sees, without its wrappers; empty for a plain environment."""
-            self._source = _Source(env, sight.view.format.space, lambda: sight.seen)
+            self._source = _Source(env, sight.view.space, lambda: take_row(sight.seen))
         else:
             self.sizes = {}
             self._source = _Source(env, env.observation_space, lambda: self._observation)

@@ -118,7 +118,7 @@ def stack_frames(env: gymnasium.Env[Any, Any], frames: int) -> gymnasium.Env[Any
     """Observe the last `frames` observations, oldest first, along the last axis."""
     space = env.observation_space
     inner = env.unwrapped
-    if isinstance(inner, TaskEnv) and (history := inner.view.format.frames):
+    if isinstance(inner, TaskEnv) and (history := inner.view.frames):
         raise RecipeError(f"frame_stack: the task declares a history of {', '.join(history)}; set frame_stack: 1")
     if not isinstance(space, spaces.Box) or len(space.shape) not in (1, 3):
         raise RecipeError(f"frame_stack: only flat and image observations can be stacked, this task has {space}")

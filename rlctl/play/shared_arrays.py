@@ -125,6 +125,15 @@ class SegmentArrays:
         """Return the segment of one environment: arrays of shape (steps, ...) that share memory."""
         return self._select(env, env, ())
 
+    def by_step(self, envs: slice) -> "SegmentArrays":
+        """Return the segment of some environments: arrays of shape (steps, n_envs, ...) that share memory."""
+        own = self._select(envs, envs, ())
+        return SegmentArrays(
+            {key: rows.swapaxes(0, 1) for key, rows in own.observation.items()},
+            {key: rows.swapaxes(0, 1) for key, rows in own.final.items()},
+            **{name: getattr(own, name).swapaxes(0, 1) for name in _ROWS},
+        )
+
     def _select(self, index: Any, observed: Any, ended: Sequence[EpisodeResult]) -> "SegmentArrays":
         return SegmentArrays(
             {key: rows[observed] for key, rows in self.observation.items()},

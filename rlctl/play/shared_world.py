@@ -11,11 +11,14 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rlctl.environments.bullet_calls import BulletCall, record_calls
 from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.play.messages import SharedWorld
+from rlctl.play.playing import Playing, RandomActions, Worlds
 from rlctl.play.seeds import Stream, episode_seed
 
 _HARMLESS = re.compile(r"setAdditionalSearchPath|\w*Debug\w*|get(Keyboard|Mouse)Events")
@@ -64,22 +67,22 @@ def _read_own_memory() -> int:
 
 
 def make_watched(spec: EnvSpec, teacher: EnvSpec | None = None) -> tuple[Any, SharedWorld | None]:
-    """Build an environment and try it for a few steps; return it, and how it shares its world with others, or None.
+    """Build one world and try it for a few steps; return it, and how it shares its world with others, or None.
 
     Tasks of rlctl and environments without PyBullet are only built. An error in the trial is left to the first episode.
     """
-    constructor = spec.constructor()
-    if is_task(constructor):
-        return spec.make(teacher=teacher, visuals=False), None
+    if is_task(spec.constructor()):
+        return spec.make_worlds(1, teacher=teacher), None
     before = _find_clients()
     with record_calls(with_results=()) as calls:
-        env = spec.make(teacher=teacher)
+        worlds: Any = spec.make_worlds(1, teacher=teacher)
     if "pybullet" not in sys.modules or not _find_clients() | before:
-        return env, None
+        return worlds, None
     with record_calls(with_results=()) as later:
-        _try(env)
-    how = _find_shared(env, calls.without_client | later.without_client, has_own=bool(_find_clients() - before))
-    return env, SharedWorld(how, _read_own_memory()) if how else None
+        _try(worlds)
+    has_own = bool(_find_clients() - before)
+    how = _find_shared(worlds.env, calls.without_client | later.without_client, has_own=has_own)
+    return worlds, SharedWorld(how, _read_own_memory()) if how else None
 
 
 def _find_shared(env: Any, without_client: Collection[BulletCall], *, has_own: bool) -> str:
@@ -91,14 +94,13 @@ def _find_shared(env: Any, without_client: Collection[BulletCall], *, has_own: b
     return "" if has_own else "it has no PyBullet client of its own"
 
 
-def _try(env: Any) -> None:
-    seed = episode_seed(0, Stream.CHECK, 0, 0)
+def _try(worlds: Worlds) -> None:
+    seed, first = episode_seed(0, Stream.CHECK, 0, 0), np.zeros(1, np.int64)
+    playing = Playing(worlds)
     try:
-        env.reset(seed=seed)
-        env.action_space.seed(seed)
-        for _ in range(_STEPS):
-            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-            if terminated or truncated:
+        observation = playing.begin(first, [seed])
+        for number, _ in enumerate(playing.play(RandomActions(worlds.action_space), first, observation), start=1):
+            if number == _STEPS:
                 return
     except BaseException:  # the first episode raises it again, with its seed and step
         return

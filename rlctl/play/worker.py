@@ -4,37 +4,27 @@ The worker answers each message (`messages.py`) of the main process once. Observ
 policy's parameters are in shared memory.
 """
 
-import contextlib
-import dataclasses
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.environments.dict_spaces import SINGLE
-from rlctl.environments.info import EnvInfo, describe
-from rlctl.environments.teacher_view import strip_teacher_view
-from rlctl.errors import describe_exception
+from rlctl.environments.gym_worlds import GymWorlds
+from rlctl.environments.info import EnvInfo, describe_worlds
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import RecipeError, describe_exception
 from rlctl.library_output import print_whole_lines
 from rlctl.play import messages
-from rlctl.play.batch_episodes import BatchEpisodes, Players
-from rlctl.play.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
-from rlctl.play.running_episode import (
-    CriticWriter,
-    ObservationWriter,
-    RunningEpisode,
-    compute_rewards,
-    show_critic,
-)
-from rlctl.play.seeds import list_training_seeds
+from rlctl.play.actors import RowsOfPlayers
+from rlctl.play.episodes import Episodes, compute_rewards
+from rlctl.play.messages import Answer, EpisodeResult, Message, describe_failure
 from rlctl.play.shared_arrays import SharedArrays, map_arrays
 from rlctl.play.shared_world import make_watched
-from rlctl.play.teaching import BatchTeacher, EpisodeTeacher, check_teacher
+from rlctl.play.teaching import Teacher, check_teacher
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_policy import PolicyPlayer
 from rlctl.policy.players.named import SERVER, make_player
@@ -42,22 +32,24 @@ from rlctl.policy.players.player import Player
 from rlctl.policy.rows import RowsPolicy
 from rlctl.printed_lines import print_line
 from rlctl.processes.pool import answer_messages
-from rlctl.task.env import TaskEnv
 from rlctl.task.events import Event, EventSettings, push
+from rlctl.task.worlds import TaskWorlds
 
 
 class Worker:
-    """A few environments and the policy that plays them; the first message must be `Build`."""
+    """A few environments and the policy that plays them; the first message must be `Build`.
+
+    The worlds of a `BatchTask` play together; other environments, of one world each, play one after the other: a world
+    takes about 28 MB, so that changing it at every step would empty the processor's caches.
+    """
 
     def __init__(self, job: messages.WorkerJob) -> None:
         self._job = job
-        self._episodes: list[RunningEpisode] = []
-        self._player: Player | None = None
-        self._batch: BatchEpisodes | None = None
-        """The worlds of a `BatchTask`; then `_episodes` has one environment that only describes them."""
-        self._players: Players | None = None
+        self._groups: list[Episodes] = []
+        self._actors: list[RowsOfPlayers] = []  # one per group
         self._make_player: Callable[[], Player]
         self._states: NDArray[np.float32] | None = None
+        self._lockstep = False  # whether the worlds of a `BatchTask` play together
         self._info: EnvInfo
         self._privileged: dict[str, int] = {}  # sizes of what only the critic sees
         self._arrays: SharedArrays
@@ -68,9 +60,9 @@ class Worker:
             case messages.Play():
                 return Answer(ended=self._play(message))
             case messages.BeginEpisodes():
-                return Answer(left=self._begin_episodes(message))
+                return Answer(left=[env for group in self._groups for env in group.replay(self._arrays, message)])
             case messages.ComputeRewards():
-                return Answer(rewards=compute_rewards(self._episodes[0].env, message.achieved, message.desired))
+                return Answer(rewards=compute_rewards(self._groups[0].worlds, message.achieved, message.desired))
             case messages.Build():
                 return self._build(message)
             case messages.SetEvents():
@@ -85,58 +77,62 @@ class Worker:
         return Answer()
 
     def _build(self, message: messages.Build) -> Answer:
-        spec, privileged, teacher = message.spec, message.privileged, message.teacher
-        taught_by = None if teacher is None else teacher.spec
-        if self._episodes:
+        if self._groups:
             self.close()
             gc.unfreeze()
             gc.collect()  # environments may hold themselves in cycles
-        shared_world = None
-        if self._job.count > 1 and not spec.is_batch:
-            first, shared_world = make_watched(spec, taught_by)
-        else:
-            first = spec.make(teacher=taught_by, visuals=False)
-        envs = [first]
+        worlds, shared_world = self._make_worlds(message)
+        teacher = message.teacher
         if teacher is not None:
-            check_teacher(teacher, first)
-        self._privileged = {} if privileged is None else show_critic(spec, first, privileged)
-        if (batch := spec.make_batch(first, self._job.count)) is not None:
-            self._batch = BatchEpisodes(batch, self._job.first)
-            self._batch.teacher = None if teacher is None else BatchTeacher(teacher, batch)
-        elif shared_world is None:
-            envs += [spec.make(teacher=taught_by, visuals=False) for _ in range(self._job.count - 1)]
-            for env in envs[1:] if privileged is not None else ():
-                show_critic(spec, env, privileged or {})
-        self._info = describe(envs[0])
-        metrics = [name for name, weight in self._info.reward_weights.items() if weight == 0]
-        self._episodes = [RunningEpisode(env, self._job.first + index, metrics) for index, env in enumerate(envs)]
-        if teacher is not None and self._batch is None:
-            for episode in self._episodes:
-                episode.teacher = EpisodeTeacher(teacher, episode.env)
-        space = envs[0].observation_space
-        # A task's environment checks its observations itself.
-        checked = isinstance(strip_teacher_view(envs[0]), TaskEnv) and not isinstance(space, spaces.Dict)
-        writer = ObservationWriter(space, checked=checked)
-        for episode in self._episodes:
-            episode.write = CriticWriter(writer, episode.env).write if self._privileged else writer.write
+            check_teacher(teacher, worlds[0])
+        if message.privileged is not None:
+            for some in worlds:
+                self._privileged = show_critic(message.spec, some, message.privileged)
+        self._lockstep = message.spec.is_batch
+        first = self._job.first
+        self._groups = []
+        for some in worlds:
+            taught_by = None if teacher is None else Teacher(teacher, some, lockstep=self._lockstep)
+            has_critic = message.privileged is not None
+            self._groups.append(Episodes(some, first, has_critic=has_critic, teacher=taught_by))
+            first += some.count
+        self._info = describe_worlds(worlds[0])
         gc.freeze()  # present objects live long: later collections skip them
-        mirror = getattr(getattr(envs[0].unwrapped, "task", None), "mirror", {}) if checked else {}
-        built = Answer(info=self._info, lockstep=self._batch is not None, shared_world=shared_world)
-        return dataclasses.replace(built, privileged=self._privileged, mirror=mirror)
+        mirror: Mapping[str, Any] = {}
+        if isinstance(worlds[0], TaskWorlds) and isinstance(worlds[0].observation_space, spaces.Box):
+            mirror = worlds[0].task.mirror
+        return Answer(
+            info=self._info,
+            lockstep=self._lockstep,
+            shared_world=shared_world,
+            privileged=self._privileged,
+            mirror=mirror,
+        )
+
+    def _make_worlds(self, message: messages.Build) -> tuple[list[Any], messages.SharedWorld | None]:
+        """Build the worlds; only the first ones if environments in one process would share a PyBullet world."""
+        spec, count = message.spec, self._job.count
+        teacher = None if message.teacher is None else message.teacher.spec
+        if spec.is_batch:
+            return [spec.make_worlds(count, teacher=teacher)], None
+        if count == 1:
+            return [spec.make_worlds(1, teacher=teacher)], None
+        first, shared_world = make_watched(spec, teacher)
+        if shared_world is not None:
+            return [first], shared_world
+        return [first, *(spec.make_worlds(1, teacher=teacher) for _ in range(count - 1))], None
 
     def _set_events(self, message: messages.SetEvents) -> EnvInfo:
         spec, added = message.spec, {}
         if message.push is not None:
             added["push at mid-episode"] = Event("interval", push, enabled=True, **message.push)
-        for episode in self._episodes:
-            env = episode.env.unwrapped
-            if not isinstance(env, TaskEnv):
+        for group in self._groups:
+            worlds = find_task_worlds(group.worlds)
+            if worlds is None:
                 raise TypeError(f"{spec.task}: a plain Gymnasium environment has no events")
-            env.set_events(EventSettings(spec.randomize, spec.events), added)
-            env.set_level(spec.level)
-        if self._batch is not None:
-            self._batch.env.set_events(self._episodes[0].env.unwrapped)
-        self._info = describe(self._episodes[0].env)
+            worlds.set_events(EventSettings(spec.randomize, spec.events), added)
+            group.worlds.level = worlds.level = spec.level
+        self._info = describe_worlds(self._groups[0].worlds)
         return self._info
 
     def _load_policy(self, message: messages.LoadPolicy) -> None:
@@ -147,17 +143,19 @@ class Worker:
             tensors = map_arrays(self._job.numbers, layout)
             self._states = tensors.pop("state", None)
             policy = PolicyFile(message.info, tensors)
-        env, other = self._episodes[0].env, message.other
-        self._set_players(lambda: make_player_of(other, env) if policy is None else PolicyPlayer(policy), policy)
+        worlds, other = self._groups[0].worlds, message.other
+        self._set_players(lambda: make_player_of(other, worlds) if policy is None else PolicyPlayer(policy), policy)
 
     def _set_players(self, make: Callable[[], Player], policy: PolicyFile | None = None) -> None:
-        self._close_player()
-        self._make_player, self._player = make, make()
-        if self._batch is not None and policy is not None and RowsPolicy.supports(policy):
-            self._players = Players(RowsPolicy(policy, self._job.count))
-        elif self._batch is not None:
-            own = None if self._states is None else self._states[self._job.first :]
-            self._players = Players(None, [make() for _ in range(self._job.count)], own)
+        self._close_actors()
+        self._make_player = make
+        for group in self._groups:
+            count = group.worlds.count
+            states = None if self._states is None else self._states[group.first : group.first + count]
+            if self._lockstep and policy is not None and RowsPolicy.supports(policy):
+                self._actors.append(RowsOfPlayers(RowsPolicy(policy, count), None, count))
+            else:
+                self._actors.append(RowsOfPlayers(None, make, count, states))
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
         from rlctl.deploy.filter.limited_player import LimitedPlayer  # few evaluations need it
@@ -166,163 +164,57 @@ class Worker:
         make, limits = self._make_player, Limits.model_validate(message.limits)
         self._set_players(lambda: LimitedPlayer(make(), self._info, limits))
 
-    @property
-    def _loaded_player(self) -> Player:
-        assert self._player is not None  # a policy is loaded before anything is played
-        return self._player
-
-    def _begin_episodes(self, message: messages.BeginEpisodes) -> list[int]:
-        """Begin episodes and replay their actions; return the environments whose episode ended or failed."""
-        left = []
-        if self._batch is not None:
-            return self._batch.replay(self._arrays, message)
-        for env, (seed, actions) in message.episodes.items():
-            episode = self._episodes[env - self._job.first]
-            try:
-                with self._within(episode):
-                    self._begin(episode, seed)
-                    if self._replay(episode, actions):
-                        left.append(env)
-            except FailedInEpisode as failure:
-                if not message.may_fail:
-                    raise
-                # It did not fail the first time, so its state differs now: the environment begins its next episode.
-                left.append(env)
-                print_line(f"{failure} when it was replayed")
-        return left
-
-    def _begin(self, episode: RunningEpisode, seed: int) -> None:
-        self._arrays.inside[episode.index] = seed, 0, -1
-        first = episode.start(seed, float(self._arrays.level[episode.index]))
-        episode.write(self._arrays.observation, episode.index, first)
-
-    def _replay(self, episode: RunningEpisode, actions: NDArray[np.generic]) -> bool:
-        """Take steps with recorded actions; return whether the episode ended."""
-        for action in actions:
-            if episode.teacher is not None:
-                episode.teacher.act(episode.seed, episode.step)  # it may have a recurrent state
-            episode.step += 1
-            self._arrays.inside[episode.index, 1] = episode.step
-            observation, _, terminated, truncated, _ = episode.take_step(action)
-            episode.write(self._arrays.observation, episode.index, observation)
-            if terminated or truncated:
-                return True
-        return False
-
     def _play(self, message: messages.Play) -> list[EpisodeResult]:
-        """Play a segment in some environments, one after the other; return the episodes that ended."""
+        """Play a segment; return the episodes that ended."""
         ended: list[EpisodeResult] = []
-        if self._batch is not None:
-            assert self._players is not None  # a policy is loaded before anything is played
-            self._players.explore(message.exploration)
-            return self._batch.play(self._arrays, message, self._players)
-        self._loaded_player.explore(message.exploration)
-        for env, seed in message.begin.items():
-            episode = self._episodes[env - self._job.first]
-            number = message.next_episodes.get(env)
-            next_seeds = None if number is None else list_training_seeds(message.run_seed, env, number)
-            with self._within(episode):
-                if seed >= 0:
-                    self._begin(episode, seed)
-                    if self._states is not None:
-                        self._states[env] = 0.0
-                ended += self._play_one(episode, message, next_seeds)
+        for group, actor in zip(self._groups, self._actors, strict=True):
+            begin = {env: message.begin[env] for env in group.envs if env in message.begin}
+            if begin:
+                ended += group.play(self._arrays, message, begin, actor)
         return ended
 
-    def _play_one(
-        self, episode: RunningEpisode, asked: messages.Play, next_seeds: Iterator[int] | None
-    ) -> list[EpisodeResult]:
-        """Play a segment of one environment; without `next_seeds` it stops when an episode ends."""
-        arrays, index, player, write = self._arrays, episode.index, self._loaded_player, episode.write
-        segment, inside = arrays.segment.of(index), arrays.inside[index]
-        now = segment.observation
-        single = now.get(SINGLE)
-        state = None if self._states is None else self._states[index]
-        if player.state is not None and state is not None:
-            player.state[:] = state
-        for key, rows in now.items():
-            rows[0] = arrays.observation[key][index]
-        player.begin_segment(episode.seed, episode.step)
-        inside[0] = episode.seed
-        ended: list[EpisodeResult] = []
-        row = 0
-        while row < asked.steps and not (ended and next_seeds is None):
-            observation = single[row] if single is not None else {key: rows[row] for key, rows in now.items()}
-            began = perf_counter()
-            chosen, action = player.act(observation, episode.seed, episode.step)
-            if episode.teacher is not None:
-                segment.label[row] = episode.teacher.act(episode.seed, episode.step)
-                if index in asked.taught:
-                    chosen = action = segment.label[row]
-            acted = perf_counter()
-            segment.stored[row] = np.ravel(chosen)
-            segment.action[row] = action
-            episode.step += 1
-            inside[1], inside[2] = episode.step, row
-            observation, reward, terminated, truncated, info = episode.take_step(segment.action[row])
-            episode.acting_s += acted - began
-            episode.stepping_s += perf_counter() - acted
-            segment.reward[row] = reward
-            segment.terminated[row], segment.truncated[row] = terminated, truncated
-            if asked.record:
-                segment.terms[row] = list(info["metrics"].values())
-            if index in asked.contacts:
-                episode.measure_contact()
-            row += 1
-            if terminated or truncated:
-                ended.append(episode.summarize(info, row - 1, player.report()))
-                if next_seeds is not None:
-                    write(segment.final, row - 1, observation)
-                    seed = next(next_seeds)
-                    inside[:] = seed, 0, row
-                    if asked.levels is not None:
-                        arrays.level[index] = asked.levels.follow(float(arrays.level[index]), ended[-1].success)
-                    observation = episode.start(seed, float(arrays.level[index]))
-                    if player.state is not None:
-                        player.state[:] = 0.0
-            write(now, row, observation)
-        for key, rows in now.items():
-            arrays.observation[key][index] = rows[row]
-        if player.state is not None and state is not None:
-            state[:] = player.state
-        return ended
-
-    @contextlib.contextmanager
-    def _within(self, episode: RunningEpisode) -> Iterator[None]:
-        """Run the code of an environment in its episode; raises `FailedInEpisode` for anything it raises."""
-        try:
-            yield
-        except BaseException as error:  # a plugin may raise anything, SystemExit too
-            raise FailedInEpisode(episode.index, episode.seed, episode.step) from error
-        self._arrays.inside[episode.index, 1] = -1
-
-    def _close_player(self) -> None:
-        for player in (self._player, self._players):
-            if player is not None:
-                player.close()
-        self._player = self._players = None
+    def _close_actors(self) -> None:
+        for actor in self._actors:
+            actor.close()
+        self._actors = []
 
     def close(self) -> None:
         """Close the environments and the policy."""
-        self._close_player()
-        for episode in self._episodes:
+        self._close_actors()
+        for group in self._groups:
             try:
-                episode.env.close()
+                group.worlds.close()
             except BaseException as error:  # its episodes are over
-                print_line(f"warning: closing environment {episode.index}: {describe_exception(error)}")
-        self._episodes = []
-        if self._batch is not None:
-            self._batch.close()
-        self._batch = None
+                print_line(f"warning: closing environment {group.first}: {describe_exception(error)}")
+        self._groups = []
 
 
-def make_player_of(name: str, env: Any) -> Player:
+def find_task_worlds(worlds: TaskWorlds | GymWorlds) -> TaskWorlds | None:
+    """Return the worlds of a task, also of one in wrappers; None for a plain environment."""
+    return worlds.task_worlds if isinstance(worlds, GymWorlds) else worlds
+
+
+def show_critic(spec: EnvSpec, worlds: Any, privileged: Mapping[str, bool]) -> dict[str, int]:
+    """Let worlds observe what only the critic sees; return its sizes by name, or raise `RecipeError`."""
+    of_task, space = find_task_worlds(worlds), worlds.observation_space
+    if of_task is None:
+        raise RecipeError(f"privileged: {spec.task} is a plain Gymnasium environment; only tasks have it")
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise RecipeError(
+            f"privileged: {spec.task} observes {space}; a critic sees more only beside a flat observation"
+        )
+    of_task.show_critic(**privileged)
+    assert of_task.critic is not None
+    return of_task.critic.sizes
+
+
+def make_player_of(name: str, worlds: Any) -> Player:
     """Return the player of a policy server (`ws://...`), or of any other name as `make_player` does."""
     if not name.startswith(SERVER):
-        return make_player(name, env.action_space)
+        return make_player(name, worlds.action_space)
     from rlctl.deploy.server.client import RemotePlayer  # only here: it imports aiohttp
 
-    return RemotePlayer(name, env.observation_space, env.action_space)
+    return RemotePlayer(name, worlds.observation_space, worlds.action_space)
 
 
 def main(connection: Connection, job: messages.WorkerJob) -> None:

@@ -47,7 +47,7 @@ class RobotWorld:
 
     def commands(self) -> dict[str, CommandTerm]:
         """Return the task's commands; raises `TaskError` for one that is not finite or has no range."""
-        commands = {} if self._env is None else self._env.task.commands()
+        commands = {} if self._env is None else self._env.commands()
         for name, command in commands.items():
             if not (math.isfinite(command.value) and command.low < command.high):
                 raise TaskError(f"commands(): {name} is {short_repr(tuple(command))}; give a value, and low < high")
@@ -72,12 +72,12 @@ class RobotWorld:
         return log
 
     def _set_commands(self, env: TaskEnv, wanted: Mapping[str, float]) -> None:
-        known = env.task.commands()
+        known = env.commands()
         values = {
             name: min(max(value, known[name].low), known[name].high) for name, value in wanted.items() if name in known
         }
         if any(known[name].value != value for name, value in values.items()):
-            env.task.set_commands(values)
+            env.set_commands(values)
 
     def _find_robot(self, env: TaskEnv, robot: Body) -> Body:
         return env.sim.body(robot.name)  # a reset may have loaded it again

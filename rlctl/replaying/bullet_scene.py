@@ -67,7 +67,7 @@ class TaskReader:
 
     def read(self, step: int) -> None:
         """Read the world after a step; 0 is the reset."""
-        positions, sim = self._env.task.markers(), self._env.sim
+        positions, sim = self._env.markers(), self._env.sim
         if step == 0:  # only now: a reset may load the bodies again
             assert isinstance(sim, PybulletSim)  # MuJoCo's worlds have a reader of their own
             self._bodies = list(sim.bodies.values())

@@ -54,7 +54,7 @@ class MujocoReader:
         self._rows.append([part.copy() for part in parts])
         inner = self._env.unwrapped
         if isinstance(inner, TaskEnv):
-            markers = inner.task.markers()
+            markers = inner.markers()
         else:
             goal = getattr(inner, "goal", None)
             markers = {"goal": goal} if isinstance(goal, np.ndarray) and goal.shape == (3,) else {}

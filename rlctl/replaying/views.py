@@ -69,7 +69,7 @@ class _TaskView:
         self._size = size
 
     def begin(self) -> None:
-        sim, markers = self._env.sim, self._env.task.markers()
+        sim, markers = self._env.sim, self._env.markers()
         assert isinstance(sim, PybulletSim)  # `look_at` asks
         bodies = [read_body(sim.client, body.id) for body in sim.bodies.values()]
         self._camera = BulletCamera(bodies, [np.asarray(position) for position in markers.values()], self._size)
@@ -92,7 +92,7 @@ class _MujocoTaskView:
         bodies = list(sim.bodies.values())
         self._followed = next((body for body in bodies if body.link_names and not body.fixed), None)
         shown = bodies if self._followed is None else [self._followed]
-        markers = [np.asarray(position) for position in self._env.task.markers().values()]
+        markers = [np.asarray(position) for position in self._env.markers().values()]
         low, high = find_mujoco_bounds(sim, shown, markers)
         self._target = (low + high) / 2
         distance = find_distance(low, high, self._size)

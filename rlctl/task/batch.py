@@ -6,11 +6,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import ShapeError, TaskError
+from rlctl.errors import ShapeError
 from rlctl.task.commands import CommandTerm
-from rlctl.task.joints import Joints
 from rlctl.task.sim import Sim
-from rlctl.task.task import Task, TaskDefinition
+from rlctl.task.task import TaskDefinition
 
 Array = NDArray[np.float64]
 
@@ -98,81 +97,6 @@ class BatchTask(TaskDefinition):
             getattr(self, name)[worlds] = 0
 
 
-class OneWorld(Task):
-    """A `BatchTask` with one world as a `Task`: without the leading axis."""
-
-    batch: BatchTask
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "batch":
-            raise AttributeError(name)
-        return getattr(self.batch, name)
-
-    def build(self, sim: Sim) -> None:
-        self.batch.prepare(sim.batch, 1)  # type: ignore[attr-defined]  # a `OneWorldSim`
-
-    def reset(self, rng: np.random.Generator) -> None:
-        self.batch.clear_kept(np.zeros(1, np.int64))
-        self.batch.reset(WorldRngs([rng]), np.zeros(1, np.int64))
-
-    @property
-    def level(self) -> float:
-        """How hard the next episode is; see `TaskDefinition.level`."""
-        return float(self.batch.level[0])
-
-    @level.setter
-    def level(self, value: float) -> None:
-        self.batch.level[:] = value
-
-    def act(self, action: NDArray[Any]) -> None:
-        self.batch.act(np.asarray(action)[None])
-
-    def observe(self) -> dict[str, Any]:
-        return self._read("observe", self.batch.observe(), 2)
-
-    def privileged(self) -> dict[str, NDArray[np.float64]]:
-        return self._read("privileged", self.batch.privileged(), 2)
-
-    def rewards(self, action: NDArray[Any]) -> dict[str, float]:
-        terms = self._read("rewards", self.batch.rewards(np.asarray(action)[None]), 1)
-        return {name: float(value) for name, value in terms.items()} if isinstance(terms, dict) else terms
-
-    def is_terminated(self) -> bool:
-        return bool(read_rows(self._name, "is_terminated()", self.batch.is_terminated(), (1,), bool)[0])
-
-    def markers(self) -> dict[str, NDArray[np.float64]]:
-        return self._read("markers", self.batch.markers(), 2)
-
-    @property
-    def _name(self) -> str:
-        return type(self).__name__
-
-    def commands(self) -> dict[str, CommandTerm]:
-        return {name: command._replace(value=command.value[0]) for name, command in self.batch.commands().items()}
-
-    def set_commands(self, values: Mapping[str, float]) -> None:
-        self.batch.set_commands({name: np.array([value]) for name, value in values.items()})
-
-    def _read(self, method: str, values: Any, axes: int) -> Any:
-        """Return the row of each array; what is not a dict is left to `TaskEnv`."""
-        if not isinstance(values, dict):
-            return values
-
-        def read(name: str, value: Any) -> Any:
-            if isinstance(value, tuple):  # the quantities of a term
-                return tuple(read(name, quantity) for quantity in value)
-            return read_rows(self._name, f"{method}()[{name!r}]", value, (1, None)[:axes], np.float64)[0]
-
-        return {name: read(name, value) for name, value in values.items()}
-
-    def describe_joints(self) -> Joints | None:
-        return self.batch.describe_joints()
-
-
-def _is_success(self: OneWorld) -> bool:
-    return bool(read_rows(self._name, "is_success()", self.batch.is_success(), (1,), bool)[0])
-
-
 def read_rows(task: str, where: str, value: Any, shape: tuple[int | None, ...], dtype: type) -> NDArray[Any]:
     """Return what a method of a `BatchTask` returned as an array; raises `ShapeError` unless it has a row per world.
 
@@ -188,23 +112,3 @@ def read_rows(task: str, where: str, value: Any, shape: tuple[int | None, ...], 
             "a row per world"
         )
     return array.astype(dtype, copy=False)
-
-
-def as_single(task: Task | BatchTask) -> Task:
-    """Return a task for one world: a `BatchTask` without its leading axis, any other as it is."""
-    if not isinstance(task, BatchTask):
-        return task
-    required = ("build", "act", "observe", "rewards")
-    missing = [f"{name}()" for name in required if getattr(type(task), name) is getattr(BatchTask, name)]
-    if missing:
-        raise TaskError(
-            f"{type(task).__name__} does not define {', '.join(missing)}; a task needs {', '.join(required)}"
-        )
-    values = {
-        name: getattr(task, name) for name in TaskDefinition.__annotations__ if name != "level" and hasattr(task, name)
-    }
-    if type(task).is_success is not BatchTask.is_success:
-        values["is_success"] = _is_success
-    single: Task = type(type(task).__name__, (OneWorld,), values | {"__doc__": type(task).__doc__})()
-    single.batch = task  # type: ignore[attr-defined]
-    return single

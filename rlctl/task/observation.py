@@ -1,4 +1,4 @@
-"""Checks what a task observes at every step, and assembles the environment's observation: a flat Box, or a Dict."""
+"""Checks what a task observes at every step, and assembles the observations of n worlds: a flat Box, or a Dict."""
 
 import dataclasses
 import math
@@ -10,11 +10,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean
-from rlctl.task.history import TermHistory
-from rlctl.task.task import Task
+from rlctl.task.history import History
+from rlctl.task.layout import Layout
+from rlctl.task.task import TaskDefinition
 from rlctl.task.terms import Term
 
-Observation = NDArray[np.float32] | dict[str, NDArray[np.float32]]
+Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
+"""Rows of shape (k, size), or a dict of arrays of shape (k, ...)."""
 
 ROUNDING = 1e-4
 """A value this far outside its bounds is clipped as a rounding error; farther outside it is an error of the task."""
@@ -36,7 +38,7 @@ class Observing:
             check_name(name, known, f"observe: {task} has no observation", RecipeError, listed="It has")
         return [name for name in known if name in self.names] or list(observed)
 
-    def find_frames(self, task: Task, names: Sequence[str]) -> dict[str, int]:
+    def find_frames(self, task: TaskDefinition, names: Sequence[str]) -> dict[str, int]:
         """Return the numbers of last values by name; raises `RecipeError` for a name that is not observed."""
         what = f"observation_history: {type(task).__name__} has no observation"
         for name in self.history:
@@ -45,7 +47,7 @@ class Observing:
         return {name: count for name, count in frames.items() if name in names and count > 1}
 
 
-def check_names(task: Task, observed: Mapping[str, Any]) -> None:
+def check_names(task: TaskDefinition, observed: Mapping[str, Any]) -> None:
     """Raise `TaskError` if a task declares something of an observation that it does not have."""
     quantities = [name for term in task.observation_terms.values() for name in term.inputs]
     for what, names, known in (
@@ -61,149 +63,195 @@ def check_names(task: Task, observed: Mapping[str, Any]) -> None:
             )
 
 
-class ObservationFormat:
-    """The space of observations, and their assembly; `first` is an example, by name.
+class View:
+    """What one policy sees of n worlds: some observations by name, with histories, as rows of a flat Box or a Dict."""
 
-    `frames` has the number of last values of those that are histories.
-    """
-
-    def __init__(self, task: Task, first: Mapping[str, Any], frames: Mapping[str, int]) -> None:
-        self._task = task
+    def __init__(
+        self,
+        task: TaskDefinition,
+        worlds: int,
+        observing: Observing,
+        observed: Mapping[str, Any],
+        privileged: Mapping[str, Any],
+    ) -> None:
+        """`observed` and `privileged` are examples of what the task's methods return for one world."""
         self._name = type(task).__name__
-        self._bounds = {name: bounds for name, bounds in task.observation_bounds.items() if name in first}
-        self.frames = dict(frames)
-        self.frame_sizes = {name: int(np.size(value)) for name, value in first.items()}
-        """Elements per name of one step, without histories."""
-        for name in frames:
+        self._is_dict = task.observation_layout == "dict"
+        if not isinstance(privileged, dict):
+            privileged = {}
+        names = observing.list_names(self._name, observed, privileged)
+        self.privileged = [name for name in names if name not in observed]
+        """What it sees of what `privileged` returns."""
+        examples = {**privileged, **observed}
+        first = {name: examples[name] for name in names}
+        self.frames = observing.find_frames(task, names)
+        """The number of last values of those that are histories."""
+        for name in self.frames:
             if len(shape := np.shape(first[name])) > 1:
                 raise TaskError(
                     f"{self._name}: observation_history of {name!r}, of shape {shape}: only vectors have one"
                 )
-        self._shapes = {
-            name: (frames[name] * int(np.size(value)),) if name in frames else np.shape(value)
-            for name, value in first.items()
-        }
-        # Camera pictures stay bytes, as libraries expect images.
-        self._dtypes: dict[str, Any] = {
-            name: np.uint8 if np.asarray(value).dtype == np.uint8 else np.float32 for name, value in first.items()
-        }
-        self.sizes = {name: math.prod(shape) for name, shape in self._shapes.items()}
-        """Elements per name, in the order of the flat observation."""
-        if empty := [name for name, size in self.sizes.items() if size == 0]:
+        self._names = names if observing.names else None
+        self._history = History(worlds, self.frames, task.history_start) if self.frames else None
+        self._single_shapes = {name: np.shape(value) for name, value in first.items()}
+        self._shapes = {name: self._find_shape(name, value) for name, value in first.items()}
+        self.layout = Layout({name: math.prod(shape) for name, shape in self._shapes.items()})
+        if empty := [name for name, size in self.layout.sizes.items() if size == 0]:
             raise TaskError(f"{self._name}: observation {empty[0]!r} is empty: check the slice in observe")
+        self._bounds = {name: bounds for name, bounds in task.observation_bounds.items() if name in first}
+        # Camera pictures stay bytes, as libraries expect images.
+        self._pictures = {
+            name for name, value in first.items() if self._is_dict and np.asarray(value).dtype == np.uint8
+        }
         self.space = self._make_space()
-        self._zeros = np.zeros(self.space.shape or (), np.float32)
+        self._zeros = np.zeros(self.layout.size, np.float32)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Elements per name, in the order of the flat observation."""
+        return self.layout.sizes
+
+    def _find_shape(self, name: str, first: Any) -> tuple[int, ...]:
+        if name in self.frames:
+            return (self.frames[name] * int(np.size(first)),)
+        return np.shape(first)
 
     def _make_space(self) -> Any:
         parts: dict[str, Any] = {}
         for name, shape in self._shapes.items():
-            is_picture = self._dtypes[name] is np.uint8 and self._task.observation_layout == "dict"
-            low, high = (0, 255) if is_picture else self._bounds.get(name, (-math.inf, math.inf))
-            parts[name] = spaces.Box(low, high, shape, np.uint8 if is_picture else np.float32)
-        if self._task.observation_layout == "dict":
+            if name in self._pictures:
+                parts[name] = spaces.Box(0, 255, shape, np.uint8)
+            else:
+                low, high = self._bounds.get(name, (-math.inf, math.inf))
+                parts[name] = spaces.Box(low, high, shape, np.float32)
+        if self._is_dict:
             return spaces.Dict(parts)
-        lows, highs = ([getattr(part, end).ravel() for part in parts.values()] for end in ("low", "high"))
+        lows = [part.low.ravel() for part in parts.values()]
+        highs = [part.high.ravel() for part in parts.values()]
         return spaces.Box(np.concatenate(lows), np.concatenate(highs), dtype=np.float32)
 
-    def assemble(self, parts: Mapping[str, Any], step: int) -> Observation:
-        """Return the observation made of its parts; raises `TaskError`, with the step, if it is not in the space."""
-        if self._task.observation_layout == "dict":
-            observed: dict[str, Any] = {name: np.array(value, self._dtypes.get(name)) for name, value in parts.items()}
-            if {name: value.shape for name, value in observed.items()} != self._shapes:
-                raise self._shape_mismatch(parts, step)
-            if not all(math.isfinite(value.sum()) for value in observed.values()):
-                raise self._not_finite(parts, step)
-            for name, (low, high) in self._bounds.items():
-                observed[name] = self._clip_rounding(observed[name], low, high, parts, step)
-            return observed
-        try:
-            observation = np.concatenate([*parts.values()], axis=None, dtype=np.float32)
-        except ValueError:
-            raise self._shape_mismatch(parts, step) from None
-        if observation.shape != self.space.shape:
-            raise self._shape_mismatch(parts, step)
-        if not math.isfinite(observation.dot(self._zeros)):  # 0, unless an element is not finite
-            raise self._not_finite(parts, step)
-        if self._bounds:
-            observation = self._clip_rounding(observation, self.space.low, self.space.high, parts, step)
-        return observation
+    def make_rows(self, count: int) -> Any:
+        """Return an array of shape (count, size), or a dict of such, for observations."""
+        if self._is_dict:
+            return {name: np.zeros((count, *part.shape), part.dtype) for name, part in self.space.spaces.items()}
+        return np.zeros((count, self.layout.size), np.float32)
 
-    def _clip_rounding(
-        self, values: NDArray[np.float32], low: Any, high: Any, parts: Mapping[str, Any], step: int
-    ) -> Any:
+    def begin(self, worlds: Any) -> None:
+        """Begin the episodes of some worlds."""
+        if self._history is not None:
+            self._history.begin(worlds)
+
+    def assemble(self, parts: Mapping[str, Any], worlds: Any) -> Observation:
+        """Return the observations of some worlds, from parts of shape (k, ...); raises `WrongRow`."""
+        if self._names is not None:
+            parts = {name: parts[name] for name in self._names if name in parts}
+        if self._history is not None:
+            if not all(name in parts for name in self.frames):
+                raise self._shape_mismatch(parts)
+            parts = self._history.add(parts, worlds)
+        if self._is_dict:
+            return self._assemble_dict(parts)
+        values = [part if part.ndim == 2 else part.reshape(len(part), -1) for part in parts.values()]
+        try:
+            rows: NDArray[np.float32] = np.concatenate(values, axis=1, dtype=np.float32)
+        except ValueError:
+            raise self._shape_mismatch(parts) from None
+        if rows.shape[1] != self.layout.size:
+            raise self._shape_mismatch(parts)
+        if not is_zero(rows.dot(self._zeros)):  # 0, unless an element is not finite
+            raise self._not_finite(parts, rows)
+        if self._bounds:
+            rows = self._clip_rounding(rows, self.space.low, self.space.high, parts)
+        return rows
+
+    def _assemble_dict(self, parts: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        observed: dict[str, Any] = {}
+        for name, value in parts.items():
+            observed[name] = np.array(value, np.uint8 if name in self._pictures else np.float32)
+        if {name: value.shape[1:] for name, value in observed.items()} != self._shapes:
+            raise self._shape_mismatch(parts)
+        for value in observed.values():
+            if not math.isfinite(value.sum()):
+                raise self._not_finite(parts, None)
+        for name, (low, high) in self._bounds.items():
+            observed[name] = self._clip_rounding(observed[name], low, high, parts)
+        return observed
+
+    def _clip_rounding(self, values: NDArray[np.float32], low: Any, high: Any, parts: Mapping[str, Any]) -> Any:
         clipped = np.minimum(np.maximum(values, low), high)
         if np.abs(clipped - values).max(initial=0.0) > ROUNDING:
-            raise self._out_of_bounds(parts, step)
+            raise self._out_of_bounds(parts)
         return clipped
 
-    def _shape_mismatch(self, parts: Mapping[str, Any], step: int) -> TaskError:
-        now = {name: np.shape(value) for name, value in parts.items()}
-        names = [name for name in {**self._shapes, **now} if self._shapes.get(name) != now.get(name)]
+    def _shape_mismatch(self, parts: Mapping[str, Any]) -> "WrongRow":
+        now = {name: np.shape(value)[1:] for name, value in parts.items()}
+        known = self._single_shapes
+        if all(name in now and now[name] == self._shapes[name] for name in self._shapes):
+            known = self._shapes
+        names = [name for name in {**known, **now} if known.get(name) != now.get(name)]
         name = names[0] if names else "order"
-        return TaskError(
-            f"{self._name}: observation {name!r} has shape {now.get(name)} at step {step}, "
-            f"{self._shapes.get(name)} at the first observation"
+        return WrongRow(
+            f"observation {name!r} has shape {now.get(name)} at step {{}}, {known.get(name)} at the first observation"
         )
 
-    def _not_finite(self, parts: Mapping[str, Any], step: int) -> TaskError:
+    def _not_finite(self, parts: Mapping[str, Any], rows: Any) -> "WrongRow":
         for name, value in parts.items():
-            if not np.isfinite(value).all():
-                return TaskError(f"{self._name}: observation {name!r} is not finite at step {step}: {value}")
-        return TaskError(f"{self._name}: observation overflows float32 at step {step}")
+            bad = ~np.isfinite(value).reshape(len(value), -1).all(axis=1)
+            if bad.any():
+                row = int(bad.argmax())
+                return WrongRow(f"observation {name!r} is not finite at step {{}}: {value[row]}", row)
+        row = 0 if rows is None else int((~np.isfinite(rows)).any(axis=1).argmax())
+        return WrongRow("observation overflows float32 at step {}", row)
 
-    def _out_of_bounds(self, parts: Mapping[str, Any], step: int) -> TaskError:
+    def _out_of_bounds(self, parts: Mapping[str, Any]) -> "WrongRow":
         for name, (low, high) in self._bounds.items():
-            worst = max(np.ravel(parts[name]).tolist(), key=lambda value: max(low - value, value - high))
-            if max(low - worst, worst - high) > ROUNDING:
-                return TaskError(
-                    f"{self._name}: observation {name!r} is {worst:g} at step {step}, "
-                    f"outside its bounds [{low:g}, {high:g}]"
+            values = np.asarray(parts[name], np.float64).reshape(len(parts[name]), -1)
+            beyond = np.maximum(low - values, values - high)
+            if beyond.max() > ROUNDING:
+                row, element = np.unravel_index(beyond.argmax(), beyond.shape)
+                return WrongRow(
+                    f"observation {name!r} is {values[row, element]:g} at step {{}}, "
+                    f"outside its bounds [{low:g}, {high:g}]",
+                    int(row),
                 )
-        return TaskError(f"{self._name}: observation outside its bounds at step {step}")
+        return WrongRow("observation outside its bounds at step {}")
 
 
-class View:
-    """What one policy sees of a task in one world: some observations by name, with histories."""
+class WrongRow(Exception):
+    """An observation of one of the rows is wrong; `{}` in the message stands for the step."""
 
-    def __init__(
-        self, task: Task, observing: Observing, observed: Mapping[str, Any], privileged: Mapping[str, Any]
-    ) -> None:
-        """`observed` and `privileged` are examples of what the task's methods return."""
-        privileged = privileged if isinstance(privileged, dict) else {}
-        names = observing.list_names(type(task).__name__, observed, privileged)
-        self._names = names if observing.names else None
-        self.privileged = [name for name in names if name not in observed]
-        """What it sees of what `privileged` returns."""
-        examples = {**privileged, **observed}
-        frames = observing.find_frames(task, names)
-        self.format = ObservationFormat(task, {name: examples[name] for name in names}, frames)
-        self._history = TermHistory(self.format.frames, task.history_start)
-
-    def begin(self) -> None:
-        """Begin an episode."""
-        self._history.begin()
-
-    def assemble(self, parts: Mapping[str, Any], step: int) -> Observation:
-        """Return the observation of a step; raises `TaskError` if it is not in the space."""
-        chosen = parts if self._names is None else {name: parts[name] for name in self._names if name in parts}
-        return self.format.assemble(self._history.add(chosen), step)
+    def __init__(self, message: str, row: int = 0) -> None:
+        super().__init__(message)
+        self.row = row
 
 
 class TeacherSight:
-    """What a teacher sees of a task that a student plays: noise and delay only where its own events `disturb`.
+    """What a teacher sees of worlds that a student plays: noise and delay only where its own events `disturb`.
 
     A policy acts best on what it was trained with.
     """
 
-    def __init__(self, view: View, disturbed: Collection[str]) -> None:
+    def __init__(self, view: View, worlds: int, disturbed: Collection[str]) -> None:
         self.view, self.disturbed = view, disturbed
-        self.seen: Observation | None = None
-        """Its observation of the present step."""
+        self.seen: Any = view.make_rows(worlds)
+        """Its observation of the present step of each world: an array of shape (worlds, size), or a dict of such."""
 
-    def look(self, exact: Mapping[str, Any], disturbed: Mapping[str, Any], step: int) -> None:
+    def look(self, exact: Mapping[str, Any], disturbed: Mapping[str, Any], worlds: Any) -> None:
         """Observe; `exact` has everything without noise and delay, `disturbed` what the student's events change."""
         parts = {name: disturbed[name] if name in self.disturbed else value for name, value in exact.items()}
-        self.seen = self.view.assemble(parts, step)
+        now = self.view.assemble(parts, worlds)
+        if isinstance(now, dict):
+            for name, rows in now.items():
+                self.seen[name][worlds] = rows
+        else:
+            self.seen[worlds] = now
+
+
+def is_zero(values: NDArray[Any]) -> bool:
+    """Return whether all values of an array of shape (k,) are 0; several times as fast for one as NumPy's functions."""
+    if len(values) == 1:
+        return bool(values.item() == 0)
+    return not np.count_nonzero(values)
 
 
 def compute_terms(name: str, terms: Mapping[str, Term], observed: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import RecipeError, TaskError, short_repr
+from rlctl.task.layout import Layout
 from rlctl.task.returned import not_by_name
 
 Row = NDArray[np.float32]
@@ -14,7 +15,7 @@ Drawn = Mapping[str, Mapping[str, float]]
 """Per event the values that it drew, by name."""
 
 
-class PrivilegedFormat:
+class CriticSight:
     """Names and sizes of what only the critic sees, and its assembly into rows of shape (size,).
 
     `first` is an example of what the task names, `drawn` of the values of its events. An event that has not acted yet
@@ -29,10 +30,7 @@ class PrivilegedFormat:
         """Number of elements by name, in the order of a row."""
         if empty := [name for name, size in self.sizes.items() if size == 0]:
             raise TaskError(f"{task}: privileged() returned {empty[0]!r} empty")
-        ends = np.cumsum([*self.sizes.values()]).tolist()
-        self._columns = {
-            name: slice(end - size, end) for (name, size), end in zip(self.sizes.items(), ends, strict=True)
-        }
+        self._columns = Layout(self.sizes).columns
         self.size = sum(self.sizes.values())
 
     @classmethod
@@ -51,15 +49,6 @@ class PrivilegedFormat:
     def read_task(self, task: Any) -> dict[str, Any]:
         """Return what the task names now."""
         return task.privileged() if self._of_task else {}
-
-    def observe(self, task: Any, drawn: Drawn, step: int) -> Row:
-        """Return what the critic of one world sees, shape (size,); raises `TaskError` if it is not finite."""
-        row = np.zeros(self.size, np.float32)
-        self.write_task(row, self.read_task(task))
-        self.write_events(row, drawn)
-        if fault := self.find_fault(row):
-            raise TaskError(f"{self._task}: privileged {fault!r} is not finite at step {step}")
-        return row
 
     def write_task(self, rows: Row, parts: Mapping[str, Any]) -> None:
         """Write what the task names into `rows`, shape (..., size); raises `TaskError` if it does not fit."""

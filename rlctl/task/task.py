@@ -174,10 +174,15 @@ def check_parameters(task: type[TaskDefinition]) -> None:
             )
 
 
-def check_definition(task: Task) -> None:
+_CONTRACTS = ("rlctl.task.task", "rlctl.task.batch")  # whose methods an author's class defines
+
+
+def check_definition(task: TaskDefinition) -> None:
     """Raise `TaskError` for an invalid attribute of a task, and for a missing method."""
     name, required = type(task).__name__, ("build", "act", "observe", "rewards")
-    if missing := [f"{method}()" for method in required if getattr(type(task), method) is getattr(Task, method)]:
+    owners = {method: next(cls for cls in type(task).__mro__ if method in vars(cls)) for method in required}
+    missing = [f"{method}()" for method, cls in owners.items() if cls.__module__ in _CONTRACTS]
+    if missing:
         raise TaskError(f"{name} does not define {', '.join(missing)}; a task needs {', '.join(required)}")
     if not isinstance(getattr(task, "action_space", None), spaces.Space):
         raise TaskError(f"{name} does not define action_space: Box(-1.0, 1.0, (7,), np.float32), for example")

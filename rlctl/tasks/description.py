@@ -77,13 +77,12 @@ def _convert(value: Any) -> Any:
 def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     from rlctl.environments.info import describe_model, find_mujoco
     from rlctl.environments.wrappers import find_time_limit
-    from rlctl.task.batch import OneWorld
     from rlctl.task.env import TaskEnv
 
     built = env.unwrapped
     task_env = built if isinstance(built, TaskEnv) else None
     definition = task_env.task if task_env else built
-    cls = type(definition.batch if isinstance(definition, OneWorld) else definition)
+    cls = type(definition)
     target = f"{cls.__module__}:{cls.__qualname__}"
     distribution, version = _find_origin(task, target)
     model, simulated = describe_model(env), find_mujoco(env)

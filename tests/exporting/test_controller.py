@@ -18,7 +18,7 @@ from rlctl.policy.numpy_policy import NumpyPolicy
 from rlctl.policy.onnx_policy import OnnxPolicy, encode
 from rlctl.policy.torch_policy import TorchPolicy
 from rlctl.task import Joints, terms
-from rlctl.task.history import TermHistory
+from rlctl.task.history import History
 from rlctl.task.rotations import normalize
 from tests.exporting.controllers import build_controller, make_arm, make_policy
 
@@ -64,9 +64,9 @@ def draw_inputs(rng):
 def play(policy, controllers, env):
     """Compare controllers with terms, history and policy in Python, in two episodes; return the largest difference."""
     rng, worst = np.random.default_rng(3), 0.0
-    history = TermHistory(env.observation_history, env.history_start)
+    history = History(1, env.observation_history, env.history_start)
     for _ in range(2):
-        history.begin()
+        history.begin(slice(None))
         policy.reset()
         last = np.zeros(2)
         for controller in controllers:
@@ -83,7 +83,7 @@ def play(policy, controllers, env):
                 "clock": [np.sin(2 * np.pi * step * 0.1 / 0.35), np.cos(2 * np.pi * step * 0.1 / 0.35)],
                 "int": inputs["int"],
             }
-            stacked = history.add(parts)
+            stacked = history.add({name: np.asarray(part)[None] for name, part in parts.items()}, slice(None))
             last = policy.predict(np.concatenate([np.ravel(part) for part in stacked.values()]).astype(np.float32))
             for controller in controllers:
                 action, _ = controller.step(inputs)

@@ -19,7 +19,7 @@ def env():
 
 @pytest.fixture
 def task(env):
-    return env.unwrapped.task.batch
+    return env.unwrapped.task
 
 
 def test_it_lies_just_above_the_ground_with_joints_within_their_limits(env, task):

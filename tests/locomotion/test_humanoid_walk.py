@@ -19,7 +19,7 @@ def env():
 
 @pytest.fixture
 def task(env):
-    return env.unwrapped.task.batch
+    return env.unwrapped.task
 
 
 def test_the_model(task):

@@ -34,13 +34,13 @@ def test_episodes_begin_where_the_ground_is_as_rough_as_their_level():
         for level in (0.0, 0.5, 1.0):
             inner.set_level(level)
             env.reset(seed=3)
-            inner.show_critic(task=True, events=True)
-            row = inner.observe_privileged()
-            columns = np.cumsum([0, *inner.privileged.sizes.values()])
-            at = list(inner.privileged.sizes).index("ground")
+            inner.worlds.show_critic(task=True, events=True)
+            row = inner.worlds.observe_privileged(np.zeros(1, int))[0]
+            columns = np.cumsum([0, *inner.worlds.critic.sizes.values()])
+            at = list(inner.worlds.critic.sizes).index("ground")
             spread[level] = np.ptp(row[columns[at] : columns[at + 1]])
         assert spread[0.0] < 0.01 < spread[0.5] < spread[1.0] <= 0.05
-        assert list(inner.privileged.sizes)[:4] == ["velocity", "height", "foot_heights", "ground"]
+        assert list(inner.worlds.critic.sizes)[:4] == ["velocity", "height", "foot_heights", "ground"]
         assert row[3] == pytest.approx(0.3, abs=0.04)  # of the trunk above the ground, at the start
         assert (row[4:8] > -0.005).all()  # no foot is in the ground
 

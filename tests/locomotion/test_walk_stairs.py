@@ -39,4 +39,4 @@ def test_a_missed_step_ends_the_episode_if_it_must_step(must_step):
         # It stands. More than 90 % of the swing are wanted from asin(0.9) / (2 pi) of the period on: 0.107 s, step six.
         ended = [env.step(np.zeros(12, np.float32))[2] for _ in range(6)]
         assert ended == [False] * 5 + [must_step]
-        assert (env.unwrapped.task.batch.foot_heights < 0.01).all()
+        assert (env.unwrapped.task.foot_heights < 0.01).all()

@@ -178,7 +178,7 @@ def test_a_value_that_is_not_finite_is_that_of_an_episode(start):
     assert error.seed in {seed(error.env, episode) for episode in range(10)}
     alone = spec.make()
     alone.reset(seed=error.seed)
-    assert alone.unwrapped.task.batch.goal[0] > 0.285
+    assert alone.unwrapped.task.goal[0] > 0.285
     assert str(error).startswith(
         f"task {STOOL!r}: Stool: reward term 'height' is not finite at step 3\nin environment {error.env}, episode "
     )

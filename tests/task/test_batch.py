@@ -53,13 +53,13 @@ def play_together(batch, choose) -> dict[int, list[np.ndarray]]:
         for world, seed, first in zip(worlds, seeds, batch.reset(np.array(worlds), seeds), strict=True):
             playing[world], episodes[seed] = seed, [first]
 
-    begin(list(range(batch.worlds)))
+    begin(list(range(batch.count)))
     step = 0
     while playing:
         worlds, step = np.array(choose(step, sorted(playing))), step + 1
         seeds = [playing[world] for world in worlds.tolist()]
         actions = np.stack([actions_of(seed)[len(episodes[seed]) - 1] for seed in seeds])
-        result = batch.step(actions, None if np.array_equal(worlds, np.arange(batch.worlds)) else worlds)
+        result = batch.step(actions, None if np.array_equal(worlds, np.arange(batch.count)) else worlds)
         ended = result.terminated | result.truncated
         for k, seed in enumerate(seeds):
             numbers = [result.reward[k], *result.terms[k], result.terminated[k], result.truncated[k], result.success[k]]
@@ -79,7 +79,7 @@ def make_both():
     def make(worlds: int, **settings):
         env = EnvSpec(STOOL, **settings).make()
         made.append(env)
-        made.append(EnvSpec(STOOL, **settings).make_batch(env, worlds))
+        made.append(EnvSpec(STOOL, **settings).make_worlds(worlds))
         return made[-2:]
 
     yield make
@@ -213,11 +213,11 @@ SHAPES = {
     "numbers": "Broken: is_success() is an array of float64 of shape (1,), expected bool of shape (1,): a row per "
     "world",
     "rewards later": f"Broken: rewards()['effort'] is an array of float32 of shape (1,), {ROW} (3,): a row per world",
-    "observe later": f"Broken: observe()['speeds'] is an array of float64 of shape (1, 2), {ROW} (3, 2): a row per "
+    "observe later": f"Broken: observe()['speeds'] is an array of float64 of shape (1, 2), {ROW} (3, size): a row per "
     "world",
     "is_terminated later": "Broken: is_terminated() is an array of bool of shape (1,), expected bool of shape (3,): a "
     "row per world",
-    "kept": "Broken: after reset self.seen has shape (2,); per_world declares (3, 2)",
+    "kept": "Broken: after reset self.seen has shape (2,); per_world declares (1, 2)",
 }
 
 
@@ -228,7 +228,7 @@ def test_an_array_of_the_wrong_shape(fault):
     def play():
         with closing(spec.make()) as env:
             if fault.endswith("later") or fault == "kept":
-                with closing(spec.make_batch(env, 3)) as batch:
+                with closing(spec.make_worlds(3)) as batch:
                     batch.reset(np.arange(3), range(3))
                     batch.step(np.zeros((3, 2), np.float32))
             env.reset(seed=0)
@@ -258,13 +258,13 @@ def test_batches_need_mujoco_and_no_wrappers():
         EnvSpec(STOOL, sim="pybullet").make()
     spec = EnvSpec(STOOL, frame_stack=2)
     with closing(spec.make()) as env, pytest.raises(UsageError, match="no frame_stack and no time_feature"):
-        spec.make_batch(env, 2)
+        spec.make_worlds(2)
 
 
 def test_an_event_function_that_fails_names_its_world(make_both):
     env, batch = make_both(3, events={"quiver": {}})
     batch.reset(np.arange(3), range(3))
-    batch._signals._on_observation[0][2]._signals[1] = lambda parts: {"hight": parts["height"]}
+    batch._signals.on_observation[0]._own[1] = lambda parts: {"hight": parts["height"]}
     with pytest.raises(KeyError) as caught:
         batch.step(np.zeros((3, 2), np.float32))
     assert caught.value.world == 1

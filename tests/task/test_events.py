@@ -150,7 +150,7 @@ def test_ranges_widen_with_the_level(make):
         env.set_level(level)
         return np.array([env.reset(seed=seed)[1]["events"]["mass"]["factor"] for seed in range(200)])
 
-    assert env.level == 1.0  # without a curriculum everything is as wide as it gets
+    assert env.worlds.level == 1.0  # without a curriculum everything is as wide as it gets
     # Half way: 0.7 to 1.6
     for level, low, high in [(0.0, 0.9, 1.1), (0.5, 0.7, 1.6), (1.0, 0.5, 2.1)]:
         drawn = drawn_at(level)

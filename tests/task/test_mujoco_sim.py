@@ -10,7 +10,7 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
-from rlctl.task import env as env_module
+from rlctl.task import worlds as worlds_module
 from rlctl.task.env import TaskEnv
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.pybullet.sim import PybulletSim
@@ -211,9 +211,9 @@ def test_a_task_draws_without_a_display(monkeypatch):
 
 
 def test_an_engine_is_chosen_by_what_is_installed(monkeypatch):
-    installed = env_module.is_installed()
+    installed = worlds_module.is_installed()
     with closing(TaskEnv(Slider())) as env:
         assert env.sim.engine == ("PyBullet" if installed else "MuJoCo")
-    monkeypatch.setattr(env_module, "is_installed", lambda: False)
+    monkeypatch.setattr(worlds_module, "is_installed", lambda: False)
     with closing(TaskEnv(Slider())) as env:
         assert env.sim.engine == "MuJoCo"

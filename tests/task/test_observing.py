@@ -58,7 +58,7 @@ def test_one_world_and_many_see_the_same_and_so_do_their_teachers():
     teacher = EnvSpec(STOOL, events={"late_noise": {}}, observe=("hips", "speeds", "goal"))
     env = student.make(teacher=teacher)
     assert describe(env).observation_sizes == {"hips": 6, "speeds": 2, "place": 3}  # in the order of the task
-    batch = student.make_batch(env, 3)
+    batch = student.make_worlds(3, teacher)
     seeds, some = [5, 6, 7], np.array([0, 2])
     batch.reset(np.arange(3), seeds)
     actions = np.random.default_rng(0).uniform(-1, 1, (4, 2)).astype(np.float32)
@@ -69,11 +69,11 @@ def test_one_world_and_many_see_the_same_and_so_do_their_teachers():
         for action in actions:
             observation = env.step(action)[0]
         np.testing.assert_array_equal(row, observation)
-        np.testing.assert_array_equal(batch.for_teacher[world], env.seen)
-        body = env.unwrapped.task.batch.body
+        np.testing.assert_array_equal(batch.teacher.seen[world], env.seen)
+        body = env.unwrapped.task.body
         np.testing.assert_allclose(env.seen[:2], body.joint_positions[0], rtol=1e-6)
         np.testing.assert_array_equal(env.seen[2:4], observation[6:8])  # with the noise it was trained with
-        assert env.seen[4] == np.float32(env.unwrapped.task.batch.goal[0])
+        assert env.seen[4] == np.float32(env.unwrapped.task.goal[0])
 
 
 def test_the_mirror_image_of_a_history_by_hand():

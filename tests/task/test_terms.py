@@ -7,10 +7,10 @@ from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError, TaskError
 from rlctl.task import Joints, terms
-from rlctl.task.batch_env import BatchEnv
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
 from rlctl.task.rotations import normalize, rotate_inverse
+from rlctl.task.worlds import TaskWorlds
 from tests.task.batches import Stool
 from tests.task.tasks import Slider
 
@@ -152,7 +152,7 @@ def test_many_worlds_have_the_histories_of_one(start):
     kind = type("Remembering", (StoolWithHistory,), {"history_start": start, "__doc__": "A stool."})
     events = EventSettings(True, {})
     single = TaskEnv(kind(), events=events, sim="mujoco")
-    batch = BatchEnv(kind(), 3, TaskEnv(kind(), events=events, sim="mujoco"), "mujoco")
+    batch = TaskWorlds(kind(), 3, events=events, sim="mujoco")
     actions = np.random.default_rng(0).uniform(-1, 1, (6, 2)).astype(np.float32)
     rows = [batch.reset(np.arange(3), [5, 6, 7])[1]]
     for step, action in enumerate(actions):

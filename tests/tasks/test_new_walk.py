@@ -101,7 +101,7 @@ def test_two_legs_step_in_time_with_a_clock(tmp_path, monkeypatch):
     assert task.other_side == (-4, 5, 6, -1, 2, 3)
     with contextlib.closing(EnvSpec(plugin.target, {"start_noise": 0.0}, sim="mujoco").make()) as env:
         env.reset(seed=0)
-        batch = env.unwrapped.task.batch
+        batch = env.unwrapped.task
         first, terminated, steps = int(batch.phase[0, 1] < 0), False, 0
         while not terminated:
             _, _, terminated, _, _ = env.step(np.zeros(6, np.float32))

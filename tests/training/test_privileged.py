@@ -16,7 +16,7 @@ from rlctl.play.workers import Workers
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_policy import load_policy
 from rlctl.recipe.recipe import merge
-from rlctl.task.privileged import PrivilegedFormat
+from rlctl.task.privileged import CriticSight
 from tests.training.comparing import assert_same_run
 
 pytest.importorskip("mujoco")
@@ -35,7 +35,7 @@ SMALL = {
 
 
 def test_values_have_their_places():
-    shown = PrivilegedFormat("Task", {"velocity": np.zeros(2)}, {"mass": {"factor": 1.0}, "push": {"x": 0.0, "y": 0.0}})
+    shown = CriticSight("Task", {"velocity": np.zeros(2)}, {"mass": {"factor": 1.0}, "push": {"x": 0.0, "y": 0.0}})
     assert shown.sizes == {"velocity": 2, "events/mass": 1, "events/push": 2}
     row = np.zeros(5, np.float32)
     shown.write_task(row, {"velocity": np.array([3.0, 4.0])})
@@ -52,14 +52,15 @@ def test_values_have_their_places():
 )
 def test_what_a_task_names_must_stay_the_same(parts, message):
     with pytest.raises(TaskError, match=message):
-        PrivilegedFormat("Task", {"velocity": np.zeros(2)}, {}).write_task(np.zeros(2, np.float32), parts)
+        CriticSight("Task", {"velocity": np.zeros(2)}, {}).write_task(np.zeros(2, np.float32), parts)
 
 
 def test_one_world_and_many_show_the_same():
     spec = EnvSpec(STOOL, randomize=True)
     env = spec.make()
-    env.unwrapped.show_critic(**SEEN)
-    batch = spec.make_batch(env, 3)
+    env.unwrapped.worlds.show_critic(**SEEN)
+    batch = spec.make_worlds(3)
+    batch.show_critic(**SEEN)
     seeds, some = [5, 6, 7], np.array([0, 2])
     batch.reset(np.arange(3), seeds)
     actions = np.random.default_rng(0).uniform(-1, 1, (8, 2)).astype(np.float32)
@@ -70,8 +71,8 @@ def test_one_world_and_many_show_the_same():
         env.reset(seed=seed)
         for action in actions:
             env.step(action)
-        np.testing.assert_array_equal(row, env.unwrapped.observe_privileged())
-    shown = env.unwrapped.privileged
+        np.testing.assert_array_equal(row, env.unwrapped.worlds.observe_privileged(np.zeros(1, int))[0])
+    shown = env.unwrapped.worlds.critic
     assert list(shown.sizes)[:2] == ["goal", "place"]
     assert shown.sizes["events/kick"] == 2  # drawn at an interval
     assert shown.sizes["events/late"] == 1  # drawn with the first observation

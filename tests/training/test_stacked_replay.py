@@ -9,7 +9,8 @@ from safetensors.numpy import load_file
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
 from rlctl.recipe.recipe import merge
-from rlctl.task.history import HistoryRows
+from rlctl.task.history import History
+from rlctl.task.layout import Layout
 from rlctl.training import algorithms
 from rlctl.training.checkpoint import ReplaySegments
 from rlctl.training.stacked_replay import StackedRows, StackLayout, store_once
@@ -47,18 +48,23 @@ def make_buffer(kind, *, once, start="first"):
 def list_steps(count, start="first"):
     """Return steps of all environments: episodes end after random times, some at a time limit or cut short."""
     rng = np.random.default_rng(0)
-    history, everyone = HistoryRows(ENVS, SIZES, FRAMES, start), np.arange(ENVS)
-    now = history.add(rng.normal(size=(ENVS, 4)), everyone).astype(np.float32)
+    history, everyone = History(ENVS, FRAMES, start), np.arange(ENVS)
+
+    def stack(rows, envs):
+        parts = history.add(Layout(SIZES).split(rows), envs)
+        return np.concatenate([*parts.values()], axis=1)
+
+    now = stack(rng.normal(size=(ENVS, 4)), everyone).astype(np.float32)
     steps = []
     for number in range(count):
-        after = history.add(rng.normal(size=(ENVS, 4)), everyone).astype(np.float32)
+        after = stack(rng.normal(size=(ENVS, 4)), everyone).astype(np.float32)
         done, limit, cut = rng.random(ENVS) < 0.2, rng.random(ENVS) < 0.5, number % 13 == 7
         infos = [{"TimeLimit.truncated": bool(flag)} for flag in done & limit]
         steps.append((cut, now, after, rng.normal(size=(ENVS, 1)), rng.normal(size=ENVS), done, infos))
         begins = np.flatnonzero(done | cut)
         history.begin(begins)
         now = after.copy()
-        now[begins] = history.add(rng.normal(size=(len(begins), 4)), begins)
+        now[begins] = stack(rng.normal(size=(len(begins), 4)), begins)
     return steps
 
 

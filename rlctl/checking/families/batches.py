@@ -80,7 +80,7 @@ class _Worlds:
 
     def __init__(self, instance: Instance, context: Context) -> None:
         self._instance = instance
-        self.env: Any = instance.call("build", context.spec.make_batch, instance.env, WORLDS)
+        self.env: Any = instance.call("build", context.spec.make_worlds, WORLDS)
         self.names = list(instance.env.unwrapped.observation_sizes.items())
         task = self.env.task
         self._excluded = {*task.per_world, *type(task).parameters(), "worlds"}

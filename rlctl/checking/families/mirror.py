@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, experiment
-from rlctl.checking.values import find_batch, is_task
+from rlctl.checking.values import is_task
 from rlctl.task.mirror import ACTION, Mirror
 
 TRIALS, STEPS = 3, 4
@@ -70,7 +70,7 @@ class _Trial:
             self._place(body, self._reflect(body, pose) if mirrored else pose)
         if mirrored:
             self._reflect_attributes()
-        seen = [self._call("observe", self._observe)]
+        seen = [self._call("observe", self.env.observe_exactly)]
         for step in range(1, STEPS + 1):
             action = rng.uniform(-WIDEST, WIDEST, self.env.action_space.shape).astype(np.float32)
             action = self._mirrors[ACTION](action) if mirrored else action
@@ -78,15 +78,14 @@ class _Trial:
         return seen
 
     def _step(self, action: NDArray[np.float32], step: int) -> dict[str, Array]:
-        self._call("act", self.task.act, action, step=step)
+        worlds, rows = self.env.worlds, action[None]
+        self._call("act", worlds.calls.act, rows, step=step)
         self._call("step", self.sim.step, step=step)
-        self._call("is_terminated", self.task.is_terminated, step=step)
-        rewards = self._call("rewards", self.task.rewards, action, step=step)
-        observed = self._call("observe", self._observe, step=step)
-        return {**observed, **{f"reward term {name}": np.array([value]) for name, value in rewards.items()}}
-
-    def _observe(self) -> Any:
-        return self.env.compute_terms(self.task.observe())
+        self._call("is_terminated", worlds.calls.is_terminated, step=step)
+        terms = self._call("rewards", worlds.calls.rewards, rows, worlds.weights, step, step=step)[0]
+        observed = self._call("observe", self.env.observe_exactly, step=step)
+        named = zip(worlds.weights, terms.tolist(), strict=True)
+        return {**observed, **{f"reward term {name}": np.array([value]) for name, value in named}}
 
     def _call(self, name: str, function: Any, *arguments: Any, step: int = 0) -> Any:
         values = self._instance.call(name, function, *arguments, step=step)
@@ -125,7 +124,7 @@ class _Trial:
 
     def _reflect_attributes(self) -> None:
         """Mirror what the task keeps under the name of an observation, such as a command."""
-        owner = find_batch(self._instance.env) or self.task
+        owner = self.task
         for name, mirror in self._mirrors.items():
             value = getattr(owner, name, None)
             if isinstance(value, np.ndarray) and value.shape[-1:] == (len(self.task.mirror[name]),):

@@ -102,7 +102,7 @@ def _play(env: TaskEnv, trajectory: Array, driven: tuple[str, ...]) -> tuple[str
         measured.append([(body.joint_positions[i], body.joint_velocities[i]) for body, i in joints.values()])
         if steps_targets:
             targets.append(read_targets(env))
-        env.task.act(action)
+        env.act(action)
         env.sim.step()
         reason, reached = _find_danger(env, joints)
         share = max(share, float(reached))
@@ -128,7 +128,7 @@ def _find_danger(env: TaskEnv, joints: dict[str, tuple[Any, int]]) -> tuple[str,
                 return f"joint {name} comes near the end of its range", largest
         if limit > 0 and speed > 1.05 * limit:
             return f"joint {name} is faster than its top speed, {limit:.3g} rad/s", largest
-    if env.task.is_terminated():
+    if env.is_terminated():
         return "the episode ends", largest
     for body in {id(body): body for body, _ in joints.values() if body.fixed}.values():
         for other in env.sim.bodies.values():

@@ -218,7 +218,7 @@ class Follower:
                 if self._targets is not None and row < len(self._targets):
                     lead_targets(env, self._targets[row])
             action = self._actions[row - delay] if row >= delay else self._resting
-            env.task.act(action.astype(self._dtype))
+            env.act(action.astype(self._dtype))
             env.sim.step()
             played[row] = self._read()
         if not np.isfinite(played).all():

@@ -16,7 +16,7 @@ def remembers_targets(env: TaskEnv) -> bool:
     env.reset(seed=0)
     before = read_targets(env)
     for end in (env.action_space.low, env.action_space.high):  # type: ignore[attr-defined]
-        env.task.act(end)  # without simulated time, so the joints do not move
+        env.act(end)  # without simulated time, so the joints do not move
         if not np.array_equal(before, read_targets(env)):
             return True
     return False
@@ -26,7 +26,7 @@ def read_targets(env: TaskEnv) -> Array:
     """Return what the task observes, or computes a term from, under the name that its joints give as `measured`."""
     described = env.task.describe_joints()
     assert described is not None
-    name, observed = described.measured, env.task.observe()
+    name, observed = described.measured, env.observe_quantities()
     for term_name, term in env.task.observation_terms.items():
         if name in term.inputs:
             value = observed[term_name]
@@ -46,4 +46,4 @@ def lead_targets(env: TaskEnv, wanted: Array) -> None:
         if total < _CLOSE or total >= last:
             return
         action = np.clip((distance / described.action_step).reshape(low.shape), low, high)
-        env.task.act(action.astype(low.dtype))
+        env.act(action.astype(low.dtype))

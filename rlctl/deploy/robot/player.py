@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.deploy.robot.commands import CommandCounts, CommandQueue
@@ -12,12 +13,16 @@ from rlctl.deploy.robot.comparison import CommandComparison
 from rlctl.deploy.robot.faults import EpisodeFaults, Faults
 from rlctl.deploy.robot.interface import Interface, Parts
 from rlctl.deploy.robot.program import Arrival, ControlProgram, SentObservation
+from rlctl.environments.dict_spaces import take_row
+from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import AnswerIsNo
 from rlctl.play.messages import EpisodeResult, FailedInEpisode, describe_failure, make_error
-from rlctl.play.running_episode import RunningEpisode
 
 _RESEND_S = 0.25  # after which an observation that is not answered is sent again: a UDP packet may be lost
+
+
+_ROW = np.zeros(1, np.int64)
 
 
 class RobotPlayer:
@@ -41,10 +46,10 @@ class RobotPlayer:
         realtime: bool,
         comparison: CommandComparison | None,
     ) -> None:
-        metrics = [name for name, weight in info.reward_weights.items() if weight == 0]
-        self._episode = RunningEpisode(env, 0, metrics)
+        self._worlds = GymWorlds(env, level)
+        self._seed = -1
         self._info, self._interface = info, interface
-        self._task, self._level, self._timeout_s, self._realtime = task, level, timeout_s, realtime
+        self._task, self._timeout_s, self._realtime = task, timeout_s, realtime
         self._controller, self._comparison = controller, comparison
         self._dt = info.control_dt or math.inf
         self._loop = asyncio.get_running_loop()
@@ -78,23 +83,41 @@ class RobotPlayer:
             self._controller.arrivals.clear()
             self._unanswered_s = math.inf
         self._begins, newest = True, None  # the newest command
-        observation = self._call(lambda: self._episode.start(seed, self._level))
+        self._seed = seed
+        observations = self._call(lambda: self._worlds.reset(_ROW, [seed]))
         self._begin_s = self._loop.time()
         while True:
-            step = self._episode.step
-            measured = self._interface.measure(observation)
+            step = self._step
+            measured = self._interface.measure(take_row(observations, 0))
             command = await self._exchange(measured, step)
             self._counts.held += command is None
             newest = newest if command is None else command
             action = self._interface.find_action(newest, measured)
-            self._episode.step = step + 1
             # `chosen` is bound now: the next step has another action.
-            observation, _, terminated, truncated, info = self._call(
-                lambda chosen=action: self._episode.take_step(chosen)  # type: ignore[misc]
-            )
-            if terminated or truncated:
+            result = self._call(lambda chosen=action: self._worlds.step([chosen]))  # type: ignore[misc]
+            observations = result.observation
+            if result.terminated[0] or result.truncated[0]:
                 self._counts.unanswered += len(self._waiting)
-                return self._episode.summarize(info, 0, {})
+                return self._summarize()
+
+    @property
+    def _step(self) -> int:
+        return int(self._worlds.step_of[0])
+
+    def _summarize(self) -> EpisodeResult:
+        totals = self._worlds.totals(0)
+        return EpisodeResult(
+            env=0,
+            seed=self._seed,
+            total_reward=totals.reward,
+            length=self._step,
+            success=totals.success,
+            terms=totals.terms,
+            final_distance=totals.distance,
+            row=0,
+            metrics=totals.metrics,
+            drawn=totals.drawn,
+        )
 
     def _call(self, simulate: Callable[[], Any]) -> Any:
         try:
@@ -102,7 +125,7 @@ class RobotPlayer:
         except BaseException as error:  # a plugin may raise anything, SystemExit too
             if isinstance(error, KeyboardInterrupt):
                 raise
-            failure = FailedInEpisode(0, self._episode.seed, self._episode.step)
+            failure = FailedInEpisode(0, self._seed, self._step)
             failure.__cause__ = error
             raise make_error(describe_failure(failure), self._task) from error
 
@@ -153,7 +176,7 @@ class RobotPlayer:
 
     def _check_present(self) -> None:
         """Raise `AnswerIsNo` if the program is no longer there."""
-        where = f"in episode {self._number}, step {self._episode.step}"
+        where = f"in episode {self._number}, step {self._step}"
         if self._controller.closed:
             raise AnswerIsNo(f"the program has disconnected {where}")
         if self._loop.time() - self._unanswered_s > self._timeout_s:
@@ -187,5 +210,5 @@ class RobotPlayer:
             self._comparison.compare(arrival.sequence, command)
         if not is_lost:
             # In lock-step the simulated clock stands still while the program computes.
-            step_s = (self._episode.step * self._dt) if not self._realtime else arrival.at - self._begin_s
+            step_s = (self._step * self._dt) if not self._realtime else arrival.at - self._begin_s
             self._queue.put((step_s if self._dt < math.inf else 0.0) + delay_s, arrival.sequence, command)

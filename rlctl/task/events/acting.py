@@ -1,17 +1,13 @@
 """The events that act in one environment: called at their moments, in the order the task declares them."""
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 
-from rlctl.errors import RlctlError, TaskError, check_name
-from rlctl.task.events.event import BoundEvent, Drawn, Parts, Signal, When
+from rlctl.errors import RlctlError, TaskError
+from rlctl.task.events.event import BoundEvent, Drawn, When
 from rlctl.task.sim import Sim
-
-_ACTION = "action"
 
 Streams = Mapping[str, np.random.Generator]
 """A random generator for each event, by its name."""
@@ -57,98 +53,12 @@ class ActingEvents:
                     drawn = event(sim, np.random.default_rng(0), 1.0)
                 except RlctlError as error:
                     raise event.error(f"events.{event.name}: {error}") from None
-                _check_drawn(event.name, drawn)
+                check_drawn(event.name, drawn)
                 all_drawn[event.name] = drawn
         return all_drawn
 
 
-class Signals:
-    """Noise and delay on observations and actions; noisy observations stay inside their `bounds`."""
-
-    def __init__(
-        self,
-        events: Mapping[str, BoundEvent],
-        first: Parts,
-        action_space: spaces.Space[Any],
-        bounds: Mapping[str, tuple[float, float]],
-    ) -> None:
-        self.on_observation = [event for event in events.values() if event.event.when == "observation"]
-        self.on_action = [event for event in events.values() if event.event.when == "action"]
-        self.of = {event.name: _find_observed(event, first) for event in self.on_observation}
-        self._first = first
-        self._space = action_space
-        for event in self.on_action:
-            if not isinstance(action_space, spaces.Box):
-                raise event.error(
-                    f"events.{event.name}: only actions in a Box can have noise or delay, not {action_space}."
-                )
-        pictures = {name: (0, 255) for name, value in first.items() if np.asarray(value).dtype == np.uint8}
-        self.bounds = {**pictures, **bounds}
-        self._observation_signals: dict[str, Signal] = {}  # by event
-        self._action_signals: list[Signal] = []
-        self.drawn: dict[str, Drawn] = {}
-        """Values drawn for this episode, by event."""
-
-    def begin(self, streams: Streams, level: float) -> None:
-        """Start an episode; each event uses its own random stream."""
-        self.drawn = {}
-        self._streams, self._level = streams, level
-        self._observation_signals = {}  # they begin with the first observation
-        if self.on_action:
-            low, high = self._space.low, self._space.high  # type: ignore[attr-defined]
-            zero = {_ACTION: np.clip(np.zeros_like(low), low, high)}
-            self._action_signals = [self._start(event, zero) for event in self.on_action]
-
-    def try_once(self) -> None:
-        """Begin every signal once, to find mistakes."""
-        self.begin(defaultdict(lambda: np.random.default_rng(0)), 1.0)
-        self.observe(self._first)
-
-    def _start(self, event: BoundEvent, first: Parts) -> Signal:
-        self.drawn[event.name], signal = start_signal(event, self._streams[event.name], first, self._level)
-        return signal
-
-    def observe(self, parts: Parts) -> Parts:
-        """Return an observation with noise and delay, as the policy sees it."""
-        for event in self.on_observation:
-            observed = {name: parts[name] for name in self.of[event.name]}
-            if event.name not in self._observation_signals:
-                self._observation_signals[event.name] = self._start(event, observed)
-            changed = dict(self._observation_signals[event.name](observed))
-            for name in observed:
-                if name in self.bounds:
-                    changed[name] = np.clip(changed[name], *self.bounds[name])
-            parts = {**parts, **changed}
-        return parts
-
-    def act(self, action: Any) -> Any:
-        """Return an action with noise and delay, as the motors get it; it stays inside the action space."""
-        if not self._action_signals:
-            return action
-        parts: Parts = {_ACTION: np.asarray(action, np.float64)}
-        for signal in self._action_signals:
-            parts = signal(parts)
-        low, high = self._space.low, self._space.high  # type: ignore[attr-defined]
-        return np.clip(parts[_ACTION], low, high).astype(self._space.dtype)
-
-
-def start_signal(event: BoundEvent, rng: np.random.Generator, first: Parts, level: float) -> tuple[Drawn, Signal]:
-    """Call the function of an event on observations or actions; raises `TaskError` for a result of the wrong type."""
-    result = event(rng, first, level)
-    if not (isinstance(result, tuple) and len(result) == 2 and callable(result[1])):
-        raise TaskError(f"events.{event.name}: its function must return the drawn values and a signal, not {result!r}")
-    drawn, signal = result
-    _check_drawn(event.name, drawn)
-    return drawn, signal
-
-
-def _find_observed(event: BoundEvent, first: Parts) -> list[str]:
-    names = [event.event.of] if isinstance(event.event.of, str) else list(event.event.of)
-    for name in names:
-        check_name(name, first, f"events.{event.name}: no observation", event.error, listed="There is")
-    return names or list(first)
-
-
-def _check_drawn(name: str, drawn: Any) -> None:
+def check_drawn(name: str, drawn: Any) -> None:
+    """Raise `TaskError` unless the function of an event returned the drawn numbers by name."""
     if not isinstance(drawn, dict) or not all(isinstance(value, int | float) for value in drawn.values()):
         raise TaskError(f"events.{name}: its function must return a dict of the drawn numbers by name, not {drawn!r}")

@@ -4,13 +4,13 @@ Each draws values from its ranges and returns them. Changes of a body start from
 """
 
 import math
-from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
 
 from rlctl.errors import TaskError
 from rlctl.task.events.event import Drawn, Fraction, NotNegative, Parts, Positive, Range, Signal, Steps, acts_at
+from rlctl.task.events.world_signals import WORLD_SIGNALS, Delay, Noise, in_one_world
 from rlctl.task.sim import Sim
 
 Rng = np.random.Generator
@@ -167,12 +167,7 @@ def noise(rng: Rng, first: Parts, *, std: NotNegative) -> tuple[Drawn, Signal]:
 
     Its standard deviation, in the unit of the observation or the action, is drawn once per episode.
     """
-    drawn = float(rng.uniform(*std))
-
-    def disturb(parts: Parts) -> Parts:
-        return {name: value + drawn * rng.standard_normal(np.shape(value)) for name, value in parts.items()}
-
-    return {"std": drawn}, disturb
+    return in_one_world(Noise, rng, first, std=std)
 
 
 @acts_at("observation", "action", steps=0.0)
@@ -181,16 +176,8 @@ def delay(rng: Rng, first: Parts, *, steps: Steps) -> tuple[Drawn, Signal]:
 
     In these first steps the observation is the first of the episode, and the action is 0 or the nearest to 0.
     """
-    drawn = int(rng.integers(int(steps[0]), int(steps[1]) + 1))
-    past = deque([_copy_parts(first)] * drawn, maxlen=drawn + 1)
-
-    def postpone(parts: Parts) -> Parts:
-        past.append(_copy_parts(parts))
-        return past[0]
-
-    return {"steps": float(drawn)}, postpone
+    return in_one_world(Delay, rng, first, steps=steps)
 
 
-def _copy_parts(parts: Parts) -> Parts:
-    # A task may change its arrays later.
-    return {name: np.array(value) for name, value in parts.items()}
+WORLD_SIGNALS[noise] = Noise
+WORLD_SIGNALS[delay] = Delay

@@ -1,0 +1,310 @@
+"""The running episodes of the worlds of a worker; their segments are written into arrays of the main process."""
+
+from collections.abc import Mapping, Sequence
+from time import perf_counter
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.environments.dict_spaces import SINGLE, join, split
+from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
+from rlctl.play import messages
+from rlctl.play.actors import RowsOfPlayers
+from rlctl.play.messages import EpisodeResult, FailedInEpisode
+from rlctl.play.playing import Index, Playing, RecordedActions, Rows
+from rlctl.play.seeds import list_training_seeds
+from rlctl.play.shared_arrays import CRITIC, SharedArrays
+from rlctl.play.teaching import Teacher
+from rlctl.printed_lines import print_line
+
+
+class Episodes:
+    """The episodes of some worlds; world 0 is the environment `first` of all.
+
+    What worlds and actors raise is raised as `FailedInEpisode`, with the episode.
+    """
+
+    def __init__(self, worlds: Any, first: int, *, has_critic: bool, teacher: Teacher | None) -> None:
+        self.worlds, self.first, self.teacher = worlds, first, teacher
+        self._has_critic = has_critic
+        self._playing = Playing(worlds)
+        self._time = np.zeros((worlds.count, 2))  # of policy and environment in each episode [s]
+        self._deepest = np.full(worlds.count, np.nan)  # how far bodies overlapped at most [m]; NaN: not measured
+
+    @property
+    def envs(self) -> range:
+        """The numbers of its environments."""
+        return range(self.first, self.first + self.worlds.count)
+
+    def _fail(self, error: BaseException, world: int) -> NoReturn:
+        world = getattr(error, "world", world)  # of `WorldFailed` and `in_world`
+        seed, step = int(self._playing.seeds[world]), int(self.worlds.step_of[world])
+        raise FailedInEpisode(self.first + world, seed, step) from error
+
+    def _begin(self, arrays: SharedArrays, index: Index, seeds: Sequence[int]) -> dict[str, Any]:
+        """Begin episodes; return their first observations by key, with what only the critic sees."""
+        self._time[index] = 0.0
+        self._deepest[index] = np.nan
+        envs = self.first + index
+        arrays.inside[envs, 0], arrays.inside[envs, 1] = seeds, 0
+        self._playing.seeds[index] = seeds
+        self.worlds.step_of[index] = 0
+        try:
+            return self._show(self._playing.begin(index, seeds, arrays.level[envs]), index)
+        except BaseException as error:  # a plugin may raise anything, SystemExit too
+            self._fail(error, int(index[0]))
+
+    def _show(self, observations: Any, index: Index) -> dict[str, Any]:
+        parts: dict[str, Any] = split(observations)
+        if self._has_critic:
+            parts = {**parts, CRITIC: self.worlds.observe_privileged(index)}
+        return parts
+
+    def replay(self, arrays: SharedArrays, asked: messages.BeginEpisodes) -> list[int]:
+        """Begin episodes and replay their actions; return the environments whose episode ended or failed."""
+        left: list[int] = []
+        episodes = {env: asked.episodes[env] for env in self.envs if env in asked.episodes}
+        while episodes:
+            try:
+                return left + self._replay(arrays, episodes)
+            except FailedInEpisode as failure:
+                if not asked.may_fail:
+                    raise
+                # It did not fail the first time, so its state differs now; the others begin again without it.
+                del episodes[failure.where[0]]
+                left.append(failure.where[0])
+                print_line(f"{failure} when it was replayed")
+        return left
+
+    def _replay(self, arrays: SharedArrays, episodes: Mapping[int, tuple[int, NDArray[Any]]]) -> list[int]:
+        """Take the recorded actions in lockstep; return the environments whose episode ended."""
+        index = np.array([*episodes], np.int64) - self.first
+        shown = self._begin(arrays, index, [seed for seed, _ in episodes.values()])
+        self._write_current(arrays, index, shown)
+        actions = {env - self.first: taken for env, (_, taken) in episodes.items()}
+        lengths = np.array([len(actions.get(world, ())) for world in range(self.worlds.count)])
+        has_actions = lengths[index] > 0
+        first = {key: part[has_actions] for key, part in shown.items() if key != CRITIC}
+        recorder = _Replayer(RecordedActions(actions), self, arrays)
+        left: list[int] = []
+        try:
+            for played in self._playing.play(recorder, index[has_actions], join(first)):
+                index = played.index
+                self._write_current(arrays, index, self._show(played.result.observation, index))
+                left += (played.ended + self.first).tolist()
+                self._playing.stop(index[self.worlds.step_of[index] >= lengths[index]])
+        except BaseException as error:  # a plugin may raise anything, SystemExit too
+            self._fail(error, int(index[0]))
+        arrays.inside[self.first : self.first + self.worlds.count, 1] = -1
+        return left
+
+    def _write_current(self, arrays: SharedArrays, index: Index, shown: Mapping[str, Any]) -> None:
+        for key, part in shown.items():
+            arrays.observation[key][self.first + index] = part
+
+    def play(
+        self, arrays: SharedArrays, asked: messages.Play, begin: Mapping[int, int], actor: RowsOfPlayers
+    ) -> list[EpisodeResult]:
+        """Play a segment in the environments of `begin`; return the episodes that ended, by environment and row."""
+        index = np.array(sorted(begin), np.int64) - self.first
+        segment = _Segment(self, arrays, asked, actor)
+        try:
+            return segment.play(index, np.array([begin[self.first + world] for world in index.tolist()], np.int64))
+        except FailedInEpisode:
+            raise
+        except BaseException as error:  # a plugin may raise anything, SystemExit too
+            self._fail(error, int(segment.index[0]))
+
+
+class _Replayer:
+    """An actor that acts as another, and lets the teacher see every step: it may have a recurrent state."""
+
+    def __init__(self, actor: RecordedActions, episodes: Episodes, arrays: SharedArrays) -> None:
+        self._actor, self._episodes, self._arrays = actor, episodes, arrays
+
+    def act(self, observations: Any, rows: Rows) -> tuple[Any, Any]:
+        """Return the actor's actions."""
+        if self._episodes.teacher is not None:
+            self._episodes.teacher.act(self._episodes.worlds, rows)
+        self._arrays.inside[self._episodes.first + rows.index, 1] = rows.step + 1
+        return self._actor.act(observations, rows)
+
+
+class _Segment:
+    """A segment that is played and written; as an actor it writes what was chosen before the worlds step."""
+
+    def __init__(self, episodes: Episodes, arrays: SharedArrays, asked: messages.Play, actor: RowsOfPlayers) -> None:
+        self._episodes, self._arrays, self._asked, self._actor = episodes, arrays, asked, actor
+        self._worlds, self._first = episodes.worlds, episodes.first
+        own = slice(self._first, self._first + self._worlds.count)
+        self._segment = arrays.segment.by_step(own)  # arrays of shape (steps, worlds, ...)
+        self._inside = arrays.inside[own]
+        self._ones = np.ones(self._worlds.count, np.int64)
+        self.index: Index = np.zeros(1, np.int64)  # the worlds that play, for errors
+        self._row = 0
+        self._acting_s = self._stepping_s = 0.0  # since the worlds that play changed last
+        self._acted_s = 0.0  # when the last action was chosen
+        self._ended: list[EpisodeResult] = []
+        following = asked.next_episodes.items()
+        self._seeds = {
+            env: list_training_seeds(asked.run_seed, env, number) for env, number in following if env in episodes.envs
+        }
+        contacts = [env - self._first for env in asked.contacts if env in episodes.envs]
+        self._contacts = np.array(contacts, np.int64)
+
+    def _at(self, row: int, index: Index) -> Any:
+        """Return the place of some worlds in a row of arrays; NumPy is fastest where the whole row is meant."""
+        if len(index) == self._worlds.count:
+            return row
+        return row, index
+
+    def play(self, index: Index, seeds: NDArray[np.int64]) -> list[EpisodeResult]:
+        """Begin the episodes whose seeds are not negative, and play."""
+        arrays, asked, segment = self._arrays, self._asked, self._segment
+        episodes, playing = self._episodes, self._episodes._playing
+        self._actor.explore(asked.exploration)
+        self.index = index
+        new = index[seeds >= 0]
+        if len(new):
+            shown = episodes._begin(arrays, new, seeds[seeds >= 0].tolist())
+            episodes._write_current(arrays, new, shown)
+            self._actor.begin(new)
+        envs = self._first + index
+        for key, part in segment.observation.items():
+            part[0, index] = arrays.observation[key][envs]
+        first = {key: part[envs] for key, part in arrays.observation.items() if key != CRITIC}
+        self._inside[index, 0] = playing.seeds[index]
+        self._actor.prepare(playing.select(index))
+        observations = segment.observation.items()
+        only = segment.observation[SINGLE] if list(segment.observation) == [SINGLE] else None
+        began = perf_counter()
+        for played in playing.play(self, index, join(first)):
+            result, row = played.result, self._row
+            self._stepping_s += perf_counter() - self._acted_s
+            self._acting_s += self._acted_s - began
+            self.index = played.index
+            at, after = self._at(row, played.index), self._at(row + 1, played.index)
+            segment.reward[at] = result.reward
+            segment.terminated[at], segment.truncated[at] = result.terminated, result.truncated
+            if asked.record:
+                segment.terms[at] = result.terms
+            if only is not None:
+                only[after] = result.observation
+            else:
+                shown = episodes._show(result.observation, played.index)
+                for key, part in observations:
+                    part[after] = shown[key]
+            if len(self._contacts):
+                self._measure_contacts()
+            if len(played.ended):
+                self._finish(played.ended)
+            self._row = row + 1
+            if self._row == asked.steps:
+                running = self.index if self._seeds else np.setdiff1d(self.index, played.ended)
+                self._write_current(running)
+                break
+            began = perf_counter()
+        self._note_times()
+        self._inside[:, 1] = -1
+        self._actor.end_segment(index)
+        # In the order of environments that play one after the other.
+        return sorted(self._ended, key=lambda ended: ended.env)
+
+    def _write_current(self, index: Index) -> None:
+        for key, part in self._segment.observation.items():
+            self._arrays.observation[key][self._first + index] = part[self._row, index]
+
+    def _note_times(self) -> None:
+        """Add the times since the last call to those of the episodes that play, each its share."""
+        if len(self.index):
+            share = 1.0 / len(self.index)
+            self._episodes._time[self.index] += self._acting_s * share, self._stepping_s * share
+        self._acting_s = self._stepping_s = 0.0
+
+    def act(self, observations: Any, rows: Rows) -> tuple[Any, Any]:
+        """Return the actor's actions, or those of the teacher where it acts, as they are written."""
+        segment, row = self._segment, self._row
+        at = self._at(row, rows.index)
+        stored, action = self._actor.act(observations, rows)
+        if self._episodes.teacher is not None:
+            label = self._episodes.teacher.act(self._worlds, rows)
+            segment.label[at] = label
+            taught = np.isin(self._first + rows.index, self._asked.taught)
+            stored[taught], action[taught] = label.reshape(stored.shape)[taught], label[taught]
+        segment.stored[at], segment.action[at] = stored, action
+        if at is row:
+            np.add(rows.step, self._ones, out=self._inside[:, 1])
+            self._inside[:, 2].fill(row)
+        else:
+            self._inside[rows.index, 1], self._inside[rows.index, 2] = rows.step + 1, row
+        self._acted_s = perf_counter()
+        return stored, action
+
+    def _measure_contacts(self) -> None:
+        deepest = self._episodes._deepest
+        for world in np.intersect1d(self.index, self._contacts).tolist():
+            deepest[world] = np.fmax(deepest[world], self._worlds.deepest_contact(world))
+
+    def _finish(self, ended: Index) -> None:
+        """Note the episodes that ended in some worlds, and begin those that follow them."""
+        arrays, asked, segment, row = self._arrays, self._asked, self._segment, self._row
+        self._note_times()
+        results = [self._summarize(world) for world in ended.tolist()]
+        self._ended += results
+        envs = self._first + ended
+        if not self._seeds:
+            for key, part in segment.observation.items():
+                arrays.observation[key][envs] = part[row + 1, ended]
+            return
+        for key, part in segment.final.items():
+            part[row, ended] = segment.observation[key][row + 1, ended]
+        if asked.levels is not None:
+            for result in results:
+                level = float(arrays.level[result.env])
+                arrays.level[result.env] = asked.levels.follow(level, result.success)
+        self._inside[ended, 2] = row + 1
+        shown = self._episodes._begin(arrays, ended, [next(self._seeds[env]) for env in envs.tolist()])
+        for key, part in shown.items():
+            segment.observation[key][row + 1, ended] = part
+        self._actor.begin(ended)
+
+    def _summarize(self, world: int) -> EpisodeResult:
+        totals = self._worlds.totals(world)
+        acting, stepping = self._episodes._time[world].tolist()
+        deepest = float(self._episodes._deepest[world])
+        return EpisodeResult(
+            env=self._first + world,
+            seed=int(self._episodes._playing.seeds[world]),
+            total_reward=totals.reward,
+            length=int(self._worlds.step_of[world]),
+            success=totals.success,
+            terms=totals.terms,
+            final_distance=totals.distance,
+            row=self._row,
+            report=self._actor.report(world),
+            deepest_contact=None if np.isnan(deepest) else deepest,
+            acting=acting / max(acting + stepping, 1e-9),
+            metrics=totals.metrics,
+            drawn=totals.drawn,
+        )
+
+
+def compute_rewards(worlds: Any, achieved: NDArray[Any], desired: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the rewards, shape (n,), that worlds compute for goals of shape (n, *goal); else `TaskError`."""
+    count = len(achieved)
+    infos: list[dict[str, Any]] = [{} for _ in range(count)]
+    try:
+        rewards = np.asarray(worlds.compute_reward(achieved, desired, infos))
+    except BaseException as error:  # a plugin may raise anything, SystemExit too
+        raise TaskError(
+            f"compute_reward raised {describe_exception(error)}", details=format_plugin_traceback(error)
+        ) from error
+    if rewards.dtype.kind not in "fiub":
+        raise TaskError(f"compute_reward returned an array of {rewards.dtype}, not of numbers")
+    if rewards.shape != (count,):
+        raise TaskError(f"compute_reward returned shape {rewards.shape} for {count} goals at once, not ({count},)")
+    if not np.isfinite(rewards).all():
+        bad = int(np.flatnonzero(~np.isfinite(rewards))[0])
+        raise TaskError(f"compute_reward is {rewards[bad]} for achieved {achieved[bad]}, desired {desired[bad]}")
+    return rewards.astype(np.float64)

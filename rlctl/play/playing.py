@@ -1,0 +1,152 @@
+"""`Playing`: the one loop that plays episodes, of worlds and of what chooses their actions."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rlctl.environments.dict_spaces import map_parts, split
+from rlctl.task.worlds import EpisodeTotals, Step
+
+Index = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+class Worlds(Protocol):
+    """`count` worlds, each with its own episode; a task or a Gymnasium environment. All arrays have a row per world."""
+
+    count: int
+    action_space: spaces.Space[Any]
+    step_of: Index
+    """Steps since the start of each world's episode, the one that runs included; shape (count,)."""
+
+    def reset(self, worlds: Index, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
+        """Begin the episodes of `seeds` in some worlds; return their first observations, shape (k, ...)."""
+
+    def step(self, action: Any, worlds: Index | None = None) -> Step:
+        """Advance some worlds by a step; `action` has a row for each, shape (k, ...)."""
+
+    def totals(self, world: int) -> EpisodeTotals:
+        """Return what the running episode of a world has added up to."""
+
+
+class Rows(NamedTuple):
+    """The rows that act: `index` of each world, `seed` of its episode, and its `step`, counted from 0; shape (k,).
+
+    The arrays are valid until the worlds step.
+    """
+
+    index: Index
+    seed: Index
+    step: Index
+
+    @property
+    def listed(self) -> Iterator[tuple[int, int, int]]:
+        """Index, seed and step of each row."""
+        return zip(self.index.tolist(), self.seed.tolist(), self.step.tolist(), strict=True)
+
+
+class RowsActor(Protocol):
+    """What chooses the actions of rows."""
+
+    def act(self, observations: Any, rows: Rows) -> tuple[Any, Any]:
+        """Return the actions to store, shape (k, elements), and those for the environments, shape (k, ...)."""
+
+
+class Played(NamedTuple):
+    """A step of some worlds."""
+
+    index: Index  # of the worlds, shape (k,)
+    action: Any
+    result: Step
+    ended: Index  # the worlds whose episode has ended
+
+
+class Playing:
+    """The episodes that run in `worlds`; whoever iterates over `play` observes them."""
+
+    def __init__(self, worlds: Worlds) -> None:
+        self.worlds = worlds
+        self.seeds: Index = np.full(worlds.count, -1, np.int64)  # of the episode of each world
+        self._none: Index = np.zeros(0, np.int64)
+        self._index = self._none  # the worlds that play
+        self._observations: Any = None  # of these, before their next action
+
+    def begin(self, index: Index, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
+        """Begin the episodes of `seeds` in some worlds; return their first observations, shape (k, ...).
+
+        In the loop of `play` they follow on episodes that ended.
+        """
+        self.seeds[index] = seeds
+        first = self.worlds.reset(index, seeds, levels)
+        if len(self._index):
+            at = np.searchsorted(self._index, index)
+            for key, part in split(self._observations).items():
+                part[at] = split(first)[key]
+        return first
+
+    def select(self, index: Index) -> Rows:
+        """Return some worlds as rows."""
+        if len(index) == self.worlds.count:
+            return Rows(index, self.seeds, self.worlds.step_of)
+        return Rows(index, self.seeds[index], self.worlds.step_of[index])
+
+    def play(self, actor: RowsActor, index: Index, observations: Any) -> Iterator[Played]:
+        """Continue the episodes of worlds, in ascending order, whose `observations` are given; yield each step.
+
+        An episode that ends leaves, unless another has begun there. Exceptions are those of worlds and actor.
+        """
+        self._index, self._observations = index, observations
+        try:
+            while len(self._index):
+                rows = self.select(self._index)
+                _, action = actor.act(self._observations, rows)
+                result = self.worlds.step(action, rows.index)
+                self._observations = result.observation
+                ended = self._none
+                if True in result.terminated.tolist() or True in result.truncated.tolist():  # faster than NumPy's any
+                    ended = rows.index[result.terminated | result.truncated]
+                yield Played(rows.index, action, result, ended)
+                if len(ended):
+                    self.stop(ended[self.worlds.step_of[ended] > 0])
+        finally:
+            self._index = self._none
+
+    def stop(self, worlds: Index) -> None:
+        """Let some worlds play no further."""
+        staying = np.isin(self._index, worlds, invert=True)
+        if not staying.all():
+            self._index = self._index[staying]
+            self._observations = map_parts(lambda part: part[staying], self._observations)
+
+
+class RecordedActions:
+    """An actor that acts as recorded; `actions` has those of each world."""
+
+    def __init__(self, actions: dict[int, NDArray[Any]]) -> None:
+        self._actions = actions
+
+    def act(self, observations: Any, rows: Rows) -> tuple[Any, Any]:
+        """Return the recorded action of each row; raises `IndexError` after the last one."""
+        actions = np.stack([self._actions[world][step] for world, _, step in rows.listed])
+        return actions, actions
+
+
+class RandomActions:
+    """An actor with uniformly random actions, which depend on the seed of the episode and the step only."""
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        self._space = copy.deepcopy(space)  # its generator is not the environment's
+
+    def act(self, observations: Any, rows: Rows) -> tuple[Any, Any]:
+        """Return an action for each row."""
+        actions = []
+        for _, seed, step in rows.listed:
+            self._space.seed(int(np.random.SeedSequence((seed, step)).generate_state(1)[0]))
+            actions.append(self._space.sample())
+        return actions, actions
