@@ -149,9 +149,10 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         super().reset(seed=seed)
         if self._closed:
             raise TaskError(f"{self.name}: reset() after close(); make a new environment")
-        if seed is None:
+        if seed is None and self.events:
             seed = int(self.np_random.integers(2**63))
-        observation = take_row(self.worlds.reset(_ROW, [seed]))
+        # Without a seed the generator goes on, as Gymnasium asks.
+        observation = take_row(self.worlds.reset(_ROW, [seed or 0], generators=[self.np_random]))
         self._running = True
         if self.render_mode == "human":
             self.move_markers()

@@ -1,5 +1,6 @@
 """Histories of observations: the last values of some terms, oldest first, in the place of their newest value."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -32,7 +33,8 @@ class History:
         stacked = dict(parts)
         new = self._is_new[worlds]
         for name, count in self._frames.items():
-            newest = np.array(parts[name], np.float64).reshape(len(new), -1)
+            newest = np.array(parts[name], np.float64)
+            newest = newest.reshape(len(new), math.prod(newest.shape[1:]))
             if name not in self._kept:
                 self._kept[name] = np.zeros((self._worlds, count, newest.shape[1]))
             before = self._kept[name][worlds]
@@ -43,6 +45,6 @@ class History:
                 before[new] = filler
             after = np.concatenate([before[:, 1:], newest[:, None]], axis=1)
             self._kept[name][worlds] = after
-            stacked[name] = after.reshape(len(new), -1)
+            stacked[name] = after.reshape(len(new), count * newest.shape[1])
         self._is_new[worlds] = False
         return stacked

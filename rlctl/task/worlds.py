@@ -207,10 +207,16 @@ class TaskWorlds:
         self._acting = ActingEvents(self.events, self.task.control_dt)
         self._signals = self._make_signals(self.events)
 
-    def reset(self, worlds: Worlds, seeds: Sequence[int], levels: Array | None = None) -> Observation:
+    def reset(
+        self,
+        worlds: Worlds,
+        seeds: Sequence[int],
+        levels: Array | None = None,
+        generators: Sequence[np.random.Generator] | None = None,
+    ) -> Observation:
         """Begin the episodes of `seeds` in `worlds`; return their first observations, shape (k, size).
 
-        `levels`, shape (k,), is how hard they are. Equal seeds give equal episodes, whatever was simulated before.
+        `levels`, shape (k,), is how hard they are; `generators` replace those of the seeds in the tasks' resets. Equal seeds give equal episodes, whatever was simulated before.
         """
         if self._is_all(worlds):
             worlds = self._all
@@ -229,7 +235,8 @@ class TaskWorlds:
         self._levels[worlds] = levels
         self.calls.set_level(levels, worlds)
         self._critic_rows[worlds] = 0.0  # what is of an event that has not acted yet
-        generators = [np_random(int(seed))[0] for seed in seeds]
+        if generators is None:
+            generators = [np_random(int(seed))[0] for seed in seeds]
         listed = worlds.tolist()
         for world, seed in zip(listed, seeds, strict=True):
             self.drawn[world] = {}

@@ -180,7 +180,7 @@ def test_a_value_that_is_not_finite_is_that_of_an_episode(start):
     alone.reset(seed=error.seed)
     assert alone.unwrapped.task.goal[0] > 0.285
     assert str(error).startswith(
-        f"task {STOOL!r}: Stool: reward term 'height' is not finite at step 3\nin environment {error.env}, episode "
+        f"task {STOOL!r}: Stool: reward term 'height' is nan at step 3\nin environment {error.env}, episode "
     )
 
 
