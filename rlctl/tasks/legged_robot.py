@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
-import re
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,9 +16,9 @@ from rlctl.tasks.gait import Gait, describe_gait
 from rlctl.tasks.legs import Leg, Skeleton, find_legs
 from rlctl.tasks.model_copy import copy_model, find_own_model, remove_floor
 from rlctl.tasks.scaling import GRAVITY, ScaledRobot, scale
-from rlctl.tasks.source_text import LINE_WIDTH, write_list, write_number
+from rlctl.tasks.source_text import Source, join_source, write_comment, write_list, write_number, write_string
 from rlctl.tasks.stance import Stance, StanceSearch, measure_stance
-from rlctl.tasks.starter_robot import StarterRobot
+from rlctl.tasks.starter_robot import StarterRobot, name_robot
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.body import MujocoBody
@@ -182,9 +179,9 @@ def _limit_forces(legged: _Legged) -> tuple[list[float], str]:
     return [limit or guess for limit in limits], "; CHANGE: a guess where the model has no limit"
 
 
-def _write_forces(forces: list[float]) -> str:
+def _write_forces(forces: list[float]) -> Source:
     if len(set(forces)) == 1:
-        return f"[{write_number(forces[0])}] * {len(forces)}"
+        return Source(f"[{write_number(forces[0])}] * {len(forces)}")
     return write_list("MAX_FORCE = ", map(write_number, forces))
 
 
@@ -223,54 +220,55 @@ def _summarize(legged: _Legged, notes: Sequence[str]) -> str:
     return ".\n".join([first, *notes, "Comments with CHANGE in task.py mark what to adapt"])
 
 
-def _list_all_joints(legged: _Legged) -> str:
+def _list_all_joints(legged: _Legged) -> Source:
     names = legged.body.joint_names
     if len(legged.joints) == len(names):
-        return "# Of all joints of the model, in its order."
-    text = f"Of all joints of the model: {', '.join(names)}."
-    return textwrap.fill(text, LINE_WIDTH, initial_indent="# ", subsequent_indent="# ")
+        return write_comment("Of all joints of the model, in its order.")
+    return write_comment(f"Of all joints of the model: {', '.join(names)}.")
 
 
 def _describe(legged: _Legged) -> dict[str, str]:
     body, stance, numbers = legged.body, legged.stance, legged.scaled
-    name = re.sub(r"[^\w .-]", "", body._sim._scene.parts["robot"].file.path.stem)
+    name = name_robot(legged.path)
     forces, force_comment = _limit_forces(legged)
     found = f", keyframe {legged.keyframe!r} of the file" if legged.keyframe else ", knees bent"
-    steps = max(1, legged.steps_up // 2)
+    steps, steps_comment = max(1, legged.steps_up // 2), Source()
+    if steps != _STEPS // 2:
+        steps_comment = Source("  # CHANGE: it fell later when this plugin was written")
     return {
         "robot": name,
         "robot_phrase": name,
         "model": legged.path.name,
-        "joints": write_list("JOINTS = ", [json.dumps(body.joint_names[joint]) for joint in legged.joints]),
+        "joints": write_list("JOINTS = ", [write_string(body.joint_names[joint]) for joint in legged.joints]),
         "all_joints": _list_all_joints(legged),
         "stance": write_list("STANCE = np.array(", map(write_number, stance.positions), ")"),
         "stance_comment": f"{found}; CHANGE: a pose in which it stands well",
-        "height": f"{legged.height:.3f}",
-        "fallen_height": f"{numbers.fallen_height:.3f}",
-        "start_height": f"{numbers.start_height:.3f}",
-        "weight": f"{body.total_mass() * GRAVITY:.3g}",
-        "leg": f"{stance.leg_length:.2g}",
-        "stiffness": f"{numbers.stiffness:g}",
-        "damping": f"{numbers.damping:g}",
-        "armature": f"{numbers.armature:g}",
-        "gear_damping": f"{numbers.gear_damping:g}",
+        "height": write_number(legged.height, ".3f"),
+        "fallen_height": write_number(numbers.fallen_height, ".3f"),
+        "start_height": write_number(numbers.start_height, ".3f"),
+        "weight": write_number(body.total_mass() * GRAVITY, ".3g"),
+        "leg": write_number(stance.leg_length, ".2g"),
+        "stiffness": write_number(numbers.stiffness, "g"),
+        "damping": write_number(numbers.damping, "g"),
+        "armature": write_number(numbers.armature, "g"),
+        "gear_damping": write_number(numbers.gear_damping, "g"),
         "max_force": _write_forces(forces),
         "force_comment": force_comment,
-        "lowest": ", ".join(f"{value:g}" for value in numbers.lowest),
-        "highest": ", ".join(f"{value:g}" for value in numbers.highest),
-        "speed_scale": f"{numbers.speed_scale:g}",
-        "turn_scale": f"{numbers.turn_scale:g}",
-        "tolerance": f"{numbers.tolerance:g}",
-        "smaller": f"{numbers.tolerance / 2:g}",
-        "push": f"{numbers.push:g}",
-        "bounce_weight": f"{numbers.bounce:g}",
-        "sway_weight": f"{numbers.sway:g}",
+        "lowest": join_source(write_number(value, "g") for value in numbers.lowest),
+        "highest": join_source(write_number(value, "g") for value in numbers.highest),
+        "speed_scale": write_number(numbers.speed_scale, "g"),
+        "turn_scale": write_number(numbers.turn_scale, "g"),
+        "tolerance": write_number(numbers.tolerance, "g"),
+        "smaller": write_number(numbers.tolerance / 2, "g"),
+        "push": write_number(numbers.push, "g"),
+        "bounce_weight": write_number(numbers.bounce, "g"),
+        "sway_weight": write_number(numbers.sway, "g"),
         "start_noise": "0.05" if legged.is_biped else "0.1",
         **_describe_steps(legged),
-        "height_weight": f"{numbers.height:g}",
-        "feet": write_list("FEET = ", map(json.dumps, sorted(set(legged.feet)))),
+        "height_weight": write_number(numbers.height, "g"),
+        "feet": write_list("FEET = ", map(write_string, sorted(set(legged.feet)))),
         "steps_up": str(steps),
-        "steps_comment": "" if steps == _STEPS // 2 else "  # CHANGE: it fell later when this plugin was written",
+        "steps_comment": steps_comment,
     }
 
 
@@ -284,11 +282,11 @@ def _describe_steps(legged: _Legged) -> dict[str, str]:
         "mirror_vector": vector,
         "mirror_turn": turn,
         "mirror_command": command,
-        "period": f"{numbers.period:g}",
-        "swing": f"{numbers.swing:g}",
-        "least_swing": f"{numbers.swing / 7:.2g}",
-        "feet_in_order": write_list("FEET = ", map(json.dumps, legged.feet)),
-        "soles": f"[{', '.join(f'{height:.3f}' for height in gait.soles)}]",
-        "aside": write_list("ASIDE = ", [json.dumps(names[joint]) for joint in gait.aside]),
+        "period": write_number(numbers.period, "g"),
+        "swing": write_number(numbers.swing, "g"),
+        "least_swing": write_number(numbers.swing / 7, ".2g"),
+        "feet_in_order": write_list("FEET = ", map(write_string, legged.feet)),
+        "soles": Source(f"[{join_source(write_number(height, '.3f') for height in gait.soles)}]"),
+        "aside": write_list("ASIDE = ", [write_string(names[joint]) for joint in gait.aside]),
         "total_timesteps": "4_000_000" if legged.is_biped else "3_000_000",
     }

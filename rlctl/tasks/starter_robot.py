@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-import re
-import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.tasks.model_copy import copy_model, find_own_model
-from rlctl.tasks.source_text import LINE_WIDTH, write_list, write_number
+from rlctl.tasks.source_text import Source, join_source, write_comment, write_list, write_number, write_string
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.body import MujocoBody
@@ -23,7 +20,7 @@ _FASTEST = {"rotates": 3.0, "slides": 0.5}  # [rad/s], [m/s] of a first task; mo
 _GUESSED_FORCE = 10.0  # [N m or N], of a joint without a limit
 _LOWEST_TIP = 0.03  # [m], above the floor, at the start
 _TRIES = 300
-_FLOOR = '        sim.load("floor", "plane.urdf", fixed=True)\n'
+_FLOOR = Source('        sim.load("floor", "plane.urdf", fixed=True)\n')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +48,7 @@ def make_planar_arm() -> StarterRobot:
         "floor": _FLOOR,
         "fixed": ", fixed=True",
         "tip": "tip",
-        "joints": '["shoulder", "elbow"]',
+        "joints": Source('["shoulder", "elbow"]'),
         "all_joints": "# Of all joints of the model, in its order.",
         "start": "[0.0, 1.2]",
         "start_comment": ", elbow bent",
@@ -151,23 +148,17 @@ def _describe(body: MujocoBody, path: Path, tip: str, joints: list[str]) -> dict
     tolerance = max(0.002, float(f"{0.05 * reach:.1g}"))
     speeds, speed_comment = _limit_speeds(body)
     forces, force_comment = _limit_forces(body)
-    name = re.sub(r"[^\w .-]", "", body._sim._scene.parts["arm"].file.path.stem)
     chosen = body.find_joints(joints)
     is_bounded = all(math.isfinite(limit) for limit in [*body.joint_low[chosen], *body.joint_high[chosen]])
     return {
-        "robot": name,
-        "robot_phrase": name,
+        "robot": name_robot(path),
+        "robot_phrase": name_robot(path),
         "model": path.name,
         "floor": "" if _has_plane(body) else _FLOOR,
         "fixed": ", fixed=True" if path.suffix == ".urdf" else "",  # other formats contain it
-        "tip": json.dumps(tip)[1:-1],
-        "joints": write_list("JOINTS = ", [json.dumps(joint) for joint in joints]),
-        "all_joints": textwrap.fill(
-            f"Of all joints of the model: {', '.join(body.joint_names)}.",
-            LINE_WIDTH,
-            initial_indent="# ",
-            subsequent_indent="# ",
-        ),
+        "tip": tip,
+        "joints": write_list("JOINTS = ", map(write_string, joints)),
+        "all_joints": write_comment(f"Of all joints of the model: {', '.join(body.joint_names)}."),
         "start": write_list("START = np.array(", map(write_number, start)),
         "start_comment": "; CHANGE: a pose from which the arm gets everywhere",
         "max_speed": write_list("MAX_SPEED = ", map(write_number, speeds)),
@@ -175,21 +166,26 @@ def _describe(body: MujocoBody, path: Path, tip: str, joints: list[str]) -> dict
         "max_force": write_list("MAX_FORCE = ", map(write_number, forces)),
         "force_comment": force_comment,
         "start_noise": "0.1",
-        "tolerance": f"{tolerance:g}",
-        "smaller": f"{tolerance / 2:g}",
+        "tolerance": write_number(tolerance, "g"),
+        "smaller": write_number(tolerance / 2, "g"),
         "goal_range": "0.8",
         "episode_s": "3.0",
-        "distance_weight": f"-{1 / reach:.2g}",
+        "distance_weight": write_number(-1 / reach, ".2g"),
         "tip_to_goal": "self.goal - self.arm.link_position(TIP)",
         "axes": "",
         "clips_target": str(is_bounded),
         "pose": write_list("    task.arm.set_joints(np.array(", map(write_number, start), "))"),
         "pose_comment": "START, and where MuJoCo placed the tip when this plugin was written: has the model changed?",
-        "pose_tip": f"[{', '.join(f'{value:.4f}' for value in place)}]",
-        "reach": f"{math.ceil(100 * reach) / 100:g}",
+        "pose_tip": Source(f"[{join_source(write_number(value, '.4f') for value in place)}]"),
+        "reach": write_number(math.ceil(100 * reach) / 100, "g"),
         "total_timesteps": "200_000",
         "every_steps": "40_000",
     }
+
+
+def name_robot(model: Path) -> str:
+    """Return the name of a model's file as text; what is no text of it becomes question marks."""
+    return model.stem.encode(errors="replace").decode()
 
 
 def _has_plane(body: MujocoBody) -> bool:
