@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rlctl.tasks.legs import Array, Leg, Skeleton
+from rlctl.tasks.legs import Leg, Skeleton
+from rlctl.tasks.shapes import Array
 from rlctl.tasks.stance import VERTICAL, Stance, compare_turns
 
 _ALIKE = 1e-3  # [rad], of rounding

@@ -16,7 +16,7 @@ from rlctl.tasks.gait import Gait, describe_gait
 from rlctl.tasks.legs import Leg, Skeleton, find_legs
 from rlctl.tasks.model_copy import copy_model, find_own_model, remove_floor
 from rlctl.tasks.scaling import GRAVITY, ScaledRobot, scale
-from rlctl.tasks.source_text import Source, join_source, write_comment, write_list, write_number, write_string
+from rlctl.tasks.source_text import SourceText, join_source, write_comment, write_list, write_number, write_string
 from rlctl.tasks.stance import Stance, StanceSearch, measure_stance
 from rlctl.tasks.starter_robot import StarterRobot, name_robot
 
@@ -179,9 +179,9 @@ def _limit_forces(legged: _Legged) -> tuple[list[float], str]:
     return [limit or guess for limit in limits], "; CHANGE: a guess where the model has no limit"
 
 
-def _write_forces(forces: list[float]) -> Source:
+def _write_forces(forces: list[float]) -> SourceText:
     if len(set(forces)) == 1:
-        return Source(f"[{write_number(forces[0])}] * {len(forces)}")
+        return SourceText(f"[{write_number(forces[0])}] * {len(forces)}")
     return write_list("MAX_FORCE = ", map(write_number, forces))
 
 
@@ -220,7 +220,7 @@ def _summarize(legged: _Legged, notes: Sequence[str]) -> str:
     return ".\n".join([first, *notes, "Comments with CHANGE in task.py mark what to adapt"])
 
 
-def _list_all_joints(legged: _Legged) -> Source:
+def _list_all_joints(legged: _Legged) -> SourceText:
     names = legged.body.joint_names
     if len(legged.joints) == len(names):
         return write_comment("Of all joints of the model, in its order.")
@@ -232,9 +232,9 @@ def _describe(legged: _Legged) -> dict[str, str]:
     name = name_robot(legged.path)
     forces, force_comment = _limit_forces(legged)
     found = f", keyframe {legged.keyframe!r} of the file" if legged.keyframe else ", knees bent"
-    steps, steps_comment = max(1, legged.steps_up // 2), Source()
+    steps, steps_comment = max(1, legged.steps_up // 2), SourceText()
     if steps != _STEPS // 2:
-        steps_comment = Source("  # CHANGE: it fell later when this plugin was written")
+        steps_comment = SourceText("  # CHANGE: it fell later when this plugin was written")
     return {
         "robot": name,
         "robot_phrase": name,
@@ -286,7 +286,7 @@ def _describe_steps(legged: _Legged) -> dict[str, str]:
         "swing": write_number(numbers.swing, "g"),
         "least_swing": write_number(numbers.swing / 7, ".2g"),
         "feet_in_order": write_list("FEET = ", map(write_string, legged.feet)),
-        "soles": Source(f"[{join_source(write_number(height, '.3f') for height in gait.soles)}]"),
+        "soles": SourceText(f"[{join_source(write_number(height, '.3f') for height in gait.soles)}]"),
         "aside": write_list("ASIDE = ", [write_string(names[joint]) for joint in gait.aside]),
         "total_timesteps": "4_000_000" if legged.is_biped else "3_000_000",
     }

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlctl.errors import UsageError
+from rlctl.tasks.shapes import Array, list_points
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.body import MujocoBody
 
-Array = NDArray[np.float64]
 MIRRORS = (np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0]))
 """Left and right exchanged, for a robot that faces along x and along y."""
 ENDLESS = np.pi  # [rad], to each side, of a joint that can turn around
 _SAMPLES = 300
 _SAME_PLACE = 0.1  # of the distance of the farthest hip: how far from its mirror image the other hip may be
 _DEPTH = 0.6  # of the deepest reach: arms do not get as far down as legs
-_POINTS = 200  # of a foot's shapes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,50 +192,9 @@ def _keep_deepest(skeleton: Skeleton, legs: list[Leg], numbers: list[int]) -> li
 
 
 def _make_foot(skeleton: Skeleton, part: int, geoms: list[int]) -> Foot:
-    clouds = [_list_points(skeleton.model, geom) for geom in geoms]
+    clouds = [list_points(skeleton.model, geom) for geom in geoms]
     bodies = [skeleton._owner(geom) for geom, (points, _) in zip(geoms, clouds, strict=True) for _ in points]
     points, radii = (np.concatenate(column) for column in zip(*clouds, strict=True))
     names = [skeleton.body.parts.link_names[body] for body in bodies]
     # The link farthest down the tree, such as a foot that is fixed to a shank.
     return Foot(names[int(np.argmax(bodies))] if names else skeleton.body.base_name, bodies, points, radii)
-
-
-def _list_points(model: Any, geom: int) -> tuple[Array, Array]:
-    """Return points on a shape in the frame of its link, shape (n, 3), and a radius around each [m], shape (n,)."""
-    import mujoco
-
-    kinds, kind, size = mujoco.mjtGeom, int(model.geom_type[geom]), model.geom_size[geom]
-    radius = 0.0
-    if kind == kinds.mjGEOM_SPHERE:
-        points, radius = np.zeros((1, 3)), float(size[0])
-    elif kind == kinds.mjGEOM_CAPSULE:
-        points, radius = np.array([[0, 0, size[1]], [0, 0, -size[1]]]), float(size[0])
-    elif kind == kinds.mjGEOM_MESH:
-        points = _list_vertices(model, int(model.geom_dataid[geom]))
-    elif kind == kinds.mjGEOM_CYLINDER:
-        turns = np.linspace(0, 2 * np.pi, 32, endpoint=False)
-        circle = np.stack([size[0] * np.cos(turns), size[0] * np.sin(turns)], axis=1)
-        points = np.concatenate([np.column_stack([circle, np.full(32, end)]) for end in (-size[1], size[1])])
-    elif kind == kinds.mjGEOM_ELLIPSOID:
-        points = _list_directions() * size
-    else:
-        points = size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    frame = np.zeros(9)
-    mujoco.mju_quat2Mat(frame, model.geom_quat[geom])
-    return points @ frame.reshape(3, 3).T + model.geom_pos[geom], np.full(len(points), radius)
-
-
-def _list_vertices(model: Any, mesh: int) -> Array:
-    """Return vertices of a mesh: those that are farthest in some direction."""
-    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    vertices = np.asarray(model.mesh_vert[first : first + count], float)
-    farthest: Array = vertices[np.unique((vertices @ _list_directions().T).argmax(axis=0))]
-    return farthest
-
-
-def _list_directions() -> Array:
-    """Return directions that are spread evenly: a spiral around the sphere."""
-    heights = 1 - (2 * np.arange(_POINTS) + 1) / _POINTS
-    turns = np.arange(_POINTS) * np.pi * (3 - np.sqrt(5))
-    around = np.sqrt(1 - heights**2)
-    return np.stack([around * np.cos(turns), around * np.sin(turns), heights], axis=1)

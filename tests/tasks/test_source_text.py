@@ -28,7 +28,10 @@ HOSTILE = [
 ]
 NUMBERS = [0.5, -1e300, 1e-300, 0.0, math.inf, -math.inf, math.nan]
 TEMPLATES = [new.TEMPLATE, legged_robot.TEMPLATE]
-KINDS = [frozenset({"walk", "mirror", "mirror_walk"}), frozenset({"clock", "aside", "mirror", "mirror_clock"})]
+KINDS = [
+    frozenset({"walk", "mirror", "mirror_walk", "origin"}),
+    frozenset({"clock", "aside", "mirror", "mirror_clock", "point", "mujoco"}),
+]
 
 
 def list_templates() -> list:
@@ -46,7 +49,7 @@ def fill(file: Path, kept: frozenset[str], text: str) -> str:
     template = new._choose_lines(file.read_text(), kept)
     names = string.Template(template).get_identifiers()
     values = dict.fromkeys(names, text)
-    values |= {name: source_text.Source(code) for name, code in CODE.items() if name in names}
+    values |= {name: source_text.SourceText(code) for name, code in CODE.items() if name in names}
     return source_text.fill_template(template, values, file.with_suffix("").suffix)
 
 
@@ -63,7 +66,20 @@ CODE = {
     "steps_comment": "  # CHANGE",
 }
 CODE |= dict.fromkeys(
-    ("joints", "start", "max_speed", "max_force", "pose", "pose_tip", "stance", "feet", "feet_in_order", "aside"), "[0]"
+    (
+        "joints",
+        "tip_point",
+        "start",
+        "max_speed",
+        "max_force",
+        "pose",
+        "pose_tip",
+        "stance",
+        "feet",
+        "feet_in_order",
+        "aside",
+    ),
+    "[0]",
 )
 CODE |= dict.fromkeys(("soles", "other_side", "mirror_vector", "mirror_turn", "mirror_command", "tip_to_goal"), "[0]")
 CODE |= dict.fromkeys(("lowest", "highest"), "0.0, 1.0")
@@ -178,14 +194,14 @@ PLACES = [(x, y) for x in (0.15, -0.15) for y in (0.08, -0.08)]
 def test_a_plugin_of_a_file_with_hostile_names(tmp_path, monkeypatch, name, walk):
     monkeypatch.chdir(tmp_path)
     file = name_a_dog(tmp_path, name, free=walk)
-    plugin = new.create("my-dog", model=file.name, walk=walk, link=None if walk else f"head {name}")
-    module = {"__file__": str((plugin.folder / "my_dog" / "task.py").absolute()), "__name__": "task"}
-    code = (plugin.folder / "my_dog" / "task.py").read_text(encoding="utf-8")
+    plugin = new.create("odd-dog", model=file.name, walk=walk, link=None if walk else f"front_left_shank {name}")
+    module = {"__file__": str((plugin.folder / "odd_dog" / "task.py").absolute()), "__name__": "task"}
+    code = (plugin.folder / "odd_dog" / "task.py").read_text(encoding="utf-8")
     exec(compile(code, "task.py", "exec"), module)
     assert not Path("PWNED").exists()
     assert module["MODEL"].is_file()
-    assert (f"neck {name}" if not walk else f"front_left_hip {name}") in module["JOINTS"]
+    assert f"front_left_hip {name}" in module["JOINTS"]
     if not walk:
-        assert module["TIP"] == f"head {name}"
+        assert module["TIP"] == f"front_left_shank {name}"
     for python in plugin.folder.rglob("*.py"):
         compile(python.read_text(encoding="utf-8"), python, "exec")
