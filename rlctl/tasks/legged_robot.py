@@ -13,12 +13,12 @@ import numpy as np
 from rlctl.errors import TaskError, UsageError
 from rlctl.task.rotations import rotate_inverse
 from rlctl.tasks.gait import Gait, describe_gait
-from rlctl.tasks.legs import Leg, Skeleton, find_legs
+from rlctl.tasks.legs import Leg, Skeleton, find_legs, find_wheels
 from rlctl.tasks.model_copy import copy_model, find_own_model, remove_floor
 from rlctl.tasks.scaling import GRAVITY, ScaledRobot, scale
 from rlctl.tasks.source_text import SourceText, join_source, write_comment, write_list, write_number, write_string
 from rlctl.tasks.stance import Stance, StanceSearch, measure_stance
-from rlctl.tasks.starter_robot import StarterRobot, name_robot
+from rlctl.tasks.starter_robot import StarterRobot, list_faults, name_robot
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.body import MujocoBody
@@ -29,6 +29,9 @@ _CONTROL_DT = 0.02  # [s]
 _STEPS = 100  # that it must stand with zero actions
 _TINY = 1e-3  # [rad], of rounding
 _ENDLESS_FORCE = 20.0  # of weight x leg length
+_WEAK = 0.15  # of weight x leg length
+_DENSEST, _LIGHTEST = 22_600.0, 1.2  # [kg/m^3], of osmium and of air
+_MOST_NAMES = 4
 _LEVEL = 0.03  # of the leg length: how much the feet's heights may differ
 _KEYED = (0.55, 0.97)  # of the longest leg: legs of a keyframe that is a stance
 _UPRIGHT = -0.9  # component z of the direction of gravity, in the trunk's frame
@@ -73,6 +76,11 @@ def read_legged_robot(model: str) -> StarterRobot:
     if body.fixed:
         raise UsageError(f"--model {model}: its base is fixed; add <freejoint/> to the body {body.base_name!r}")
     skeleton = Skeleton(body)
+    if wheels := find_wheels(skeleton):
+        raise UsageError(
+            f"--model {model}: it stands on wheels ({', '.join(wheels)}), and --walk is for legs; "
+            "write a task for them as docs/task.md describes, beginning with: rlctl tasks new NAME"
+        )
     legs, mirror = find_legs(skeleton)
     if slides := [body.joint_names[joint] for leg in legs for joint in leg.joints if _slides(body, joint)]:
         raise UsageError(f"--model {model}: joint {slides[0]!r} slides; --walk needs legs whose joints rotate")
@@ -193,11 +201,19 @@ def _list_notes(legged: _Legged) -> list[str]:
         notes.append(f"{', '.join(others)} {'keep' if len(others) > 1 else 'keeps'} STANCE")
     if legged.gait.faces_y:
         notes.append("Its legs are in pairs along x, so it may face along y; the commanded lin_vel_x is along x")
+    if legged.gait.asymmetry and not legged.gait.other_side:
+        notes.append(
+            f"Its sides are no mirror images: with mirrored torques they accelerate up to {legged.gait.asymmetry:.0%} "
+            "differently, because of masses or inertias. So the plugin has no mirror"
+        )
     if stance.unevenness > _LEVEL * stance.leg_length:
         notes.append(
             f"Found no stance with level feet: their heights differ by {stance.unevenness:.2g} m; write your own STANCE"
         )
     limits = legged.body.joint_max_force
+    notes += list_faults(legged.body)
+    notes += _judge_torques(legged)
+    notes += _judge_densities(legged.body)
     if not all(limits) or min(limits) > _ENDLESS_FORCE * legged.scaled.stiffness:
         notes.append("The file has no useful torque limits for all joints: write those of your motors into MAX_FORCE")
     # Two legs that are springs hold no robot for long.
@@ -208,6 +224,39 @@ def _list_notes(legged: _Legged) -> list[str]:
         )
     if legged.is_biped:
         notes.append("It steps in time with a clock, which PERIOD and SWING describe")
+    return notes
+
+
+def _judge_torques(legged: _Legged) -> list[str]:
+    """Return a sentence if the strongest joint of the legs cannot hold the robot up."""
+    largest = max(legged.body.joint_max_force[joint] for joint in legged.joints)
+    needed = legged.body.total_mass() * GRAVITY * legged.stance.leg_length
+    if not 0 < largest < _WEAK * needed:
+        return []
+    return [
+        f"The largest torque limit of its legs, {largest:.3g} N m, is {100 * largest / needed:.2g} % of weight x leg "
+        f"length, {needed:.3g} N m: walking robots have more than {100 * _WEAK:g} %. Correct MAX_FORCE"
+    ]
+
+
+def _judge_densities(body: MujocoBody) -> list[str]:
+    """Return a sentence for links that are denser than any metal, and for a robot that is lighter than air."""
+    model, dense, volume = body._sim.model, [], 0.0
+    for number, link in body.parts.link_names.items():
+        geoms = [geom for geom in body.parts.geoms if int(model.geom_bodyid[geom]) == number]
+        box = float(sum(8 * np.prod(model.geom_aabb[geom, 3:]) for geom in geoms))  # [m^3], at least that of the link
+        mass = float(model.body_mass[number])
+        volume += box
+        if geoms and box > 0 and mass / box > _DENSEST:
+            dense.append(f"{link} {mass:.3g} kg in {1e6 * box:.3g} cm^3")
+    notes = []
+    if dense:
+        more = f" and {len(dense) - _MOST_NAMES} more" if len(dense) > _MOST_NAMES else ""
+        notes.append(f"Links denser than any metal: {', '.join(dense[:_MOST_NAMES])}{more}. Correct masses or lengths")
+    if volume > 0 and body.total_mass() / volume < _LIGHTEST:
+        notes.append(
+            f"It weighs {body.total_mass():.3g} kg in {volume:.3g} m^3, less than air. Correct masses or lengths"
+        )
     return notes
 
 

@@ -19,6 +19,8 @@ MIRRORS = (np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0]))
 ENDLESS = np.pi  # [rad], to each side, of a joint that can turn around
 _SAMPLES = 300
 _SAME_PLACE = 0.1  # of the distance of the farthest hip: how far from its mirror image the other hip may be
+_LEVEL_AXIS = 0.5  # component z of the axis of a wheel, at most
+_ROUND = 0.8  # of a wheel's radius: its smallest
 _DEPTH = 0.6  # of the deepest reach: arms do not get as far down as legs
 
 
@@ -74,6 +76,10 @@ class Skeleton:
         """Set all joints."""
         self.data.qpos[self._places] = positions
         self._mujoco.mj_kinematics(self.model, self.data)
+
+    def forward(self) -> None:
+        """Compute accelerations."""
+        self._mujoco.mj_forward(self.model, self.data)
 
     def anchors(self, joints: Sequence[int]) -> Array:
         """Return where joints are [m], shape (joints, 3)."""
@@ -198,3 +204,34 @@ def _make_foot(skeleton: Skeleton, part: int, geoms: list[int]) -> Foot:
     names = [skeleton.body.parts.link_names[body] for body in bodies]
     # The link farthest down the tree, such as a foot that is fixed to a shank.
     return Foot(names[int(np.argmax(bodies))] if names else skeleton.body.base_name, bodies, points, radii)
+
+
+def find_wheels(skeleton: Skeleton) -> list[str]:
+    """Return the links that are wheels: round about the only joint that moves them, which is level and endless."""
+    skeleton.place(skeleton.rest)
+    wheels = []
+    for joints, foot in _find_chains(skeleton):
+        if len(joints) == 1 and _is_endless(skeleton, joints[0]) and _is_round(skeleton, joints[0], foot):
+            wheels.append(foot.link)
+    return wheels
+
+
+def _is_endless(skeleton: Skeleton, joint: int) -> bool:
+    body = skeleton.body
+    return bool(body.joint_high[joint] - body.joint_low[joint] >= 2 * ENDLESS)
+
+
+def _is_round(skeleton: Skeleton, joint: int, foot: Foot) -> bool:
+    """Return whether a foot's shapes are round about a joint that is level: as far from it in all directions."""
+    data = skeleton.data
+    anchor, axis = skeleton.anchors([joint])[0], skeleton.axes([joint])[0]
+    if abs(axis[2]) > _LEVEL_AXIS:
+        return False
+    frames = data.xmat[foot.bodies].reshape(-1, 3, 3)
+    places = data.xpos[foot.bodies] + np.einsum("nij,nj->ni", frames, foot.points) - anchor
+    forwards = np.cross(axis, (0.0, 0.0, 1.0))
+    upwards = np.cross(forwards, axis)
+    turns = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
+    directions = np.cos(turns)[:, None] * forwards + np.sin(turns)[:, None] * upwards
+    farthest = (places @ directions.T + foot.radii[:, None]).max(axis=0)
+    return bool(farthest.min() > _ROUND * farthest.max())
