@@ -2,7 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -31,8 +31,27 @@ def find_model_faults(body: Body) -> list[str]:
     urdf = read_urdf(body.file, fixed=body.fixed, inertia_from_file=body.inertia_from_file)
     if urdf.root is None:
         return []
-    faults = [*_find_faults(body, urdf, urdf.root), *_find_joint_faults(urdf.root)]
-    return [f"{body.file.name}, {place}: {fault}" for place, fault in faults]
+    links = _group(_find_faults(body, urdf, urdf.root))
+    joints = _group(_find_joint_faults(urdf.root))
+    lines = [f"{_list_names('link', names)}: {fault}" for fault, names in links.items()]
+    lines += [f"{_list_names('joint', names)}: {fault}" for fault, names in joints.items()]
+    return [f"{body.file.name}, {line}" for line in lines]
+
+
+def _group(faults: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Return the names by their fault: links with one copied inertia have the same."""
+    names: dict[str, list[str]] = {}
+    for name, fault in faults:
+        names.setdefault(fault, []).append(name)
+    return names
+
+
+def _list_names(noun: str, names: Sequence[str]) -> str:
+    shown = ", ".join(map(repr, names[:_MOST_NAMES]))
+    if len(names) == 1:
+        return f"{noun} {shown}"
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return f"{noun}s {shown}{more}"
 
 
 def find_frames(body: Body) -> str:
@@ -42,39 +61,42 @@ def find_frames(body: Body) -> str:
     names = read_urdf(body.file, fixed=body.fixed).frames
     if not names:
         return ""
-    shown = ", ".join(map(repr, names[:_MOST_NAMES])) + f" and {len(names) - _MOST_NAMES} more" * (
-        len(names) > _MOST_NAMES
-    )
+    shown = _list_names("", names).removeprefix("s").lstrip()
     return f"{body.file.name}: links without <inertial> weigh {FRAME_MASS * 1e6:g} mg: {shown}"
 
 
 def _find_faults(body: Body, urdf: Urdf, root: ElementTree.Element) -> Iterator[tuple[str, str]]:
+    for name, mesh in urdf.undrawn.items():
+        yield name, f"its visual mesh {mesh!r} is missing. Its other shapes are drawn."
     total = sum(max(0.0, read_mass(link) or 0.0) for link in root.findall("link"))
     for link in root.findall("link"):
         name, mass = link.get("name", ""), read_mass(link) or 0.0
-        place = f"link {name!r}"
         if fault := _find_text(link, body.inertia_from_file):
-            yield place, fault
+            yield name, fault
         elif name == body.base_name and body.fixed:
             continue  # held by the world: its mass is not used
         elif mass < 0:
-            yield place, f"a mass of {mass:g} kg."
+            yield name, f"a mass of {mass:g} kg."
         elif name in urdf.guessed:
-            yield place, f"no <inertial>, so it weighs {GUESSED_MASS:g} kg. Write its mass and inertia."
+            yield name, f"no <inertial>, so it weighs {GUESSED_MASS:g} kg. Write its mass and inertia."
         # Frames of a gram with a rounded-up inertia are common and harmless: they keep the solver stable.
         elif mass > _LIGHT * total and body.inertia_from_file and (fault := _judge_inertia(body, urdf, link, mass)):
-            yield place, fault
+            yield name, fault
 
 
 def _find_joint_faults(root: ElementTree.Element) -> Iterator[tuple[str, str]]:
     for joint in root.findall("joint"):
         limit, fault = joint.find("limit"), _find_text(joint)
-        if not fault and limit is not None and joint.get("type") == "revolute":
+        if not fault and limit is not None and joint.get("type") in ("revolute", "prismatic"):
             lower, upper = (float(limit.get(name, 0)) for name in ("lower", "upper"))
-            if _DEGREES[0] <= max(-lower, upper) <= _DEGREES[1]:
+            rotates = joint.get("type") == "revolute"
+            unit = "rad" if rotates else "m"
+            if lower > upper:
+                fault = f"a lower limit of {lower:g} {unit}, above the upper one of {upper:g}: so it has no limits."
+            elif rotates and _DEGREES[0] <= max(-lower, upper) <= _DEGREES[1]:
                 fault = f"limits of {lower:g} and {upper:g} rad. Are these degrees?"
         if fault:
-            yield f"joint {joint.get('name', '')!r}", fault
+            yield joint.get("name", ""), fault
 
 
 def _find_text(owner: ElementTree.Element, inertia_used: bool = True) -> str:

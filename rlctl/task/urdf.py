@@ -6,7 +6,10 @@ these changes.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import math
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +31,8 @@ _SMALLEST_MOMENT = FRAME_MASS * _SMALLEST_RADIUS**2  # [kg m^2]; MuJoCo refuses 
 _MOST_NAMES = 4
 _ROUNDING = 1e-12
 _MARGIN = 1e-9
+_LATIN = "latin-1"
+_DECLARED = re.compile(rb"""\s*(?:\xef\xbb\xbf)?<\?xml[^>]*\bencoding\s*=\s*["']([A-Za-z][\w.-]*)["']""")
 _PRODUCTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
@@ -43,7 +48,9 @@ class Urdf:
     changed: bool = False
     """Whether an engine must read `root` instead of the file."""
     missing: list[str] = dataclasses.field(default_factory=list)
-    """Meshes that were not found, each with its link."""
+    """Meshes of collision shapes that were not found, each with its link."""
+    undrawn: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Meshes of visual shapes that were not found, by link; its collision shapes are drawn if it has no other."""
     frames: list[str] = dataclasses.field(default_factory=list)
     """Links without `<inertial>` that weigh `FRAME_MASS`."""
     guessed: list[str] = dataclasses.field(default_factory=list)
@@ -60,7 +67,7 @@ class Urdf:
         return ElementTree.tostring(self.root, encoding="unicode")
 
     def check_meshes(self) -> None:
-        """Raise `TaskError` if a mesh is missing."""
+        """Raise `TaskError` if a mesh of a collision shape is missing."""
         if self.missing:
             raise TaskError(
                 f"{self.path}, {self.missing[0]} not found: neither below a folder above the file, nor in "
@@ -71,23 +78,58 @@ class Urdf:
 def read_urdf(path: Path, *, fixed: bool = False, inertia_from_file: bool = True) -> Urdf:
     """Read a URDF file; `fixed` means that its base is held by the world.
 
-    Raises `TaskError` for two joints of one name, and for several bases, which crash PyBullet.
+    Raises `TaskError` for links and joints without a name, two joints of one name, several bases, which crash PyBullet,
+    and masses that are not finite.
     """
     try:
-        root = ElementTree.fromstring(path.read_bytes().strip())
+        root = _parse(path.read_bytes().strip())
     except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two: an unknown encoding
         return Urdf(path, None, str(error))
     urdf = Urdf(path, root)
     _check_names(path, root)
+    _check_masses(path, root)
     _find_meshes(urdf, root)
     _add_masses(urdf, root, fixed)
     if inertia_from_file:
         _raise_moments(urdf, root)
-    urdf.changed = urdf.changed or bool(urdf.frames or urdf.guessed or urdf.raised)
+    urdf.changed = urdf.changed or bool(urdf.frames or urdf.guessed or urdf.raised or urdf.undrawn)
+    urdf.changed = urdf.changed or find_encoding(path.read_bytes()) == _LATIN
     return urdf
 
 
+def find_encoding(data: bytes) -> str:
+    """Return the encoding of a URDF: what it declares, or UTF-8, or Latin-1 if it is not that.
+
+    Files that were saved as Latin-1 often declare nothing, or UTF-8.
+    """
+    declared = _DECLARED.match(data)
+    name = declared[1].decode("ascii") if declared else "utf-8"
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
+    if name.lower() not in ("utf-8", "utf8", "us-ascii"):
+        return name
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return _LATIN
+    return "utf-8"
+
+
+def _parse(data: bytes) -> Element:
+    if find_encoding(data) == _LATIN:
+        return ElementTree.fromstring(data.decode(_LATIN))
+    return ElementTree.fromstring(data)
+
+
 def _check_names(path: Path, root: Element) -> None:
+    for joint in root.findall("joint"):
+        child = joint.find("child")
+        if not joint.get("name"):
+            whose = f" to link {child.get('link')!r}" if child is not None else ""
+            raise TaskError(f"{path}: the joint{whose} has no name; give it one")
+    for number, link in enumerate(root.findall("link"), 1):
+        if not link.get("name"):
+            raise TaskError(f"{path}: link {number} has no name; give it one")
     names = [joint.get("name") for joint in root.findall("joint")]
     if (name := next((name for name in names if names.count(name) > 1), None)) is not None:
         raise TaskError(f"{path}: {names.count(name)} joints are called {name!r}; give each its own name")
@@ -98,18 +140,42 @@ def _check_names(path: Path, root: Element) -> None:
         raise TaskError(f"{path}: {len(bases)} links are no joint's child ({shown}); a URDF has one base")
 
 
+def _check_masses(path: Path, root: Element) -> None:
+    for link in root.findall("link"):
+        mass = read_mass(link)
+        if mass is not None and not math.isfinite(mass):
+            raise TaskError(f"{path}: link {link.get('name')!r} has a mass of {mass:g} kg; write its mass")
+
+
 def _find_meshes(urdf: Urdf, root: Element) -> None:
     for link in root.findall("link"):
-        for mesh in link.iterfind(".//mesh[@filename]"):
-            name = mesh.get("filename", "")
-            found = resolve_mesh(name, urdf.path)
-            urdf.changed = urdf.changed or has_scheme(name)
-            if found is None:
-                urdf.missing.append(f"link {link.get('name', '')!r}: mesh {name!r}")
-            else:
-                mesh.set("filename", str(found))
+        for shape in [*link.findall("collision"), *link.findall("visual")]:
+            for mesh in shape.iterfind(".//mesh[@filename]"):
+                _find_mesh(urdf, link, shape, mesh)
+        if link.get("name") in urdf.undrawn and link.find("visual") is None:
+            _draw_collision_shapes(link)
     for texture in root.iterfind(".//texture[@filename]"):
         texture.set("filename", str(resolve_mesh(texture.get("filename", ""), urdf.path) or texture.get("filename")))
+
+
+def _find_mesh(urdf: Urdf, link: Element, shape: Element, mesh: Element) -> None:
+    name, link_name = mesh.get("filename", ""), link.get("name", "")
+    found = resolve_mesh(name, urdf.path)
+    urdf.changed = urdf.changed or has_scheme(name)
+    if found is not None:
+        mesh.set("filename", str(found))
+    elif shape.tag == "visual":
+        urdf.undrawn[link_name] = name
+        link.remove(shape)
+    else:
+        urdf.missing.append(f"link {link_name!r}: mesh {name!r}")
+
+
+def _draw_collision_shapes(link: Element) -> None:
+    for shape in link.findall("collision"):
+        drawn = copy.deepcopy(shape)
+        drawn.tag = "visual"
+        link.append(drawn)
 
 
 def _add_masses(urdf: Urdf, root: Element, fixed: bool) -> None:

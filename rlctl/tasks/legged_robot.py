@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
-import re
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,12 +13,12 @@ import numpy as np
 from rlctl.errors import TaskError, UsageError
 from rlctl.task.rotations import rotate_inverse
 from rlctl.tasks.gait import Gait, describe_gait
-from rlctl.tasks.legs import Leg, Skeleton, find_legs
+from rlctl.tasks.legs import Leg, Skeleton, find_legs, find_wheels
 from rlctl.tasks.model_copy import copy_model, find_own_model, remove_floor
 from rlctl.tasks.scaling import GRAVITY, ScaledRobot, scale
-from rlctl.tasks.source_text import LINE_WIDTH, write_list, write_number
+from rlctl.tasks.source_text import SourceText, join_source, write_comment, write_list, write_number, write_string
 from rlctl.tasks.stance import Stance, StanceSearch, measure_stance
-from rlctl.tasks.starter_robot import StarterRobot
+from rlctl.tasks.starter_robot import StarterRobot, list_faults, name_robot
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.body import MujocoBody
@@ -32,6 +29,9 @@ _CONTROL_DT = 0.02  # [s]
 _STEPS = 100  # that it must stand with zero actions
 _TINY = 1e-3  # [rad], of rounding
 _ENDLESS_FORCE = 20.0  # of weight x leg length
+_WEAK = 0.15  # of weight x leg length
+_DENSEST, _LIGHTEST = 22_600.0, 1.2  # [kg/m^3], of osmium and of air
+_MOST_NAMES = 4
 _LEVEL = 0.03  # of the leg length: how much the feet's heights may differ
 _KEYED = (0.55, 0.97)  # of the longest leg: legs of a keyframe that is a stance
 _UPRIGHT = -0.9  # component z of the direction of gravity, in the trunk's frame
@@ -76,6 +76,11 @@ def read_legged_robot(model: str) -> StarterRobot:
     if body.fixed:
         raise UsageError(f"--model {model}: its base is fixed; add <freejoint/> to the body {body.base_name!r}")
     skeleton = Skeleton(body)
+    if wheels := find_wheels(skeleton):
+        raise UsageError(
+            f"--model {model}: it stands on wheels ({', '.join(wheels)}), and --walk is for legs; "
+            "write a task for them as docs/task.md describes, beginning with: rlctl tasks new NAME"
+        )
     legs, mirror = find_legs(skeleton)
     if slides := [body.joint_names[joint] for leg in legs for joint in leg.joints if _slides(body, joint)]:
         raise UsageError(f"--model {model}: joint {slides[0]!r} slides; --walk needs legs whose joints rotate")
@@ -182,9 +187,9 @@ def _limit_forces(legged: _Legged) -> tuple[list[float], str]:
     return [limit or guess for limit in limits], "; CHANGE: a guess where the model has no limit"
 
 
-def _write_forces(forces: list[float]) -> str:
+def _write_forces(forces: list[float]) -> SourceText:
     if len(set(forces)) == 1:
-        return f"[{write_number(forces[0])}] * {len(forces)}"
+        return SourceText(f"[{write_number(forces[0])}] * {len(forces)}")
     return write_list("MAX_FORCE = ", map(write_number, forces))
 
 
@@ -196,11 +201,19 @@ def _list_notes(legged: _Legged) -> list[str]:
         notes.append(f"{', '.join(others)} {'keep' if len(others) > 1 else 'keeps'} STANCE")
     if legged.gait.faces_y:
         notes.append("Its legs are in pairs along x, so it may face along y; the commanded lin_vel_x is along x")
+    if legged.gait.asymmetry and not legged.gait.other_side:
+        notes.append(
+            f"Its sides are no mirror images: with mirrored torques they accelerate up to {legged.gait.asymmetry:.0%} "
+            "differently, because of masses or inertias. So the plugin has no mirror"
+        )
     if stance.unevenness > _LEVEL * stance.leg_length:
         notes.append(
             f"Found no stance with level feet: their heights differ by {stance.unevenness:.2g} m; write your own STANCE"
         )
     limits = legged.body.joint_max_force
+    notes += list_faults(legged.body)
+    notes += _judge_torques(legged)
+    notes += _judge_densities(legged.body)
     if not all(limits) or min(limits) > _ENDLESS_FORCE * legged.scaled.stiffness:
         notes.append("The file has no useful torque limits for all joints: write those of your motors into MAX_FORCE")
     # Two legs that are springs hold no robot for long.
@@ -214,6 +227,39 @@ def _list_notes(legged: _Legged) -> list[str]:
     return notes
 
 
+def _judge_torques(legged: _Legged) -> list[str]:
+    """Return a sentence if the strongest joint of the legs cannot hold the robot up."""
+    largest = max(legged.body.joint_max_force[joint] for joint in legged.joints)
+    needed = legged.body.total_mass() * GRAVITY * legged.stance.leg_length
+    if not 0 < largest < _WEAK * needed:
+        return []
+    return [
+        f"The largest torque limit of its legs, {largest:.3g} N m, is {100 * largest / needed:.2g} % of weight x leg "
+        f"length, {needed:.3g} N m: walking robots have more than {100 * _WEAK:g} %. Correct MAX_FORCE"
+    ]
+
+
+def _judge_densities(body: MujocoBody) -> list[str]:
+    """Return a sentence for links that are denser than any metal, and for a robot that is lighter than air."""
+    model, dense, volume = body._sim.model, [], 0.0
+    for number, link in body.parts.link_names.items():
+        geoms = [geom for geom in body.parts.geoms if int(model.geom_bodyid[geom]) == number]
+        box = float(sum(8 * np.prod(model.geom_aabb[geom, 3:]) for geom in geoms))  # [m^3], at least that of the link
+        mass = float(model.body_mass[number])
+        volume += box
+        if geoms and box > 0 and mass / box > _DENSEST:
+            dense.append(f"{link} {mass:.3g} kg in {1e6 * box:.3g} cm^3")
+    notes = []
+    if dense:
+        more = f" and {len(dense) - _MOST_NAMES} more" if len(dense) > _MOST_NAMES else ""
+        notes.append(f"Links denser than any metal: {', '.join(dense[:_MOST_NAMES])}{more}. Correct masses or lengths")
+    if volume > 0 and body.total_mass() / volume < _LIGHTEST:
+        notes.append(
+            f"It weighs {body.total_mass():.3g} kg in {volume:.3g} m^3, less than air. Correct masses or lengths"
+        )
+    return notes
+
+
 def _summarize(legged: _Legged, notes: Sequence[str]) -> str:
     start = f"keyframe {legged.keyframe!r}" if legged.keyframe else "a search"
     first = (
@@ -223,54 +269,55 @@ def _summarize(legged: _Legged, notes: Sequence[str]) -> str:
     return ".\n".join([first, *notes, "Comments with CHANGE in task.py mark what to adapt"])
 
 
-def _list_all_joints(legged: _Legged) -> str:
+def _list_all_joints(legged: _Legged) -> SourceText:
     names = legged.body.joint_names
     if len(legged.joints) == len(names):
-        return "# Of all joints of the model, in its order."
-    text = f"Of all joints of the model: {', '.join(names)}."
-    return textwrap.fill(text, LINE_WIDTH, initial_indent="# ", subsequent_indent="# ")
+        return write_comment("Of all joints of the model, in its order.")
+    return write_comment(f"Of all joints of the model: {', '.join(names)}.")
 
 
 def _describe(legged: _Legged) -> dict[str, str]:
     body, stance, numbers = legged.body, legged.stance, legged.scaled
-    name = re.sub(r"[^\w .-]", "", body._sim._scene.parts["robot"].file.path.stem)
+    name = name_robot(legged.path)
     forces, force_comment = _limit_forces(legged)
     found = f", keyframe {legged.keyframe!r} of the file" if legged.keyframe else ", knees bent"
-    steps = max(1, legged.steps_up // 2)
+    steps, steps_comment = max(1, legged.steps_up // 2), SourceText()
+    if steps != _STEPS // 2:
+        steps_comment = SourceText("  # CHANGE: it fell later when this plugin was written")
     return {
         "robot": name,
         "robot_phrase": name,
         "model": legged.path.name,
-        "joints": write_list("JOINTS = ", [json.dumps(body.joint_names[joint]) for joint in legged.joints]),
+        "joints": write_list("JOINTS = ", [write_string(body.joint_names[joint]) for joint in legged.joints]),
         "all_joints": _list_all_joints(legged),
         "stance": write_list("STANCE = np.array(", map(write_number, stance.positions), ")"),
         "stance_comment": f"{found}; CHANGE: a pose in which it stands well",
-        "height": f"{legged.height:.3f}",
-        "fallen_height": f"{numbers.fallen_height:.3f}",
-        "start_height": f"{numbers.start_height:.3f}",
-        "weight": f"{body.total_mass() * GRAVITY:.3g}",
-        "leg": f"{stance.leg_length:.2g}",
-        "stiffness": f"{numbers.stiffness:g}",
-        "damping": f"{numbers.damping:g}",
-        "armature": f"{numbers.armature:g}",
-        "gear_damping": f"{numbers.gear_damping:g}",
+        "height": write_number(legged.height, ".3f"),
+        "fallen_height": write_number(numbers.fallen_height, ".3f"),
+        "start_height": write_number(numbers.start_height, ".3f"),
+        "weight": write_number(body.total_mass() * GRAVITY, ".3g"),
+        "leg": write_number(stance.leg_length, ".2g"),
+        "stiffness": write_number(numbers.stiffness, "g"),
+        "damping": write_number(numbers.damping, "g"),
+        "armature": write_number(numbers.armature, "g"),
+        "gear_damping": write_number(numbers.gear_damping, "g"),
         "max_force": _write_forces(forces),
         "force_comment": force_comment,
-        "lowest": ", ".join(f"{value:g}" for value in numbers.lowest),
-        "highest": ", ".join(f"{value:g}" for value in numbers.highest),
-        "speed_scale": f"{numbers.speed_scale:g}",
-        "turn_scale": f"{numbers.turn_scale:g}",
-        "tolerance": f"{numbers.tolerance:g}",
-        "smaller": f"{numbers.tolerance / 2:g}",
-        "push": f"{numbers.push:g}",
-        "bounce_weight": f"{numbers.bounce:g}",
-        "sway_weight": f"{numbers.sway:g}",
+        "lowest": join_source(write_number(value, "g") for value in numbers.lowest),
+        "highest": join_source(write_number(value, "g") for value in numbers.highest),
+        "speed_scale": write_number(numbers.speed_scale, "g"),
+        "turn_scale": write_number(numbers.turn_scale, "g"),
+        "tolerance": write_number(numbers.tolerance, "g"),
+        "smaller": write_number(numbers.tolerance / 2, "g"),
+        "push": write_number(numbers.push, "g"),
+        "bounce_weight": write_number(numbers.bounce, "g"),
+        "sway_weight": write_number(numbers.sway, "g"),
         "start_noise": "0.05" if legged.is_biped else "0.1",
         **_describe_steps(legged),
-        "height_weight": f"{numbers.height:g}",
-        "feet": write_list("FEET = ", map(json.dumps, sorted(set(legged.feet)))),
+        "height_weight": write_number(numbers.height, "g"),
+        "feet": write_list("FEET = ", map(write_string, sorted(set(legged.feet)))),
         "steps_up": str(steps),
-        "steps_comment": "" if steps == _STEPS // 2 else "  # CHANGE: it fell later when this plugin was written",
+        "steps_comment": steps_comment,
     }
 
 
@@ -284,11 +331,11 @@ def _describe_steps(legged: _Legged) -> dict[str, str]:
         "mirror_vector": vector,
         "mirror_turn": turn,
         "mirror_command": command,
-        "period": f"{numbers.period:g}",
-        "swing": f"{numbers.swing:g}",
-        "least_swing": f"{numbers.swing / 7:.2g}",
-        "feet_in_order": write_list("FEET = ", map(json.dumps, legged.feet)),
-        "soles": f"[{', '.join(f'{height:.3f}' for height in gait.soles)}]",
-        "aside": write_list("ASIDE = ", [json.dumps(names[joint]) for joint in gait.aside]),
+        "period": write_number(numbers.period, "g"),
+        "swing": write_number(numbers.swing, "g"),
+        "least_swing": write_number(numbers.swing / 7, ".2g"),
+        "feet_in_order": write_list("FEET = ", map(write_string, legged.feet)),
+        "soles": SourceText(f"[{join_source(write_number(height, '.3f') for height in gait.soles)}]"),
+        "aside": write_list("ASIDE = ", [write_string(names[joint]) for joint in gait.aside]),
         "total_timesteps": "4_000_000" if legged.is_biped else "3_000_000",
     }

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlctl.errors import UsageError
+from rlctl.tasks.shapes import Array, list_points
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.body import MujocoBody
 
-Array = NDArray[np.float64]
 MIRRORS = (np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0]))
 """Left and right exchanged, for a robot that faces along x and along y."""
 ENDLESS = np.pi  # [rad], to each side, of a joint that can turn around
 _SAMPLES = 300
 _SAME_PLACE = 0.1  # of the distance of the farthest hip: how far from its mirror image the other hip may be
+_LEVEL_AXIS = 0.5  # component z of the axis of a wheel, at most
+_ROUND = 0.8  # of a wheel's radius: its smallest
 _DEPTH = 0.6  # of the deepest reach: arms do not get as far down as legs
-_POINTS = 200  # of a foot's shapes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +76,10 @@ class Skeleton:
         """Set all joints."""
         self.data.qpos[self._places] = positions
         self._mujoco.mj_kinematics(self.model, self.data)
+
+    def forward(self) -> None:
+        """Compute accelerations."""
+        self._mujoco.mj_forward(self.model, self.data)
 
     def anchors(self, joints: Sequence[int]) -> Array:
         """Return where joints are [m], shape (joints, 3)."""
@@ -194,7 +198,7 @@ def _keep_deepest(skeleton: Skeleton, legs: list[Leg], numbers: list[int]) -> li
 
 
 def _make_foot(skeleton: Skeleton, part: int, geoms: list[int]) -> Foot:
-    clouds = [_list_points(skeleton.model, geom) for geom in geoms]
+    clouds = [list_points(skeleton.model, geom) for geom in geoms]
     bodies = [skeleton._owner(geom) for geom, (points, _) in zip(geoms, clouds, strict=True) for _ in points]
     points, radii = (np.concatenate(column) for column in zip(*clouds, strict=True))
     names = [skeleton.body.parts.link_names[body] for body in bodies]
@@ -202,42 +206,32 @@ def _make_foot(skeleton: Skeleton, part: int, geoms: list[int]) -> Foot:
     return Foot(names[int(np.argmax(bodies))] if names else skeleton.body.base_name, bodies, points, radii)
 
 
-def _list_points(model: Any, geom: int) -> tuple[Array, Array]:
-    """Return points on a shape in the frame of its link, shape (n, 3), and a radius around each [m], shape (n,)."""
-    import mujoco
-
-    kinds, kind, size = mujoco.mjtGeom, int(model.geom_type[geom]), model.geom_size[geom]
-    radius = 0.0
-    if kind == kinds.mjGEOM_SPHERE:
-        points, radius = np.zeros((1, 3)), float(size[0])
-    elif kind == kinds.mjGEOM_CAPSULE:
-        points, radius = np.array([[0, 0, size[1]], [0, 0, -size[1]]]), float(size[0])
-    elif kind == kinds.mjGEOM_MESH:
-        points = _list_vertices(model, int(model.geom_dataid[geom]))
-    elif kind == kinds.mjGEOM_CYLINDER:
-        turns = np.linspace(0, 2 * np.pi, 32, endpoint=False)
-        circle = np.stack([size[0] * np.cos(turns), size[0] * np.sin(turns)], axis=1)
-        points = np.concatenate([np.column_stack([circle, np.full(32, end)]) for end in (-size[1], size[1])])
-    elif kind == kinds.mjGEOM_ELLIPSOID:
-        points = _list_directions() * size
-    else:
-        points = size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    frame = np.zeros(9)
-    mujoco.mju_quat2Mat(frame, model.geom_quat[geom])
-    return points @ frame.reshape(3, 3).T + model.geom_pos[geom], np.full(len(points), radius)
+def find_wheels(skeleton: Skeleton) -> list[str]:
+    """Return the links that are wheels: round about the only joint that moves them, which is level and endless."""
+    skeleton.place(skeleton.rest)
+    wheels = []
+    for joints, foot in _find_chains(skeleton):
+        if len(joints) == 1 and _is_endless(skeleton, joints[0]) and _is_round(skeleton, joints[0], foot):
+            wheels.append(foot.link)
+    return wheels
 
 
-def _list_vertices(model: Any, mesh: int) -> Array:
-    """Return vertices of a mesh: those that are farthest in some direction."""
-    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    vertices = np.asarray(model.mesh_vert[first : first + count], float)
-    farthest: Array = vertices[np.unique((vertices @ _list_directions().T).argmax(axis=0))]
-    return farthest
+def _is_endless(skeleton: Skeleton, joint: int) -> bool:
+    body = skeleton.body
+    return bool(body.joint_high[joint] - body.joint_low[joint] >= 2 * ENDLESS)
 
 
-def _list_directions() -> Array:
-    """Return directions that are spread evenly: a spiral around the sphere."""
-    heights = 1 - (2 * np.arange(_POINTS) + 1) / _POINTS
-    turns = np.arange(_POINTS) * np.pi * (3 - np.sqrt(5))
-    around = np.sqrt(1 - heights**2)
-    return np.stack([around * np.cos(turns), around * np.sin(turns), heights], axis=1)
+def _is_round(skeleton: Skeleton, joint: int, foot: Foot) -> bool:
+    """Return whether a foot's shapes are round about a joint that is level: as far from it in all directions."""
+    data = skeleton.data
+    anchor, axis = skeleton.anchors([joint])[0], skeleton.axes([joint])[0]
+    if abs(axis[2]) > _LEVEL_AXIS:
+        return False
+    frames = data.xmat[foot.bodies].reshape(-1, 3, 3)
+    places = data.xpos[foot.bodies] + np.einsum("nij,nj->ni", frames, foot.points) - anchor
+    forwards = np.cross(axis, (0.0, 0.0, 1.0))
+    upwards = np.cross(forwards, axis)
+    turns = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
+    directions = np.cos(turns)[:, None] * forwards + np.sin(turns)[:, None] * upwards
+    farthest = (places @ directions.T + foot.radii[:, None]).max(axis=0)
+    return bool(farthest.min() > _ROUND * farthest.max())

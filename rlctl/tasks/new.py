@@ -5,13 +5,13 @@ import importlib.util
 import keyword
 import os
 import re
-import string
 from pathlib import Path
 
 from rlctl.environments import installed
 from rlctl.errors import UsageError
 from rlctl.recipe.recipe import SCHEMA_FILE
 from rlctl.storage import files as storage_files
+from rlctl.tasks.source_text import fill_template, quote_code_of_markdown
 from rlctl.tasks.starter_robot import StarterRobot, make_planar_arm, read_robot
 
 TEMPLATE = Path(__file__).with_name("template")
@@ -59,15 +59,12 @@ def create(name: str, *, model: str | None = None, link: str | None = None, walk
     robot = _read_robot(model, link, walk=walk)
     sources = _read_templates(TEMPLATE) | (_read_templates(robot.template) if robot.template else {})
     cls = _make_class_name(name, "".join(sources.values()))
-    values = {**robot.values, "name": name, "package": package, "cls": cls}
-    content = {
-        Path(*(package if part == "package" else part for part in path.parts)): string.Template(
-            _choose_lines(text, robot.kept)
-        )
-        .substitute(values)
-        .encode()
-        for path, text in sources.items()
-    }
+    model_in_readme = quote_code_of_markdown(f"{package}/{robot.values['model']}")
+    values = {**robot.values, "name": name, "package": package, "cls": cls, "model_in_readme": model_in_readme}
+    content: dict[Path, bytes] = {}
+    for path, text in sources.items():
+        place = Path(*(package if part == "package" else part for part in path.parts))
+        content[place] = fill_template(_choose_lines(text, robot.kept), values, path.suffix).encode()
     content |= {package / path: data for path, data in robot.files.items()}
     # The recipe's schema is copied next to it, since a path to this machine's packages is wrong on other machines.
     content[Path(package, SCHEMA_FILE.name)] = SCHEMA_FILE.read_bytes()

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.tasks.legs import Array, Leg, Skeleton
+from rlctl.tasks.legs import Leg, Skeleton
+from rlctl.tasks.shapes import Array
 
 _BENT, _BENT_OF_TWO = 0.77, 0.88  # of the longest leg: height of the hip in the stance; on two legs
 _SPRAWLED = (0.5, 0.55)  # of the longest leg: height of the hip, distance of the foot to its side

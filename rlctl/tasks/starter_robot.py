@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
-import re
-import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.tasks.model_copy import copy_model, find_own_model
-from rlctl.tasks.source_text import LINE_WIDTH, write_list, write_number
+from rlctl.tasks.pybullet_probe import reads_in_pybullet
+from rlctl.tasks.source_text import SourceText, join_source, write_comment, write_list, write_number, write_string
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.body import MujocoBody
+    from rlctl.tasks.arms import ArmModel, Tip
 
 _PLANAR_ARM = Path(__file__).with_name("arm.urdf")
 _FASTEST = {"rotates": 3.0, "slides": 0.5}  # [rad/s], [m/s] of a first task; models often have no useful limit
 _GUESSED_FORCE = 10.0  # [N m or N], of a joint without a limit
 _LOWEST_TIP = 0.03  # [m], above the floor, at the start
+_IN_FLOOR = 1e-3  # [m]
 _TRIES = 300
-_FLOOR = '        sim.load("floor", "plane.urdf", fixed=True)\n'
+_FLOOR = SourceText('        sim.load("floor", "plane.urdf", fixed=True)\n')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +51,8 @@ def make_planar_arm() -> StarterRobot:
         "floor": _FLOOR,
         "fixed": ", fixed=True",
         "tip": "tip",
-        "joints": '["shoulder", "elbow"]',
+        "tip_point": SourceText("[]"),
+        "joints": SourceText('["shoulder", "elbow"]'),
         "all_joints": "# Of all joints of the model, in its order.",
         "start": "[0.0, 1.2]",
         "start_comment": ", elbow bent",
@@ -66,7 +67,7 @@ def make_planar_arm() -> StarterRobot:
         "episode_s": "1.5",
         "distance_weight": "-1.0",
         # The arm moves in a plane: the third element would never change.
-        "tip_to_goal": "(self.goal - self.arm.link_position(TIP))[:2]",
+        "tip_to_goal": SourceText("(self.goal - self.find_tip())[:2]"),
         "axes": "[:2]",
         "clips_target": "True",
         "pose": "[0.0, 0.0]",
@@ -81,15 +82,28 @@ def make_planar_arm() -> StarterRobot:
         values,
         dict([arm]),
         "A planar arm moves its tip to a goal. Comments with CHANGE in task.py mark what to replace",
+        kept=frozenset({"origin"}),
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class _Arm:
+    body: MujocoBody
+    path: Path
+    model: ArmModel
+    tip: Tip
+    joints: list[str]  # that move the tip
+    start: Any  # positions of all joints
+    height: float  # [m], of the base above where the file has it
+
+
 def read_robot(model: str, link: str | None) -> StarterRobot:
-    """Read a user's URDF or MJCF file; `link` is the tip, by default `_find_tip`.
+    """Read a user's URDF or MJCF file; `link` is the tip, by default that of `ArmModel.find_tip`.
 
     Raises `UsageError` for a file that is missing, cannot be loaded, has no joints, a free base or no such link.
     """
     from rlctl.task.mujoco.sim import MujocoSim
+    from rlctl.tasks.arms import ArmModel
 
     sim, path = MujocoSim(control_dt=1 / 30, substeps=4), find_own_model(model)
     try:
@@ -100,74 +114,70 @@ def read_robot(model: str, link: str | None) -> StarterRobot:
         what = "its base is free" if not body.fixed else "it has no joints"
         legs = "" if body.fixed else "; for a robot with legs add --walk"
         raise UsageError(f"--model {model}: {what}; this makes a task for an arm that is mounted{legs}")
-    tip = link if link is not None else _find_tip(body)
-    check_name(tip, [body.base_name, *body.link_names], f"--link: {path.name} has no link", UsageError)
-    joints = [body.joint_names[joint] for joint in _list_joints_to(body, tip)]
+    arm = ArmModel(body)
+    name = link if link is not None else arm.find_tip()
+    check_name(name, [body.base_name, *body.link_names], f"--link: {path.name} has no link", UsageError)
+    joints = [body.joint_names[joint] for joint in arm.list_joints_to(name)]
     if not joints:
-        raise UsageError(f"--link {tip!r}: no joint moves it; choose another of: {', '.join(body.link_names)}")
-    others = [name for name in body.joint_names if name not in joints]
-    held = f" START of {', '.join(others)} is kept." if others else ""
+        raise UsageError(f"--link {name!r}: no joint moves it; choose another of: {', '.join(body.link_names)}")
+    tip = arm.choose_point(name)
+    start, height = _find_start(arm, tip)
+    described = _Arm(body, path, arm, tip, joints, start, height)
+    only_mujoco = not reads_in_pybullet(path, body.joint_names)
+    kept = {"point" if tip.point is not None else "origin": True, "mujoco": only_mujoco}
     return StarterRobot(
-        _describe(body, path, tip, joints),
+        _describe(described),
         copy_model(path),
-        f"{', '.join(joints)} of {path.name} bring {tip!r} to a goal.{held} --link chooses another link; "
-        "comments with CHANGE in task.py mark what to adapt",
+        _summarize(described, only_mujoco=only_mujoco),
+        kept=frozenset(name for name, is_kept in kept.items() if is_kept),
     )
 
 
-def _list_parents(body: MujocoBody, link: str) -> list[int]:
-    """Return the numbers of MuJoCo's bodies from a link to the base."""
-    parents, number = body._sim.model.body_parentid, body.find_link(link)
-    numbers = [number]
-    while number and number != body.find_link(body.base_name):
-        number = int(parents[number])
-        numbers.append(number)
-    return numbers
+def _summarize(arm: _Arm, *, only_mujoco: bool) -> str:
+    """Return what was chosen, a sentence a line."""
+    others = [name for name in arm.body.joint_names if name not in arm.joints]
+    tip = f"{arm.tip.link!r}" if arm.tip.point is None else f"the end of {arm.tip.link!r}"
+    lines = [f"{', '.join(arm.joints)} of {arm.path.name} bring {tip} to a goal"]
+    if others:
+        lines.append(f"START of {', '.join(others)} is kept")
+    if arm.height:
+        lines.append(f"It is {arm.height:g} m above the floor, into which it hangs otherwise")
+    if only_mujoco:
+        lines.append("PyBullet does not read this file as MuJoCo does, so the recipe has sim: mujoco")
+    lines += list_faults(arm.body)
+    lines.append("--link chooses another link; comments with CHANGE in task.py mark what to adapt")
+    return ".\n".join(lines)
 
 
-def _list_joints_to(body: MujocoBody, link: str) -> list[int]:
-    """Return the indices of the joints that move a link."""
-    chain = set(_list_parents(body, link))
-    owners = body._sim.model.jnt_bodyid[body.parts.joints].tolist()
-    return [index for index, owner in enumerate(owners) if owner in chain]
+def list_faults(body: MujocoBody) -> list[str]:
+    """Return what is wrong with a model's file, without a full stop; `rlctl check-env` finds it, too."""
+    from rlctl.task.model_faults import find_model_faults
+
+    return [fault.rstrip(".") for fault in find_model_faults(body)]
 
 
-def _find_tip(body: MujocoBody) -> str:
-    """Return the link at the end of the longest chain; a frame without shapes, which marks a tool, goes first."""
-    model = body._sim.model
-    moved = [link for link in body.link_names if _list_joints_to(body, link)]
-    parents = {int(model.body_parentid[body.find_link(link)]) for link in moved}
-    ends = [link for link in moved if body.find_link(link) not in parents]
-    frames = [link for link in ends if model.body_geomnum[body.find_link(link)] == 0]
-    return max(frames or ends or moved, key=lambda link: len(_list_joints_to(body, link)))
-
-
-def _describe(body: MujocoBody, path: Path, tip: str, joints: list[str]) -> dict[str, str]:
-    start, model = _find_start(body, tip), body._sim.model
+def _describe(arm: _Arm) -> dict[str, str]:
+    body, path, start = arm.body, arm.path, arm.start
     body.set_joints(start)
-    place = body.link_position(tip)
-    reach = sum(math.dist(model.body_pos[number], (0, 0, 0)) for number in _list_parents(body, tip)[:-1])
-    reach += sum(abs(model.jnt_range[joint]).max() for joint in body.parts.joints if model.jnt_type[joint] == 2)
+    place = arm.model.locate(arm.tip)
+    place[2] += arm.height
+    reach, farthest = arm.model.measure_reach(arm.tip)
     tolerance = max(0.002, float(f"{0.05 * reach:.1g}"))
     speeds, speed_comment = _limit_speeds(body)
     forces, force_comment = _limit_forces(body)
-    name = re.sub(r"[^\w .-]", "", body._sim._scene.parts["arm"].file.path.stem)
-    chosen = body.find_joints(joints)
+    chosen = body.find_joints(arm.joints)
     is_bounded = all(math.isfinite(limit) for limit in [*body.joint_low[chosen], *body.joint_high[chosen]])
+    point = arm.tip.point if arm.tip.point is not None else ()
     return {
-        "robot": name,
-        "robot_phrase": name,
+        "robot": name_robot(path),
+        "robot_phrase": name_robot(path),
         "model": path.name,
-        "floor": "" if _has_plane(body) else _FLOOR,
-        "fixed": ", fixed=True" if path.suffix == ".urdf" else "",  # other formats contain it
-        "tip": json.dumps(tip)[1:-1],
-        "joints": write_list("JOINTS = ", [json.dumps(joint) for joint in joints]),
-        "all_joints": textwrap.fill(
-            f"Of all joints of the model: {', '.join(body.joint_names)}.",
-            LINE_WIDTH,
-            initial_indent="# ",
-            subsequent_indent="# ",
-        ),
+        "floor": SourceText() if arm.model.has_plane() else _FLOOR,
+        "fixed": _write_pose(arm),
+        "tip": arm.tip.link,
+        "tip_point": SourceText(f"[{join_source(map(write_number, point))}]"),
+        "joints": write_list("JOINTS = ", map(write_string, arm.joints)),
+        "all_joints": write_comment(f"Of all joints of the model: {', '.join(body.joint_names)}."),
         "start": write_list("START = np.array(", map(write_number, start)),
         "start_comment": "; CHANGE: a pose from which the arm gets everywhere",
         "max_speed": write_list("MAX_SPEED = ", map(write_number, speeds)),
@@ -175,46 +185,57 @@ def _describe(body: MujocoBody, path: Path, tip: str, joints: list[str]) -> dict
         "max_force": write_list("MAX_FORCE = ", map(write_number, forces)),
         "force_comment": force_comment,
         "start_noise": "0.1",
-        "tolerance": f"{tolerance:g}",
-        "smaller": f"{tolerance / 2:g}",
+        "tolerance": write_number(tolerance, "g"),
+        "smaller": write_number(tolerance / 2, "g"),
         "goal_range": "0.8",
         "episode_s": "3.0",
-        "distance_weight": f"-{1 / reach:.2g}",
-        "tip_to_goal": "self.goal - self.arm.link_position(TIP)",
+        "distance_weight": write_number(-1 / reach, ".2g"),
+        "tip_to_goal": SourceText("self.goal - self.find_tip()"),
         "axes": "",
         "clips_target": str(is_bounded),
         "pose": write_list("    task.arm.set_joints(np.array(", map(write_number, start), "))"),
         "pose_comment": "START, and where MuJoCo placed the tip when this plugin was written: has the model changed?",
-        "pose_tip": f"[{', '.join(f'{value:.4f}' for value in place)}]",
-        "reach": f"{math.ceil(100 * reach) / 100:g}",
+        "pose_tip": SourceText(f"[{join_source(write_number(value, '.4f') for value in place)}]"),
+        "reach": write_number(math.ceil(100 * (farthest + arm.height)) / 100, "g"),
         "total_timesteps": "200_000",
         "every_steps": "40_000",
     }
 
 
-def _has_plane(body: MujocoBody) -> bool:
-    """Return whether the model, which is all of the world, has a floor of its own."""
-    import mujoco
+def _write_pose(arm: _Arm) -> SourceText:
+    """Return the arguments of `Sim.load` that say where the base is; only URDF files do not contain it."""
+    position = f", position=(0.0, 0.0, {write_number(arm.height, 'g')})" if arm.height else ""
+    fixed = ", fixed=True" if arm.path.suffix == ".urdf" else ""
+    return SourceText(position + fixed)
 
-    return int(mujoco.mjtGeom.mjGEOM_PLANE) in body._sim.model.geom_type.tolist()
+
+def name_robot(model: Path) -> str:
+    """Return the name of a model's file as text; what is no text of it becomes question marks."""
+    return model.stem.encode(errors="replace").decode()
 
 
-def _find_start(body: MujocoBody, tip: str) -> Any:
-    """Return joint positions inside their limits in which the tip is above the floor, near 0 if possible."""
+def _find_start(arm: ArmModel, tip: Tip) -> tuple[Any, float]:
+    """Return joint positions inside their limits, near 0 if possible, and how far the base must be raised [m].
+
+    The tip is above the floor, and no link that moves is in it. If there are no such positions the base is raised by
+    how far down the robot gets.
+    """
     import numpy as np
 
-    low, high = body.joint_low, body.joint_high
-    inner_low, inner_high = np.where(np.isfinite(low), 0.9 * low + 0.1 * high, -1), 0.1 * low + 0.9 * high
-    inner_high = np.where(np.isfinite(high), inner_high, 1)
+    low, high = arm.find_range()
     rng = np.random.default_rng(0)
-    poses = [np.clip(0.0, inner_low, inner_high), (inner_low + inner_high) / 2]
-    poses += [rng.uniform(inner_low, inner_high) for _ in range(_TRIES)]
+    poses = [np.clip(0.0, low, high), (low + high) / 2, *(rng.uniform(low, high) for _ in range(_TRIES))]
+    shapes, has_plane, lowest = arm.list_moving_shapes(), arm.has_plane(), 0.0
     for pose in poses:
         pose = np.round(pose, 3) + 0.0  # no -0.0
-        body.set_joints(pose)
-        if body.link_position(tip)[2] > _LOWEST_TIP:
-            return pose
-    raise UsageError(f"{body.file.name}: {tip!r} is never above the floor, z = 0; choose another --link")
+        arm.body.set_joints(pose)
+        tip_height, lowest_shape = float(arm.locate(tip)[2]), arm.find_lowest(shapes)
+        if tip_height > _LOWEST_TIP and (has_plane or lowest_shape > -_IN_FLOOR):
+            return pose, 0.0
+        lowest = min(lowest, tip_height, lowest_shape)
+    if has_plane:
+        raise UsageError(f"{arm.body.file.name}: {tip.link!r} is never above the floor, z = 0; choose another --link")
+    return np.round(poses[0], 3) + 0.0, math.ceil(100 * (_LOWEST_TIP - lowest)) / 100
 
 
 def _limit_speeds(body: MujocoBody) -> tuple[list[float], str]:
@@ -228,7 +249,7 @@ def _limit_speeds(body: MujocoBody) -> tuple[list[float], str]:
 
 
 def _limit_forces(body: MujocoBody) -> tuple[list[float], str]:
-    limits = body.joint_max_force.tolist()
+    limits = [limit if math.isfinite(limit) else 0.0 for limit in body.joint_max_force.tolist()]
     if all(limits):
         return limits, ", as in the model; CHANGE: those of your motors"
     return [limit or _GUESSED_FORCE for limit in limits], "; CHANGE: a guess where the model has no limit"

@@ -85,6 +85,7 @@ def test_faults(sim, tmp_path, inertial, fault):
             '<limit lower="-3" upper="3"/><origin xyz="0,1 0 0"/>',
             "origin xyz='0,1 0 0' is not a number; PyBullet reads its first digits, or 0.",
         ),
+        ('<limit lower="2" upper="-1"/>', "a lower limit of 2 rad, above the upper one of -1: so it has no limits."),
         ('<limit lower="-90" upper="90"/>', "limits of -90 and 90 rad. Are these degrees?"),
         ('<limit lower="-1.57" upper="1.57"/><origin xyz="0, 1, 0" rpy=" 0 0 1.5e-3"/>', None),
     ],
@@ -98,12 +99,20 @@ def test_joints(sim, tmp_path, of_joint, fault):
     assert find_model_faults(body) == ([f"model.urdf, joint 'joint': {fault}"] if fault else [])
 
 
-@pytest.mark.parametrize(("encoding", "faults"), [("ISO-8859-1", 1), ("UTF-8", 0), ("none", 0)])
+@pytest.mark.parametrize(("encoding", "faults"), [("ISO-8859-1", 1), ("UTF-8", 1), ("none", 0)])
 def test_a_file_that_is_not_utf_8(sim, tmp_path, encoding, faults):
     rod = f'<!-- Stoß --><link name="rod">{BOX}</link>'
     file = models.urdf(tmp_path, models.link("base", 1.0), rod, models.joint("joint", "base", "rod"))
     file.write_bytes(f'<?xml version="1.0" encoding="{encoding}"?>\n{file.read_text()}'.encode("latin-1"))
     assert len(find_model_faults(sim.load("body", file, fixed=True))) == faults
+
+
+def test_equal_faults_are_one(sim, tmp_path):
+    rods = [f'<link name="rod {number}">{inertial(1, 1, 1)}{BOX}</link>' for number in range(6)]
+    joints = [models.joint(f"joint {number}", "base", f"rod {number}") for number in range(6)]
+    body = sim.load("body", models.urdf(tmp_path, models.link("base", 1.0), *rods, *joints), fixed=True)
+    (fault,) = find_model_faults(body)
+    assert fault.startswith("model.urdf, links 'rod 0', 'rod 1', 'rod 2', 'rod 3' and 2 more: a moment of 1 kg m^2 is")
 
 
 def test_what_is_not_used_is_no_fault(sim, tmp_path):

@@ -239,8 +239,8 @@ def test_inertia_of_shapes_keeps_the_mass_of_the_file(tmp_path):
         ),
         (
             "missing.urdf",
-            '<robot name="r"><link name="a"><visual><geometry><mesh filename="no.stl"/></geometry></visual></link>'
-            "</robot>",
+            '<robot name="r"><link name="a"><collision><geometry><mesh filename="no.stl"/></geometry></collision>'
+            "</link></robot>",
             r"link 'a': mesh 'no\.stl' not found: neither below",
         ),
         ("broken.xml", "<mujoco>\n<worldbody></mujoco>", "XML_ERROR_MISMATCHED_ELEMENT .*Line number=2"),

@@ -1,5 +1,6 @@
 """URDF files as people have them: found meshes, repaired inertias and frames, the same in both engines."""
 
+import re
 import tempfile
 
 import numpy as np
@@ -193,6 +194,9 @@ def test_a_changed_file_is_read_again_after_it_was_edited(tmp_path):
     sim.close()
 
 
+BOX = '<collision><geometry><box size="0.1 0.1 0.3"/></geometry></collision>'
+
+
 def test_two_bases(sim, tmp_path):
     file = models.urdf(tmp_path, models.link("a", 1.0), models.link("b", 1.0))
     with pytest.raises(TaskError, match=r"model\.urdf: 2 links are no joint's child \('a', 'b'\); a URDF has one base"):
@@ -204,6 +208,42 @@ def test_two_joints_of_one_name(sim, tmp_path):
     file = models.urdf(tmp_path, *(models.link(name, 1.0) for name in "abc"), *joints)
     with pytest.raises(TaskError, match=r"model\.urdf: 2 joints are called 'elbow'; give each its own name"):
         sim.load("robot", file)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ('joint name="elbow"', 'joint name=""', "the joint to link 'b' has no name; give it one"),  # crashes PyBullet
+        ('joint name="elbow"', "joint", "the joint to link 'b' has no name; give it one"),
+        ('link name="b"', "link", "link 2 has no name; give it one"),
+        ('mass value="1.0"', 'mass value="inf"', "link 'a' has a mass of inf kg; write its mass"),
+        ('mass value="1.0"', 'mass value="nan"', "link 'a' has a mass of nan kg; write its mass"),
+    ],
+)
+def test_what_no_engine_loads(sim, tmp_path, before, after, message):
+    file = models.urdf(tmp_path, models.link("a", 1.0), models.link("b", 1.0), models.joint("elbow", "a", "b"))
+    assert before in file.read_text()
+    file.write_text(file.read_text().replace(before, after))
+    with pytest.raises(TaskError, match=re.escape(f"model.urdf: {message}")):
+        sim.load("robot", file)
+
+
+def test_a_file_in_latin_1_that_does_not_say_so(sim, tmp_path):
+    file = models.urdf(tmp_path, models.link("a", 1.0), models.link("b", 1.0), models.joint("größe", "a", "b"))
+    file.write_bytes(file.read_text(encoding="utf-8").encode("latin-1"))
+    assert sim.load("robot", file, fixed=True).joint_names == ["größe"]
+
+
+def test_a_missing_visual_mesh_is_a_fault_and_collision_shapes_are_drawn(sim, tmp_path):
+    visual = '<visual><geometry><mesh filename="package://other/arm.dae"/></geometry></visual>'
+    arm = models.link("arm", 1.0).replace("</link>", f"{visual}{BOX}</link>")
+    file = models.urdf(tmp_path, models.link("base", 1.0), arm, models.joint("turn", "base", "arm"))
+    body = sim.load("robot", file, fixed=True)
+    fault = "model.urdf, link 'arm': its visual mesh 'package://other/arm.dae' is missing. Its other shapes are drawn."
+    assert find_model_faults(body) == [fault]
+    urdf = read_urdf(file)
+    assert urdf.root is not None
+    assert urdf.root.find("link[@name='arm']/visual/geometry/box") is not None
 
 
 @pytest.mark.pybullet

@@ -183,6 +183,49 @@ def test_models_that_cannot_be(tmp_path, monkeypatch, given, message):
     assert not Path("other-dog").exists()
 
 
+WHEEL = """<body name="{side}" pos="0 {y} 0"><joint name="{side}" axis="0 1 0"/>
+<geom type="cylinder" size="0.08 0.02" euler="90 0 0" mass="1"/></body>"""
+
+
+def test_wheels_are_no_legs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = write_dog(tmp_path, pairs=(0.0,))
+    wheels = "".join(WHEEL.format(side=side, y=y) for side, y in (("left", 0.2), ("right", -0.2)))
+    dog = file.read_text().replace('<body name="head"', wheels + '<body name="head"').replace("90 0 0", "1.5708 0 0")
+    file.write_text(dog)
+    with pytest.raises(UsageError, match=r"it stands on wheels \(left, right\), .* docs/task\.md"):
+        new.create("wheeled-dog", model="dog.xml", walk=True)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "note"),
+    [
+        # 4.2 kg x 9.81 x 0.24 m = 9.9 N m
+        ("-9 9", "-0.5 0.5", r"The largest torque limit of its legs, 0\.5 N m, is 5.* of weight x leg length, "),
+        # 0.3 x 0.12 x 0.08 m is 2,880 cm^3.
+        ('mass="2"', 'mass="80"', r"Links denser than any metal: trunk 80 kg in 2\.88e\+03 cm\^3"),
+        # A head in a box of 6 m, 216 m^3.
+        ('size="0.03" mass="0.2"', 'size="3" mass="0.2"', r"It weighs 4\.2 kg in 216 m\^3, less than air"),
+    ],
+)
+def test_what_cannot_be_is_said(tmp_path, monkeypatch, before, after, note):
+    monkeypatch.chdir(tmp_path)
+    file = write_dog(tmp_path)
+    file.write_text(file.read_text().replace(before, after))
+    assert re.search(note, new.create("odd-dog", model="dog.xml", walk=True).summary)
+
+
+def test_a_mirror_that_the_masses_do_not_have_is_left_out(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = write_dog(tmp_path)
+    # The left thighs are 0.2 kg and the right ones 0.6 kg.
+    file.write_text(re.sub(r'(_right_thigh".*?size="0.01" mass=)"0.2"', r'\1"0.6"', file.read_text(), flags=re.DOTALL))
+    plugin = new.create("lopsided-dog", model="dog.xml", walk=True)
+    assert "Its sides are no mirror images" in plugin.summary
+    assert "mirror" not in (plugin.folder / "lopsided_dog" / "task.yaml").read_text()
+    assert not hasattr(read_task(plugin), "other_side")
+
+
 def test_an_arm_that_is_free_may_have_legs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_dog(tmp_path)
