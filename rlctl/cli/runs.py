@@ -1,5 +1,6 @@
 """`rlctl runs` and its commands."""
 
+import time
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -7,7 +8,7 @@ import typer
 from typer.core import TyperGroup
 
 from rlctl.cli.arguments import command, parse_changes
-from rlctl.options import TASK_FORMS, Argument, EpisodeSeed, Json, Option, RunName, RunsFolder, Settings, Yes
+from rlctl.options import TASK_FORMS, Argument, EpisodeSeed, Json, Junit, Option, RunName, RunsFolder, Settings, Yes
 
 
 class _RunsGroup(TyperGroup):
@@ -96,19 +97,30 @@ def compare_runs(
     margin: Annotated[
         float | None, Option("Exit 1 unless the episodes exclude a larger loss of success, e.g. 0.05.", min=0)
     ] = None,
+    allow_no_success: Annotated[
+        bool, Option("Let the gate pass where neither ever succeeds.", ("--allow-no-success",))
+    ] = False,
     json: Json = None,
+    junit: Junit = None,
 ) -> None:
     """Test whether a policy, or a recipe trained with several seeds, is better than another."""
     from rlctl.evaluation.request import EvalRequest
     from rlctl.runs.comparison import compare
-    from rlctl.runs.comparison_report import show
+    from rlctl.runs.comparison_report import make_suite, show
+    from rlctl.storage.junit import write as write_junit
 
+    began = time.monotonic()
     changes = parse_changes(settings)
     request = EvalRequest(None, task=task, episodes=episodes, seed=seed, changes=changes)
     result = compare(runs, request, threshold, force=force, margin=margin)
-    show(result, json, gate, margin)
-    if gate or margin is not None:
-        result.check(margin)
+    show(result, json, gate, margin, allow_no_success=allow_no_success)
+    has_gate = gate is not None or margin is not None
+    if junit is not None:
+        seconds = time.monotonic() - began
+        suite = make_suite(result, seconds, has_gate=has_gate, margin=margin, allow_no_success=allow_no_success)
+        write_junit(junit, [suite])
+    if has_gate:
+        result.check(margin, allow_no_success=allow_no_success)
 
 
 @app.command("import")
