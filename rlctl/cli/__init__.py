@@ -32,27 +32,43 @@ def _root(
     pass
 
 
-COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
-    "check-env": tasks.check_env,
-    "train": train.train,
-    "distill": train.distill,
-    "tune": train.tune,
-    "eval": eval.evaluate,
-    "gate": gate.gate,
-    "export": export.export,
-    "replay": eval.replay,
-    "push": export.push,
-    "serve": deploy.serve,
-    "robot": deploy.robot,
-    "play": deploy.play,
-    "identify": deploy.identify,
-    "diagnose": diagnose.diagnose,
-    "tasks": tasks.app,
-    "recipe": tasks.recipe,
-    "runs": runs.app,
-    "demo": demo.demo,
-    "bugreport": runs.report_bug,
+Commands = dict[str, Callable[..., None] | typer.Typer]
+
+GROUPS: dict[str, Commands] = {
+    "Learn": {
+        "check-env": tasks.check_env,
+        "train": train.train,
+        "distill": train.distill,
+        "tune": train.tune,
+    },
+    "Judge": {
+        "eval": eval.evaluate,
+        "runs": runs.app,
+        "gate": gate.gate,
+    },
+    "Show": {
+        "replay": eval.replay,
+        "play": deploy.play,
+        "demo": demo.demo,
+    },
+    "Robot": {
+        "export": export.export,
+        "serve": deploy.serve,
+        "robot": deploy.robot,
+        "identify": deploy.identify,
+        "diagnose": diagnose.diagnose,
+    },
+    "Tools": {
+        "tasks": tasks.app,
+        "recipe": tasks.recipe,
+        "push": export.push,
+        "bugreport": runs.report_bug,
+    },
 }
+"""The commands by what they are for, as the help shows them."""
+
+COMMANDS: Commands = {name: command for group in GROUPS.values() for name, command in group.items()}
+_PANELS = {name: panel for panel, group in GROUPS.items() for name in group}
 
 _CLASSES = {"check-env": tasks.CheckCommand, "replay": eval.ReplayCommand}  # that read arguments in their own way
 
@@ -76,9 +92,9 @@ def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
     for name in names:
         command = COMMANDS[name]
         if isinstance(command, typer.Typer):
-            app.add_typer(command, name=name)
+            app.add_typer(command, name=name, rich_help_panel=_PANELS[name])
         else:
-            app.command(name, cls=_CLASSES.get(name))(command)
+            app.command(name, cls=_CLASSES.get(name), rich_help_panel=_PANELS[name])(command)
     return app
 
 

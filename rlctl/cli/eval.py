@@ -13,7 +13,7 @@ from typer.core import TyperCommand
 from rlctl.cli.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates, MinReturn, MinSuccess, MinSuccessLower
-from rlctl.options import Cluster, Json, Junit, On, Option, Pretrained, Settings, Yes
+from rlctl.options import Cluster, Json, Junit, On, Option, PictureFile, Pretrained, Settings, Yes
 from rlctl.replaying.request import ReplayRequest
 
 
@@ -24,7 +24,7 @@ from rlctl.replaying.request import ReplayRequest
         "Robustness": ["vary", "push", "sim", "yes"],
         "How": ["deterministic", "limits", "env_timeout_s"],
         "Where": ["n_envs", "on", "cluster"],
-        "Output": ["record", "json", "junit"],
+        "Output": ["record", "picture", "json", "junit"],
     }
 )
 def evaluate(
@@ -52,6 +52,7 @@ def evaluate(
     yes: Yes = False,
     on: On = None,
     cluster: Cluster = None,
+    picture: PictureFile = None,
     json: Json = None,
     junit: Junit = None,
 ) -> None:
@@ -74,6 +75,13 @@ def evaluate(
     request = EvalRequest(**vars(chosen), changes=parse_changes(settings, only))
     if on is not None and not vary and sim is None:
         raise UsageError("--on needs a robustness map: give --vary or --sim too")
+    if picture is not None:
+        if not vary and sim is None:
+            raise UsageError("--picture draws maps: give --vary or --sim too")
+        from rlctl.runs.report import plots
+        from rlctl.storage import files
+
+        plots.choose_form(picture)  # raises before any episode is played
     if vary or push or sim is not None:
         unsupported: dict[str, object] = {
             "--policy": request.baseline,
@@ -89,6 +97,8 @@ def evaluate(
         play = choose_cell_player(on, cluster)
         robustness = measure_robustness(request, vary, push=push, sim=sim, yes=yes, gates=gates, play_cells=play)
         show_robustness(robustness, json)
+        if picture is not None:
+            files.write_result(picture, plots.draw_maps(robustness, plots.choose_form(picture)))
         if junit is not None:
             write_junit(junit, [suites.make_robustness_suite(robustness, gates, time.monotonic() - began)])
         return check_gates(robustness, gates)

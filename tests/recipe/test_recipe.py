@@ -318,3 +318,13 @@ def test_a_shorter_training_is_evaluated_as_often():
     assert resolve("reach", None, {"total_timesteps": 20_000}).eval.every_steps == 4_000
     chosen = {"total_timesteps": 20_000, "eval": {"every_steps": 10_000}}
     assert resolve("reach", None, chosen).eval.every_steps == 10_000
+
+
+def test_command_shows_the_merged_recipe(rlctl, config):
+    file = config("n_envs: 4\n")
+    done = rlctl("recipe", "reach", "--config", file, "--algo", "sac", "--set", "algo_kwargs.gamma=0.9")
+    assert done.returncode == 0, done.stderr
+    expected = resolve("reach", file, {"algo": "sac", "algo_kwargs": {"gamma": 0.9}})
+    assert done.stdout == expected.to_yaml()
+    assert "is for ppo; not used for sac: algo_kwargs, policy_kwargs; used: total_timesteps 120000" in done.stderr
+    assert rlctl("recipe", "reach", "--algo", "sacc").returncode == 2
