@@ -6,12 +6,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from rlctl.checking import junit as check_junit
 from rlctl.checking.check import CheckReport, check
 from rlctl.checking.rules import choose_rules
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError, UsageError
 from rlctl.evaluation import junit as evaluation_junit
 from rlctl.evaluation.evaluate import Evaluation, run_evaluation
+from rlctl.evaluation.players import find_player
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.exporting.export import ExportReport, export_policy
 from rlctl.exporting.request import ExportRequest, Format
@@ -91,9 +93,7 @@ class GateReport:
         classname = f"{self.task}.gate"
         suites = []
         if self.checked is not None:
-            from rlctl.checking.junit import make_suite
-
-            suites.append(make_suite(self.checked))
+            suites.append(check_junit.make_suite(self.checked))
         if self.evaluation is not None:
             seconds = next(step.seconds for step in self.steps if step.name == "eval")
             suites.append(evaluation_junit.make_suite(self.evaluation, self.gates, seconds))
@@ -116,8 +116,11 @@ def run_gate(request: GateRequest, show: Callable[[object], None], *, quiet: boo
     A step that fails does not end the gate: the report says everything that is wrong. Only the export is left out after
     a failure, so that nothing lies ready that must not be used. Raises `ArtifactError` if there is no policy.
     """
-    source = lookup.find_policy(request.evaluation.run, request.evaluation.checkpoint)
-    found = _Findings(request, source, (lambda result: None) if quiet else show)
+    source, _, spec = find_player(request.evaluation, print_notes=lambda notes: None)
+    if source.run is not None:  # `latest` may be another run before the gate ends
+        pinned = dataclasses.replace(request.evaluation, run=str(source.run.path))
+        request = dataclasses.replace(request, evaluation=pinned)
+    found = _Findings(request, source, spec, (lambda result: None) if quiet else show)
     steps = [found.take("check", found.check), found.take("eval", found.play)]
     if request.against is None:
         steps.append(Step("compare", Result.SKIPPED, "nothing to compare with: --against FILE"))
@@ -144,12 +147,11 @@ def run_gate(request: GateRequest, show: Callable[[object], None], *, quiet: boo
 class _Findings:
     """Takes the steps, and keeps what each found."""
 
-    def __init__(self, request: GateRequest, source: lookup.FoundPolicy, show: Callable[[object], None]) -> None:
-        from rlctl.evaluation.players import choose_spec, load_player
-
+    def __init__(
+        self, request: GateRequest, source: lookup.FoundPolicy, spec: EnvSpec, show: Callable[[object], None]
+    ) -> None:
         self._request, self._source, self._show = request, source, show
-        info = load_player(source.file, deterministic=True).info
-        self.spec: EnvSpec = source.locate(choose_spec(info, request.evaluation))
+        self.spec = spec
         self.checked: CheckReport | None = None
         self.evaluation: Evaluation | None = None
         self.comparison: RunComparison | None = None
