@@ -50,6 +50,13 @@ Sim = Annotated[
 ]
 EpisodeSeed = Annotated[int, Option("Seed of the list of episodes.", min=0)]
 Json = Annotated[str | None, Option("Also write the result as JSON; - writes only JSON, to stdout.", metavar="FILE")]
+Junit = Annotated[
+    Path | None,
+    Option("Also write the result as JUnit XML, whose failures CI services list.", ("--junit",), metavar="FILE"),
+]
+PictureFile = Annotated[
+    Path | None, Option("Also draw the maps: FILE.png, .svg or .pdf.", ("--picture",), metavar="FILE")
+]
 Yes = Annotated[bool, Option("Do not ask.", ("--yes",))]
 Config = Annotated[Path | None, Option("Recipe that overrides the task's own, or presets/NAME.", metavar="FILE")]
 RunsFolder = Annotated[Path, Option("Folder for the folders of runs.", ("--output", "-o"), metavar="FOLDER")]

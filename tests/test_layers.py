@@ -20,6 +20,7 @@ LAYERS = [
     {"cluster"},
     {"tuning"},
     {"training"},
+    {"gating"},
     {"runs"},
     {"playing"},
     {"exporting", "replaying", "tasks", "importing", "deploy.robot"},

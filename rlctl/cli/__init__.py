@@ -7,11 +7,12 @@ import contextlib
 import itertools
 import sys
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from rlctl.cli import demo, deploy, diagnose, eval, export, runs, tasks, train
+from rlctl.cli import demo, deploy, diagnose, eval, export, gate, runs, tasks, train
 from rlctl.errors import AnswerIsNo, RlctlError, UsageError
 from rlctl.processes import error_boundary
 from rlctl.version import __version__
@@ -31,26 +32,43 @@ def _root(
     pass
 
 
-COMMANDS: dict[str, Callable[..., None] | typer.Typer] = {
-    "check-env": tasks.check_env,
-    "train": train.train,
-    "distill": train.distill,
-    "tune": train.tune,
-    "eval": eval.evaluate,
-    "export": export.export,
-    "replay": eval.replay,
-    "push": export.push,
-    "serve": deploy.serve,
-    "robot": deploy.robot,
-    "play": deploy.play,
-    "identify": deploy.identify,
-    "diagnose": diagnose.diagnose,
-    "tasks": tasks.app,
-    "recipe": tasks.recipe,
-    "runs": runs.app,
-    "demo": demo.demo,
-    "bugreport": runs.report_bug,
+Commands = dict[str, Callable[..., None] | typer.Typer]
+
+GROUPS: dict[str, Commands] = {
+    "Learn": {
+        "check-env": tasks.check_env,
+        "train": train.train,
+        "distill": train.distill,
+        "tune": train.tune,
+    },
+    "Judge": {
+        "eval": eval.evaluate,
+        "runs": runs.app,
+        "gate": gate.gate,
+    },
+    "Show": {
+        "replay": eval.replay,
+        "play": deploy.play,
+        "demo": demo.demo,
+    },
+    "Robot": {
+        "export": export.export,
+        "serve": deploy.serve,
+        "robot": deploy.robot,
+        "identify": deploy.identify,
+        "diagnose": diagnose.diagnose,
+    },
+    "Tools": {
+        "tasks": tasks.app,
+        "recipe": tasks.recipe,
+        "push": export.push,
+        "bugreport": runs.report_bug,
+    },
 }
+"""The commands by what they are for, as the help shows them."""
+
+COMMANDS: Commands = {name: command for group in GROUPS.values() for name, command in group.items()}
+_PANELS = {name: panel for panel, group in GROUPS.items() for name in group}
 
 _CLASSES = {"check-env": tasks.CheckCommand, "replay": eval.ReplayCommand}  # that read arguments in their own way
 
@@ -74,9 +92,9 @@ def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
     for name in names:
         command = COMMANDS[name]
         if isinstance(command, typer.Typer):
-            app.add_typer(command, name=name)
+            app.add_typer(command, name=name, rich_help_panel=_PANELS[name])
         else:
-            app.command(name, cls=_CLASSES.get(name))(command)
+            app.command(name, cls=_CLASSES.get(name), rich_help_panel=_PANELS[name])(command)
     return app
 
 
@@ -120,11 +138,22 @@ def _call(arguments: list[str]) -> int:
 
 
 def _present_failure(arguments: list[str], error: RlctlError) -> None:
-    """Write exit code and error to the target of `--json`: its reader must not find the result of an earlier call."""
-    following = dict(itertools.pairwise(arguments))
-    joined = (argument.removeprefix("--json=") for argument in arguments if argument.startswith("--json="))
-    if (target := following.get("--json", next(joined, None))) is not None:
+    """Write the error to the targets of `--json` and `--junit`: their reader must not find those of an earlier call."""
+    if (target := _find_value(arguments, "--json")) is not None:
         from rlctl import output
 
         with contextlib.suppress(RlctlError, OSError):  # the first error is the one to tell
             output.present({"format": "rlctl error 1", "exit_code": error.exit_code, "error": str(error)}, target)
+    if (target := _find_value(arguments, "--junit")) is not None:
+        from rlctl.storage import junit
+
+        case = junit.Case(f"rlctl {arguments[0]}", "error", [junit.CaseEntry("error", message=str(error))])
+        with contextlib.suppress(RlctlError, OSError):
+            junit.write(Path(target), [junit.Suite(f"rlctl {arguments[0]}", 0.0, [case])])
+
+
+def _find_value(arguments: list[str], option: str) -> str | None:
+    """Return the value of an option, written as `--json FILE` or `--json=FILE`."""
+    following = dict(itertools.pairwise(arguments))
+    joined = (argument.partition("=")[2] for argument in arguments if argument.startswith(f"{option}="))
+    return following.get(option, next(joined, None))

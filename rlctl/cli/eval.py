@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import re
+import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +13,7 @@ from typer.core import TyperCommand
 from rlctl.cli.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates, MinReturn, MinSuccess, MinSuccessLower
-from rlctl.options import Cluster, Json, On, Option, Pretrained, Settings, Yes
+from rlctl.options import Cluster, Json, Junit, On, Option, PictureFile, Pretrained, Settings, Yes
 from rlctl.replaying.request import ReplayRequest
 
 
@@ -23,7 +24,7 @@ from rlctl.replaying.request import ReplayRequest
         "Robustness": ["vary", "push", "sim", "yes"],
         "How": ["deterministic", "limits", "env_timeout_s"],
         "Where": ["n_envs", "on", "cluster"],
-        "Output": ["record", "json"],
+        "Output": ["record", "picture", "json", "junit"],
     }
 )
 def evaluate(
@@ -51,15 +52,20 @@ def evaluate(
     yes: Yes = False,
     on: On = None,
     cluster: Cluster = None,
+    picture: PictureFile = None,
     json: Json = None,
+    junit: Junit = None,
 ) -> None:
     """Evaluate a policy: success rate with its interval, returns, reward terms."""
+    from rlctl.evaluation import junit as suites
     from rlctl.evaluation.evaluate import run_evaluation
     from rlctl.evaluation.group_scores import evaluate_group
     from rlctl.evaluation.report import show, show_group, show_robustness
     from rlctl.run.directory import is_group
     from rlctl.run.group import read_group
+    from rlctl.storage.junit import write as write_junit
 
+    began = time.monotonic()
     gates = Gates(min_success, min_success_lower, min_return)
     chosen = dataclasses.replace(options, checkpoint=choose_checkpoint(options.checkpoint, pretrained))
     # PyBullet has no range of contacts, and what a robustness map cannot be combined with is played in one engine.
@@ -69,6 +75,13 @@ def evaluate(
     request = EvalRequest(**vars(chosen), changes=parse_changes(settings, only))
     if on is not None and not vary and sim is None:
         raise UsageError("--on needs a robustness map: give --vary or --sim too")
+    if picture is not None:
+        if not vary and sim is None:
+            raise UsageError("--picture draws maps: give --vary or --sim too")
+        from rlctl.runs.report import plots
+        from rlctl.storage import files
+
+        plots.choose_form(picture)  # raises before any episode is played
     if vary or push or sim is not None:
         unsupported: dict[str, object] = {
             "--policy": request.baseline,
@@ -84,15 +97,23 @@ def evaluate(
         play = choose_cell_player(on, cluster)
         robustness = measure_robustness(request, vary, push=push, sim=sim, yes=yes, gates=gates, play_cells=play)
         show_robustness(robustness, json)
+        if picture is not None:
+            files.write_result(picture, plots.draw_maps(robustness, plots.choose_form(picture)))
+        if junit is not None:
+            write_junit(junit, [suites.make_robustness_suite(robustness, gates, time.monotonic() - began)])
         return check_gates(robustness, gates)
     if request.run is not None and request.baseline is None and is_group(folder := Path(request.run)):
         if request.decide_early:
             raise UsageError("--decide-early is for one run: of a group every seed plays all episodes")
         scores = evaluate_group(read_group(folder), request)
         show_group(scores, json)
+        if junit is not None:
+            write_junit(junit, [suites.make_group_suite(scores, gates, time.monotonic() - began)])
         return scores.check(gates)
     result = run_evaluation(request, gates)
     show(result, json, gates)
+    if junit is not None:
+        write_junit(junit, [suites.make_suite(result, gates, time.monotonic() - began)])
     return gates.check(result)
 
 

@@ -1,13 +1,30 @@
 """`rlctl runs` and its commands."""
 
+import time
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.core import TyperGroup
 
 from rlctl.cli.arguments import command, parse_changes
-from rlctl.options import TASK_FORMS, Argument, EpisodeSeed, Json, Option, RunName, RunsFolder, Settings, Yes
+from rlctl.errors import UsageError
+from rlctl.options import (
+    TASK_FORMS,
+    Argument,
+    EpisodeSeed,
+    Json,
+    Junit,
+    Option,
+    PictureFile,
+    RunName,
+    RunsFolder,
+    Settings,
+    Yes,
+)
+
+if TYPE_CHECKING:
+    from rlctl.evaluation.request import EvalRequest
 
 
 class _RunsGroup(TyperGroup):
@@ -57,10 +74,11 @@ def report_runs(
         Argument("Runs, groups, globs or folders of runs, all of one task.", metavar="RUN", default_text="latest"),
     ] = [],
     output: Annotated[
-        Path | None, Option("Default: report.FORMAT; md goes to stdout.", ("--output", "-o"), metavar="FILE")
+        Path | None, Option("Default: report.FORMAT; md and table go to stdout.", ("--output", "-o"), metavar="FILE")
     ] = None,
     format: Annotated[
-        Literal["html", "md", "svg", "pdf"], Option("A page, text for pull requests, or the learning curves alone.")
+        Literal["html", "md", "table", "svg", "pdf", "png"],
+        Option("A page, text for pull requests, the table of results alone, or the learning curves alone."),
     ] = "html",
     pictures: Annotated[bool, Option("Do not replay episodes to draw pictures.", ("/--no-pictures",))] = True,
     episodes: Annotated[
@@ -96,19 +114,63 @@ def compare_runs(
     margin: Annotated[
         float | None, Option("Exit 1 unless the episodes exclude a larger loss of success, e.g. 0.05.", min=0)
     ] = None,
+    allow_no_success: Annotated[
+        bool, Option("Let the gate pass where neither ever succeeds.", ("--allow-no-success",))
+    ] = False,
+    vary: Annotated[
+        list[str],
+        Option(
+            "Compare two policies in a map of the difference, e.g. mass=0.6:1.4:5; give it twice for a 2-D map.",
+            metavar="NAME=LOW:HIGH:COUNT|all",
+        ),
+    ] = [],
+    picture: PictureFile = None,
+    yes: Yes = False,
     json: Json = None,
+    junit: Junit = None,
 ) -> None:
     """Test whether a policy, or a recipe trained with several seeds, is better than another."""
     from rlctl.evaluation.request import EvalRequest
     from rlctl.runs.comparison import compare
-    from rlctl.runs.comparison_report import show
+    from rlctl.runs.comparison_report import make_suite, show
+    from rlctl.storage.junit import write as write_junit
 
+    began = time.monotonic()
     changes = parse_changes(settings)
     request = EvalRequest(None, task=task, episodes=episodes, seed=seed, changes=changes)
+    if vary:
+        if gate or margin is not None or junit is not None:
+            raise UsageError("--vary draws a map and judges nothing: leave out --gate, --margin and --junit")
+        _compare_maps(runs, request, vary, picture, yes=yes, json=json)
+        return
+    if picture is not None:
+        raise UsageError("--picture draws maps: add --vary, or draw learning curves: rlctl runs report --format png")
     result = compare(runs, request, threshold, force=force, margin=margin)
-    show(result, json, gate, margin)
-    if gate or margin is not None:
-        result.check(margin)
+    show(result, json, gate, margin, allow_no_success=allow_no_success)
+    has_gate = gate is not None or margin is not None
+    if junit is not None:
+        seconds = time.monotonic() - began
+        suite = make_suite(result, seconds, has_gate=has_gate, margin=margin, allow_no_success=allow_no_success)
+        write_junit(junit, [suite])
+    if has_gate:
+        result.check(margin, allow_no_success=allow_no_success)
+
+
+def _compare_maps(
+    runs: list[str], request: "EvalRequest", vary: list[str], picture: Path | None, *, yes: bool, json: str | None
+) -> None:
+    from rlctl.runs.comparison_map import compare_maps, show
+
+    if picture is None:
+        show(compare_maps(runs, request, vary, yes=yes), json)
+        return
+    from rlctl.runs.report.plots import choose_form, draw_differences
+    from rlctl.storage import files
+
+    form = choose_form(picture)  # before any episode is played
+    result = compare_maps(runs, request, vary, yes=yes)
+    show(result, json)
+    files.write_result(picture, draw_differences(result, form))
 
 
 @app.command("import")

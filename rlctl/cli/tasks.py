@@ -10,7 +10,7 @@ from typer.core import TyperCommand
 
 from rlctl.cli.arguments import command, command_in_panels, parse_changes
 from rlctl.errors import UsageError
-from rlctl.options import Argument, EnvTimeout, Json, Option, OptionalTask, Settings, Sim, TaskName
+from rlctl.options import Argument, Config, EnvTimeout, Json, Option, OptionalTask, Settings, Sim, TaskName
 
 ReportFormat = enum.StrEnum("ReportFormat", ["text", "json", "sarif", "junit", "github"])
 
@@ -170,9 +170,12 @@ def new_task(
 @command
 def recipe(
     task: OptionalTask = None,
+    config: Config = None,
+    algo: Annotated[str | None, Option("As with another algorithm.", completes="algorithm")] = None,
+    settings: Settings = [],
     schema: Annotated[bool, Option("Print the JSON schema of recipes, for editors.", ("--schema",))] = False,
 ) -> None:
-    """Print the complete recipe of a task, or the JSON schema of recipes."""
+    """Print the complete recipe of a task, as rlctl train merges it, or the JSON schema of recipes."""
     from rlctl import output
 
     if schema:
@@ -182,8 +185,9 @@ def recipe(
         return
     if task is None:
         raise UsageError("give a task, such as rlctl recipe reach, or --schema")
-    from rlctl.environments import registry
-    from rlctl.recipe.sources import resolve
+    from rlctl.recipe.sources import describe_other_algorithm, merge_flags, resolve_with_stages
 
-    registry.load(task)  # a name that is no task has no recipe
-    output.results().write(resolve(task, None, {}).to_yaml())
+    merged = merge_flags(settings, algo=algo)
+    recipe = resolve_with_stages(task, config, merged)  # imports the task: a name that is no task has no recipe
+    output.print_notes(describe_other_algorithm(task, config, merged))
+    output.results().write(recipe.to_yaml())

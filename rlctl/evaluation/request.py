@@ -62,6 +62,10 @@ class EvalRequest(EvalOptions):
     """Whether to measure how much actions change; all episodes are then kept in memory."""
 
 
+Scores = tuple[float | None, tuple[float, float] | None, float]
+"""Success rate and its interval, where the task reports success, and mean return."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Gates:
     """The minimum scores that an evaluation must reach."""
@@ -109,13 +113,25 @@ class Gates:
 
     def list_missed(self, rate: float | None, interval: tuple[float, float] | None, mean_return: float) -> list[str]:
         """Return a phrase for each gate that these scores miss."""
-        missed = []
+        return list(self.find_missed(rate, interval, mean_return).values())
+
+    def list_given(self) -> dict[str, str]:
+        """Return name and text of each gate that is set: `--min-success-lower 0.9`."""
+        values = {name: value for name, value in vars(self).items() if value is not None}
+        return {name: f"--{name.replace('_', '-')} {value:g}" for name, value in values.items()}
+
+    def find_missed(
+        self, rate: float | None, interval: tuple[float, float] | None, mean_return: float
+    ) -> dict[str, str]:
+        """Return the names of the gates that these scores miss, each with a phrase."""
+        missed = {}
         if self.min_success is not None and rate is not None and rate < self.min_success:
-            missed.append(f"success rate {rate:.3f} is below {self.min_success:g}")
-        if self.min_success_lower is not None and interval is not None and interval[0] < self.min_success_lower:
-            missed.append(f"lower bound {interval[0]:.3f} of the success rate is below {self.min_success_lower:g}")
+            missed["min_success"] = f"success rate {rate:.3f} is below {self.min_success:g}"
+        lower = self.min_success_lower
+        if lower is not None and interval is not None and interval[0] < lower:
+            missed["min_success_lower"] = f"lower bound {interval[0]:.3f} of the success rate is below {lower:g}"
         if self.min_return is not None and mean_return < self.min_return:
-            missed.append(f"mean return {mean_return:.3f} is below {self.min_return:g}")
+            missed["min_return"] = f"mean return {mean_return:.3f} is below {self.min_return:g}"
         return missed
 
 

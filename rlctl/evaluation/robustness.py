@@ -116,6 +116,14 @@ class Robustness(_Content):
     command: str = ""  # the command that measured it
     versions: dict[str, str] = {}
 
+    def name_worst(self) -> tuple[str, Outcome]:
+        """Return name and scores of the worst cell; without maps, of the nominal setting."""
+        worst = self.find_worst()
+        if worst is None:
+            return "nominal", self.nominal
+        varied, cell = worst
+        return varied.name_cell(cell), cell
+
     def find_worst(self) -> tuple[RobustnessMap, Cell] | None:
         """Return the worst cell of all maps with its map; None where nothing was varied."""
         cells = ((varied, cell) for varied in self.maps for cell in varied.cells)

@@ -170,8 +170,7 @@ def _store(file: Path, result: Robustness) -> None:
 
 def check_gates(result: Robustness, gates: Gates) -> None:
     """Raise `AnswerIsNo` if the worst cell of all maps misses a gate; without maps, the nominal one."""
-    worst = result.find_worst()
-    where, outcome = ("nominal", result.nominal) if worst is None else (worst[0].name_cell(worst[1]), worst[1])
+    where, outcome = result.name_worst()
     if missed := gates.list_missed(outcome.success_rate, outcome.success_interval, outcome.mean_return):
         raise AnswerIsNo(f"gate missed in the worst cell, {where}: " + "; ".join(missed))
 

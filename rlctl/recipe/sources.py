@@ -10,7 +10,7 @@ from rlctl.environments import registry
 from rlctl.environments.spec import EnvChanges, merge
 from rlctl.errors import ArtifactError, RecipeError, check_name, did_you_mean, short_repr
 from rlctl.recipe.hyperparameters import ON_POLICY
-from rlctl.recipe.recipe import NormalizeSettings, Recipe, Source, validate
+from rlctl.recipe.recipe import WITH_PRIVILEGED, NormalizeSettings, Recipe, Source, validate
 from rlctl.storage import yaml_text
 
 _PRESETS = Path(__file__).with_name("presets")
@@ -20,7 +20,9 @@ _FEWEST_EVALUATIONS = 5
 _WITH_UNIT = re.compile(r"([\d.]+)([kKmM])")
 _DEFAULT_ROLLOUT = 4096  # [steps], all environments together
 _OF_THE_ENVIRONMENT = ("task", "reward_weights", "randomize", "events", "sim")
-_OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "n_envs", "total_timesteps")
+_DEFAULT_ALGORITHM = "ppo"
+_OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "mirror", "mirror_loss")
+_OF_ANY_ALGORITHM = ("n_envs", "total_timesteps")  # how much is trained: equal where algorithms are compared
 
 
 def resolve(
@@ -30,20 +32,9 @@ def resolve(
 
     `stages` are those of the task's class; the key `stages` of a recipe replaces them.
     """
-    packaged_file = registry.find_recipe_file(task)
-    packaged = read(packaged_file) if packaged_file else {}
-    config = find_config(config) if config else None
-    from_config = read(config) if config else {}
+    sources = _list_sources(task, config, settings)
+    _, from_config, packaged = (_select_values(source, sources) for source in sources)
     overrides = merge(from_config, settings)
-    sources = [
-        Source("", settings),
-        Source(str(config), from_config, config),
-        Source(str(packaged_file), packaged, packaged_file),
-    ]
-    algo = overrides.get("algo", packaged.get("algo", "ppo"))
-    if packaged.get("algo", "ppo") != algo:
-        # The packaged hyperparameters and number of environments are for another algorithm.
-        packaged = {k: v for k, v in packaged.items() if k not in _OF_THE_ALGORITHM}
     merged = merge(packaged, overrides)
     if stages and "stages" not in merged:
         merged["stages"] = validate({"stages": list(stages)}, f"class of {task}").model_dump(by_alias=True)["stages"]
@@ -54,6 +45,66 @@ def resolve(
         every = min(recipe.eval.every_steps or 1, max(1, recipe.total_timesteps // _FEWEST_EVALUATIONS))
         recipe = recipe.model_copy(update={"eval": recipe.eval.model_copy(update={"every_steps": every})})
     return recipe
+
+
+def _list_sources(task: str, config: Path | None, settings: Mapping[str, Any]) -> tuple[Source, Source, Source]:
+    """Return the command line's settings, `--config` and the packaged recipe, in order of precedence."""
+    packaged_file = registry.find_recipe_file(task)
+    packaged = read(packaged_file) if packaged_file else {}
+    config = find_config(config) if config else None
+    from_config = read(config) if config else {}
+    return (
+        Source("", settings),
+        Source(str(config), from_config, config),
+        Source(str(packaged_file), packaged, packaged_file),
+    )
+
+
+def _choose_algorithm(sources: Sequence[Source]) -> Any:
+    named = (source.values["algo"] for source in sources if "algo" in source.values)
+    return next(named, _DEFAULT_ALGORITHM)
+
+
+def _is_for_another_algorithm(source: Source, sources: Sequence[Source]) -> bool:
+    """Return whether a source of higher precedence names another algorithm than this one is for."""
+    algo = _choose_algorithm(sources)
+    if source is sources[-1]:
+        return bool(source.values.get("algo", _DEFAULT_ALGORITHM) != algo)
+    return bool(source.values.get("algo", algo) != algo)  # without `algo` it is for any, as the user says
+
+
+def _select_values(source: Source, sources: Sequence[Source]) -> dict[str, Any]:
+    """Return the values of a source that fit the chosen algorithm."""
+    if not _is_for_another_algorithm(source, sources):
+        return dict(source.values)
+    lost = _list_keys_of_algorithm(_choose_algorithm(sources))
+    return {key: value for key, value in source.values.items() if key not in lost}
+
+
+def _list_keys_of_algorithm(chosen: Any) -> tuple[str, ...]:
+    """Return the keys that a recipe for another algorithm than `chosen` loses."""
+    if chosen in WITH_PRIVILEGED:
+        return _OF_THE_ALGORITHM
+    return (*_OF_THE_ALGORITHM, "privileged")
+
+
+def describe_other_algorithm(task: str, config: Path | None, settings: Mapping[str, Any]) -> list[str]:
+    """Return a line for each recipe that is for another algorithm than the chosen one: what does not carry over."""
+    sources = _list_sources(task, config, settings)
+    algo = _choose_algorithm(sources)
+    lines = []
+    for number, source in enumerate(sources):
+        lost = [key for key in _list_keys_of_algorithm(algo) if key in source.values and key != "algo"]
+        if not lost or not _is_for_another_algorithm(source, sources):
+            continue
+        its_algorithm = source.values.get("algo", _DEFAULT_ALGORITHM)
+        line = f"{source.name} is for {its_algorithm}; not used for {algo}: {', '.join(lost)}"
+        above = [key for higher in sources[:number] for key in higher.values]
+        used = [key for key in _OF_ANY_ALGORITHM if key in source.values and key not in above]
+        if used:
+            line += f"; used: {', '.join(f'{key} {source.values[key]}' for key in used)}"
+        lines.append(line)
+    return lines
 
 
 def resolve_with_stages(task: str, config: Path | None = None, settings: Mapping[str, Any] | None = None) -> Recipe:

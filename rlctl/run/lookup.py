@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import difflib
 import os
 import re
 import sys
@@ -21,6 +22,8 @@ from rlctl.run.directory import GROUP_FILE, ROOT, TUNE_FILE, RunDirectory, is_gr
 
 _MOST_COMPARED = 50  # older runs whose scores are looked at
 _IN_TASK = ("*/run.json", "*_seeds/*/run.json")
+_BEGINS_WITH_DATE = re.compile(r"^\d{4}-\d\d")
+_SAME_RUN = 0.7  # similarity of a path with a typo, and of another run's of the same day
 _RUN_NAME = re.compile(r"^\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_s\d+(_\d+)?$")
 
 
@@ -86,11 +89,32 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
         option = f"rlctl train {text} --from {text}" if to_train else "--pretrained"
         shipped = f"; to use the policy that it ships: {option}" if entry.policy_file else ""
         raise ArtifactError(f"no run of {text!r} yet under {root.resolve()}; train one: rlctl train {text}{shipped}")
-    names = {folder.name for folder in root.glob("*/")} | {folder.name for folder in installed.list_installed()}
-    hint = did_you_mean(text, sorted(names)) or " All runs: rlctl runs"
+    hint = _suggest_run(text, root) or " All runs: rlctl runs"
     if ":" in text:  # a task that is named by its file or module
         hint = f" To see it before a training: rlctl replay {text} --policy zero"
     raise ArtifactError(f"no run {text!r}: neither a folder nor a task with a run.{hint}")
+
+
+def _suggest_run(text: str, root: Path) -> str:
+    """Return a hint at the run or group that a text with a typo means; else at a task; empty if none is similar.
+
+    A path, or a name that begins with a date, means a run: a task would be another thing.
+    """
+    is_path = os.sep in text
+    if is_path or _BEGINS_WITH_DATE.match(text):
+        files = [*root.glob("*/*/run.json"), *root.glob(f"*/*/{GROUP_FILE}"), *root.glob("*/*_seeds/*/run.json")]
+        # `runs/TASK/NAME`, or TASK/NAME, as `rlctl runs` lists it, or the name alone
+        word = os.path.normpath(text)
+        if word.startswith(f"{root}{os.sep}"):
+            word = os.path.relpath(word, root)
+        known = {}
+        for file in sorted(files):
+            inside = file.parent.relative_to(root)
+            known[str(inside) if os.sep in word else inside.name] = file.parent
+        close = difflib.get_close_matches(word, known, n=1, cutoff=_SAME_RUN)
+        return did_you_mean(text, [str(known[close[0]])], str(known[close[0]])) if close else ""
+    names = {folder.name for folder in root.glob("*/")} | {folder.name for folder in installed.list_installed()}
+    return did_you_mean(text, sorted(names))
 
 
 def refuse_tuning(path: Path) -> None:

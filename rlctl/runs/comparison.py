@@ -60,6 +60,11 @@ class Side:
         """Whether the task reports success to every run."""
         return all(run.evaluation.success_rate is not None for run in self.runs)
 
+    @property
+    def never_succeeds(self) -> bool:
+        """Whether the task reports success, and no episode of any run succeeded."""
+        return all(run.evaluation.success_rate == 0 for run in self.runs)
+
     def scores(self, quantity: Quantity) -> NDArray[np.float64]:
         """Return each run's mean over its episodes, shape (runs,)."""
         return np.array([np.nanmean(run.values(quantity)) for run in self.runs], np.float64)
@@ -104,26 +109,38 @@ class RunComparison:
         """The baseline, then the candidates' sides."""
         return [self.baseline, *(candidate.side for candidate in self.candidates)]
 
-    def list_missed(self, margin: float | None = None) -> list[str]:
-        """Return a phrase for each candidate that is worse than the baseline; with `margin`, that may be by more.
+    def list_missed(self, margin: float | None = None, *, allow_no_success: bool = False) -> list[str]:
+        """Return a phrase for each candidate that misses the gate, see `find_missed`."""
+        return list(self.find_missed(margin, allow_no_success=allow_no_success).values())
+
+    def find_missed(self, margin: float | None = None, *, allow_no_success: bool = False) -> dict[str, str]:
+        """Return the candidates that are worse than the baseline; with `margin`, that may be by more, with a phrase.
 
         `margin` is a success rate, and only success counts then; or a return if the task reports no success. A
-        candidate with the same policy is neither.
+        candidate with the same policy is neither. A candidate that never succeeds, as the baseline, is not worse but
+        does nothing; it misses the gate too, unless `allow_no_success`.
         """
-        if margin is None:
-            worse = [candidate.side.name for candidate in self.candidates if candidate.verdict is Verdict.WORSE]
-            return [f"{', '.join(worse)} worse than {self.baseline.name}"] if worse else []
-        missed = []
+        missed = {}
         for candidate in self.candidates:
-            (quantity, difference), *_ = candidate.differences.items()
-            if difference.low < -margin and not candidate.same_policy:
-                loss = f"its {quantity} may be lower by {-difference.low:.3g}, more than {margin:g}"
-                missed.append(f"{candidate.side.name}: {loss}")
+            name = candidate.side.name
+            if candidate.side.never_succeeds and self.baseline.never_succeeds and not allow_no_success:
+                missed[name] = (
+                    f"{name}: not worse, but both succeed in none of {self.episodes} episodes, so nothing is shown; "
+                    "--allow-no-success lets that pass"
+                )
+            elif margin is None:
+                if candidate.verdict is Verdict.WORSE:
+                    missed[name] = f"{name}: worse than {self.baseline.name}"
+            elif not candidate.same_policy:
+                (quantity, difference), *_ = candidate.differences.items()
+                if difference.low < -margin:
+                    loss = f"its {quantity} may be lower by {-difference.low:.3g}, more than {margin:g}"
+                    missed[name] = f"{name}: {loss}"
         return missed
 
-    def check(self, margin: float | None = None) -> None:
+    def check(self, margin: float | None = None, *, allow_no_success: bool = False) -> None:
         """Raise `AnswerIsNo` for what `list_missed` returns."""
-        if missed := self.list_missed(margin):
+        if missed := self.list_missed(margin, allow_no_success=allow_no_success):
             raise AnswerIsNo(f"gate missed: {'; '.join(missed)}")
 
 

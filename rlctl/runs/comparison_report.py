@@ -10,13 +10,42 @@ from rlctl.evaluation.request import judge
 from rlctl.recipe.stages import format_value
 from rlctl.runs import significance
 from rlctl.runs.comparison import Candidate, EvaluatedRun, RunComparison, Side
+from rlctl.storage.junit import Suite, make_gate_case
 from rlctl.version import collect_versions
 
 
-def show(result: RunComparison, json: str | None, gate: str | None = None, margin: float | None = None) -> None:
+def make_suite(
+    result: RunComparison,
+    seconds: float,
+    *,
+    has_gate: bool,
+    margin: float | None = None,
+    allow_no_success: bool = False,
+) -> Suite:
+    """Return a test case for each candidate, which fails where it misses the gate; it took so long [s]."""
+    missed = result.find_missed(margin, allow_no_success=allow_no_success) if has_gate else {}
+    cases = []
+    for candidate in result.candidates:
+        name = candidate.side.name
+        problems = [missed[name]] if name in missed else []
+        text = "\n".join([str(candidate.verdict), *describe_candidate(result, candidate)])
+        classname = f"{result.task}.runs compare"
+        cases.append(make_gate_case(classname, f"{name} against {result.baseline.name}", problems, text))
+    return Suite(f"rlctl runs compare {result.task}", seconds, cases)
+
+
+def show(
+    result: RunComparison,
+    json: str | None,
+    gate: str | None = None,
+    margin: float | None = None,
+    *,
+    allow_no_success: bool = False,
+) -> None:
     """Print which question is answered, the scores, the differences and the verdicts; or JSON alone for `-`."""
     has_gate = gate is not None or margin is not None
-    verdict = judge("runs compare", result.list_missed(margin) if has_gate else [], has_gate=has_gate)
+    missed = result.list_missed(margin, allow_no_success=allow_no_success) if has_gate else []
+    verdict = judge("runs compare", missed, has_gate=has_gate)
     gates = {"gate": "not-worse" if has_gate else None, "margin": margin}
     if output.present(as_json(result) | verdict | gates, json):
         return

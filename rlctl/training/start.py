@@ -22,7 +22,7 @@ from rlctl.errors import ArtifactError, RecipeError, RlctlError, UsageError
 from rlctl.hub import store
 from rlctl.policy import own_modules
 from rlctl.recipe.recipe import Recipe, validate
-from rlctl.recipe.sources import describe_rounding, resolve_with_stages
+from rlctl.recipe.sources import describe_other_algorithm, describe_rounding, resolve_with_stages
 from rlctl.run import lookup
 from rlctl.run.directory import RunDirectory, RunLock
 from rlctl.run.train_request import TrainRequest
@@ -116,9 +116,11 @@ def _find_new(request: TrainRequest, task: str) -> Start:
         raise RecipeError(f"--demos: {algo} cannot clone demonstrations; use ppo, a2c, sac, tqc, crossq, td3 or ddpg")
     if request.demos is not None and recipe.privileged is not None:
         raise RecipeError("--demos: demonstrations do not hold what only the critic sees; add --set privileged=null")
-    notes = tuple(filter(None, [describe_rounding(recipe)]))
+    notes = describe_other_algorithm(task, request.config, request.settings)
+    if (rounding := describe_rounding(recipe)) is not None:
+        notes.append(rounding)
     demos = describe_demonstrations(Path(request.demos)) if request.demos is not None else None
-    return Start(request, task, recipe, notes=notes, callbacks=callbacks, source=source, demos=demos)
+    return Start(request, task, recipe, notes=tuple(notes), callbacks=callbacks, source=source, demos=demos)
 
 
 def _find_checkpoint(request: TrainRequest) -> Start:

@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from rlctl.cli import COMMANDS
+from rlctl.cli import COMMANDS, GROUPS, build_app
 from rlctl.cli.arguments import command, command_in_panels
 from rlctl.options import Argument, Option
 
@@ -95,7 +95,7 @@ def test_help_in_panels():
     assert result.output == f"{Picking('cup', tries=7)} True\n"
 
 
-@pytest.mark.parametrize("name", ["train", "tune", "eval", "check-env"])
+@pytest.mark.parametrize("name", ["train", "tune", "eval", "check-env", "gate"])
 def test_every_option_is_in_a_panel(name):
     parameters = inspect.signature(COMMANDS[name]).parameters.values()
     panels = {
@@ -106,3 +106,14 @@ def test_every_option_is_in_a_panel(name):
     assert [name for name, panel in panels.items() if panel is None] == []
     assert next(iter(panels.values())) == "Options"
     assert len(set(panels.values())) >= 4
+
+
+def test_help_shows_the_commands_in_groups():
+    shown = CliRunner().invoke(build_app(), ["--help"]).output
+    order = [
+        *("─ Learn", "│ train ", "─ Judge", "│ eval ", "─ Show", "│ replay "),
+        *("─ Robot", "│ export ", "─ Tools", "│ tasks "),
+    ]
+    places = [shown.index(text) for text in order]
+    assert places == sorted(places)
+    assert len(COMMANDS) == sum(map(len, GROUPS.values()))

@@ -1,6 +1,7 @@
 import json
 import math
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.episode_statistics import Spread, mean_terms, success_interval, success_rate
 from rlctl.evaluation.evaluate import measure_score, run_evaluation
 from rlctl.evaluation.group_scores import GroupScore, SeedScore
+from rlctl.evaluation.junit import make_group_suite, make_suite
 from rlctl.evaluation.report import as_json
 from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.play.messages import EpisodeResult
@@ -236,3 +238,27 @@ def test_an_exported_policy_is_evaluated_alike_and_without_torch(reach_run, eval
             theirs[key] for key in ("seed", "success", "length")
         ]
         assert ours["return"] == pytest.approx(theirs["return"], rel=1e-3)
+
+
+def test_junit_has_a_case_for_each_gate(evaluation):
+    suite = make_suite(evaluation, Gates(min_success=0.0, min_success_lower=0.99, min_return=-1e9), 2.5)
+    names = ["--min-success 0", "--min-success-lower 0.99", "--min-return -1e+09"]
+    assert [case.name for case in suite.cases] == names
+    assert [case.outcomes[0].tag for case in suite.cases] == ["system-out", "failure", "system-out"]
+    assert suite.cases[1].outcomes[0].message.startswith("lower bound 0.")
+    assert [case.name for case in make_suite(evaluation, Gates(), 2.5).cases] == ["evaluation"]
+
+
+def test_junit_has_the_seeds_of_a_group_and_an_error_for_one_without_a_score():
+    group = SimpleNamespace(task="reach")
+    scores = GroupScore(group, [SeedScore(0, problem="not started yet")])
+    (case,) = make_group_suite(scores, Gates(min_success=0.5), 1.0).cases
+    assert (case.classname, case.name, case.outcomes[0].tag) == ("reach.eval", "seed 0", "error")
+
+
+def test_a_missed_gate_and_an_error_are_in_the_junit_file(reach_run, rlctl, tmp_path):
+    done = rlctl("eval", reach_run.path, "--episodes", 2, "--min-return", 1e9, "--junit", "eval.xml")
+    assert done.returncode == 1
+    assert '<failure message="mean return' in (tmp_path / "eval.xml").read_text()
+    assert rlctl("eval", "nothing.onnx", "--junit=eval.xml").returncode == 5
+    assert '<error message="' in (tmp_path / "eval.xml").read_text()

@@ -50,11 +50,45 @@ def test_set_goes_over_config_goes_over_packaged(packaged, config):
 
 def test_another_algorithm_takes_nothing_of_the_packaged_ones(packaged):
     result = resolve(packaged, None, {"algo": "sac", "algo_kwargs": {"gamma": 0.98}})
-    assert result.algo_kwargs == {"gamma": 0.98, "gradient_steps": -1, "train_freq": 1, "buffer_size": 300_000}
+    assert result.algo_kwargs == {"gamma": 0.98, "gradient_steps": -1, "train_freq": 1, "buffer_size": 200_000}
     assert result.policy_kwargs == {}
-    assert result.n_envs == 8
     assert result.task == {"size": 3, "shape": "round"}  # of the task, not of the algorithm
     assert not result.normalize.observation
+
+
+def test_algorithms_are_compared_with_equal_environments_and_steps(packaged, config):
+    result = resolve(packaged, None, {"algo": "sac"})
+    assert (result.n_envs, result.total_timesteps) == (64, 200_000)
+    file = config("algo: ppo\nalgo_kwargs: {n_steps: 50}\nnormalize: {reward: true}\nn_envs: 4\n")
+    result = resolve(packaged, file, {"algo": "sac"})
+    assert (result.n_envs, result.total_timesteps) == (4, 200_000)
+    assert "n_steps" not in result.algo_kwargs  # --algo takes nothing of a --config for another algorithm either
+    assert not result.normalize.reward
+
+
+def test_a_config_without_an_algorithm_is_for_the_chosen_one(packaged, config):
+    file = config("algo_kwargs: {tau: 0.01}\n")
+    assert resolve(packaged, file, {"algo": "sac"}).algo_kwargs["tau"] == 0.01
+
+
+def test_keys_that_the_chosen_algorithm_does_not_have_are_left_out(packaged, tmp_path):
+    (tmp_path / "my_env.yaml").write_text("algo: ppo\nprivileged: {}\nmirror: true\nmirror_loss: 0.5\n")
+    assert resolve(packaged, None, {"algo": "sac"}).privileged is not None
+    td3 = resolve(packaged, None, {"algo": "td3"})
+    assert (td3.privileged, td3.mirror, td3.mirror_loss) == (None, False, 0.0)
+
+
+def test_a_line_for_what_does_not_carry_over(packaged, config):
+    own = packaged.replace(".py:MyEnv", ".yaml")
+    assert sources.describe_other_algorithm(packaged, None, {}) == []
+    assert sources.describe_other_algorithm(packaged, None, {"algo": "sac", "n_envs": 2}) == [
+        f"{own} is for ppo; not used for sac: algo_kwargs, policy_kwargs; used: total_timesteps 200000"
+    ]
+    file = config("algo: ppo\nher: null\nn_envs: 4\ntotal_timesteps: 10\n")
+    assert sources.describe_other_algorithm(packaged, file, {"algo": "a2c"}) == [
+        f"{file} is for ppo; not used for a2c: her; used: n_envs 4, total_timesteps 10",
+        f"{own} is for ppo; not used for a2c: algo_kwargs, policy_kwargs",
+    ]
 
 
 def test_another_algorithm_takes_no_hindsight_of_the_packaged_one(packaged, tmp_path):
@@ -284,3 +318,13 @@ def test_a_shorter_training_is_evaluated_as_often():
     assert resolve("reach", None, {"total_timesteps": 20_000}).eval.every_steps == 4_000
     chosen = {"total_timesteps": 20_000, "eval": {"every_steps": 10_000}}
     assert resolve("reach", None, chosen).eval.every_steps == 10_000
+
+
+def test_command_shows_the_merged_recipe(rlctl, config):
+    file = config("n_envs: 4\n")
+    done = rlctl("recipe", "reach", "--config", file, "--algo", "sac", "--set", "algo_kwargs.gamma=0.9")
+    assert done.returncode == 0, done.stderr
+    expected = resolve("reach", file, {"algo": "sac", "algo_kwargs": {"gamma": 0.9}})
+    assert done.stdout == expected.to_yaml()
+    assert "is for ppo; not used for sac: algo_kwargs, policy_kwargs; used: total_timesteps 120000" in done.stderr
+    assert rlctl("recipe", "reach", "--algo", "sacc").returncode == 2

@@ -75,6 +75,27 @@ def test_a_word_that_stands_for_no_run(root, make_run, tmp_path):
     assert error(ArtifactError, find_run, "stuff", root) == "stuff: not a run of rlctl: it has no run.json"
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{root}/reach/2026-01-01_10-00-00_s1",
+        "{root}/reech/2026-01-01_10-00-00_s0",
+        "2026-01-01_10-00-0_s0",
+        "2026-01-01_10-00-00_s0/",
+    ],
+)
+def test_a_typo_in_the_name_of_a_run_suggests_the_run_and_no_task(root, make_run, text):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    message = error(ArtifactError, find_run, text.format(root=root), root)
+    assert message.endswith(f" Did you mean '{run.path}'?")
+
+
+@pytest.mark.parametrize("text", ["reach/other", "2024-03", "runs/reach"])
+def test_a_path_that_is_like_no_run_suggests_no_task(root, make_run, text):
+    make_run("hopper", "2026-01-01_10-00-00_s0")
+    assert error(ArtifactError, find_run, text, root).endswith(" All runs: rlctl runs")
+
+
 def test_which_policy(root, make_run):
     run = make_run("reach", "2026-01-01_10-00-00_s0")
     found = find_policy("reach", root=root)

@@ -16,7 +16,7 @@ from rlctl.recipe.sources import resolve
 from rlctl.run.directory import RunDirectory
 from rlctl.run.train_request import TrainRequest
 from rlctl.runs.comparison import Candidate, RunComparison, Side, compare, find_recipe_changes
-from rlctl.runs.comparison_report import as_json, describe_candidate, format_needed
+from rlctl.runs.comparison_report import as_json, describe_candidate, format_needed, make_suite
 from rlctl.runs.listing import find_runs_of
 from rlctl.runs.margin import check_margin
 from rlctl.runs.report.write import write_report
@@ -212,6 +212,43 @@ def test_gate(root):
                 each.check()
         else:
             each.check()
+
+
+def never_succeeding(result):
+    """The same comparison, as if no episode had succeeded."""
+
+    def fail(side):
+        runs = [
+            dataclasses.replace(run, evaluation=dataclasses.replace(run.evaluation, success_rate=0.0))
+            for run in side.runs
+        ]
+        return dataclasses.replace(side, runs=runs)
+
+    candidates = [dataclasses.replace(candidate, side=fail(candidate.side)) for candidate in result.candidates]
+    return dataclasses.replace(result, baseline=fail(result.baseline), candidates=candidates)
+
+
+def test_two_policies_that_never_succeed_pass_no_gate_unless_told_to(root):
+    one, two = sorted((root / "0.9/Line").iterdir())
+    result = never_succeeding(compare([str(one), str(two)], EvalRequest(None, episodes=4)))
+    for margin in (None, 1.0):
+        with pytest.raises(AnswerIsNo, match=r"both succeed in none of 4 episodes.*--allow-no-success lets that pass$"):
+            result.check(margin)
+    (name,) = result.find_missed(1.0)
+    assert name == str(two)
+    assert "both succeed" not in str(result.list_missed(allow_no_success=True))
+    half = dataclasses.replace(result, candidates=[])
+    half.check()
+
+
+def test_junit_has_a_case_for_each_candidate(root):
+    one, two = sorted((root / "0.9/Line").iterdir())
+    result = never_succeeding(compare([str(one), str(two)], EvalRequest(None, episodes=4)))
+    (case,) = make_suite(result, 1.5, has_gate=True).cases
+    assert case.name == f"{two} against {one}"
+    assert [outcome.tag for outcome in case.outcomes] == ["failure"]
+    (case,) = make_suite(result, 1.5, has_gate=False).cases
+    assert [outcome.tag for outcome in case.outcomes] == ["system-out"]
 
 
 def test_a_parameter_that_is_not_set_has_its_default():

@@ -370,6 +370,83 @@ def test_every_sign_of_a_finding_exists():
     assert {each["id"] for each in _texts()["findings"]} == {f"Q{number}" for number in range(1, 15)}
 
 
+# Of PPO with a learning rate of 0.03, whose rollouts are so long that 60,000 steps are four updates.
+FOUR = slice(0, 4)
+COLLAPSE = {
+    "return": [-369.0, -500.0, -1100.0, -1282.0],
+    "approx_kl": [0.8, 1.6, 9.0, 18.4],
+    "clip_fraction": 0.67,
+    "success": None,
+}
+
+
+@pytest.mark.parametrize("more", [{}, {"status": "running", "recipe": {"total_timesteps": 400_000}}])
+def test_a_collapse_is_found_after_four_updates(write_training, more):
+    every = {name: np.broadcast_to(values, UPDATES)[FOUR] for name, values in HEALTHY.items() if name != "success"}
+    columns = {**every, **COLLAPSE, "steps": [15_000, 30_000, 45_000, 60_000]}
+    run = write_training(**more)
+    _write_table(run.metrics_file, columns)
+    run.evals_file.unlink()
+    (finding,) = diagnose(run)
+    assert (finding.id, finding.name, finding.grade) == ("Q3", "oscillates", Grade.WARNING)
+    assert "return falls from -369 to -1282 at step 60,000" in finding.evidence
+    _write_table(run.metrics_file, {**every, "steps": columns["steps"]})
+    assert diagnose(run) == []  # the first updates of a healthy training
+
+
+def test_a_return_that_falls_while_updates_are_small_is_not_called_a_collapse(write_training):
+    assert diagnose(write_training({"return": -RISING, "success": None})) == []
+
+
+FLAT_SUCCESS = [0.02, 0.09, 0.2, 0.11, 0.08, 0.12]
+
+
+def test_a_training_that_ends_flat_with_some_successes_is_found(write_training):
+    success = np.repeat(FLAT_SUCCESS, 5)
+    run = write_training({"success": success}, {"success": [0.02, 0.2, 0.08, 0.11, 0.12]})
+    (finding,) = diagnose(run)
+    assert (finding.id, finding.name, finding.grade) == ("Q1", "the success rate stays low", Grade.WARNING)
+    assert finding.evidence == ["success 8% to 12% in the last 3 evaluations, 20% at best"]
+
+
+@pytest.mark.parametrize(
+    ("success", "status"),
+    [
+        ([0.0, 0.02, 0.05, 0.2, 0.45], "finished"),  # still rises: more steps help
+        ([0.1, 0.4, 0.5, 0.6, 0.6], "finished"),
+        ([0.02, 0.2, 0.08, 0.11, 0.12], "running"),
+    ],
+)
+def test_a_success_rate_that_rises_or_may_still_rise_is_no_finding(write_training, success, status):
+    recipe = {"total_timesteps": 300_000} if status == "running" else {}
+    assert diagnose(write_training({"success": None}, {"success": success}, recipe, status=status)) == []
+
+
+def test_a_specific_finding_replaces_the_general_one(write_training):
+    run = write_training({"approx_kl": 3.0, "clip_fraction": 0.85, "success": 0.1})
+    assert [finding.id for finding in diagnose(run)] == ["Q3"]
+
+
+ALTERNATING = np.column_stack([SMOOTH[:, 0], 0.3 * (-1.0) ** np.arange(100)])
+
+
+@pytest.mark.parametrize("status", ["finished", "running"])
+def test_an_action_that_alternates_is_found_in_a_training_that_succeeds_and_at_once(write_training, status):
+    recipe = {"total_timesteps": 3_000_000} if status == "running" else {}
+    run = write_training(episodes=[make_episode(ALTERNATING)], recipe=recipe, status=status)
+    (finding,) = diagnose(run)
+    assert (finding.id, finding.name, finding.grade) == ("Q7", "alternates from step to step", Grade.WARNING)
+    assert finding.evidence[0] == (
+        "action 1 changes direction in 100% of the steps, on average by 0.6 of half its range (1 of 2 actions do so)"
+    )
+
+
+def test_a_noisy_action_and_a_fast_swing_do_not_alternate(write_training):
+    noise = np.random.default_rng(0).uniform(-1, 1, 100)  # reverses in two of three steps
+    swing = np.sin(np.arange(100))  # a turn in six steps
+    assert diagnose(write_training(episodes=[make_episode(np.column_stack([noise, swing]))])) == []
+
+
 def test_damaged_run_is_not_an_error(write_training):
     run = write_training()
     run.metrics_file.write_text("steps,return\n1,\n2,nan\nx,1\n3")
@@ -385,7 +462,7 @@ def test_damaged_run_is_not_an_error(write_training):
 def test_who_learns_to_succeed_does_not_shake_in_place(write_training):
     episodes = [make_episode(SHAKING, terms=np.tile([1.0, 0.0], (100, 1)))]
     run = write_training({"success": None}, {"success": [0.03, 0.27, 0.3, 0.4, 0.47]}, episodes=episodes)
-    assert "Q7" not in {finding.id for finding in diagnose(run)}
+    assert [finding.name for finding in diagnose(run)] == ["alternates from step to step"]
 
 
 def test_a_finding_is_explained(rlctl):

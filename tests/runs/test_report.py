@@ -17,7 +17,8 @@ from rlctl.evaluation.robustness import Axis, Cell, Outcome, Robustness, Robustn
 from rlctl.recipe.sources import parse_settings, resolve
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
-from rlctl.runs.report import content
+from rlctl.runs import comparison_map
+from rlctl.runs.report import content, plots
 from rlctl.runs.report.write import write_report
 from rlctl.storage import files
 from rlctl.training.status import find_recipe_changes
@@ -92,7 +93,7 @@ def test_command_for_another_algorithm_trains_the_same_recipe(write_run):
     other = resolve("reach", None, {"algo": "sac", "task": {"tolerance": 0.1}, "seed": 3})
     changes = find_recipe_changes("reach", other)
     # What follows from another algorithm, its own defaults, is no choice of the user's.
-    assert changes == {"algo": "sac", "n_envs": 8, "total_timesteps": 300_000, "task.tolerance": 0.1}
+    assert changes == {"algo": "sac", "task.tolerance": 0.1}
     run = write_run("reach/2026-11-21_10-00-00_s3", seed=3, recipe_changes=changes)
     (command,) = content.list_commands(content.collect([str(run)]))
     words = shlex.split(command)
@@ -242,3 +243,97 @@ def test_browser_shows_it(group, tmp_path, width):
     assert int(content) <= int(inside)  # nothing to scroll sideways
     assert done.stdout.count("<svg") == 3
     assert "the best policies of 3 trainings" in done.stdout
+
+
+def test_legends_have_the_names_of_single_runs(group):
+    write_recipes(group[:2], a={"learning_rate": 0.001}, b={"learning_rate": 0.002})
+    page = write(*group[:2], episodes=0)
+    assert all(page.count(f">{run.name}</text>") == 2 for run in group[:2])  # of return and success
+
+
+def test_results_alone_are_a_table(group, tmp_path):
+    table = write(group[0], form="table", target=tmp_path / "table.md")
+    head, line, row = table.splitlines()
+    assert head == "| run | recipe | algo | seed | steps | minutes | success | return |"
+    assert line == "|" + " --- |" * 8
+    assert row.startswith(f"| reach/{group[0].name} |  | ppo | 0 |")
+
+
+def test_curves_are_drawn_as_png(group, tmp_path):
+    path = write_report([str(group[0])], "png", tmp_path / "curves.png")
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_moving_average_by_hand():
+    values = np.array([0.0, 3.0, 6.0, 0.0, 3.0])
+    # At the ends the mean of two: (0 + 3) / 2 and (0 + 3) / 2; inside of three: 9 / 3, 9 / 3, 9 / 3.
+    assert plots.smooth_values(values, 3) == pytest.approx([1.5, 3.0, 3.0, 3.0, 1.5])
+
+
+def make_measured(rates):
+    """Return a measurement of two axes with these success rates, shape (2, 2)."""
+    axes = [
+        {"name": name, "setting": f"events.{name}.factor", "values": [0.5, 1.0], "nominal": 1.0}
+        for name in ("mass", "friction")
+    ]
+    cells = [
+        {
+            "success_rate": rate,
+            "success_interval": (max(0.0, rate - 0.1), min(1.0, rate + 0.1)),
+            "mean_return": 1.0,
+            "return_interval": (0.0, 2.0),
+            "values": [0.5 + 0.5 * (index // 2), 0.5 + 0.5 * (index % 2)],
+            "nominal": index == 3,
+        }
+        for index, rate in enumerate(rates)
+    ]
+    nominal = {key: value for key, value in cells[3].items() if key not in ("values", "nominal")}
+    return Robustness.model_validate(
+        {
+            "task": "reach",
+            "parameters": {},
+            "policy_file": "x.safetensors",
+            "algo": "ppo",
+            "training_steps": 1,
+            "episodes": 10,
+            "seed": 0,
+            "deterministic": True,
+            "nominal": nominal,
+            "maps": [{"axes": axes, "cells": cells}],
+        }
+    )
+
+
+def test_difference_of_two_maps():
+    one, two = make_measured([0.2, 0.5, 0.5, 1.0]), make_measured([0.9, 0.55, 0.1, 1.0])
+    result = comparison_map.subtract(("one", "two"), one, two)
+    (compared,) = result.maps
+    assert [cell.difference for cell in compared.cells] == pytest.approx([0.7, 0.05, -0.4, 0.0])
+    assert [cell.is_clear for cell in compared.cells] == [True, False, True, False]
+    cells = comparison_map.as_json(result)["maps"][0]["cells"]
+    assert [cell["intervals_overlap"] for cell in cells] == [False, True, False, True]
+    assert plots.draw_differences(result, "png").startswith(b"\x89PNG")
+    assert b"two minus one" in plots.draw_differences(result, "svg")
+
+
+def test_maps_of_a_policy_are_a_picture():
+    measured = make_measured([0.2, 0.5, 0.5, 1.0])
+    assert plots.draw_maps(measured, "png").startswith(b"\x89PNG")
+    assert plots.draw_maps(measured, "pdf").startswith(b"%PDF")
+    with pytest.raises(UsageError, match=r"^map\.jpg: the name of a picture ends in \.png, \.svg or \.pdf$"):
+        plots.choose_form(Path("map.jpg"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["compare", "a", "b", "c", "--vary", "mass=0:1:2"], "--vary compares two policies, the baseline first"),
+        (["compare", "a", "b", "--vary", "mass=0:1:2", "--gate", "not-worse"], "--vary draws a map and judges nothing"),
+        (["compare", "a", "b", "--picture", "x.png"], "--picture draws maps: add --vary"),
+        (["compare", "a", "b", "--vary", "mass=0:1:2", "--picture", "x.gif"], "x.gif: the name of a picture ends in"),
+    ],
+)
+def test_a_map_that_cannot_be_drawn_is_refused(rlctl, arguments, message):
+    done = rlctl("runs", *arguments)
+    assert done.returncode == 2
+    assert message in done.stderr

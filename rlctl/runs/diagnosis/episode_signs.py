@@ -11,6 +11,8 @@ from rlctl.runs.diagnosis.history import History
 Array = NDArray[np.float64]
 
 _LEAST_STEPS = 20
+_EVERY_STEP = 0.8  # fraction of the steps; white noise reverses in 0.67, the shipped policies in 0.6
+_LEAST_CHANGE = 0.1  # of half the action range, from step to step
 _MOST_SPEED = {"m/s": 50.0, "rad/s": 300.0}  # no joint or body of a robot is faster: 300 rad/s are 2,900 turns a minute
 _MOST_POSITION_SPEED = 50.0  # [m/s]
 _MOST_OVERLAP = 0.05  # [m]; feet that hit the ground reach 0.02, a fall 0.03
@@ -42,6 +44,29 @@ def shakes(run: History) -> str | None:
     return (
         f"actions change direction in {reversals:.0%} of the steps, on average by {size:.2g} of half the action range"
     )
+
+
+def alternates(run: History) -> str | None:
+    """An action changes its direction in nearly every step; no motor or robot can follow that."""
+    measured = [_measure_changes(actions) for actions in _actions(run)]
+    if not measured:
+        return None
+    reversals, sizes = np.median(measured, axis=0)
+    alternating = np.flatnonzero((reversals >= _EVERY_STEP) & (sizes >= _LEAST_CHANGE))
+    if not len(alternating):
+        return None
+    worst = int(alternating[sizes[alternating].argmax()])
+    return (
+        f"action {worst} changes direction in {reversals[worst]:.0%} of the steps, on average by {sizes[worst]:.2g} "
+        f"of half its range ({len(alternating)} of {len(sizes)} actions do so)"
+    )
+
+
+def _measure_changes(actions: Array) -> Array:
+    """Return the fraction of steps that reverse each action, and the mean size of its changes, shape (2, elements)."""
+    change = np.diff(actions, axis=0)
+    reversals = (change[1:] * change[:-1] < 0).mean(axis=0)
+    return np.stack([reversals, np.abs(change).mean(axis=0)])
 
 
 def stands_still(run: History) -> str | None:

@@ -79,7 +79,12 @@ def diagnose(run: RunDirectory | History) -> list[Finding]:
     history = run if isinstance(run, History) else History(run)
     functions = list_signs()
     read_sign = functools.cache(lambda name: functions[name](history))
-    findings = [finding for text in _texts()["findings"] if (finding := _check(text, read_sign, history)) is not None]
+    texts = _texts()["findings"]
+    specific = [text for text in texts if not text.get("alone")]
+    findings = [finding for text in specific if (finding := _check(text, read_sign, history)) is not None]
+    if all(finding.grade != Grade.WARNING for finding in findings):
+        general = [text for text in texts if text.get("alone")]
+        findings += [finding for text in general if (finding := _check(text, read_sign, history)) is not None]
     return sorted(findings, key=lambda finding: list(Grade).index(finding.grade))
 
 

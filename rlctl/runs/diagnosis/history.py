@@ -22,7 +22,8 @@ from rlctl.runs.summary import Rows, list_points, read_table
 Array = NDArray[np.float64]
 _Record = TypeVar("_Record")
 
-LEAST_ROWS = 10  # rows of `metrics.csv`; with fewer rows most signs are not checked
+LEAST_ROWS = 10  # rows of `metrics.csv`; with fewer rows signs in the course of a curve are not checked
+FEW_ROWS = 3  # rows for a sign that one value shows; one row alone may be chance
 _GOOD = 0.8  # a training with this success rate has succeeded, whatever its other records are
 EPISODES = 4  # recorded episodes that are checked: the first and the worst of the last two evaluations
 

@@ -8,7 +8,7 @@ import numpy as np
 from rlctl.output import format_count
 from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import Recipe
-from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
+from rlctl.runs.diagnosis.history import FEW_ROWS, LEAST_ROWS, Curve, History
 
 _MOST_NORMALIZED_REWARD = 10.0  # where SB3's `VecNormalize` clips
 
@@ -25,7 +25,7 @@ def critic_explains_nothing(run: History) -> str | None:
 def values_explode(run: History) -> str | None:
     """The critic predicts more than rewards can add up to."""
     value, most = run.curve("value"), _largest_value(run)
-    if len(value) < LEAST_ROWS or most is None:
+    if len(value) < FEW_ROWS or most is None:
         return None
     peak, last = float(np.abs(value.values).max()), value.thirds()[1]
     # An entropy bonus comes on top of rewards, most at the beginning.
@@ -37,7 +37,7 @@ def values_explode(run: History) -> str | None:
 def gradients_explode(run: History) -> str | None:
     """Gradients are far larger than errors of the value function can explain."""
     norm, most = run.curve("gradient_norm"), _largest_value(run)
-    if len(norm) < LEAST_ROWS or most is None or (peak := float(norm.values.max())) < 1000 * max(most, 1.0):
+    if len(norm) < FEW_ROWS or most is None or (peak := float(norm.values.max())) < 1000 * max(most, 1.0):
         return None
     return f"the gradient norm reaches {peak:.2g}, but rewards add up to {most:.3g} at most"
 
@@ -55,7 +55,7 @@ def _largest_value(run: History) -> float | None:
 
 def policy_hardly_changes(run: History) -> str | None:
     """Updates change nothing, before a schedule has lowered the learning rate."""
-    change = _read_change(run)
+    change = _read_change(run) if len(run.metrics) >= LEAST_ROWS else None
     return change.describe(".1e") if change and change.kl <= 1e-4 and change.clipped <= 1e-3 else None
 
 
@@ -85,7 +85,7 @@ class _Change(NamedTuple):
 def _read_change(run: History) -> _Change | None:
     curves = [run.curve(name).values for name in ("approx_kl", "clip_fraction")]
     early = [values[: (2 * len(values) + 2) // 3] for values in curves]
-    return _Change(*(float(np.median(values)) for values in early)) if min(map(len, early)) >= LEAST_ROWS else None
+    return _Change(*(float(np.median(values)) for values in early)) if min(map(len, curves)) >= FEW_ROWS else None
 
 
 def exploration_vanishes(run: History) -> str | None:
@@ -113,7 +113,7 @@ def exploration_does_not_fall(run: History) -> str | None:
 
 def exploration_explodes(run: History) -> str | None:
     """The policy becomes far more random than the actions' range."""
-    if len(curve := _exploration(run)) < LEAST_ROWS:
+    if len(curve := _exploration(run)) < FEW_ROWS:
         return None
     first, last = curve.thirds()
     grows = last > max(2 * first, 2.0)
@@ -123,7 +123,7 @@ def exploration_explodes(run: History) -> str | None:
 def saturated(run: History) -> str | None:
     """Nearly all actions are at a limit of their range."""
     curve = run.curve("action_saturation")
-    if len(curve) < LEAST_ROWS or (last := curve.thirds()[1]) < 0.8:
+    if len(curve) < FEW_ROWS or (last := curve.thirds()[1]) < 0.8:
         return None
     return f"{last:.0%} of the actions are at a limit in the last third"
 

@@ -13,6 +13,10 @@ _LEAST_EVALUATIONS = 4
 _NEVER = 0.02  # success rate
 _BY_CHANCE = 0.1  # success rate
 _HALF = 0.5  # success rate
+_LEAST_TO_FALL = 3  # points of a curve
+_CLEAR = 5.0  # [standard errors]
+_LARGE_FALL = 0.4  # fraction of the largest return
+_SAME = 0.1  # difference of success rates of evaluations that chance explains
 
 
 def flat(run: History) -> str | None:
@@ -166,6 +170,35 @@ def _find_fall(curve: Curve) -> tuple[float, float, float, float] | None:
     ):
         return None
     return float(smooth[0]), float(smooth[at]), end, float(curve.steps[min(at + window - 1, len(curve) - 1)])
+
+
+def return_falls(run: History) -> str | None:
+    """The return is far lower at the end than at the beginning; three rows suffice."""
+    curve = run.curve("return")
+    if len(curve) < _LEAST_TO_FALL:
+        curve = run.evaluation_curve("return")
+    if len(curve) < _LEAST_TO_FALL or run.is_good:
+        return None
+    first, last = curve.thirds()
+    is_large = first - last > _LARGE_FALL * float(np.abs(curve.values).max())
+    if not is_large and curve.rise() > -_CLEAR:
+        return None
+    return f"return falls from {first:.4g} to {last:.4g} at step {curve.steps[-1]:,.0f}"
+
+
+def ends_low(run: History) -> str | None:
+    """The training is over, and in its second half the success rate neither rose nor reached a half."""
+    curve = run.evaluation_curve("success")
+    if len(curve) < _LEAST_EVALUATIONS or run.progress < 1:
+        return None
+    second_half = curve.values[len(curve) // 2 :]
+    first, last = Curve(curve.steps[-len(second_half) :], second_half).thirds()
+    if curve.values.max() >= _HALF or curve.values.max() <= _NEVER or last - first > _SAME:
+        return None
+    return (
+        f"success {second_half.min():.0%} to {second_half.max():.0%} in the last {len(second_half)} evaluations, "
+        f"{curve.values.max():.0%} at best"
+    )
 
 
 def early_peak(run: History) -> str | None:

@@ -14,6 +14,7 @@ from rlctl.errors import ArtifactError, RlctlError, UsageError, short_repr
 from rlctl.output import format_duration
 from rlctl.recipe.recipe import NOT_SET, Recipe
 from rlctl.recipe.stages import format_value
+from rlctl.run.directory import is_group
 from rlctl.run.episode import RecordedEpisode
 from rlctl.runs.comparison import find_recipe_changes
 from rlctl.runs.diagnosis.findings import Finding
@@ -32,6 +33,7 @@ class RecipeRuns:
 
     name: str  # what distinguishes this recipe from the others; empty for a single one
     runs: list[RunDescription]
+    label: str = ""  # in legends: the name of its run or group; where a recipe has none, `name`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,10 +96,21 @@ def _group_by_recipe(runs: Sequence[RunDescription]) -> list[RecipeRuns]:
             same.append(run)
     changes = [find_recipe_changes(recipe, groups[0][0]) for recipe, _ in groups]
     baseline = {key: before for change in changes for key, (_, before) in change.items()}
-    return [
-        RecipeRuns(_name_recipe(baseline | {key: value for key, (value, _) in change.items()}), group)
-        for change, (_, group) in zip(changes, groups, strict=True)
-    ]
+    names = [_name_recipe(baseline | {key: value for key, (value, _) in change.items()}) for change in changes]
+    labels = [_find_folder(group) for _, group in groups]
+    if "" in labels or len(set(labels)) < len(labels) or len(groups) == 1:
+        labels = names
+    return [RecipeRuns(name, group, label) for name, label, (_, group) in zip(names, labels, groups, strict=True)]
+
+
+def _find_folder(runs: Sequence[RunDescription]) -> str:
+    """Return the name of a single run's folder, or of the group that all are in; empty where they have none."""
+    paths = [run.run.path.resolve() for run in runs]
+    if len(paths) == 1:
+        return paths[0].name
+    folders = {path.parent for path in paths}
+    group = folders.pop()
+    return "" if folders or not is_group(group) else group.name
 
 
 def _name_recipe(settings: Mapping[str, Any]) -> str:
@@ -107,6 +120,21 @@ def _name_recipe(settings: Mapping[str, Any]) -> str:
         for key, value in settings.items()
     ]
     return ", ".join(names[:_SETTINGS_NAMED]) + (", ..." if len(names) > _SETTINGS_NAMED else "")
+
+
+def list_rows(report: RunReport) -> list[tuple[str, ...]]:
+    """Return the results as a table, a row per run, below the names of the columns."""
+    rows: list[tuple[str, ...]] = [("run", "recipe", "algo", "seed", "steps", "minutes", "success", "return")]
+    for recipe in report.recipes:
+        for run in recipe.runs:
+            summary = run.summary
+            minutes = "" if summary.seconds is None else f"{summary.seconds / 60:.1f}"
+            success = "" if summary.best_success is None else f"{summary.best_success:.1%}"
+            value = "" if summary.best_return is None else f"{summary.best_return:.4g}"
+            steps = "" if summary.steps is None else f"{summary.steps:,}"
+            numbers = (str(summary.seed), steps, minutes, success, value)
+            rows.append((summary.name, recipe.name, summary.algo, *numbers))
+    return rows
 
 
 def list_facts(report: RunReport) -> list[tuple[str, str]]:

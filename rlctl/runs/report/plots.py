@@ -1,17 +1,23 @@
 """The plots of a report, as SVG texts for an HTML page or as a file of their own."""
 
+import functools
 import io
 import re
 import textwrap
-from typing import Any, Literal
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
+from numpy.typing import NDArray
 
-from rlctl.evaluation.robustness import PushTest, RobustnessMap
+from rlctl.errors import UsageError
+from rlctl.evaluation.robustness import Axis, PushTest, Robustness, RobustnessMap
+from rlctl.runs.comparison_map import MapComparison, MapDifference
 from rlctl.runs.report.content import RecipeRuns, RunReport, mean_curve
 
 _SIZE = (4.4, 2.7)  # [inches]: the width of a phone, so that text is readable there
@@ -25,6 +31,10 @@ _STYLE: dict[Any, Any] = {
     "axes.grid": True,
     "grid.alpha": 0.3,
 }
+Picture = Literal["svg", "pdf", "png"]
+_PNG_RESOLUTION = 200  # [dots per inch]
+_UNDATED: dict[Picture, dict[Any, Any]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
+_LONG = 40  # points of a curve that is smoothed
 _LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8}
 _NO_METADATA: dict[Any, Any] = dict.fromkeys(("Date", "Creator", "Format", "Type"))
 _TITLES = {"return": "Return", "success": "Success rate"}
@@ -37,15 +47,69 @@ def plot_learning(report: RunReport, column: str) -> str | None:
     return _finish(figure, axes) if _draw_learning(axes, report, column) else None
 
 
-def draw_learning(report: RunReport, form: Literal["svg", "pdf"]) -> bytes:
+def draw_learning(report: RunReport, form: Picture) -> bytes:
     """Return the learning curves as a file for a paper; a quantity without values has no panel."""
     with matplotlib.rc_context(_STYLE):
         figure, file = Figure(figsize=(2 * _SIZE[0], _SIZE[1]), layout="constrained"), io.BytesIO()
         for axes, column in zip(figure.subplots(1, 2), _TITLES, strict=True):
             if not _draw_learning(axes, report, column, for_paper=True):
                 axes.remove()
-        figure.savefig(file, format=form, metadata={"Date": None} if form == "svg" else {"CreationDate": None})
+        _save(figure, file, form)
     return file.getvalue()
+
+
+def _save(figure: Figure, file: io.BytesIO, form: Picture) -> None:
+    figure.savefig(file, format=form, dpi=_PNG_RESOLUTION, metadata=_UNDATED[form])
+
+
+def choose_form(path: Path) -> Picture:
+    """Return the format of a picture by the suffix of its file; raises `UsageError` for another one."""
+    for form in get_args(Picture):
+        if path.suffix == f".{form}":
+            return cast(Picture, form)
+    raise UsageError(f"{path}: the name of a picture ends in .png, .svg or .pdf")
+
+
+def draw_maps(result: Robustness, form: Picture) -> bytes:
+    """Return the robustness maps of a policy, next to each other, as a picture."""
+    return _draw_panels([functools.partial(_draw_map, varied=varied) for varied in result.maps], form)
+
+
+def draw_differences(result: MapComparison, form: Picture) -> bytes:
+    """Return the maps of the difference of two policies, next to each other, as a picture."""
+    panels = [functools.partial(_draw_difference, names=result.names, compared=compared) for compared in result.maps]
+    return _draw_panels(panels, form)
+
+
+def _draw_panels(panels: Sequence[Callable[[Figure, Axes], None]], form: Picture) -> bytes:
+    with matplotlib.rc_context(_STYLE):
+        figure, file = Figure(figsize=(len(panels) * _SIZE[0], _SIZE[1]), layout="constrained"), io.BytesIO()
+        for draw, axes in zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True):
+            draw(figure, axes)
+        _save(figure, file, form)
+    return file.getvalue()
+
+
+def _draw_difference(figure: Figure, axes: Axes, names: tuple[str, str], compared: MapDifference) -> None:
+    unit = "difference in the success rate" if compared.has_success else "difference in the return"
+    values = np.array([cell.difference for cell in compared.cells])
+    clear = np.array([cell.is_clear for cell in compared.cells])
+    title = textwrap.fill(f"{Path(names[1]).name} minus {Path(names[0]).name}", 48)
+    if len(compared.axes) == 1:
+        (axis,) = compared.axes
+        axes.axhline(0.0, color="gray", linewidth=0.8)
+        axes.plot(axis.values, values, marker="o", ms=3, mfc="white")
+        axes.plot(np.array(axis.values)[clear], values[clear], "o", ms=4, color="C0", label="intervals do not overlap")
+        axes.legend(loc="best", **_LEGEND)
+        _label(axes, axis.name, unit, title)
+        return
+    rows, columns = compared.axes
+    largest = 1.0 if compared.has_success else float(np.abs(values).max()) or 1.0
+    limits = {"cmap": "RdYlGn", "vmin": -largest, "vmax": largest}
+    _draw_heat(figure, axes, values, (rows, columns), unit, limits, "{x:+.0%}" if compared.has_success else None)
+    for index in np.flatnonzero(clear):
+        axes.plot(index % len(columns.values), index // len(columns.values), marker="*", ms=6, color="black")
+    _label(axes, columns.name, rows.name, title)
 
 
 def _draw_learning(axes: Axes, report: RunReport, column: str, *, for_paper: bool = False) -> bool:
@@ -53,10 +117,10 @@ def _draw_learning(axes: Axes, report: RunReport, column: str, *, for_paper: boo
         training = mean_curve([run.metrics for run in recipe.runs], column)
         evaluated = mean_curve([run.evaluations for run in recipe.runs], column)
         color = {"color": f"C{number}"} if recipe.name else {}  # a colour per recipe
-        name = textwrap.fill(textwrap.shorten(recipe.name, 64, placeholder=" ..."), 34)
+        name = textwrap.fill(textwrap.shorten(recipe.label, 64, placeholder=" ..."), 34)
         alone = for_paper and evaluated is not None  # readers expect one curve per recipe
         if training is not None and not alone:
-            _draw_curve(axes, training, name or "training", color)
+            _draw_smoothed(axes, training, name or "training", color)
         if evaluated is not None:
             line = {"linestyle": "-" if alone else "none", **color} if recipe.name else {}
             label = "evaluations" if not name else name if alone else ""
@@ -66,6 +130,23 @@ def _draw_learning(axes: Axes, report: RunReport, column: str, *, for_paper: boo
     axes.legend(loc="best", **_LEGEND) if axes.lines else None
     _label(axes, "training steps", _UNITS[column], f"{_TITLES[column]} over training steps")
     return bool(axes.lines)
+
+
+def _draw_smoothed(axes: Axes, curve: dict[str, Any], label: str, style: dict[str, Any]) -> None:
+    """Draw a curve as it is, and a long one pale below its moving average."""
+    means = np.asarray(curve["mean"], np.float64)
+    if len(means) < _LONG:
+        _draw_curve(axes, curve, label, style)
+        return
+    (line,) = axes.plot(curve["steps"], means, linewidth=0.7, alpha=0.3, **style)
+    smooth = {**curve, "mean": smooth_values(means, len(means) // _LONG * 2 + 1)}
+    _draw_curve(axes, smooth, label, {**style, "color": line.get_color()})
+
+
+def smooth_values(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """Return the moving average over `window` points, an odd number, shape (points,); over fewer at the ends."""
+    weights = np.ones(window)
+    return np.convolve(values, weights, "same") / np.convolve(np.ones(len(values)), weights, "same")
 
 
 def plot_terms(recipe: RecipeRuns) -> str | None:
@@ -94,39 +175,60 @@ def _draw_curve(axes: Axes, curve: dict[str, Any], label: str, style: dict[str, 
 
 def plot_robustness(result: RobustnessMap) -> str:
     """Return a map of success, or return where there is no success: a heat map, or a curve with its interval."""
-    quantity = "success" if result.cells[0].success_rate is not None else "return"
-    if len(result.axes) == 1:
-        return _plot_varied(result, quantity)
-    rows, columns = result.axes
-    shape = (len(rows.values), len(columns.values))
-    values = np.array([_value(cell, quantity) for cell in result.cells]).reshape(shape)
-    limits: dict[str, Any] = {"vmin": 0, "vmax": 1} if quantity == "success" else {}
     figure, axes = _make_figure()
-    axes.grid(False)
-    image = axes.imshow(values, origin="lower", aspect="auto", cmap="viridis", **limits)
-    axes.set_xticks(range(shape[1]), [f"{value:g}" for value in columns.values])
-    axes.set_yticks(range(shape[0]), [f"{value:g}" for value in rows.values])
-    for index, cell in enumerate(result.cells):
+    _draw_map(figure, axes, result)
+    return _finish(figure, axes)
+
+
+def _draw_map(figure: Figure, axes: Axes, varied: RobustnessMap) -> None:
+    quantity = "success" if varied.cells[0].success_rate is not None else "return"
+    if len(varied.axes) == 1:
+        _draw_varied(axes, varied, quantity)
+        return
+    rows, columns = varied.axes
+    values = np.array([_value(cell, quantity) for cell in varied.cells])
+    limits: dict[str, Any] = {"vmin": 0, "vmax": 1} if quantity == "success" else {}
+    form = "{x:.0%}" if quantity == "success" else None
+    _draw_heat(figure, axes, values, (rows, columns), _UNITS[quantity], {"cmap": "viridis", **limits}, form)
+    for index, cell in enumerate(varied.cells):
         if cell.nominal:
-            axes.plot(index % shape[1], index // shape[1], marker="s", ms=9, mfc="none", mec="white", mew=1.5)
-    figure.colorbar(image, label=_UNITS[quantity], format="{x:.0%}" if quantity == "success" else None)
-    return _finish(figure, axes, columns.name, rows.name, f"{_TITLES[quantity]} by {rows.name} and {columns.name}")
+            place = index % len(columns.values), index // len(columns.values)
+            axes.plot(*place, marker="s", ms=9, mfc="none", mec="white", mew=1.5)
+    _label(axes, columns.name, rows.name, f"{_TITLES[quantity]} by {rows.name} and {columns.name}")
 
 
-def _plot_varied(result: RobustnessMap, quantity: str) -> str:
+def _draw_heat(
+    figure: Figure,
+    axes: Axes,
+    values: NDArray[np.float64],
+    varied: tuple[Axis, Axis],
+    unit: str,
+    limits: dict[str, Any],
+    form: str | None,
+) -> None:
+    """Draw values, shape (cells,), as colours: the first axis upwards, the second to the right."""
+    rows, columns = varied
+    axes.grid(False)
+    grid = values.reshape(len(rows.values), len(columns.values))
+    image = axes.imshow(grid, origin="lower", aspect="auto", **limits)
+    axes.set_xticks(range(len(columns.values)), [f"{value:g}" for value in columns.values])
+    axes.set_yticks(range(len(rows.values)), [f"{value:g}" for value in rows.values])
+    figure.colorbar(image, ax=axes, label=unit, format=form)
+
+
+def _draw_varied(axes: Axes, result: RobustnessMap, quantity: str) -> None:
     (axis,) = result.axes
     intervals = [cell.success_interval if quantity == "success" else cell.return_interval for cell in result.cells]
     low, high = np.array(intervals, np.float64).T
     means = [_value(cell, quantity) for cell in result.cells]
     curve = {"steps": axis.values, "mean": means, "low": low, "high": high, "count": len(means)}
-    figure, axes = _make_figure()
     _draw_curve(axes, curve, quantity, {"marker": "o", "ms": 3})
     if axis.nominal is not None:
         axes.axvline(axis.nominal, linestyle=":", color="gray", label="nominal")
         axes.legend(loc="best", **_LEGEND)
     if quantity == "success":
         _scale_rates(axes)
-    return _finish(figure, axes, axis.name, _UNITS[quantity], f"{_TITLES[quantity]} by {axis.name}")
+    _label(axes, axis.name, _UNITS[quantity], f"{_TITLES[quantity]} by {axis.name}")
 
 
 def plot_push(test: PushTest) -> str:

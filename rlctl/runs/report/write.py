@@ -23,19 +23,23 @@ _PICTURES = 6  # of an episode
 
 def write_report(
     runs: Sequence[str],
-    form: Literal["html", "md", "svg", "pdf"] = "html",
+    form: Literal["html", "md", "table", "svg", "pdf", "png"] = "html",
     target: Path | None = None,
     *,
     pictures: bool = True,
     episodes: int = 100,
 ) -> Path | None:
-    """Write a report, or its learning curves alone (svg, pdf), and return its file; None for Markdown that was printed.
+    """Write a report, its learning curves alone (svg, pdf, png), or its table of results alone (table, as Markdown).
+
+    Return its file; None for Markdown that was printed.
 
     Runs of several recipes are compared first, each plays `episodes` for it; 0 leaves it out.
     """
     report = content.collect(runs)
     path = target or Path(f"report.{form}")
-    if form in ("svg", "pdf"):
+    if form == "table":
+        return _write_text(_format_table(content.list_rows(report)), target)
+    if form in ("svg", "pdf", "png"):
         from rlctl.runs.report import plots
 
         files.write_result(path, plots.draw_learning(report, form))
@@ -47,11 +51,22 @@ def write_report(
     )
     template = environment.from_string(Path(__file__).with_name(f"report.{form}.jinja").read_text(encoding="utf-8"))
     text = template.render(_values(report, is_html, pictures, episodes))
-    if target is None and not is_html:
+    return _write_text(text, path if is_html else target)
+
+
+def _write_text(text: str, target: Path | None) -> Path | None:
+    """Write a text to a file, or without one to stdout."""
+    if target is None:
         output.results().write(output.escape_controls(text))
         return None
-    files.write_result(path, text.encode(errors="backslashreplace"))
-    return path
+    files.write_result(target, text.encode(errors="backslashreplace"))
+    return target
+
+
+def _format_table(rows: Sequence[Sequence[str]]) -> str:
+    head, *body = rows
+    lines = [head, ["---"] * len(head), *body]
+    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
 
 
 def _escape_html(value: Any) -> Any:

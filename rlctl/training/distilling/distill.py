@@ -15,7 +15,7 @@ from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers, count_envs
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.players.player import Exploration
-from rlctl.recipe.recipe import ON_POLICY
+from rlctl.recipe.recipe import ON_POLICY, Recipe
 from rlctl.recipe.sources import resolve_with_stages
 from rlctl.run import lookup
 from rlctl.run.train_request import TrainRequest
@@ -26,6 +26,7 @@ from rlctl.training.start import Start, find_start
 
 EPISODES = 100
 """Unseen episodes in which student and teacher are compared."""
+_SHARE_OF_STEPS = 4  # a student takes a quarter of the steps of a training
 _EPISODE_SEED = 0  # of `rlctl eval` too, whose result is therefore the same
 
 
@@ -100,14 +101,17 @@ def make_settings(request: DistillRequest, teacher: EnvSpec) -> dict[str, Any]:
         environment["observe"] = [name.strip() for name in request.observe.split(",") if name.strip()]
     packaged = resolve_with_stages(teacher.task).algo
     if packaged not in ON_POLICY:
-        environment["algo"] = "ppo"
+        # Replay needs fewer environments and steps than a student that learns from its rollouts.
+        defaults = Recipe.model_fields
+        environment |= {"algo": "ppo", "n_envs": defaults["n_envs"].default}
+        environment["total_timesteps"] = defaults["total_timesteps"].default // _SHARE_OF_STEPS
     settings = merge(environment, request.settings)
     settings.setdefault("total_timesteps", _count_steps(teacher.task, settings))
     return settings
 
 
 def _count_steps(task: str, settings: Mapping[str, Any]) -> int:
-    return max(1, resolve_with_stages(task, None, settings).total_timesteps // 4)
+    return max(1, resolve_with_stages(task, None, settings).total_timesteps // _SHARE_OF_STEPS)
 
 
 def compare(result: training.TrainResult, teacher: Teacher, request: DistillRequest) -> tuple[PlayedScore, PlayedScore]:

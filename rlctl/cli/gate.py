@@ -1,0 +1,79 @@
+"""`rlctl gate`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rlctl.cli.arguments import choose_checkpoint, command_in_panels, parse_changes
+from rlctl.evaluation.request import MinReturn, MinSuccess, MinSuccessLower
+from rlctl.options import Checkpoint, EpisodeSeed, Json, Junit, Option, Pretrained, RunName, Settings
+
+
+@command_in_panels(
+    {
+        "Options": ["task", "checkpoint", "pretrained", "episodes", "seed", "settings"],
+        "Check": ["strict", "budget"],
+        "Gates": ["min_success", "min_success_lower", "min_return", "decide_early"],
+        "Comparison": ["against", "margin", "allow_no_success"],
+        "Output": ["export", "json", "junit", "sarif", "markdown"],
+    }
+)
+def gate(
+    run: RunName = None,
+    task: Annotated[str | None, Option("Judge on this task instead of the one it was trained on.")] = None,
+    checkpoint: Checkpoint = "best",
+    pretrained: Pretrained = False,
+    episodes: Annotated[int, Option("Episodes, each with its own seed.", min=2, max=1_000_000)] = 100,
+    seed: EpisodeSeed = 0,
+    settings: Settings = [],
+    strict: Annotated[bool, Option("Warnings of the check fail too.", ("--strict",))] = False,
+    budget: Annotated[float, Option("Computing time of the check in seconds.", min=1)] = 18.0,
+    min_success: MinSuccess = None,
+    min_success_lower: MinSuccessLower = None,
+    min_return: MinReturn = None,
+    decide_early: Annotated[bool, Option("End the evaluation when its gate is decided.", ("--decide-early",))] = False,
+    against: Annotated[Path | None, Option("The policy in use; the new one must not be worse.", metavar="FILE")] = None,
+    margin: Annotated[
+        float | None, Option("The episodes must exclude a larger loss of success, e.g. 0.05.", min=0)
+    ] = None,
+    allow_no_success: Annotated[
+        bool, Option("Let the comparison pass where neither ever succeeds.", ("--allow-no-success",))
+    ] = False,
+    export: Annotated[
+        Path | None, Option("File to write if all steps pass, .onnx or .c; it is verified.", metavar="FILE")
+    ] = None,
+    json: Json = None,
+    junit: Junit = None,
+    sarif: Annotated[Path | None, Option("Also write what the check found as SARIF.", metavar="FILE")] = None,
+    markdown: Annotated[
+        Path | None, Option("Also write the report as Markdown, for a pull request.", metavar="FILE")
+    ] = None,
+) -> None:
+    """Check, evaluate, compare with the policy in use, and export: one report and one exit code, for CI."""
+    from rlctl.evaluation.request import EvalRequest, Gates
+    from rlctl.gating.gate import GateRequest, run_gate
+    from rlctl.gating.report import show, show_step
+
+    evaluation = EvalRequest(
+        run,
+        task=task,
+        checkpoint=choose_checkpoint(checkpoint, pretrained),
+        episodes=episodes,
+        seed=seed,
+        decide_early=decide_early,
+        changes=parse_changes(settings),
+    )
+    request = GateRequest(
+        evaluation=evaluation,
+        gates=Gates(min_success, min_success_lower, min_return),
+        against=against,
+        margin=margin,
+        allow_no_success=allow_no_success,
+        export=export,
+        strict=strict,
+        budget_s=budget,
+    )
+    report = run_gate(request, show_step, quiet=json == "-")
+    show(report, json, junit, sarif, markdown)
+    raise typer.Exit(report.exit_code)

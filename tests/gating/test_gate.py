@@ -1,0 +1,88 @@
+"""The gate: every step is taken, one report says what is wrong, and one exit code."""
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from rlctl.errors import ArtifactError, UsageError
+from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
+from rlctl.gating.gate import GateReport, GateRequest, Result, Step
+from rlctl.gating.report import as_json, to_markdown
+from rlctl.storage import junit
+from tests.evaluation.conftest import block_run  # noqa: F401 - a fixture
+
+PASSED = Step("check", Result.PASSED, "no findings")
+MISSED = Step("eval", Result.FAILED, "success 50 %", ("success rate 0.500 is below 0.9",), exit_code=1, seconds=2.0)
+DAMAGED = Step("compare", Result.ERROR, "used.onnx: damaged", ("used.onnx: damaged",), exit_code=5)
+LEFT_OUT = Step("export", Result.SKIPPED, "nothing is written after a step that failed")
+
+
+def make_report(*steps):
+    return GateReport("reach", Path("new.safetensors"), list(steps), Gates(min_success=0.9))
+
+
+@pytest.mark.parametrize(
+    ("steps", "code"),
+    [([PASSED], 0), ([PASSED, MISSED, LEFT_OUT], 1), ([MISSED, DAMAGED], 5), ([PASSED, LEFT_OUT], 0)],
+)
+def test_one_exit_code_stands_for_all_steps(steps, code):
+    report = make_report(*steps)
+    assert report.exit_code == code
+    assert as_json(report)["exit_code"] == code
+    assert as_json(report)["passed"] == (code == 0)
+
+
+def test_junit_has_a_case_for_each_step():
+    (suite,) = ElementTree.fromstring(junit.to_xml(make_report(PASSED, MISSED, DAMAGED, LEFT_OUT).make_suites()))
+    counts = {name: suite.get(name) for name in ("tests", "failures", "errors", "skipped")}
+    assert counts == {"tests": "4", "failures": "1", "errors": "1", "skipped": "1"}
+    (failed,) = suite.findall("testcase/failure")
+    assert failed.get("message") == "success rate 0.500 is below 0.9"
+    assert [case.get("classname") for case in suite] == ["reach.gate"] * 4
+
+
+def test_markdown_has_a_row_for_each_step():
+    lines = to_markdown(make_report(PASSED, MISSED)).splitlines()
+    assert lines[0] == "**rlctl gate not passed: new.safetensors on reach**"
+    assert lines[-2:] == ["| check | passed | no findings |", "| eval | failed | success rate 0.500 is below 0.9 |"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gates": NO_GATES}, r"^gate: say what the policy must reach, e\.g\. --min-success-lower 0\.9"),
+        ({"margin": 0.05}, r"^--margin: with what is it compared\? Add --against"),
+        ({"export": Path("policy.txt")}, r"^--export policy\.txt: give a name that ends in \.onnx or \.c$"),
+    ],
+)
+def test_a_gate_that_could_not_say_no_is_refused(options, message):
+    with pytest.raises(UsageError, match=message):
+        GateRequest(**{"evaluation": EvalRequest("x"), "gates": Gates(min_success=0.9), **options})
+
+
+def test_without_a_policy_the_files_say_so(rlctl, tmp_path):
+    done = rlctl("gate", "nothing.onnx", "--min-success", 0.5, "--json", "gate.json", "--junit", "gate.xml")
+    assert done.returncode == ArtifactError.exit_code
+    assert json.loads((tmp_path / "gate.json").read_text())["exit_code"] == ArtifactError.exit_code
+    (suite,) = ElementTree.fromstring((tmp_path / "gate.xml").read_text())
+    assert suite.get("errors") == "1"
+
+
+@pytest.mark.slow
+def test_all_steps_of_a_policy(rlctl, block_run, tmp_path):  # noqa: F811
+    used = tmp_path / "used.safetensors"
+    used.write_bytes(block_run.best_policy.read_bytes())
+    files = ("--json", "gate.json", "--junit", "gate.xml", "--sarif", "gate.sarif", "--markdown", "gate.md")
+    options = ("--episodes", 3, "--against", used, "--export", "policy.onnx", "--set", "randomize=false")
+    done = rlctl("gate", block_run.path, "--min-success", 0.5, *options, *files)
+    content = json.loads((tmp_path / "gate.json").read_text())
+    results = {step["name"]: step["result"] for step in content["steps"]}
+    assert (results["eval"], results["compare"]) == ("passed", "passed"), done.stdout + done.stderr
+    assert done.returncode == content["exit_code"]
+    # An environment whose actions do nothing is one of the mistakes that the check finds.
+    assert (results["check"], results["export"], done.returncode) == ("failed", "skipped", 1)
+    assert not (tmp_path / "policy.onnx").exists()
+    assert json.loads((tmp_path / "gate.sarif").read_text())["runs"][0]["results"]
+    assert (tmp_path / "gate.md").read_text().startswith("**rlctl gate not passed")
