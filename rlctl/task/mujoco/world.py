@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import UsageError, WorldFailed
 from rlctl.library_output import print_mujoco_warnings
+from rlctl.task.mujoco.ideal_motors import IdealMotors
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64] | None
@@ -57,6 +58,7 @@ class MujocoWorld:
         self.batch: Any = None
         self.extra: dict[str, Array] = {}
         """Arrays by name, without the leading axis of worlds."""
+        self.ideal = IdealMotors(self)
         self._built: dict[str, Array] = {}  # values of the built world, of arrays that may have changed
         self._rows: dict[str, Array] = {}  # arrays of `extra` with a row per world
         self._of_steps: dict[str, Array] = {}  # arrays of `_OF_STEPS` of a batch, since the last step or reset
@@ -152,11 +154,14 @@ class MujocoWorld:
         mujoco, model, data = self.mujoco, self.mj_model, self.mj_data
         if not self._is_fresh:
             mujoco.mj_step1(model, data)
-        # The same as `substeps` calls of mj_step, but the last one leaves what is derived up to date.
-        mujoco.mj_step2(model, data)
-        if self.substeps > 1:
-            mujoco.mj_step(model, data, nstep=self.substeps - 1)
-        mujoco.mj_step1(model, data)
+        if self.ideal.is_used:
+            self.ideal.step(self.substeps)
+        else:
+            # The same as `substeps` calls of mj_step, but the last one leaves what is derived up to date.
+            mujoco.mj_step2(model, data)
+            if self.substeps > 1:
+                mujoco.mj_step(model, data, nstep=self.substeps - 1)
+            mujoco.mj_step1(model, data)
         self._is_fresh = True
         if data.warning.number.any():
             self._raise_warning()

@@ -1,7 +1,7 @@
 """A body of a task's world in PyBullet."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,19 @@ class PybulletBody(Properties):
         self.joint_low, self.joint_high = np.where(limits[:, :1] > limits[:, 1:], (-np.inf, np.inf), limits).T
         self.joint_max_force: Array = np.array([info[10] for info in movable])
         self.joint_max_speed: Array = np.array([info[11] for info in movable])
+
+    def let_roll(self, wheels: Mapping[str, float]) -> None:
+        """Let a body move on its wheels as in MuJoCo; their widths [m] are by link.
+
+        PyBullet slows all links down: with the speed v they lose 0.04 * v * (1 + v) per second, which brakes fast
+        wheels. And it finds one contact point of a wheel, in its middle, where two at its edges resist its turning.
+        """
+        pybullet.changeDynamics(self.id, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client)
+        for link, width in wheels.items():
+            index = self._links[link]
+            spinning = pybullet.getDynamicsInfo(self.id, index, physicsClientId=self.client)[7]
+            if spinning == 0.0:  # the file gives none
+                self._change(index, spinningFriction=width / 2)
 
     def _joint_states(self) -> tuple[Array, Array, Any]:
         # Positions, velocities, and motor torques in a tuple: few tasks need them as an array.
