@@ -193,14 +193,14 @@ class BatchEnv:
         if len(worlds) == self.worlds:
             yield
             return
-        others = np.ones(self.worlds, bool)
-        others[worlds] = False
-        state = self.sim.world.batch.state
-        saved, kept = state[others], {name: getattr(self.task, name)[others] for name in self.task.per_world}
-        yield
-        state[others] = saved
-        for name, values in kept.items():
-            getattr(self.task, name)[others] = values
+        others = np.setdiff1d(self._all, worlds)
+        kept = {name: getattr(self.task, name)[others] for name in self.task.per_world}
+        try:
+            with self.sim.keep(others):
+                yield
+        finally:
+            for name, values in kept.items():
+                getattr(self.task, name)[others] = values
 
     def _check_kept(self, when: str) -> None:
         for name, shape in self.task.per_world.items():

@@ -253,13 +253,9 @@ class MujocoBody(MujocoMotors):
 
     def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:
         numbers, world = self._find_links(links), self._sim.world
-        for name in ("body_mass", "body_inertia"):
-            array = self._fields.model(name)
-            array[..., numbers] if name == "body_mass" else array[..., numbers, :]
-            if name == "body_mass":
-                array[..., numbers] = factor * world.built(name)[numbers]
-            else:
-                array[..., numbers, :] = factor * world.built(name)[numbers]
+        masses, inertias = self._fields.model("body_mass"), self._fields.model("body_inertia")
+        masses[..., numbers] = factor * world.built("body_mass")[numbers]
+        inertias[..., numbers, :] = factor * world.built("body_inertia")[numbers]
         self._fields.touch()
 
     def total_mass(self) -> float:

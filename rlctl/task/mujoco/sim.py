@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -259,6 +259,18 @@ class MujocoSim(Sim):
         self.world.restore(worlds)
         for body in self.bodies.values():
             body.forget_motors(worlds)
+
+    @contextlib.contextmanager
+    def keep(self, worlds: NDArray[np.int64]) -> Iterator[None]:
+        """Take back what the block of a `with` changes in some worlds of a batch."""
+        modes = {name: dict(body.parts.active) for name, body in self.bodies.items()}
+        try:
+            with self.world.keep(worlds):
+                yield
+        finally:
+            for name, body in self.bodies.items():
+                if body.parts.active != modes[name]:
+                    body.forget_motors(worlds)  # the next command writes its kind into all worlds again
 
     def shift_gravity(self, change: float) -> None:
         self.fields.model("opt.gravity")[..., 2] = self.world.built("opt.gravity")[2] + change

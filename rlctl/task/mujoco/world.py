@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -235,6 +237,26 @@ class MujocoWorld:
             kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_setState(self.mj_model, self.mj_data, self._saved, kind)
         self.touch(worlds)
+
+    @contextlib.contextmanager
+    def keep(self, worlds: NDArray[np.int64]) -> Iterator[None]:
+        """Take back what the block of a `with` changes in some worlds of a batch: their state and their model."""
+        state = self.batch.state[worlds]
+        fields = {name: self.model(name)[worlds] for name in self._built}
+        try:
+            yield
+        finally:
+            has_changed = not np.array_equal(self.batch.state[worlds], state)
+            self.batch.state[worlds] = state
+            for name, built in self._built.items():
+                values = self.model(name)
+                before = fields.get(name, built)  # one that the block has used first was as it was built
+                has_changed = has_changed or not np.array_equal(
+                    values[worlds], np.broadcast_to(before, values[worlds].shape), equal_nan=True
+                )
+                values[worlds] = before
+            if has_changed:
+                self.touch(worlds)
 
 
 class Fields:
