@@ -5,6 +5,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from rlctl.errors import UsageError
 from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.task.pybullet.sim import PybulletSim
 from rlctl.task.urdf import read_urdf
@@ -141,3 +142,22 @@ def test_what_is_a_wheel(tmp_path):
         assert other != text
         file.write_text(other)
         assert read_urdf(file).wheels == {}
+
+
+def test_the_frame_of_the_base_is_that_of_a_link(sim, tmp_path):
+    cart = load_cart(sim, tmp_path)
+    half = np.sqrt(0.5)
+    cart.set_base((1.0, 2.0, 3.0), (half, 0.0, 0.0, half))  # on its side: its y axis points up
+    # Its centre of mass is at z = -0.05 m of its frame, whose z axis points along -y.
+    assert cart.link_position("body") == pytest.approx([1.0, 1.95, 3.0])
+    assert cart.link_orientation("body") == pytest.approx([half, 0.0, 0.0, half])
+    assert cart.mass_positions(["body"])[0] == pytest.approx([1.0, 2.0, 3.0])
+
+
+def test_what_has_no_rows_says_so(tmp_path):
+    with closing(MujocoSim(control_dt=0.02, substeps=4, worlds=2)) as sim:
+        cart = load_cart(sim, tmp_path)
+        with pytest.raises(
+            UsageError, match=r"^mass_state has no rows, so a BatchTask of many worlds cannot use it; li"
+        ):
+            cart.mass_state("body")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, check_name
+from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.task.body import Contacts, MassState, Vector
 from rlctl.task.mujoco.inverse_kinematics import solve
 from rlctl.task.mujoco.motors import MujocoMotors
@@ -138,7 +138,10 @@ class MujocoBody(MujocoMotors):
     def _single(self, method: str) -> MujocoSim:
         """Return the simulation; raises `UsageError` if it has many worlds."""
         if self._sim.world.count not in (None, 1):
-            self._refuse(f"{method} of many worlds")
+            raise UsageError(
+                f"{method} has no rows, so a BatchTask of many worlds cannot use it; link_position, link_orientation, "
+                "base_velocity, base_angular_velocity and sensor have"
+            )
         return self._sim
 
     def add_force_sensor(self, joint: str) -> None:

@@ -117,12 +117,21 @@ class PybulletBody(Properties):
 
     def _link_pose(self, link: str) -> tuple[Array, Array]:
         pose = self._cache.get(("link", link))  # a pair: a link may be called "base" or "joints"
-        if pose is None:
+        if pose is None and link == self.base_name and link not in self._links:
+            pose = self._cache["link", link] = self._base_frame()
+        elif pose is None:
             index = self._link_index(link)
             state = pybullet.getLinkState(self.id, index, computeForwardKinematics=1, physicsClientId=self.client)
             # Items 4 and 5 are the link frame; 0 and 1 are the centre of mass.
             pose = self._cache["link", link] = (np.array(state[4]), np.array(state[5]))
         return pose
+
+    def _base_frame(self) -> tuple[Array, Array]:
+        # PyBullet has the pose of the base's centre of mass; the frame of the link is relative to it.
+        mass = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
+        info = pybullet.getDynamicsInfo(self.id, -1, physicsClientId=self.client)
+        frame = pybullet.multiplyTransforms(*mass, *pybullet.invertTransform(info[3], info[4]))
+        return np.array(frame[0]), np.array(frame[1])
 
     def link_position(self, link: str) -> Array:
         return self._link_pose(link)[0]
@@ -146,6 +155,8 @@ class PybulletBody(Properties):
         return MassState(*pose, *pybullet.getBaseVelocity(self.id, physicsClientId=self.client))
 
     def mass_positions(self, links: Sequence[str]) -> list[Vector]:
+        if self.base_name in links and self.base_name not in self._links:
+            return [self._mass_centre(self._part_index(link)) for link in links]
         numbers = [self._links[link] if link in self._links else self._link_index(link) for link in links]
         states = pybullet.getLinkStates(self.id, numbers, physicsClientId=self.client) or ()
         return [state[0] for state in states]
