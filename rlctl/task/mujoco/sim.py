@@ -298,13 +298,15 @@ class MujocoSim(Sim):
         target: Sequence[float] = (0.2, 0.0, 0.4),
         up: Sequence[float] = (0.0, 0.0, 1.0),
         field_of_view: float = 45.0,
+        sun: bool = False,
     ) -> NDArray[np.uint8]:
+        """Draw the world as `Sim.render` does; films have a `sun`, which policies that see pictures do not."""
         if self.world.batch is not None:
             self._refuse("pictures of many worlds")
         self.world.refresh()
         model, data = self._see()
         size = width, height
-        return draw(model, data, size, self._markers, eye=eye, target=target, field_of_view=field_of_view)
+        return draw(model, data, size, self._markers, eye=eye, target=target, field_of_view=field_of_view, sun=sun)
 
     def _see(self) -> tuple[Any, Any]:
         """Return the model and the data that pictures show."""
