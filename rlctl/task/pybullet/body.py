@@ -156,7 +156,8 @@ class PybulletBody(Properties):
 
     def mass_positions(self, links: Sequence[str]) -> list[Vector]:
         if self.base_name in links and self.base_name not in self._links:
-            return [self._mass_centre(self._part_index(link)) for link in links]
+            centres = [self._mass_centre(self._part_index(link)) for link in links]
+            return [(x, y, z) for x, y, z in centres]
         numbers = [self._links[link] if link in self._links else self._link_index(link) for link in links]
         states = pybullet.getLinkStates(self.id, numbers, physicsClientId=self.client) or ()
         return [state[0] for state in states]
