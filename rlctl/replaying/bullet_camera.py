@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rlctl.replaying.bullet_bodies import BulletBody, find_bounds, list_body_ids, read_body, read_pose
 from rlctl.replaying.bullet_log import BulletLog
-from rlctl.replaying.camera import FIELD_OF_VIEW, Camera, Viewpoint
+from rlctl.replaying.camera import FIELD_OF_VIEW, FilmCamera, Viewpoint
 from rlctl.task.pybullet.library import draw_world
 
 Picture = NDArray[np.uint8]
@@ -39,7 +39,7 @@ class BulletCamera:
             low, high = find_bounds(self._moving, points, only_moving=True)
         else:
             low, high = find_bounds([self._followed[0]], only_moving=True)
-        self._camera = Camera(low, high, size, view)
+        self._camera = FilmCamera(low, high, size, view)
 
     def draw(self) -> Picture:
         """Return a picture of the present state, shape (height, width, 3)."""

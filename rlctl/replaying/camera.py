@@ -71,7 +71,7 @@ def find_distance(
     return max(_CLOSEST, float(needed.max()))
 
 
-class Camera:
+class FilmCamera:
     """A camera of an episode. It goes back, at once, where what moves would leave the picture, and not nearer again.
 
     `low` and `high` are corners of a box [m] around what is seen at first; `size` is width and height of the picture.

@@ -7,7 +7,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, describe_exception
 from rlctl.replaying.bullet_bodies import read_body
 from rlctl.replaying.bullet_camera import BulletCamera, Picture, find_world
-from rlctl.replaying.camera import FIELD_OF_VIEW, Camera, Viewpoint
+from rlctl.replaying.camera import FIELD_OF_VIEW, FilmCamera, Viewpoint
 from rlctl.replaying.drawable import DrawableEnv, make_drawable
 from rlctl.replaying.mujoco_scene import find_mujoco_bounds
 from rlctl.replaying.scene import Env
@@ -99,7 +99,7 @@ class _MujocoTaskView:
             low, high = find_mujoco_bounds(sim, self._moving, markers)
         else:
             low, high = find_mujoco_bounds(sim, [self._followed], [])
-        self._camera = Camera(low, high, self._size, self._viewpoint)
+        self._camera = FilmCamera(low, high, self._size, self._viewpoint)
 
     def draw(self) -> Picture:
         self._env.move_markers()

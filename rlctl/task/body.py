@@ -353,15 +353,14 @@ class Body:
             for limits in (self.joint_max_speed[chosen], self.joint_max_force[chosen])
         )
         bounded = bool((low < high).all() and np.isfinite([low, high]).all())
-        limits: dict[str, Any] = {"max_speed": speed, "max_torque": torque}
+        given: dict[str, Any] = {"max_speed": speed, "max_torque": torque, "default_positions": default_positions}
         return Joints(
             names=[self.joint_names[joint] for joint in chosen],
-            default_positions=default_positions,
             stiffness=() if self.drives is None else self.drives.stiffness[chosen].tolist(),
             damping=() if self.drives is None else self.drives.damping[chosen].tolist(),
             low=low.tolist() if bounded else (),
             high=high.tolist() if bounded else (),
-            **(limits | commanded),
+            **(given | commanded),
         )
 
     def _find_force_limits(self, joints: list[int], max_force: Limit) -> Array:

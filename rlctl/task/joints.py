@@ -11,7 +11,6 @@ from gymnasium import spaces
 from rlctl.errors import TaskError, check_name, short_repr
 
 Command = Literal["", "position", "step", "speed", "torque"]
-PerJoint = Sequence[float] | float
 _KINDS: dict[Command, str] = {"position": "scale", "step": "step", "speed": "speed", "torque": "torque"}
 
 
@@ -19,23 +18,23 @@ _KINDS: dict[Command, str] = {"position": "scale", "step": "step", "speed": "spe
 class Joints:
     """Joints in the order of the action's elements; every other field has one element per joint, or is empty.
 
-    A single number is that of all joints.
+    A single number, which becomes one element per joint, is that of all joints.
 
     Units: [rad] and [N m] for rotating joints, [m] and [N] for sliding joints.
     """
 
     names: Sequence[str]
-    default_positions: PerJoint = ()  # start positions; with `action_scale` also the target of action 0
-    action_scale: PerJoint = ()  # only if the target of an action is `default_positions + action_scale * action`
-    stiffness: PerJoint = ()  # of the position controller that follows the action [N m/rad]
-    damping: PerJoint = ()  # of the same controller [N m s/rad]
-    low: PerJoint = ()  # lower position limits
-    high: PerJoint = ()
-    max_speed: PerJoint = ()  # [rad/s or m/s]
-    max_torque: PerJoint = ()
-    action_step: PerJoint = ()  # only if the target is what `measured` has, plus `action_step * action`
-    action_speed: PerJoint = ()  # only if the target is a speed, `action_speed * action` [rad/s or m/s]
-    action_torque: PerJoint = ()  # only if the target is a torque or force, `action_torque * action`
+    default_positions: Sequence[float] = ()  # start positions; with `action_scale` also the target of action 0
+    action_scale: Sequence[float] = ()  # only if the target of an action is `default_positions + action_scale * action`
+    stiffness: Sequence[float] = ()  # of the position controller that follows the action [N m/rad]
+    damping: Sequence[float] = ()  # of the same controller [N m s/rad]
+    low: Sequence[float] = ()  # lower position limits
+    high: Sequence[float] = ()
+    max_speed: Sequence[float] = ()  # [rad/s or m/s]
+    max_torque: Sequence[float] = ()
+    action_step: Sequence[float] = ()  # only if the target is what `measured` has, plus `action_step * action`
+    action_speed: Sequence[float] = ()  # only if the target is a speed, `action_speed * action` [rad/s or m/s]
+    action_torque: Sequence[float] = ()  # only if the target is a torque or force, `action_torque * action`
     measured: str = ""  # observation, or quantity of a term, with the positions or last targets of these joints
     clips_target: bool = False  # whether a position that an action commands is clipped to `low` and `high`
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import UsageError
-from rlctl.replaying.camera import FIELD_OF_VIEW, Camera, Viewpoint, read_viewpoint
+from rlctl.replaying.camera import FIELD_OF_VIEW, FilmCamera, Viewpoint, read_viewpoint
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.request import ReplayRequest
 
@@ -26,7 +26,7 @@ def is_seen(point, eye, target):
 
 @pytest.mark.parametrize("text", [None, "90", "0,70", "-130,10,1"])
 def test_all_that_moves_stays_in_the_picture(text):
-    camera = Camera(LOW, HIGH, SIZE, read_viewpoint(text))
+    camera = FilmCamera(LOW, HIGH, SIZE, read_viewpoint(text))
     for reach in np.linspace(0.0, 0.6, 20):  # an arm that stretches out and lifts its load
         high = HIGH + np.array([reach, 0.0, reach])
         eye, target = camera.aim(LOW, high)
@@ -37,13 +37,13 @@ def test_all_that_moves_stays_in_the_picture(text):
 
 
 def test_what_falls_for_ever_is_not_followed():
-    camera = Camera(LOW, HIGH, SIZE, Viewpoint())
+    camera = FilmCamera(LOW, HIGH, SIZE, Viewpoint())
     first = math.dist(*camera.aim(LOW, HIGH))
     assert math.dist(*camera.aim(LOW - np.array([0.0, 0.0, 100.0]), HIGH)) == pytest.approx(3 * first)
 
 
 def test_a_robot_is_followed_upstairs_and_its_gait_is_not():
-    camera = Camera(LOW, HIGH, SIZE, Viewpoint())
+    camera = FilmCamera(LOW, HIGH, SIZE, Viewpoint())
     heights = []
     for step in range(100):
         lift = np.array([0.05 * step, 0.0, 0.02 * math.sin(step)])  # a trunk of 0.5 m that goes up and down by 2 cm
@@ -59,8 +59,8 @@ def test_a_robot_is_followed_upstairs_and_its_gait_is_not():
 
 def test_the_viewpoint():
     assert Viewpoint(90.0, 0.0).direction == pytest.approx([0.0, 1.0, 0.0])
-    far = Camera(LOW, HIGH, SIZE, Viewpoint()).aim(LOW, HIGH)
-    near = Camera(LOW, HIGH, SIZE, read_viewpoint("-42,22,2")).aim(LOW, HIGH)
+    far = FilmCamera(LOW, HIGH, SIZE, Viewpoint()).aim(LOW, HIGH)
+    near = FilmCamera(LOW, HIGH, SIZE, read_viewpoint("-42,22,2")).aim(LOW, HIGH)
     assert math.dist(*far) == pytest.approx(2 * math.dist(*near))
 
 
