@@ -71,6 +71,14 @@ class BulletBody:
         """Indices of the joints with one degree of freedom."""
         return [index for index, joint in enumerate(self.joints) if joint.moves]
 
+    def find_moving_links(self) -> list[int]:
+        """Return PyBullet's numbers of the links that are not fixed to the world, -1 for the base."""
+        moving = [] if self.is_fixed else [-1]
+        for index, joint in enumerate(self.joints):  # a parent comes before its children
+            if joint.moves or joint.kind == pybullet.JOINT_SPHERICAL or joint.parent in moving:
+                moving.append(index)
+        return moving
+
     def find_trunk(self) -> int | None:
         """Return the index in `links` of the link that travels: a free base, or one on a sliding joint without limits.
 
@@ -184,15 +192,54 @@ def read_pose(body: BulletBody, link: int) -> Pose:
     return pybullet.getLinkState(body.id, link - 1, physicsClientId=body.client)[:2]
 
 
-def find_bounds(bodies: Iterable[BulletBody], points: Sequence[Array] = ()) -> tuple[Array, Array]:
-    """Return the lowest and highest corner [m] of bodies as they are now, without the ground, and of points."""
+def find_bounds(
+    bodies: Iterable[BulletBody], points: Sequence[Array] = (), *, only_moving: bool = False
+) -> tuple[Array, Array]:
+    """Return the lowest and highest corner [m] of bodies as they are now, without the ground, and of points.
+
+    With `only_moving` links that are fixed to the world are left out.
+    """
     corners = list(points)
     for body in bodies:
-        links = range(-1, len(body.joints))
+        links = body.find_moving_links() if only_moving else range(-1, len(body.joints))
         boxes = [np.array(pybullet.getAABB(body.id, link, physicsClientId=body.client)) for link in links]
         wide = any((box[1] - box[0])[:2].min() > _GROUND_SIZE for box in boxes)
         corners += [] if wide else list(itertools.chain(*boxes))
+        if not wide:
+            corners += _find_drawn_corners(body, set(links))
     return (np.min(corners, axis=0), np.max(corners, axis=0)) if corners else (-np.ones(3), np.ones(3))
+
+
+def _find_drawn_corners(body: BulletBody, links: set[int]) -> list[Array]:
+    """Return corners [m] of the visual boxes, balls, capsules and cylinders of links: they may not collide."""
+    corners = []
+    for shape in body.visuals:
+        halves = _find_halves(shape[2], shape[3])
+        if shape[1] not in links or halves is None:
+            continue
+        if shape[1] < 0:
+            mass = pybullet.getBasePositionAndOrientation(body.id, physicsClientId=body.client)
+            frame = pybullet.multiplyTransforms(*mass, *pybullet.invertTransform(*body.inertial))
+        else:
+            state = pybullet.getLinkState(body.id, shape[1], physicsClientId=body.client)
+            frame = state[4:6]
+        place, turn = pybullet.multiplyTransforms(*frame, shape[5], shape[6])
+        axes = np.abs(np.array(pybullet.getMatrixFromQuaternion(turn)).reshape(3, 3))
+        reach = axes @ halves
+        corners += [np.array(place) - reach, np.array(place) + reach]
+    return corners
+
+
+def _find_halves(kind: int, size: Sequence[float]) -> Array | None:
+    """Return the half sides of the box around a shape [m]; None for meshes and planes."""
+    if kind == pybullet.GEOM_BOX:
+        return np.array(size) / 2
+    if kind == pybullet.GEOM_SPHERE:
+        return np.full(3, size[0])
+    if kind in (pybullet.GEOM_CYLINDER, pybullet.GEOM_CAPSULE):
+        length, radius = size[:2]
+        return np.array([radius, radius, length / 2 + radius])
+    return None
 
 
 @dataclasses.dataclass(frozen=True)

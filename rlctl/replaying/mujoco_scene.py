@@ -124,9 +124,10 @@ def find_trunk_joint(model: mujoco.MjModel, joint: int) -> Literal["free", "rail
 
 
 def find_mujoco_bounds(sim: MujocoSim, bodies: Sequence[Body], markers: Sequence[Array]) -> tuple[Array, Array]:
-    """Return the lowest and highest corner [m] of markers and bodies of a task's world, without the ground."""
+    """Return the lowest and highest corner [m] of markers and of the links that are not fixed to the world."""
     sim.world.refresh()
-    wanted = {number for body in bodies for number in sim.bodies[body.name].parts.links.values()}
+    parts = [sim.bodies[body.name].parts for body in bodies]
+    wanted = {number for part in parts for link, number in part.links.items() if link in part.moving}
     geoms = [
         geom
         for geom in range(sim.model.ngeom)

@@ -17,6 +17,7 @@ import numpy as np
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError, explain_missing_package
 from rlctl.replaying.bullet_camera import Picture
+from rlctl.replaying.camera import Viewpoint
 from rlctl.replaying.recorder import (
     DEFAULT_DT,
     Choose,
@@ -100,13 +101,14 @@ def film_episodes(
     *,
     policy: str,
     watch: Watch = lambda step: None,
+    viewpoint: Viewpoint | None = None,
 ) -> tuple[list[Rollout], FilmReport]:
     """Play an episode per seed and write one film of all of them, atomically; `watch` is called after every step."""
     rollouts: list[Rollout] = []
     reports: list[FilmReport] = []
 
     def write(part: Path) -> None:
-        film = _Film(env, part)
+        film = _Film(env, part, viewpoint)
         both = join_watches(watch, film.watch)
         for seed in seeds:
             rollouts.append(play_episode(env, spec, seed, begin(seed), policy=policy, watch=both))
@@ -119,8 +121,8 @@ def film_episodes(
 
 
 class _Film:
-    def __init__(self, env: Env, path: Path) -> None:
-        self._view = look_at(env, *_SIZE[path.suffix])
+    def __init__(self, env: Env, path: Path, viewpoint: Viewpoint | None) -> None:
+        self._view = look_at(env, *_SIZE[path.suffix], viewpoint)
         dt = find_dt(env) or DEFAULT_DT
         self._every = max(1, round(1 / (_RATE[path.suffix] * dt)))
         self._rate = 1 / (dt * self._every)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rlctl import output
 from rlctl.errors import UsageError
+from rlctl.replaying.camera import read_viewpoint
 from rlctl.replaying.pictures import check_file, film_episodes
 from rlctl.replaying.recorder import Rollout
 from rlctl.replaying.report import ReplayResult
@@ -35,6 +36,7 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
         recorded = load_located(request.verify)
         rollout, verification = verify_episode(recorded, request.verify)
         return ReplayResult(recorded.info.spec.task, recorded.info.policy, [summarize(rollout)], verification)
+    viewpoint = read_viewpoint(request.camera)
     source = _choose_source(request)
     spec, seeds, film = source.spec, source.seeds, None
     rollouts: list[Rollout] = []
@@ -42,7 +44,14 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
         with closing(make_filmable(spec)) as env:
             begin = functools.partial(source.begin, env)
             rollouts, film = film_episodes(
-                request.video, env, spec, seeds, begin, policy=source.name, watch=source.watch
+                request.video,
+                env,
+                spec,
+                seeds,
+                begin,
+                policy=source.name,
+                watch=source.watch,
+                viewpoint=viewpoint,
             )
     elif request.gui and seeds:
         with closing(open_window(spec)) as env:
@@ -71,6 +80,8 @@ def _check_request(request: ReplayRequest) -> None:
     for names in (("verify", "gui", "video", "output"), ("worst", "best", "failures")):
         if len(given := [f"--{name}" for name in names if getattr(request, name)]) > 1:
             raise UsageError(f"{given[0]} and {given[1]} exclude each other: leave out {given[1]}")
+    if request.camera is not None and request.video is None:
+        raise UsageError("--camera is for films: add --video FILE.mp4")
     if request.verify is not None and source is not None:
         raise UsageError(f"--verify replays only {request.verify}: leave out {source}")
     if request.baseline is not None:

@@ -59,6 +59,14 @@ class ReplayRequest:
         ),
     ] = None
     video: Annotated[Path | None, Option("Write a film instead, .mp4 or .gif.", metavar="FILE")] = None
+    camera: Annotated[
+        str | None,
+        Option(
+            "Where the film's camera is: degrees from the x axis, degrees up, times nearer.",
+            metavar="AZIMUTH[,ELEVATION[,ZOOM]]",
+            default_text="-42,22,1",
+        ),
+    ] = None
 
     @property
     def choice(self) -> Choice | None:

@@ -6,7 +6,8 @@ from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, describe_exception
 from rlctl.replaying.bullet_bodies import read_body
-from rlctl.replaying.bullet_camera import EYE_DIRECTION, BulletCamera, Picture, find_distance, find_world
+from rlctl.replaying.bullet_camera import BulletCamera, Picture, find_world
+from rlctl.replaying.camera import FIELD_OF_VIEW, FilmCamera, Viewpoint
 from rlctl.replaying.drawable import DrawableEnv, make_drawable
 from rlctl.replaying.mujoco_scene import find_mujoco_bounds
 from rlctl.replaying.scene import Env
@@ -23,9 +24,9 @@ def make_filmable(spec: EnvSpec) -> Env:
 class _PlainView:
     """A plain environment: its own pictures, or else a camera in its PyBullet world."""
 
-    def __init__(self, env: Env, size: tuple[int, int]) -> None:
+    def __init__(self, env: Env, size: tuple[int, int], viewpoint: Viewpoint) -> None:
         self._env = env
-        self._size = size
+        self._size, self._viewpoint = size, viewpoint
         self._reason = env.no_pictures if isinstance(env, DrawableEnv) else ""
 
     def begin(self) -> None:
@@ -48,7 +49,7 @@ class _PlainView:
 
     def _place_camera(self) -> BulletCamera | None:
         bodies = find_world(self._env.bullet_log) if isinstance(self._env, DrawableEnv) else []
-        return BulletCamera(bodies, (), self._size) if bodies else None
+        return BulletCamera(bodies, (), self._size, self._viewpoint) if bodies else None
 
     def _render(self) -> Picture:
         try:
@@ -64,15 +65,16 @@ class _PlainView:
 class _TaskView:
     """A camera in a task's PyBullet world."""
 
-    def __init__(self, env: TaskEnv, size: tuple[int, int]) -> None:
+    def __init__(self, env: TaskEnv, size: tuple[int, int], viewpoint: Viewpoint) -> None:
         self._env = env
-        self._size = size
+        self._size, self._viewpoint = size, viewpoint
 
     def begin(self) -> None:
         sim, markers = self._env.sim, self._env.markers()
         assert isinstance(sim, PybulletSim)  # `look_at` asks
         bodies = [read_body(sim.client, body.id) for body in sim.bodies.values()]
-        self._camera = BulletCamera(bodies, [np.asarray(position) for position in markers.values()], self._size)
+        points = [np.asarray(position) for position in markers.values()]
+        self._camera = BulletCamera(bodies, points, self._size, self._viewpoint)
 
     def draw(self) -> Picture:
         self._env.move_markers()
@@ -82,36 +84,44 @@ class _TaskView:
 class _MujocoTaskView:
     """A camera in a task's MuJoCo world, which follows the first body with a free base."""
 
-    def __init__(self, env: TaskEnv, size: tuple[int, int]) -> None:
+    def __init__(self, env: TaskEnv, size: tuple[int, int], viewpoint: Viewpoint) -> None:
         self._env = env
-        self._size = size
+        self._size, self._viewpoint = size, viewpoint
 
     def begin(self) -> None:
         sim = self._env.sim
         assert isinstance(sim, MujocoSim)  # `look_at` asks
         bodies = list(sim.bodies.values())
         self._followed = next((body for body in bodies if body.link_names and not body.fixed), None)
-        shown = bodies if self._followed is None else [self._followed]
-        markers = [np.asarray(position) for position in self._env.markers().values()]
-        low, high = find_mujoco_bounds(sim, shown, markers)
-        self._target = (low + high) / 2
-        distance = find_distance(low, high, self._size)
-        self._offset = distance * EYE_DIRECTION / np.linalg.norm(EYE_DIRECTION)
+        self._moving = [body for body in bodies if body.parts.moving]
+        if self._followed is None:
+            markers = [np.asarray(position) for position in self._env.markers().values()]
+            low, high = find_mujoco_bounds(sim, self._moving, markers)
+        else:
+            low, high = find_mujoco_bounds(sim, [self._followed], [])
+        self._camera = FilmCamera(low, high, self._size, self._viewpoint)
 
     def draw(self) -> Picture:
         self._env.move_markers()
+        sim, moving, followed = self._env.sim, self._moving, None
+        assert isinstance(sim, MujocoSim)
         if self._followed is not None:
-            self._target[:2] = self._followed.base_position[:2]  # the height is constant: a gait would shake the film
-        eye, target = (self._target + self._offset).tolist(), self._target.tolist()
-        return self._env.sim.render(*self._size, eye=eye, target=target)
+            followed = self._followed.base_position
+            moving = [body for body in moving if np.linalg.norm(body.base_position - followed) < self._camera.near]
+        eye, target = self._camera.aim(*find_mujoco_bounds(sim, moving, []), followed)
+        return sim.render(*self._size, eye=eye, target=target, field_of_view=FIELD_OF_VIEW, sun=True)
 
 
-def look_at(env: Env, width: int, height: int) -> _TaskView | _MujocoTaskView | _PlainView:
+def look_at(
+    env: Env, width: int, height: int, viewpoint: Viewpoint | None = None
+) -> _TaskView | _MujocoTaskView | _PlainView:
     """Return the view of an environment: a camera in its task's world, or a plain environment's own pictures.
 
     Pictures of a camera have `width` and `height` [pixels].
     """
-    inner, size = env.unwrapped, (width, height)
+    inner, size, chosen = env.unwrapped, (width, height), viewpoint or Viewpoint()
     if not isinstance(inner, TaskEnv):
-        return _PlainView(env, size)
-    return _TaskView(inner, size) if isinstance(inner.sim, PybulletSim) else _MujocoTaskView(inner, size)
+        return _PlainView(env, size, chosen)
+    if isinstance(inner.sim, PybulletSim):
+        return _TaskView(inner, size, chosen)
+    return _MujocoTaskView(inner, size, chosen)

@@ -338,12 +338,12 @@ class Body:
         self._refuse("set_color")
 
     def describe_joints(
-        self, joints: Sequence[str], *, default_positions: Sequence[float] = (), **commanded: Any
+        self, joints: Sequence[str], *, default_positions: Sequence[float] | float = (), **commanded: Any
     ) -> Joints:
         """Return joints with the limits of the model file, for `Task.describe_joints`.
 
-        `commanded` are the fields of `Joints` that describe the action: `action_scale=[0.25] * 12`, for example; and
-        `max_speed` and `max_torque`, where the task's motors have other limits than the model file.
+        `commanded` are the fields of `Joints` that describe the action: `action_scale=0.25`, for example, or a number
+        per joint; and `max_speed` and `max_torque`, where the task's motors have other limits than the model file.
         If a limit is missing, 0 or infinite for one of the joints, it is left out for all of them.
         """
         chosen = self.find_joints(joints)
@@ -353,15 +353,14 @@ class Body:
             for limits in (self.joint_max_speed[chosen], self.joint_max_force[chosen])
         )
         bounded = bool((low < high).all() and np.isfinite([low, high]).all())
-        limits: dict[str, Any] = {"max_speed": speed, "max_torque": torque}
+        given: dict[str, Any] = {"max_speed": speed, "max_torque": torque, "default_positions": default_positions}
         return Joints(
             names=[self.joint_names[joint] for joint in chosen],
-            default_positions=default_positions,
             stiffness=() if self.drives is None else self.drives.stiffness[chosen].tolist(),
             damping=() if self.drives is None else self.drives.damping[chosen].tolist(),
             low=low.tolist() if bounded else (),
             high=high.tolist() if bounded else (),
-            **(limits | commanded),
+            **(given | commanded),
         )
 
     def _find_force_limits(self, joints: list[int], max_force: Limit) -> Array:

@@ -284,15 +284,12 @@ class ManyWorldCalls:
         if len(worlds) == self._worlds:
             yield
             return
-        others = np.ones(self._worlds, bool)
-        others[worlds] = False
-        state = sim.world.batch.state
-        saved = state[others]
+        others = np.setdiff1d(np.arange(self._worlds), worlds)
         kept = {name: getattr(self.task, name)[others] for name in self.task.per_world}
         try:
-            yield
+            with sim.keep(others):
+                yield
         finally:
-            state[others] = saved
             for name, values in kept.items():
                 getattr(self.task, name)[others] = values
 

@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
+import numpy as np
 from gymnasium import spaces
 
 from rlctl.errors import TaskError, check_name, short_repr
@@ -16,6 +17,8 @@ _KINDS: dict[Command, str] = {"position": "scale", "step": "step", "speed": "spe
 @dataclasses.dataclass(frozen=True)
 class Joints:
     """Joints in the order of the action's elements; every other field has one element per joint, or is empty.
+
+    A single number, which becomes one element per joint, is that of all joints.
 
     Units: [rad] and [N m] for rotating joints, [m] and [N] for sliding joints.
     """
@@ -39,7 +42,11 @@ class Joints:
         for field in dataclasses.fields(self)[1:]:
             if field.default != ():
                 continue
-            values = [float(value) for value in getattr(self, field.name)]
+            given = getattr(self, field.name)
+            if isinstance(given, str) or np.ndim(given) > 1:
+                raise TaskError(f"joints: {field.name} is {given!r:.40}; give a number, or one per joint")
+            spread = [given] * len(self.names) if np.ndim(given) == 0 else given
+            values = [float(value) for value in spread]
             if values and (len(values) != len(self.names) or not all(map(math.isfinite, values))):
                 raise TaskError(
                     f"joints: {field.name} must have {len(self.names)} finite values, one per joint, but is "
@@ -49,9 +56,9 @@ class Joints:
         if odd := [name for name in self.names if not isinstance(name, str)]:
             raise TaskError(f"joints: names must be text, not {odd[0]!r}")
         object.__setattr__(self, "names", tuple(self.names))
-        given = [f"action_{kind}" for kind in _KINDS.values() if getattr(self, f"action_{kind}")]
-        if len(given) > 1:
-            raise TaskError(f"joints: {' and '.join(given)} exclude each other: an action commands one thing")
+        commands = [f"action_{kind}" for kind in _KINDS.values() if getattr(self, f"action_{kind}")]
+        if len(commands) > 1:
+            raise TaskError(f"joints: {' and '.join(commands)} exclude each other: an action commands one thing")
         if self.action_step and not self.measured:
             raise TaskError(
                 "joints: action_step needs measured: the observation with the joints' positions or last targets"

@@ -33,6 +33,7 @@ _ROUNDING = 1e-12
 _MARGIN = 1e-9
 _LATIN = "latin-1"
 _DECLARED = re.compile(rb"""\s*(?:\xef\xbb\xbf)?<\?xml[^>]*\bencoding\s*=\s*["']([A-Za-z][\w.-]*)["']""")
+_SAME_AXIS = 1e-3  # [m], and [rad]
 _PRODUCTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
@@ -59,6 +60,8 @@ class Urdf:
     """Principal moments by link that replace impossible ones."""
     impossible: dict[str, Moments] = dataclasses.field(default_factory=dict)
     """Those of the file."""
+    wheels: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Widths of wheels by link [m], see `find_wheels`."""
 
     @property
     def text(self) -> str:
@@ -90,6 +93,7 @@ def read_urdf(path: Path, *, fixed: bool = False, inertia_from_file: bool = True
     _check_masses(path, root)
     _find_meshes(urdf, root)
     _add_masses(urdf, root, fixed)
+    urdf.wheels = find_wheels(root)
     if inertia_from_file:
         _raise_moments(urdf, root)
     urdf.changed = urdf.changed or bool(urdf.frames or urdf.guessed or urdf.raised or urdf.undrawn)
@@ -212,6 +216,51 @@ def _list_joints(root: Element) -> Iterator[_Joint]:
         parent, child = joint.find("parent"), joint.find("child")
         if parent is not None and child is not None:
             yield _Joint(parent.get("link", ""), child.get("link", ""), joint.get("type") == "fixed")
+
+
+def find_wheels(root: Element) -> dict[str, float]:
+    """Return the widths of wheels by link [m]: collision cylinders on a joint without limits, about the same axis."""
+    links = {str(link.get("name")): link for link in root.findall("link")}
+    wheels: dict[str, float] = {}
+    for joint in root.findall("joint"):
+        child = joint.find("child")
+        name = "" if child is None else child.get("link", "")
+        if joint.get("type") != "continuous" or name not in links:
+            continue
+        axis = _read_vector(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
+        for shape in links[name].findall("collision"):
+            cylinder = shape.find("geometry/cylinder")
+            if cylinder is not None and _is_about(axis, shape.find("origin")):
+                wheels[name] = max(wheels.get(name, 0.0), read_number(cylinder, "length"))
+    return wheels
+
+
+def _is_about(axis: NDArray[np.float64], place: Element | None) -> bool:
+    """Return whether the z axis of a shape is that of a joint, both in the frame of the link."""
+    length = float(np.linalg.norm(axis))
+    if not length > 0:
+        return False
+    roll, pitch, yaw = _read_vector(place, "rpy", (0.0, 0.0, 0.0))
+    along = np.array(
+        [
+            math.cos(yaw) * math.sin(pitch) * math.cos(roll) + math.sin(yaw) * math.sin(roll),
+            math.sin(yaw) * math.sin(pitch) * math.cos(roll) - math.cos(yaw) * math.sin(roll),
+            math.cos(pitch) * math.cos(roll),
+        ]
+    )
+    off_axis = np.linalg.norm(np.cross(_read_vector(place, "xyz", (0.0, 0.0, 0.0)), axis)) / length  # [m]
+    tilt = np.linalg.norm(np.cross(along, axis)) / length  # the sine of the angle
+    return bool(off_axis < _SAME_AXIS and tilt < _SAME_AXIS)
+
+
+def _read_vector(element: Element | None, name: str, default: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Return an attribute of three numbers, or `default`; engines complain of one that is something else."""
+    text = "" if element is None else element.get(name, "")
+    try:
+        values = np.array([float(part) for part in text.split()])
+    except ValueError:
+        return np.array(default)
+    return values if values.shape == (3,) else np.array(default)
 
 
 def _find_top(link: str, joints: list[_Joint]) -> str:

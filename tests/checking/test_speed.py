@@ -150,6 +150,9 @@ def test_line_for_the_report():
         "slowest: pybullet.stepSimulation 61% (world.py:10)"
     )
     assert format_speed(Records("any")) == ""
+    assert format_speed(with_speed(is_batch=True)).endswith(
+        "(world.py:10); this is one world alone, those of a batch are several times faster"
+    )
 
 
 def test_a_step_that_takes_longer_now_and_then_counts_and_a_disturbance_does_not():

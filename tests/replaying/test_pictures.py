@@ -9,7 +9,7 @@ from PIL import Image
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
-from rlctl.replaying.bullet_camera import find_distance
+from rlctl.replaying.camera import find_distance
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.report import ReplayResult, show
 from rlctl.replaying.request import ReplayRequest

@@ -44,3 +44,29 @@ def two_wheels(folder):
         joint("left_joint", "base", "left", axis="0 0 1"),
         joint("right_joint", "base", "right", x=0.2, axis="0 0 1"),
     )
+
+
+def cart(folder, contact=""):
+    """A cart of 4.8 kg on two wheels of 0.1 m, its mass below their axle; `contact` is XML of the wheels."""
+    wheel = (
+        '<link name="{name}"><inertial><mass value="0.4"/>'
+        '<inertia ixx="0.0011" iyy="0.002" izz="0.0011" ixy="0" ixz="0" iyz="0"/></inertial>'
+        '<collision><origin rpy="1.5707963 0 0"/><geometry><cylinder radius="0.1" length="0.03"/></geometry>'
+        '</collision><contact><lateral_friction value="1"/>{contact}</contact></link>'
+    )
+    hinge = (
+        '<joint name="{name}" type="continuous"><parent link="body"/><child link="{name}_wheel"/>'
+        '<origin xyz="0 {y} 0"/><axis xyz="0 1 0"/><limit effort="4" velocity="30"/></joint>'
+    )
+    body = (
+        '<link name="body"><inertial><origin xyz="0 0 -0.05"/><mass value="4"/>'
+        '<inertia ixx="0.08" iyy="0.07" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    )
+    return urdf(
+        folder,
+        body,
+        wheel.format(name="left_wheel", contact=contact),
+        wheel.format(name="right_wheel", contact=contact),
+        hinge.format(name="left", y=0.15),
+        hinge.format(name="right", y=-0.15),
+    )

@@ -1,9 +1,11 @@
 """Tasks in batches: an episode has the same bits alone and in any world, whatever the other worlds do."""
 
+import contextlib
 from contextlib import closing
 
 import numpy as np
 import pytest
+from rlctl.task.batch_env import BatchEnv
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ShapeError, TaskError, UsageError, WorldFailed
@@ -139,6 +141,42 @@ def test_a_step_or_a_reset_of_some_worlds_leaves_the_others_alone(make_both):
     for one, other in zip(before, state_of(batch, others), strict=True):
         np.testing.assert_array_equal(one, other)
     assert batch.step_of.tolist() == [4, 5, 4, 4, 0]
+
+
+class Meddler(Stool):
+    """In each step it changes the model of all worlds, and fails if it is told to."""
+
+    fails = False
+
+    def act(self, action):
+        super().act(action)
+        self.body.set_friction(0.1 + 0.01 * self.steps.max())
+        self.body.set_joint_damping(2.0 + self.steps.max())
+        self.body.set_base(np.tile([0.0, 0.0, 0.3 + 0.1 * self.steps.max()], (len(action), 1)))
+        if self.fails:
+            raise RuntimeError("on purpose")
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_others_keep_their_model_and_a_failed_step_leaves_them_alone_too(fails):
+    single = TaskEnv(Meddler(), sim="mujoco")
+    with closing(single), closing(BatchEnv(Meddler(), 4, single, "mujoco")) as batch:
+        batch.reset(np.arange(4), range(4))
+        batch.step(np.full((4, 2), 0.4, np.float32))
+        others = np.array([0, 2])
+        world = batch.sim.world
+        height = batch.task.body.base_position[others, 2]
+        names = ["pair_friction", "dof_damping", "friction", "actuator_biasprm"]
+        before = [*state_of(batch, others), *(world.model(name)[others].copy() for name in names)]
+        batch.task.fails = fails
+        with contextlib.suppress(RuntimeError):
+            batch.step(np.full((2, 2), -0.8, np.float32), np.array([1, 3]))
+        after = [*state_of(batch, others), *(world.model(name)[others] for name in names)]
+        for one, other in zip(before, after, strict=True):
+            np.testing.assert_array_equal(one, other)
+        assert (world.model("dof_damping")[1] != world.model("dof_damping")[0]).any()
+        # What was computed from the state that was taken back is computed again.
+        np.testing.assert_array_equal(batch.task.body.base_position[others, 2], height)
 
 
 def test_random_numbers_of_worlds_have_a_row_each():

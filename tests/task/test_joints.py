@@ -72,3 +72,12 @@ def test_joints_are_those_of_the_action(task):
 def test_values_must_fit_the_names(values):
     with pytest.raises(TaskError, match="must have 2 finite values, one per joint"):
         Joints(["hip", "knee"], action_scale=values)
+
+
+def test_a_number_is_that_of_all_joints():
+    joints = Joints(["one", "two"], default_positions=0.1, action_torque=0.6, max_torque=np.float32(2.0))
+    assert (joints.default_positions, joints.action_torque, joints.max_torque) == ((0.1, 0.1), (0.6, 0.6), (2.0, 2.0))
+    body = describe_task("reach")[1].task.arm
+    assert body.describe_joints(body.joint_names, action_torque=0.6).action_torque == (0.6,) * 7
+    with pytest.raises(TaskError, match=r"^joints: action_torque is '0.6'; give a number, or one per joint"):
+        Joints(["one"], action_torque="0.6")  # text

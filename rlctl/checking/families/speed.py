@@ -12,7 +12,7 @@ from rlctl.checking.profiling import Profile, Stopwatch, TimedCall, find_own_cod
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import ChildMessage, Fact, Records
 from rlctl.checking.rules import NotJudged, RuleFinding, Severity, check, experiment, list_names
-from rlctl.checking.values import find_author, is_task
+from rlctl.checking.values import find_author, find_batch, is_task
 from rlctl.environments.bullet_calls import visible_to_profilers
 from rlctl.output import format_duration
 
@@ -46,6 +46,7 @@ class Speed:
     suspicious_in_step: list[TimedCall]  # with what they call; none is inside another
     suspicious_in_reset: list[TimedCall]
     rebuilds: bool  # a task of rlctl that declares slow resets
+    is_batch: bool = False  # a `BatchTask`: one of its worlds was timed
 
 
 @experiment("speed", share=1.5)
@@ -73,6 +74,7 @@ def measure_speed(context: Context) -> Iterator[ChildMessage]:
         suspicious_in_step=in_step.suspicious(),
         suspicious_in_reset=in_reset.suspicious(),
         rebuilds=is_task(instance.env) and not find_author(instance.env).fast_reset,
+        is_batch=find_batch(instance.env) is not None,
     )
     yield Fact("speed", speed)
 
@@ -162,9 +164,11 @@ def format_speed(records: Records) -> str:
     episode_s = reset_s + steps * step_s
     per_s = float(f"{steps / episode_s:.2g}")
     calls = f"; slowest: {_list(speed.slowest_in_step)}" if speed.slowest_in_step else ""
+    alone = "; this is one world alone, those of a batch are several times faster" if speed.is_batch else ""
     return (
         f"step {_time(step_s)}, reset {_time(reset_s)} ({reset_s / episode_s:.1%} of an episode), "
         f"{per_s:,.{0 if per_s >= 10 else 1}f} steps/s: a million steps take {format_duration(MILLION / per_s)}{calls}"
+        f"{alone}"
     )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, check_name
+from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.task.body import Contacts, MassState, Vector
 from rlctl.task.mujoco.inverse_kinematics import solve
 from rlctl.task.mujoco.motors import MujocoMotors
@@ -138,7 +138,10 @@ class MujocoBody(MujocoMotors):
     def _single(self, method: str) -> MujocoSim:
         """Return the simulation; raises `UsageError` if it has many worlds."""
         if self._sim.world.count not in (None, 1):
-            self._refuse(f"{method} of many worlds")
+            raise UsageError(
+                f"{method} has no rows, so a BatchTask of many worlds cannot use it; link_position, link_orientation, "
+                "base_velocity, base_angular_velocity and sensor have"
+            )
         return self._sim
 
     def add_force_sensor(self, joint: str) -> None:
@@ -253,13 +256,9 @@ class MujocoBody(MujocoMotors):
 
     def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:
         numbers, world = self._find_links(links), self._sim.world
-        for name in ("body_mass", "body_inertia"):
-            array = self._fields.model(name)
-            array[..., numbers] if name == "body_mass" else array[..., numbers, :]
-            if name == "body_mass":
-                array[..., numbers] = factor * world.built(name)[numbers]
-            else:
-                array[..., numbers, :] = factor * world.built(name)[numbers]
+        masses, inertias = self._fields.model("body_mass"), self._fields.model("body_inertia")
+        masses[..., numbers] = factor * world.built("body_mass")[numbers]
+        inertias[..., numbers, :] = factor * world.built("body_inertia")[numbers]
         self._fields.touch()
 
     def total_mass(self) -> float:

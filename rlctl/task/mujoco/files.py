@@ -33,6 +33,7 @@ class ModelFile:
     spin: dict[str, float]  # spinning friction by link [m]
     moved_by: dict[str, str]  # link that a joint moves, by joint; fixed joints too
     inertia_from_file: bool = False
+    roll: dict[str, float] = dataclasses.field(default_factory=dict)  # rolling friction by link [m]
 
 
 def read_model_file(
@@ -173,6 +174,7 @@ def _describe_urdf(path: Path, spec: Any, root: ElementTree.Element, inertia_fro
         {name: _read(link, "contact/spinning_friction") for name, link in links.items()},
         {name: str(child.get("link")) for name, joint in joints.items() if (child := joint.find("child")) is not None},
         inertia_from_file,
+        {name: _read(link, "contact/rolling_friction") for name, link in links.items()},
     )
 
 

@@ -1,7 +1,8 @@
 """Motors of a body's joints in MuJoCo: its own actuators, so that nothing of Python runs between substeps.
 
 Each joint has an actuator with the force `ctrl + b1 * position + b2 * velocity`, within a range. `drive_to` makes it a
-spring and a damper (b1 = -stiffness, b2 = -damping), `drive_at` a damper, `set_torques` a force.
+spring and a damper (b1 = -stiffness, b2 = -damping), `drive_at` a damper, `set_torques` a force. Without `set_drives`
+the motors of a single world are those of `IdealMotors`; those of many worlds are springs and dampers which come close.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body, Drives
+from rlctl.task.mujoco.ideal_motors import IDEAL_DAMPING, IdealMotors
 from rlctl.task.mujoco.parts import Parts, find_slice
 from rlctl.task.mujoco.world import Rows
 
@@ -34,6 +36,7 @@ class _Mode(NamedTuple):
     damping: Array
     force: Array  # its limit [N m or N]
     max_speed: Array | None
+    is_ideal: bool  # see `IdealMotors`
 
 
 class MujocoMotors(Body):
@@ -107,12 +110,19 @@ class MujocoMotors(Body):
         mode = self._find_mode("position", joints, max_force, gain, max_speed)
         targets = self._read(positions, mode)
         self._write_mode(mode)
+        if mode.is_ideal:
+            self._ideal.aim_at(mode.motors, targets)
+            return
         force = mode.stiffness * targets
         if mode.max_speed is not None:
             force = self._limit_approach(mode, targets, force)
         if self.parts.drives is None:
             force = force + self._hold(mode)
         self._fields.data("ctrl")[..., mode.motors] = force
+
+    @property
+    def _ideal(self) -> IdealMotors:
+        return self._sim.world.ideal
 
     def _hold(self, mode: _Mode) -> Array:
         """Return the torques that hold the joints against gravity now, as PyBullet's ideal motors do."""
@@ -139,10 +149,17 @@ class MujocoMotors(Body):
         mode = self._find_mode("velocity", joints, max_force, 0.0, None)
         targets = self._read(velocities, mode)
         self._write_mode(mode)
+        if mode.is_ideal:
+            self._ideal.aim_at(mode.motors, targets)
+            return
         self._fields.data("ctrl")[..., mode.motors] = mode.damping * targets + self._hold(mode)
 
     def disable_motors(self, joints: Sequence[str] = ()) -> None:
-        self._chosen.update(self.find_joints(joints))
+        chosen = self.find_joints(joints)
+        self._chosen.update(chosen)
+        driven = [self.joint_names[joint] for joint in chosen if joint in self.parts.active]
+        if driven:
+            self.set_torques(np.zeros((*self._fields.shape, len(driven))), driven)
 
     def set_torques(self, torques: Array, joints: Sequence[str] = ()) -> None:
         mode = self._find_mode("torque", joints, np.inf, 0.0, None)
@@ -213,7 +230,22 @@ class MujocoMotors(Body):
             speed = np.where(given > 0, given, np.inf) if (given > 0).any() else None
         elif kind == "torque":
             damping = np.zeros(len(chosen))
-        return _Mode(key, chosen, motors, stiffness if kind == "position" else 0.0 * damping, damping, force, speed)
+        is_ideal = self._sim.world.count is None and kind != "torque"
+        if kind == "position" and self.parts.drives is not None:
+            is_ideal = False
+        if is_ideal:
+            damping = IDEAL_DAMPING * inertia / dt
+        is_spring = kind == "position" and not is_ideal
+        return _Mode(
+            key=key,
+            joints=chosen,
+            motors=motors,
+            stiffness=stiffness if is_spring else 0.0 * damping,
+            damping=damping,
+            force=force,
+            max_speed=speed,
+            is_ideal=is_ideal,
+        )
 
     def _write_mode(self, mode: _Mode) -> None:
         """Write a kind of command into the model, if it is not there yet."""
@@ -223,6 +255,18 @@ class MujocoMotors(Body):
         biases, ranges = self._fields.model("actuator_biasprm"), self._fields.model("actuator_forcerange")
         biases[..., mode.motors, 1], biases[..., mode.motors, 2] = -mode.stiffness, -mode.damping
         force = mode.force * self._fields.model("strength")[..., mode.motors]
+        if self._sim.world.count is None:
+            self._ideal.release(mode.motors)
+        if mode.is_ideal:
+            kind, gain = mode.key[:2]
+            self._ideal.switch_on(
+                mode.motors,
+                damping=mode.damping,
+                max_force=force,
+                gain=gain if kind == "position" else None,
+                max_speed=mode.max_speed,
+            )
+            force = np.full_like(force, _UNLIMITED)  # `IdealMotors` limits it
         ranges[..., mode.motors, 0], ranges[..., mode.motors, 1] = -force, force
 
     def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:

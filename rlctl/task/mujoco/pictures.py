@@ -14,6 +14,9 @@ from rlctl.errors import UsageError, describe_exception
 from rlctl.task.mujoco.world import import_mujoco
 
 _NEAREST = 0.05  # of the distance from the eye to the target
+_SUN = (-0.45, -0.55, -0.7)  # the direction of its light
+_SHADOW_PIXELS = 4096
+_OF_CAMERA = 0.5  # how much of the light from the camera is left
 _HINT = "without a display set MUJOCO_GL=egl (Debian: libegl1) or MUJOCO_GL=osmesa"
 
 
@@ -35,11 +38,12 @@ def draw(
     eye: Sequence[float],
     target: Sequence[float],
     field_of_view: float,
+    sun: bool = False,
 ) -> NDArray[np.uint8]:
     """Return an RGB image of shape (height, width, 3), seen from `eye` [m] to `target` [m]; z is up.
 
     `size` is width and height, `field_of_view` is vertical [degrees]. `markers` are spheres: position [m], radius
-    [m] and colour.
+    [m] and colour. With `sun` there is light and shadow from the side, too.
     """
     mujoco = import_mujoco()
     camera, way = mujoco.MjvCamera(), np.subtract(target, eye)
@@ -50,6 +54,10 @@ def draw(
     model.vis.global_.fovy = field_of_view
     # Nothing nearer is drawn. By default it is a hundredth of the world, on wide ground half of a robot.
     model.vis.map.znear = min(model.vis.map.znear, _NEAREST * camera.distance / model.stat.extent)
+    if sun:
+        # Shadows have so many pixels across the part of the world that the camera sees.
+        model.vis.quality.shadowsize = _SHADOW_PIXELS
+        model.vis.map.shadowclip = 2.0 * camera.distance / model.stat.extent
     model.vis.global_.offwidth, model.vis.global_.offheight = (
         max(wanted, present)
         for wanted, present in zip(size, (model.vis.global_.offwidth, model.vis.global_.offheight), strict=True)
@@ -57,6 +65,8 @@ def draw(
     try:
         renderer = _find_renderer(model, size)
         renderer.update_scene(data, camera)
+        if sun:
+            _add_sun(renderer.scene, target)
         for marker in markers:
             _add_marker(renderer.scene, marker)
         picture: NDArray[np.uint8] = renderer.render()
@@ -114,6 +124,19 @@ def _choose_opengl(mujoco: Any) -> None:
     if sys.platform == "linux" and not os.environ.get("DISPLAY") and "glfw" in chosen.GLContext.__module__:
         os.environ.setdefault("MUJOCO_GL", "egl")
         importlib.reload(chosen)
+
+
+def _add_sun(scene: Any, target: Any) -> None:
+    """Light a picture from the side too: from the camera alone, stairs are stripes."""
+    mujoco = import_mujoco()
+    for light in scene.lights[: scene.nlight]:  # the camera's
+        light.diffuse[:] = [_OF_CAMERA * part for part in light.diffuse]
+    sun = scene.lights[scene.nlight]
+    sun.type, sun.castshadow, sun.headlight = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL), 1, 0
+    sun.dir[:] = _SUN
+    sun.pos[:] = np.asarray(target, float) - 4.0 * np.array(_SUN)
+    sun.ambient[:], sun.diffuse[:], sun.specular[:] = [0.0] * 3, [0.65] * 3, [0.1] * 3
+    scene.nlight += 1
 
 
 def _add_marker(scene: Any, marker: Marker) -> None:

@@ -206,10 +206,16 @@ class MujocoScene:
 
     def _add_pair(self, first: Parts, one: int, link: str, second: Parts, two: int, other: str) -> None:
         spins = first.file.spin.get(link, 0.0) + second.file.spin.get(other, 0.0)
+        rolls = first.file.roll.get(link, 0.0) + second.file.roll.get(other, 0.0)
+        dimensions = 3
+        if rolls:
+            dimensions = 6
+        elif spins:
+            dimensions = 4
         self.spec.add_pair(
             geomname1=f"{first.name}/{one}",
             geomname2=f"{second.name}/{two}",
-            condim=4 if spins else 3,
+            condim=dimensions,
             solref=[self.solref, 1.0],
         )
         self.pairs.append((first.full_name(link), second.full_name(other)))

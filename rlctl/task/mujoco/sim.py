@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +20,7 @@ from rlctl.errors import UsageError
 from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.mujoco.body import MujocoBody
 from rlctl.task.mujoco.drawn_world import DrawnWorld
+from rlctl.task.mujoco.ideal_motors import make_ideal_motors
 from rlctl.task.mujoco.parts import WORLD, Parts
 from rlctl.task.mujoco.pictures import Marker, draw
 from rlctl.task.mujoco.scene import MujocoScene
@@ -194,14 +195,16 @@ class MujocoSim(Sim):
         self.spread_friction()
 
     def _set_extra(self, model: Any) -> None:
-        friction, spin = np.zeros(model.nbody), np.zeros(model.nbody)
+        friction, spin, roll = np.zeros(model.nbody), np.zeros(model.nbody), np.zeros(model.nbody)
         for parts in self._scene.parts.values():
             for link, value in parts.file.friction.items():
                 number = 0 if link == WORLD else parts.links.get(link)
                 if number is not None:
                     friction[number] = parts.built_friction.get(link, value)
                     spin[number] = parts.file.spin[link]
-        self.world.extra |= {"friction": friction, "spin": spin, "strength": np.ones(model.nu)}
+                    roll[number] = parts.file.roll.get(link, 0.0)
+        self.world.extra |= {"friction": friction, "spin": spin, "roll": roll, "strength": np.ones(model.nu)}
+        self.world.extra["ideal motors"] = make_ideal_motors(model.nu)
         self.world.extra["color"] = np.full((model.nbody, 3), np.nan)  # of links, where it was changed
         numbers = [[model.body(end).id for end in pair] for pair in self._scene.pairs]
         self._pair_links = np.array(numbers, int).reshape(-1, 2)
@@ -215,6 +218,10 @@ class MujocoSim(Sim):
         turning = spin[..., one] * friction[..., two] + spin[..., two] * friction[..., one]
         pairs = self.fields.model("pair_friction")
         pairs[..., :3] = np.maximum(np.stack([product, product, turning], axis=-1), self.mujoco.mjMINMU)
+        roll = self.fields.model("roll")
+        rolling = roll[..., one] * friction[..., two] + roll[..., two] * friction[..., one]
+        if rolling.any():
+            pairs[..., 3:] = np.maximum(rolling, self.mujoco.mjMINMU)[..., None]
         self.fields.touch()
 
     def step(self, worlds: Rows = None) -> None:
@@ -253,6 +260,18 @@ class MujocoSim(Sim):
         for body in self.bodies.values():
             body.forget_motors(worlds)
 
+    @contextlib.contextmanager
+    def keep(self, worlds: NDArray[np.int64]) -> Iterator[None]:
+        """Take back what the block of a `with` changes in some worlds of a batch."""
+        modes = {name: dict(body.parts.active) for name, body in self.bodies.items()}
+        try:
+            with self.world.keep(worlds):
+                yield
+        finally:
+            for name, body in self.bodies.items():
+                if body.parts.active != modes[name]:
+                    body.forget_motors(worlds)  # the next command writes its kind into all worlds again
+
     def shift_gravity(self, change: float) -> None:
         self.fields.model("opt.gravity")[..., 2] = self.world.built("opt.gravity")[2] + change
         self.fields.touch()
@@ -279,13 +298,15 @@ class MujocoSim(Sim):
         target: Sequence[float] = (0.2, 0.0, 0.4),
         up: Sequence[float] = (0.0, 0.0, 1.0),
         field_of_view: float = 45.0,
+        sun: bool = False,
     ) -> NDArray[np.uint8]:
+        """Draw the world as `Sim.render` does; films have a `sun`, which policies that see pictures do not."""
         if self.world.batch is not None:
             self._refuse("pictures of many worlds")
         self.world.refresh()
         model, data = self._see()
         size = width, height
-        return draw(model, data, size, self._markers, eye=eye, target=target, field_of_view=field_of_view)
+        return draw(model, data, size, self._markers, eye=eye, target=target, field_of_view=field_of_view, sun=sun)
 
     def _see(self) -> tuple[Any, Any]:
         """Return the model and the data that pictures show."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import UsageError, WorldFailed
 from rlctl.library_output import print_mujoco_warnings
+from rlctl.task.mujoco.ideal_motors import IdealMotors
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64] | None
@@ -57,6 +60,7 @@ class MujocoWorld:
         self.batch: Any = None
         self.extra: dict[str, Array] = {}
         """Arrays by name, without the leading axis of worlds."""
+        self.ideal = IdealMotors(self)
         self._built: dict[str, Array] = {}  # values of the built world, of arrays that may have changed
         self._rows: dict[str, Array] = {}  # arrays of `extra` with a row per world
         self._of_steps: dict[str, Array] = {}  # arrays of `_OF_STEPS` of a batch, since the last step or reset
@@ -152,11 +156,14 @@ class MujocoWorld:
         mujoco, model, data = self.mujoco, self.mj_model, self.mj_data
         if not self._is_fresh:
             mujoco.mj_step1(model, data)
-        # The same as `substeps` calls of mj_step, but the last one leaves what is derived up to date.
-        mujoco.mj_step2(model, data)
-        if self.substeps > 1:
-            mujoco.mj_step(model, data, nstep=self.substeps - 1)
-        mujoco.mj_step1(model, data)
+        if self.ideal.is_used:
+            self.ideal.step(self.substeps)
+        else:
+            # The same as `substeps` calls of mj_step, but the last one leaves what is derived up to date.
+            mujoco.mj_step2(model, data)
+            if self.substeps > 1:
+                mujoco.mj_step(model, data, nstep=self.substeps - 1)
+            mujoco.mj_step1(model, data)
         self._is_fresh = True
         if data.warning.number.any():
             self._raise_warning()
@@ -230,6 +237,26 @@ class MujocoWorld:
             kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_setState(self.mj_model, self.mj_data, self._saved, kind)
         self.touch(worlds)
+
+    @contextlib.contextmanager
+    def keep(self, worlds: NDArray[np.int64]) -> Iterator[None]:
+        """Take back what the block of a `with` changes in some worlds of a batch: their state and their model."""
+        state = self.batch.state[worlds]
+        fields = {name: self.model(name)[worlds] for name in self._built}
+        try:
+            yield
+        finally:
+            has_changed = not np.array_equal(self.batch.state[worlds], state)
+            self.batch.state[worlds] = state
+            for name, built in self._built.items():
+                values = self.model(name)
+                before = fields.get(name, built)  # one that the block has used first was as it was built
+                has_changed = has_changed or not np.array_equal(
+                    values[worlds], np.broadcast_to(before, values[worlds].shape), equal_nan=True
+                )
+                values[worlds] = before
+            if has_changed:
+                self.touch(worlds)
 
 
 class Fields:

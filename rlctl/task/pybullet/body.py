@@ -1,7 +1,7 @@
 """A body of a task's world in PyBullet."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,19 @@ class PybulletBody(Properties):
         self.joint_low, self.joint_high = np.where(limits[:, :1] > limits[:, 1:], (-np.inf, np.inf), limits).T
         self.joint_max_force: Array = np.array([info[10] for info in movable])
         self.joint_max_speed: Array = np.array([info[11] for info in movable])
+
+    def let_roll(self, wheels: Mapping[str, float]) -> None:
+        """Let a body move on its wheels as in MuJoCo; their widths [m] are by link.
+
+        PyBullet slows all links down: with the speed v they lose 0.04 * v * (1 + v) per second, which brakes fast
+        wheels. And it finds one contact point of a wheel, in its middle, where two at its edges resist its turning.
+        """
+        pybullet.changeDynamics(self.id, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client)
+        for link, width in wheels.items():
+            index = self._links[link]
+            spinning = pybullet.getDynamicsInfo(self.id, index, physicsClientId=self.client)[7]
+            if spinning == 0.0:  # the file gives none
+                self._change(index, spinningFriction=width / 2)
 
     def _joint_states(self) -> tuple[Array, Array, Any]:
         # Positions, velocities, and motor torques in a tuple: few tasks need them as an array.
@@ -104,12 +117,21 @@ class PybulletBody(Properties):
 
     def _link_pose(self, link: str) -> tuple[Array, Array]:
         pose = self._cache.get(("link", link))  # a pair: a link may be called "base" or "joints"
-        if pose is None:
+        if pose is None and link == self.base_name and link not in self._links:
+            pose = self._cache["link", link] = self._base_frame()
+        elif pose is None:
             index = self._link_index(link)
             state = pybullet.getLinkState(self.id, index, computeForwardKinematics=1, physicsClientId=self.client)
             # Items 4 and 5 are the link frame; 0 and 1 are the centre of mass.
             pose = self._cache["link", link] = (np.array(state[4]), np.array(state[5]))
         return pose
+
+    def _base_frame(self) -> tuple[Array, Array]:
+        # PyBullet has the pose of the base's centre of mass; the frame of the link is relative to it.
+        mass = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
+        info = pybullet.getDynamicsInfo(self.id, -1, physicsClientId=self.client)
+        frame = pybullet.multiplyTransforms(*mass, *pybullet.invertTransform(info[3], info[4]))
+        return np.array(frame[0]), np.array(frame[1])
 
     def link_position(self, link: str) -> Array:
         return self._link_pose(link)[0]
@@ -133,6 +155,9 @@ class PybulletBody(Properties):
         return MassState(*pose, *pybullet.getBaseVelocity(self.id, physicsClientId=self.client))
 
     def mass_positions(self, links: Sequence[str]) -> list[Vector]:
+        if self.base_name in links and self.base_name not in self._links:
+            centres = [self._mass_centre(self._part_index(link)) for link in links]
+            return [(x, y, z) for x, y, z in centres]
         numbers = [self._links[link] if link in self._links else self._link_index(link) for link in links]
         states = pybullet.getLinkStates(self.id, numbers, physicsClientId=self.client) or ()
         return [state[0] for state in states]

@@ -62,6 +62,7 @@ def _import_silently(name: str) -> ModuleType:
         os.close(devnull)
 
 
+_SUN = {"shadow": 1, "lightDirection": (0.45, -0.2, 0.8), "lightAmbientCoeff": 0.45, "lightDiffuseCoeff": 0.5}
 pybullet: Any = _LazyModule("pybullet")
 pybullet_data: Any = _LazyModule("pybullet_data")
 
@@ -93,12 +94,14 @@ def draw_world(
     target: Sequence[float],
     up: Sequence[float] = (0.0, 0.0, 1.0),
     field_of_view: float,
+    sun: bool = False,
 ) -> NDArray[np.uint8]:
-    """Draw a client's world as `Sim.render` does."""
+    """Draw a client's world as `Sim.render` does; with `sun` there is more light from the side, and shadow."""
     view = pybullet.computeViewMatrix(eye, target, up)
     projection = pybullet.computeProjectionMatrixFOV(field_of_view, width / height, 0.05, 10.0)
+    light: dict[str, Any] = _SUN if sun else {"shadow": 0}
     image = pybullet.getCameraImage(
-        width, height, view, projection, shadow=0, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=client
+        width, height, view, projection, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=client, **light
     )
     # PyBullet returns a flat tuple if it was built without numpy.
     return np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[:, :, :3]

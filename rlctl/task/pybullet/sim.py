@@ -19,7 +19,7 @@ from rlctl.task.pybullet.body import PybulletBody
 from rlctl.task.pybullet.constraints import Constraints
 from rlctl.task.pybullet.library import check_display, draw_world, pybullet, pybullet_data, read_complaint
 from rlctl.task.pybullet.temporary_files import write_temporary
-from rlctl.task.urdf import read_urdf
+from rlctl.task.urdf import Urdf, read_urdf
 
 
 @dataclasses.dataclass
@@ -85,6 +85,7 @@ class PybulletSim(Constraints):
     ) -> PybulletBody:
         self._check_new(name)
         path = find_model_file(file)
+        wheels: dict[str, float] = {}
         if path.suffix == ".urdf":
             flags |= pybullet.URDF_USE_INERTIA_FROM_FILE if inertia == "file" else 0
         if self_collision:
@@ -101,18 +102,25 @@ class PybulletSim(Constraints):
             body_id = int(ids[0])
             fixed = pybullet.getDynamicsInfo(body_id, -1, physicsClientId=self.client)[0] == 0  # a base without mass
         else:
-            body_id = self._load_urdf(path, position, orientation, fixed, flags)
+            inertia_from_file = bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE)
+            urdf = read_urdf(path, fixed=fixed, inertia_from_file=inertia_from_file)
+            wheels = urdf.wheels
+            if wheels:
+                flags |= pybullet.URDF_USE_IMPLICIT_CYLINDER  # by default a cylinder is a prism of 32 sides
+            body_id = self._load_urdf(urdf, position, orientation, fixed, flags)
         body = self.bodies[name] = PybulletBody(self.client, *self._times, name, body_id, path, fixed)
         body.inertia_from_file = bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE)
+        if wheels:
+            body.let_roll(wheels)
         speeds = body.joint_max_speed
         if path.suffix == ".urdf" and fixed and speeds.size and (speeds > 0).all():
             body.cap_joint_speed(float(speeds.max()))
         return body
 
     def _load_urdf(
-        self, path: Path, position: Sequence[float], orientation: Sequence[float], fixed: bool, flags: int
+        self, urdf: Urdf, position: Sequence[float], orientation: Sequence[float], fixed: bool, flags: int
     ) -> Any:
-        urdf = read_urdf(path, fixed=fixed, inertia_from_file=bool(flags & pybullet.URDF_USE_INERTIA_FROM_FILE))
+        path = urdf.path
         options: dict[str, Any] = {"useFixedBase": fixed, "flags": flags}
         if not urdf.changed:
             return self._call_loader(path, pybullet.loadURDF, position, orientation, **options)
