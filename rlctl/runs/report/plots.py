@@ -1,6 +1,7 @@
 """The plots of a report, as SVG texts for an HTML page or as a file of their own."""
 
 import io
+import math
 import re
 import textwrap
 from typing import Any, Literal
@@ -11,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from rlctl.evaluation.robustness import PushTest, RobustnessMap
+from rlctl.evaluation.robustness import Cell, FailedCell, PushTest, RobustnessMap
 from rlctl.runs.report.content import RecipeRuns, RunReport, mean_curve
 
 _SIZE = (4.4, 2.7)  # [inches]: the width of a phone, so that text is readable there
@@ -94,7 +95,7 @@ def _draw_curve(axes: Axes, curve: dict[str, Any], label: str, style: dict[str, 
 
 def plot_robustness(result: RobustnessMap) -> str:
     """Return a map of success, or return where there is no success: a heat map, or a curve with its interval."""
-    quantity = "success" if result.cells[0].success_rate is not None else "return"
+    quantity = "success" if result.has_success else "return"
     if len(result.axes) == 1:
         return _plot_varied(result, quantity)
     rows, columns = result.axes
@@ -115,8 +116,7 @@ def plot_robustness(result: RobustnessMap) -> str:
 
 def _plot_varied(result: RobustnessMap, quantity: str) -> str:
     (axis,) = result.axes
-    intervals = [cell.success_interval if quantity == "success" else cell.return_interval for cell in result.cells]
-    low, high = np.array(intervals, np.float64).T
+    low, high = np.array([_interval(cell, quantity) for cell in result.cells], np.float64).T
     means = [_value(cell, quantity) for cell in result.cells]
     curve = {"steps": axis.values, "mean": means, "low": low, "high": high, "count": len(means)}
     figure, axes = _make_figure()
@@ -139,8 +139,21 @@ def plot_push(test: PushTest) -> str:
     return _finish(figure, axes, "push [N s]", f"episodes: {test.measure}", f"{test.measure.capitalize()} by push")
 
 
-def _value(cell: Any, quantity: str) -> float:
-    return float(cell.success_rate if quantity == "success" else cell.mean_return)
+def _value(cell: Cell | FailedCell, quantity: str) -> float:
+    """Return a score of a cell, NaN where the environment failed: nothing is drawn there."""
+    if isinstance(cell, FailedCell):
+        return math.nan
+    if quantity == "success" and cell.success_rate is not None:
+        return cell.success_rate
+    return cell.mean_return
+
+
+def _interval(cell: Cell | FailedCell, quantity: str) -> tuple[float, float]:
+    if isinstance(cell, FailedCell):
+        return math.nan, math.nan
+    if quantity == "success" and cell.success_interval is not None:
+        return cell.success_interval
+    return cell.return_interval
 
 
 def _make_figure() -> tuple[Figure, Axes]:
