@@ -1,5 +1,7 @@
 """Reading logs: columns by name, and errors that name row and column."""
 
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -130,6 +132,27 @@ def test_arrays_of_an_npz(tmp_path, info, rows):
         read_robot_log(path, info)
     path.write_bytes(b"PK")
     with pytest.raises(ArtifactError, match=r"damaged, or not an \.npz file"):
+        read_robot_log(path, info)
+
+
+@pytest.mark.parametrize("shape", ["(3, 1000000000000)", "(1000000000000, 9999)", "(3, -1)"])
+def test_an_npz_declares_more_than_it_has(tmp_path, info, shape):
+    path = tmp_path / "log.npz"
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("positions.npy", b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header + bytes(72))
+    with pytest.raises(ArtifactError, match=r"log\.npz: "):
+        read_robot_log(path, info)
+
+
+def test_an_encrypted_npz(tmp_path, info, rows):
+    path = tmp_path / "log.npz"
+    np.savez(path, positions=rows)
+    content = bytearray(path.read_bytes())
+    content[6] |= 1
+    content[content.rfind(b"PK\1\2") + 8] |= 1
+    path.write_bytes(content)
+    with pytest.raises(ArtifactError, match=r"log\.npz: positions\.npy: damaged: .* is encrypted"):
         read_robot_log(path, info)
 
 
