@@ -91,9 +91,9 @@ def test_what_was_recorded_before_an_error_is_written(tmp_path):
 @pytest.mark.parametrize(
     ("message", "problem"),
     [
-        ('{"speed": 100}', "Input should be less than or equal to 2"),
-        ('{"commands": {"lin_vel_x": NaN}}', "Input should be a finite number"),
-        ('{"comands": {}}', "Extra inputs are not permitted"),
+        ('{"speed": 100}', "speed: Input should be less than or equal to 2"),
+        ('{"commands": {"lin_vel_x": NaN}}', "commands.lin_vel_x: Input should be a finite number"),
+        ('{"comands": {}}', "comands: Extra inputs are not permitted"),
         ("[", "Invalid JSON: EOF while parsing a list at line 1 column 1"),
     ],
 )

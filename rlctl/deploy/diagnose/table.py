@@ -60,6 +60,11 @@ def read_header(path: Path) -> TableHeader:
     elif path.suffix.lower() in (".csv", ".txt"):
         with untrusted.open_file(path) as file:
             names = [name.strip() for name in _split_line(path, _read_line(path, file), 1)]
+        if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+            raise ArtifactError(
+                f"{path}, line 1: columns are separated by semicolons or tabs; "
+                "write commas between columns, and points in numbers"
+            )
         if twice := [name for name in names if names.count(name) > 1]:
             raise ArtifactError(f"{path}, line 1: column {twice[0]!r} is given twice")
     else:
@@ -142,15 +147,22 @@ def _read_row(path: Path, header: TableHeader, line: str, number: int, indices: 
         raise ArtifactError(f"{path}, line {number}: {len(row)} values for {len(header.names)} columns")
     numbers = []
     for name, index in indices.items():
-        try:
-            value = float(row[index])
-        except ValueError:
-            value = math.nan
+        value = _read_number(row[index])
         if not math.isfinite(value):
             text = short_repr(row[index].strip())
             raise ArtifactError(f"{path}, line {number}, column {name}: {text!r} is not a finite number")
         numbers.append(value)
     return numbers
+
+
+def _read_number(text: str) -> float:
+    """Return a number, NaN for text that is none; `1_7`, which Python takes for 17, is none in a file."""
+    if "_" in text:
+        return math.nan
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 @dataclasses.dataclass(frozen=True)
