@@ -42,8 +42,9 @@ total_timesteps: 200_000
 eval: {every_steps: 20_000, episodes: 50}
 ```
 
-`--algo sac` on a recipe for PPO keeps its task, `n_envs` and `total_timesteps`, so that the comparison is fair. What only
-fits the other algorithm (`algo_kwargs`, `policy_kwargs`, `normalize`, `her`, `mirror`) gets its defaults, and a line says so.
+`--algo sac` on a recipe for PPO keeps its task, `n_envs` and `total_timesteps`, so that the comparison is fair. What
+only fits the other algorithm (`algo_kwargs`, `policy_kwargs`, `normalize`, `her`, `mirror`) gets its defaults, and a
+line says so.
 
 YAML 1.2: `3e-4` is a number, `1e6` is a whole number where one is expected, `on` is text. Anchors, aliases and tags are
 not supported. A key of `--set` has dots: `--set algo_kwargs.gamma=0.98`. `check-env`, `eval` and `replay` accept only

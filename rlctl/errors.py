@@ -98,6 +98,12 @@ class PolicyError(TaskError):
     """A policy that is a user's function raised an exception, or returned something that is not an action."""
 
 
+PLAY_OTHERS = (
+    "To play another program's policy, call it in a function act(observation): rlctl eval TASK --policy FILE.py:act"
+)
+"""What refusals of a foreign file advise."""
+
+
 class EpisodeFailed(TaskError):
     """An environment failed in an episode; `hint` says how to reproduce it."""
 

@@ -16,12 +16,9 @@ from rlctl.cluster.ray_trainings import Pulse, connect, describe_slots, is_copie
 from rlctl.cluster.work import ClusterSettings, compare_versions, describe_driver
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.evaluation.episode_statistics import summarize
-from rlctl.evaluation.evaluate import start_workers
 from rlctl.evaluation.players import LoadedPolicy, load_player
 from rlctl.evaluation.request import EvalRequest
-from rlctl.evaluation.robustness import Outcome
-from rlctl.evaluation.vary import CellPlayer, order_cells
+from rlctl.evaluation.vary import CellPlayer, Scores, order_cells
 
 _POLL_S = 5.0
 
@@ -40,14 +37,12 @@ class CellActor:
         file = Path(self._folder.name) / name
         file.write_bytes(policy)
         player = load_player(file, request.deterministic)
-        workers = start_workers(spec, request)
-        player.give_to(workers)
-        self._player = CellPlayer(workers, player, request)
+        self._player = CellPlayer(spec, player, request)
         return warnings
 
-    def play(self, spec: EnvSpec) -> Outcome:
+    def play(self, spec: EnvSpec) -> Scores:
         """Play all episodes in one setting."""
-        return summarize(self._player.play(spec))
+        return self._player.measure(spec)
 
 
 class RayCells:
@@ -59,7 +54,7 @@ class RayCells:
         self._calls: dict[Any, tuple[Any, int | None]] = {}  # per call its actor and its cell, None for the start
         self._lost: Counter[int | None] = Counter()
 
-    def play(self, specs: Sequence[EnvSpec]) -> Iterator[tuple[int, Outcome]]:
+    def play(self, specs: Sequence[EnvSpec]) -> Iterator[tuple[int, Scores]]:
         """Yield the index and the scores of each setting.
 
         Raises the errors of rlctl that occur on a node, and `TaskError` for a cell whose actor is lost too often.

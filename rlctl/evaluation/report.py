@@ -13,7 +13,7 @@ from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.evaluate import Evaluation
 from rlctl.evaluation.group_scores import GroupScore, SeedScore
 from rlctl.evaluation.request import NO_GATES, Gates, judge
-from rlctl.evaluation.robustness import Cell, Outcome, PushTest, Robustness, RobustnessMap
+from rlctl.evaluation.robustness import Cell, FailedCell, Outcome, PushTest, Robustness, RobustnessMap
 from rlctl.evaluation.sequential import EarlyGate
 from rlctl.evaluation.vary import format_command
 from rlctl.policy.shipped import Interval, MeasuredScore
@@ -194,6 +194,8 @@ def show_robustness(result: Robustness, json: str | None) -> None:
         varied, cell = worst
         out.print(f"\nworst: {varied.name_cell(cell)}: {_format_outcome(cell)}")
         out.print(f"to play only these episodes: {format_command(result, varied, cell)}")
+    for line in result.list_failed():
+        out.print(f"failed: {line}")
     if result.push is not None:
         out.print()
         _show_push(result.push)
@@ -212,10 +214,13 @@ def _show_map(varied: RobustnessMap, worst: Cell | None) -> None:
 
 
 def _show_list(varied: RobustnessMap, worst: Cell | None) -> None:
-    successes = ("success", "95 % interval") if varied.cells[0].success_rate is not None else ()
+    successes = ("success", "95 % interval") if varied.has_success else ()
     rows = []
     for cell in varied.cells:
         cells = [f"{cell.values[0]:g}"]
+        if isinstance(cell, FailedCell):
+            rows.append([*cells, *("-" for _ in successes), "-", "-", "failed"])
+            continue
         if cell.success_rate is not None:
             cells += [f"{cell.success_rate:.1%}", _format_interval(cell.success_interval, ".1%")]
         cells += [f"{cell.mean_return:.4g}", _format_interval(cell.return_interval, ".4g")]
@@ -227,7 +232,6 @@ def _show_list(varied: RobustnessMap, worst: Cell | None) -> None:
 def _show_grid(varied: RobustnessMap, worst: Cell | None) -> None:
     """Print a heat map: the first axis downwards, the second across."""
     down, across = varied.axes
-    has_success = varied.cells[0].success_rate is not None
     cells = iter(zip(varied.cells, _color_cells(varied), strict=True))
     rows: list[list[str | Text]] = [
         [f"{value:.3g} ", *(_draw_cell(*next(cells), worst) for _ in across.values)] for value in down.values
@@ -236,10 +240,13 @@ def _show_grid(varied: RobustnessMap, worst: Cell | None) -> None:
     output.print_table(columns, rows, gap="")
     out = output.out()
     marks = [*([f"{_NOMINAL} nominal"] if any(cell.nominal for cell in varied.cells) else []), f"{_WORST} worst"]
-    out.print(f"{'success [%]' if has_success else 'mean return'}; {', '.join(marks)}")
+    quantity = "success [%]" if varied.has_success else "mean return"
+    out.print(f"{quantity}; {', '.join(marks)}")
 
 
-def _draw_cell(cell: Cell, color: str, worst: Cell | None) -> Text:
+def _draw_cell(cell: Cell | FailedCell, color: str, worst: Cell | None) -> Text:
+    if isinstance(cell, FailedCell):
+        return Text(" failed ", style=f"black on {color}")
     text = f"{cell.mean_return:.3g}" if cell.success_rate is None else f"{100 * cell.success_rate:.0f}"
     mark = f"{_NOMINAL if cell.nominal else ''}{_WORST if cell is worst else ''}"
     return Text(f" {text}{mark or ' '}", style=f"black on {color}")
@@ -247,9 +254,16 @@ def _draw_cell(cell: Cell, color: str, worst: Cell | None) -> Text:
 
 def _color_cells(varied: RobustnessMap) -> list[str]:
     """Return a colour per cell, from red over yellow to green: of success rates from 0 to 1, else of the returns."""
-    cells, returns = varied.cells, [cell.mean_return for cell in varied.cells]
-    low, size = min(returns), max(returns) - min(returns) or 1.0
-    parts = [(cell.mean_return - low) / size if cell.success_rate is None else cell.success_rate for cell in cells]
+    returns = [cell.mean_return for cell in varied.played]
+    low, size = min(returns, default=0.0), max(returns, default=0.0) - min(returns, default=0.0) or 1.0
+    parts = []
+    for cell in varied.cells:
+        if isinstance(cell, FailedCell):
+            parts.append(0.0)
+        elif cell.success_rate is None:
+            parts.append((cell.mean_return - low) / size)
+        else:
+            parts.append(cell.success_rate)
     return [f"rgb({min(255, round(510 * (1 - part)))},{min(255, round(510 * part))},80)" for part in parts]
 
 

@@ -54,6 +54,19 @@ class Cell(Outcome):
         return (0.0 if self.success_rate is None else self.success_rate), self.mean_return
 
 
+class Failure(_Content):
+    """Why the environment could not play the episodes in one setting."""
+
+    failure: str  # the first line of the error
+
+
+class FailedCell(Failure):
+    """A cell of a map that has no scores; it is worse than any other."""
+
+    values: list[float]  # one per axis
+    nominal: bool  # whether every value is that of the unchanged world
+
+
 class Axis(_Content):
     """What is varied."""
 
@@ -68,9 +81,25 @@ class RobustnessMap(_Content):
     """One or two axes varied together; everything else is nominal."""
 
     axes: list[Axis]
-    cells: list[Cell]  # for every combination of the axes' values; the value of the last axis changes fastest
+    cells: list[Cell | FailedCell]
+    """For every combination of the axes' values; the value of the last axis changes fastest."""
 
-    def name_cell(self, cell: Cell) -> str:
+    @property
+    def has_success(self) -> bool:
+        """Whether the task reports success."""
+        return any(cell.success_rate is not None for cell in self.played)
+
+    @property
+    def played(self) -> list[Cell]:
+        """The cells that have scores."""
+        return [cell for cell in self.cells if isinstance(cell, Cell)]
+
+    @property
+    def failed(self) -> list[FailedCell]:
+        """The cells in which the environment failed."""
+        return [cell for cell in self.cells if isinstance(cell, FailedCell)]
+
+    def name_cell(self, cell: Cell | FailedCell) -> str:
         """Return where a cell is: `mass 0.6, friction 0.2`."""
         return ", ".join(f"{axis.name} {value:g}" for axis, value in zip(self.axes, cell.values, strict=True))
 
@@ -125,9 +154,14 @@ class Robustness(_Content):
         return varied.name_cell(cell), cell
 
     def find_worst(self) -> tuple[RobustnessMap, Cell] | None:
-        """Return the worst cell of all maps with its map; None where nothing was varied."""
-        cells = ((varied, cell) for varied in self.maps for cell in varied.cells)
+        """Return the worst cell of all maps that has scores, with its map; None where nothing was varied."""
+        cells = ((varied, cell) for varied in self.maps for cell in varied.played)
         return min(cells, key=lambda pair: pair[1].score, default=None)
+
+    def list_failed(self) -> list[str]:
+        """Return a line for each cell in which the environment failed."""
+        pairs = [(varied, cell) for varied in self.maps for cell in varied.failed]
+        return [f"{varied.name_cell(cell)}: {cell.failure}" for varied, cell in pairs]
 
 
 def read(path: Path) -> Robustness:

@@ -15,14 +15,14 @@ from pathlib import Path
 from rlctl import output
 from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
+from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.evaluation import robustness
 from rlctl.evaluation.episode_statistics import summarize
 from rlctl.evaluation.evaluate import start_workers
 from rlctl.evaluation.players import LoadedPolicy, find_player
 from rlctl.evaluation.push import measure_push
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
-from rlctl.evaluation.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
+from rlctl.evaluation.robustness import Axis, Cell, FailedCell, Failure, Outcome, Robustness, RobustnessMap
 from rlctl.play.collect import play_episodes
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.seeds import Stream, episode_seeds
@@ -32,7 +32,8 @@ from rlctl.storage import files
 from rlctl.version import collect_versions
 
 ASK_ABOVE_S = 600.0  # rlctl asks before it starts a measurement that takes longer than this [s]
-PlayCells = Callable[[LoadedPolicy, EvalRequest, Sequence[EnvSpec]], Iterator[tuple[int, Outcome]]]
+Scores = Outcome | Failure
+PlayCells = Callable[[LoadedPolicy, EvalRequest, Sequence[EnvSpec]], Iterator[tuple[int, Scores]]]
 """Plays the episodes of a request in each setting; yields the index and the scores of each, in any order."""
 
 
@@ -63,9 +64,7 @@ def measure_robustness(
         maps.append([Axis(name="mujoco solref", setting=robustness.SIM, values=values, nominal=None)])
     cells = sum(math.prod(len(axis.values) for axis in axes) for axes in maps)
     gates.check_reachable(request.episodes)
-    with start_workers(spec, request) as workers:
-        policy.give_to(workers)
-        player = CellPlayer(workers, policy, request)
+    with CellPlayer(spec, policy, request) as player:
         start = time.monotonic()
         episodes = player.play(spec)
         nominal = summarize(episodes)
@@ -97,15 +96,27 @@ def measure_robustness(
     return result
 
 
-class CellPlayer:
+class CellPlayer(contextlib.AbstractContextManager["CellPlayer"]):
     """Plays the same episodes in one setting after another, with the same workers."""
 
-    def __init__(self, workers: Workers, policy: LoadedPolicy, request: EvalRequest) -> None:
-        self.workers = workers
-        self._policy = policy
+    def __init__(self, spec: EnvSpec, policy: LoadedPolicy, request: EvalRequest) -> None:
+        self._spec, self._policy, self._request = spec, policy, request
         self._seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
         self._exploration = Exploration(stochastic=not request.deterministic)
-        self._has_events = is_task(workers.spec.constructor())
+        self._has_events = is_task(spec.constructor())
+        self.workers = self._start_workers()
+
+    def _start_workers(self) -> Workers:
+        workers = start_workers(self._spec, self._request)
+        try:
+            self._policy.give_to(workers)
+        except BaseException:
+            workers.close()
+            raise
+        return workers
+
+    def __exit__(self, *_: object) -> None:
+        self.workers.close()
 
     def play(self, spec: EnvSpec, push: dict[str, object] | None = None) -> list[EpisodeResult]:
         """Play all episodes with the events and parameters of `spec`; `push` is as in `Workers.set_events`."""
@@ -117,10 +128,19 @@ class CellPlayer:
             workers.set_events(spec, push)
         return [episode.result for episode in play_episodes(workers, self._seeds, self._exploration)]
 
-    def play_cells(self, specs: Sequence[EnvSpec]) -> Iterator[tuple[int, Outcome]]:
+    def play_cells(self, specs: Sequence[EnvSpec]) -> Iterator[tuple[int, Scores]]:
         """Play all episodes in each setting; yield its index and scores."""
         for index in order_cells(specs):
-            yield index, summarize(self.play(specs[index]))
+            yield index, self.measure(specs[index])
+
+    def measure(self, spec: EnvSpec) -> Scores:
+        """Play all episodes in one setting; an error of the environment is the result there, and ends nothing else."""
+        try:
+            return summarize(self.play(spec))
+        except TaskError as error:
+            self.workers.close(grace_s=0.0)
+            self.workers = self._start_workers()
+            return Failure(failure=str(error).partition("\n")[0])
 
 
 def order_cells(specs: Sequence[EnvSpec]) -> list[int]:
@@ -129,16 +149,20 @@ def order_cells(specs: Sequence[EnvSpec]) -> list[int]:
 
 
 def _play_maps(
-    maps: Sequence[list[Axis]], spec: EnvSpec, play: Callable[[Sequence[EnvSpec]], Iterator[tuple[int, Outcome]]]
+    maps: Sequence[list[Axis]], spec: EnvSpec, play: Callable[[Sequence[EnvSpec]], Iterator[tuple[int, Scores]]]
 ) -> list[RobustnessMap]:
     points = [(axes, values) for axes in maps for values in itertools.product(*(axis.values for axis in axes))]
-    cells: dict[int, Cell] = {}
+    cells: dict[int, Cell | FailedCell] = {}
     with output.show_progress("varying", len(points)) as show:
         for index, outcome in play([robustness.apply_axes(axes, values, spec) for axes, values in points]):
             pairs = list(zip(*points[index], strict=True))
             nominal = all(axis.nominal is not None and abs(axis.nominal - value) < 1e-9 for axis, value in pairs)
-            cells[index] = Cell(**outcome.model_dump(), values=[value for _, value in pairs], nominal=nominal)
+            kind = FailedCell if isinstance(outcome, Failure) else Cell
+            cells[index] = kind(**outcome.model_dump(), values=[value for _, value in pairs], nominal=nominal)
             show(len(cells))
+    failures = [cell.failure for cell in cells.values() if isinstance(cell, FailedCell)]
+    if len(failures) == len(points):
+        raise TaskError(f"{failures[0]}\nso it is in every cell of --vary; nothing is stored")
     return [
         RobustnessMap(axes=axes, cells=[cells[index] for index in range(len(points)) if points[index][0] is axes])
         for axes in maps
@@ -169,7 +193,13 @@ def _store(file: Path, result: Robustness) -> None:
 
 
 def check_gates(result: Robustness, gates: Gates) -> None:
-    """Raise `AnswerIsNo` if the worst cell of all maps misses a gate; without maps, the nominal one."""
+    """Raise `AnswerIsNo` if the worst cell of all maps misses a gate; without maps, the nominal one.
+
+    A cell in which the environment failed misses every gate.
+    """
+    failed = result.list_failed()
+    if failed and gates != NO_GATES:
+        raise AnswerIsNo(f"gate missed: the episodes could not be played at {failed[0]}")
     where, outcome = result.name_worst()
     if missed := gates.list_missed(outcome.success_rate, outcome.success_interval, outcome.mean_return):
         raise AnswerIsNo(f"gate missed in the worst cell, {where}: " + "; ".join(missed))

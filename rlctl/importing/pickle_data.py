@@ -13,6 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_OPCODES = 2_000_000
+_MOST_VALUES = 10_000_000
+"""Values of a pickle, one that it mentions several times counted each time: what walks through them takes as long."""
+_MOST_ARGUMENTS = 1000  # of a call; each call with keywords copies them
+_KEYS = (str, bytes, int, float, type(None))
 
 
 class NotPlainData(ValueError):
@@ -53,6 +57,8 @@ _MARK = object()
 def _make_call(function: Any, arguments: Any, keywords: Any = None) -> Call:
     if not isinstance(function, Name) or not isinstance(arguments, tuple):
         raise NotPlainData("a call of something other than a name")
+    if len(arguments) > _MOST_ARGUMENTS:
+        raise NotPlainData(f"a call with {len(arguments):,} arguments")
     return Call(function, arguments if keywords is None else (*arguments, keywords))
 
 
@@ -63,8 +69,22 @@ def _set_state(target: Any, state: Any) -> Any:
     return target
 
 
+def _make_name(module: Any, qualname: Any) -> Name:
+    if not isinstance(module, str) or not isinstance(qualname, str):
+        raise NotPlainData("a name that is not text")
+    return Name(module, qualname)
+
+
 def _pair(items: list[Any]) -> dict[Any, Any]:
-    return dict(zip(items[::2], items[1::2], strict=True))
+    return dict(zip(_check_keys(items[::2]), items[1::2], strict=True))
+
+
+def _check_keys(keys: list[Any]) -> list[Any]:
+    """Refuse keys whose hash is computed from other values: tuples of tuples of tuples would take forever."""
+    for key in keys:
+        if not isinstance(key, (*_KEYS, Name)):
+            raise NotPlainData(f"a {type(key).__name__} as a key")
+    return keys
 
 
 def _set_items(target: Any, items: list[Any]) -> None:
@@ -84,7 +104,7 @@ _MAKES: dict[str, tuple[int, Callable[..., Any]]] = {
     "TUPLE1": (1, lambda *values: values),
     "TUPLE2": (2, lambda *values: values),
     "TUPLE3": (3, lambda *values: values),
-    "STACK_GLOBAL": (2, lambda module, qualname: Name(str(module), str(qualname))),
+    "STACK_GLOBAL": (2, _make_name),
     "REDUCE": (2, _make_call),
     "NEWOBJ": (2, _make_call),
     "NEWOBJ_EX": (3, _make_call),
@@ -93,13 +113,13 @@ _MAKES: dict[str, tuple[int, Callable[..., Any]]] = {
 }
 """Instruction -> the number of values that it pops, and the function that makes one value of them."""
 _COLLECTS: dict[str, Callable[[list[Any]], Any]] = {
-    "TUPLE": tuple, "LIST": list, "FROZENSET": frozenset, "DICT": _pair,
+    "TUPLE": tuple, "LIST": list, "FROZENSET": lambda items: frozenset(_check_keys(items)), "DICT": _pair,
 }  # fmt: skip
 """Instruction -> the function that makes one value of the values above the mark."""
 _ADDS: dict[str, tuple[int | None, Callable[[Any, list[Any]], None]]] = {
     "APPEND": (1, lambda target, items: target.extend(items)),
     "APPENDS": (None, lambda target, items: target.extend(items)),
-    "ADDITEMS": (None, lambda target, items: target.update(items)),
+    "ADDITEMS": (None, lambda target, items: target.update(_check_keys(items))),
     "SETITEM": (2, _set_items),
     "SETITEMS": (None, _set_items),
 }
@@ -119,13 +139,43 @@ def read(content: bytes | BinaryIO) -> Any:
             if count > MOST_OPCODES:
                 raise NotPlainData(f"more than {MOST_OPCODES:,} instructions")
             if opcode.name == "STOP":
-                return machine.stack.pop()
+                return _check_size(machine.stack.pop())
             machine.run(opcode.name, argument)
     except NotPlainData:
         raise
     except (IndexError, KeyError, TypeError, AttributeError, ValueError):
         raise NotPlainData("its pickle is damaged") from None
     raise NotPlainData("its pickle has no end")
+
+
+def _check_size(value: Any) -> Any:
+    """Return a value that has at most `_MOST_VALUES`; one that it mentions twice counts twice."""
+    sizes: dict[int, int] = {}
+    waiting = [(value, False)]
+    while waiting:
+        current, parts_are_counted = waiting.pop()
+        parts = _list_parts(current)
+        if parts_are_counted:
+            sizes[id(current)] = 1 + sum(sizes[id(part)] for part in parts)
+            if sizes[id(current)] > _MOST_VALUES:
+                raise NotPlainData(f"more than {_MOST_VALUES:,} values, or one that contains itself")
+        elif id(current) not in sizes:
+            sizes[id(current)] = _MOST_VALUES  # until its parts are counted: one that contains itself has no size
+            waiting.append((current, True))
+            waiting.extend((part, False) for part in parts)
+    return value
+
+
+def _list_parts(value: Any) -> list[Any]:
+    if isinstance(value, list | tuple):
+        return list(value)
+    if isinstance(value, dict):
+        return list(value.values())
+    if isinstance(value, Call):
+        return [value.arguments, value.state, value.items]
+    if isinstance(value, Persistent):
+        return [value.content]
+    return []
 
 
 class _Machine:

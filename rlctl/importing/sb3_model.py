@@ -89,9 +89,7 @@ def _explain_errors(path: Path, what: str) -> Iterator[None]:
         yield
     except NotPlainData as error:
         raise ArtifactError(f"{path}: it has data that cannot be imported: {error}") from None
-    except zipfile.BadZipFile:
-        raise ArtifactError(f"{path}: not a zip archive, so not {what} of Stable-Baselines3") from None
-    except (KeyError, ValueError, TypeError, AttributeError, OSError, RecursionError, NotImplementedError) as error:
+    except (*untrusted.ZIP_ERRORS, KeyError, TypeError, AttributeError) as error:
         raise ArtifactError(f"{path}: not {what} of Stable-Baselines3, or damaged: {error}") from None
 
 

@@ -120,7 +120,9 @@ class PageServer:
         try:
             self._controls.apply(PageMessage.model_validate_json(text))
         except pydantic.ValidationError as error:
-            return str(error.errors()[0]["msg"])
+            problem = error.errors()[0]
+            key = ".".join(str(part) for part in problem["loc"])
+            return f"{key}: {problem['msg']}" if key else str(problem["msg"])
         return ""
 
 

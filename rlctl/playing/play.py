@@ -131,14 +131,18 @@ class Game:
                 return self.result
             self._recording = wishes.record
             rollout = self._play_episode(episode_seed(seed, Stream.REPLAY, 0, number))
-            self.result.episodes += 1
-            self.result.steps += rollout.length
-            if self._recording and rollout.length:
-                self._write(rollout)
+            self._finish(rollout)
             if rollout.ended:
                 self._show("ended")
                 self._controls.wait(_SHOW_END_S)
         raise AssertionError
+
+    def _finish(self, rollout: Rollout) -> None:
+        """Count an episode, or the steps before an error, and write what is to be recorded."""
+        self.result.episodes += 1
+        self.result.steps += rollout.length
+        if self._recording and rollout.length:
+            self._write(rollout)
 
     def _warn(self, text: str) -> None:
         """Print a warning once: the world is read for each picture."""
@@ -158,7 +162,16 @@ class Game:
         self._controls.keep_commands(self._velocities)
         draw = self._warn if self._recording else None
         name = f"{self._source.name}, steered by a person"
-        return play_episode(self._env, self._spec, seed, self._steer(policy), policy=name, draw=draw, watch=self._watch)
+        return play_episode(
+            self._env,
+            self._spec,
+            seed,
+            self._steer(policy),
+            policy=name,
+            draw=draw,
+            watch=self._watch,
+            salvage=self._finish,
+        )
 
     def _steer(self, policy: Choose) -> Choose:
         def choose(observation: Any, step: int) -> Any:

@@ -85,7 +85,9 @@ class RobotWorld:
     def _push(self, env: TaskEnv, robot: Body, direction: tuple[float, float]) -> str:
         """Push the trunk, or the last link of a robot that is fixed to the ground."""
         link = self._trunk or robot.link_names[-1]
-        force = robot.total_mass() * _PUSH_SPEED / _PUSH_S * np.array(direction) / math.hypot(*direction)
+        largest = max(abs(part) for part in direction)  # divided by first: a square may be too large or small
+        scaled = np.array(direction) / largest
+        force = robot.total_mass() * _PUSH_SPEED / _PUSH_S * scaled / np.linalg.norm(scaled)
         env.sim.push(robot.name, [*force.tolist(), 0.0], _PUSH_S, None if link == robot.base_name else link)
         return f"push of {np.linalg.norm(force):.3g} N for {_PUSH_S:g} s"
 

@@ -14,7 +14,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import Observations, split
-from rlctl.errors import ArtifactError, UsageError, short_repr
+from rlctl.errors import PLAY_OTHERS, ArtifactError, UsageError, short_repr
 from rlctl.policy.file import GRAPH, PolicyInfo, Tensors, parse_info
 from rlctl.policy.layers import Normalize
 from rlctl.policy.policy import Policy
@@ -49,18 +49,35 @@ def encode(model: onnx.ModelProto) -> bytes:
     return content.replace(_ZEROS, files.digest(content).encode())
 
 
+def _parse(content: bytes) -> onnx.ModelProto:
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        return onnx.ModelProto.FromString(content)
+    except DecodeError:
+        raise ValueError("cut off, or not ONNX") from None
+
+
+def _read_metadata(content: bytes) -> dict[str, str]:
+    """Return the metadata of a graph; raises `ValueError` if it is damaged, or empty as text that parses is."""
+    model = _parse(content)
+    if not model.graph.node:
+        raise ValueError("it has no graph")
+    for entry in model.metadata_props:
+        if not isinstance(entry.key, str) or not isinstance(entry.value, str):  # bytes, for damaged text
+            raise ValueError("its metadata is not text")
+    return {entry.key: entry.value for entry in model.metadata_props}
+
+
 def check(content: bytes) -> None:
     """Raise `ValueError` for a graph that is damaged, or that has more than a policy needs.
 
     A loop may never end, and for a tensor in another file onnxruntime would read a path that the sender chose.
     """
     import onnx
-    from google.protobuf.message import DecodeError
 
-    try:
-        model = onnx.ModelProto.FromString(content)
-    except DecodeError:
-        raise ValueError("cut off, or not ONNX") from None
+    model = _parse(content)
     attributes = [attribute for node in model.graph.node for attribute in node.attribute]
     refused = [model.functions, model.training_info, model.graph.sparse_initializer]
     refused += [attribute.graphs or attribute.sparse_tensors for attribute in attributes]
@@ -108,21 +125,24 @@ class OnnxPolicy(Policy):
     @classmethod
     def load(cls, path: Path) -> OnnxPolicy:
         """Read an exported file; raises `ArtifactError` if it is missing, damaged, foreign or of a newer format."""
+        content = untrusted.read_bytes(path)
         try:
-            session = open_session(untrusted.read_bytes(path))
-            metadata = session.get_modelmeta().custom_metadata_map
-            text = metadata.get(METADATA_KEY)
-        except ValueError as error:  # for damaged metadata a UnicodeDecodeError
-            raise ArtifactError(f"{path}: damaged, or not an ONNX file of rlctl: {error}") from None
+            metadata = _read_metadata(content)
+        except ValueError as error:
+            raise ArtifactError(f"{path}: damaged, or not an ONNX file: {error}") from None
         if CONTROLLER_KEY in metadata:
             raise ArtifactError(
                 f"{path}: a controller takes what a robot measures; give the policy that it was made of"
             )
+        text = metadata.get(METADATA_KEY)
         if text is None:
             raise ArtifactError(
-                f"{path}: not an ONNX file of rlctl: its metadata has no {METADATA_KEY!r} entry; "
-                "write one with rlctl export --onnx"
+                f"{path}: an ONNX file of another program: its metadata has no {METADATA_KEY!r} entry. {PLAY_OTHERS}"
             )
+        try:
+            session = open_session(content)
+        except ValueError as error:
+            raise ArtifactError(f"{path}: damaged: {error}") from None
         info = parse_info(text, path)
         try:
             policy = cls(info, session)

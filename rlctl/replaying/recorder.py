@@ -127,11 +127,12 @@ def play_episode(
     policy: str = "",
     draw: Warn | None = None,
     watch: Watch = lambda step: None,
+    salvage: Callable[[Rollout], None] = lambda rollout: None,
 ) -> Rollout:
     """Play the episode of a seed and record it; `watch` is called after the reset and after each step.
 
     With `draw` the rollout has a scene, and `draw` receives the reasons for missing parts. Raises `TaskError`, with
-    seed and step, for any exception of the environment.
+    seed and step, for any exception of the environment; `salvage` receives the steps before any exception.
     """
     about, space = describe(env), env.observation_space
     reader = make_reader(env, draw) if draw is not None else None
@@ -143,25 +144,35 @@ def play_episode(
         observation, info = env.reset(seed=seed)
         first, drawn = copy_observation(observation, space), _find_events(info, about)
         read(0)
-    watch(0)
-    while not (terminated or truncated) and (action := choose(observation, len(steps))) is not None:
-        with _locate_errors(spec.task, seed, len(steps) + 1):
-            observation, reward, terminated, truncated, info = env.step(cast(action))
-            steps.append(_read_step(action, copy_observation(observation, space), float(reward), info, about))
-            read(len(steps))
-        watch(len(steps))
-    end = "terminated" if terminated else "truncated: time limit" if truncated else ""
-    successes = [step.success for step in steps if step.success is not None]
-    return Rollout(
-        env=about,
-        episode=_make_episode(spec, seed, policy, about, first, steps, env.action_space),
-        weighted_terms=_stack_terms([step.weighted for step in steps], about),
-        successes=np.array(successes, np.bool_) if steps and len(successes) == len(steps) else None,
-        ended=bool(end),
-        log=[LogEntry(0, f"reset with seed {seed}"), *_log_events(0, drawn), *_log_steps(steps, end)],
-        dt=find_dt(env),
-        scene=Scene() if reader is None else reader.scene(),
-    )
+
+    def collect(end: str) -> Rollout:
+        successes = [step.success for step in steps if step.success is not None]
+        return Rollout(
+            env=about,
+            episode=_make_episode(spec, seed, policy, about, first, steps, env.action_space),
+            weighted_terms=_stack_terms([step.weighted for step in steps], about),
+            successes=np.array(successes, np.bool_) if steps and len(successes) == len(steps) else None,
+            ended=bool(end),
+            log=[LogEntry(0, f"reset with seed {seed}"), *_log_events(0, drawn), *_log_steps(steps, end)],
+            dt=find_dt(env),
+            scene=Scene() if reader is None else reader.scene(),
+        )
+
+    try:
+        watch(0)
+        while not (terminated or truncated) and (action := choose(observation, len(steps))) is not None:
+            with _locate_errors(spec.task, seed, len(steps) + 1):
+                observation, reward, terminated, truncated, info = env.step(cast(action))
+                step = _read_step(action, copy_observation(observation, space), float(reward), info, about)
+                read(len(steps) + 1)
+                steps.append(step)
+            watch(len(steps))
+    except Exception as error:
+        rollout = collect("")
+        failure = LogEntry(len(steps), str(error).partition("\n")[0], "WARN")
+        salvage(dataclasses.replace(rollout, log=[*rollout.log, failure]))
+        raise
+    return collect("terminated" if terminated else "truncated: time limit" if truncated else "")
 
 
 def _read_step(action: Any, observation: Any, reward: float, info: dict[str, Any], about: EnvInfo) -> _Step:

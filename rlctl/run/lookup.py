@@ -13,7 +13,7 @@ from pathlib import Path
 from rlctl.environments import installed, registry, suggestions
 from rlctl.environments.registry import describe_task_changes
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import ArtifactError, UsageError, did_you_mean
+from rlctl.errors import PLAY_OTHERS, ArtifactError, UsageError, did_you_mean
 from rlctl.hub import store
 from rlctl.output import format_duration
 from rlctl.policy.file import PolicyFile, PolicyInfo
@@ -75,7 +75,7 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
         raise UsageError(model)
     if Path(text).is_file() and Path(text).suffix != ".zip":
         hint = f"; its run: {Path(text).parent}" if (Path(text).parent / "run.json").is_file() else ""
-        raise ArtifactError(f"{text}: neither a run nor a policy (.safetensors, .onnx){hint}")
+        raise ArtifactError(f"{text}: neither a run nor a policy (.safetensors, .onnx){hint}. {PLAY_OTHERS}")
     if Path(text).suffix == ".zip":
         raise ArtifactError(
             f"{text}: a .zip, the model format of Stable-Baselines3, not a run; convert it: "

@@ -61,6 +61,8 @@ def describe_robustness(result: Robustness) -> Iterator[str]:
         for name, outcome in ((where, worst[1]), ("with nothing varied", result.nominal)):
             rate = "" if outcome.success_rate is None else f"success {outcome.success_rate:.1%}, "
             yield f"{name}: {rate}return {outcome.mean_return:.4g}"
+    for line in result.list_failed():
+        yield f"failed: {line}"
     if result.push is not None:
         yield result.push.verdict
     if result.command:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+import lzma
 import os
 import stat
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
@@ -27,6 +30,8 @@ JSON_LIMIT = 16 * 2**20  # [bytes]
 _DEEPEST = 100  # levels of JSON; writing or printing more may exceed a recursion limit
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 _ALWAYS_READ = 1_000_000  # [bytes]
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, RuntimeError, OSError, ValueError)
+"""What reading a damaged archive raises; `RuntimeError` for one that is encrypted or packed in an unknown way."""
 _MEMBERS = 1000  # maximum number of arrays in a file
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Allowed compressions: those of numpy. With LZMA the file itself would decide how much memory unpacking takes."""
@@ -55,7 +60,7 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
         size = os.fstat(file.fileno()).st_size
         if limit is not None and size > limit:
             raise ArtifactError(f"{path}: too large: {format_bytes(size)}, the limit is {format_bytes(limit)}")
-        _check_size(path, size)
+        check_size(path, size)
         try:
             content = file.read()
         except OSError as error:
@@ -70,7 +75,7 @@ def _check_content(path: Path, content: bytes) -> None:
         raise ArtifactError(f"{path}: a pointer of Git LFS, not the file itself: git lfs pull")
 
 
-def _check_size(path: Path, size: int, what: str = "") -> None:
+def check_size(path: Path, size: int, what: str = "") -> None:
     """Raise `ArtifactError` if `size` bytes are more than half of the available memory."""
     # Measuring memory costs as much as reading a small file, and `rlctl runs` reads thousands of them.
     if size > _ALWAYS_READ and (free := measure_free_memory()) is not None and size > free // 2:
@@ -81,7 +86,7 @@ def _check_size(path: Path, size: int, what: str = "") -> None:
 def check_safetensors(path: Path) -> None:
     """Raise `ArtifactError` for a policy file that is not a regular file, or too large for the memory."""
     with open_file(path) as file:
-        _check_size(path, os.fstat(file.fileno()).st_size)
+        check_size(path, os.fstat(file.fileno()).st_size)
         _check_content(path, file.read(len(_LFS_POINTER)))
 
 
@@ -136,7 +141,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         for member in members:
             if not member.filename.endswith(".npy") or member.compress_type not in _PACKED:
                 raise ValueError(f"{member.filename!r} is not an array, or its compression is not numpy's")
-        _check_size(path, sum(member.file_size for member in members), "unpacked ")
+        check_size(path, sum(member.file_size for member in members), "unpacked ")
         arrays: dict[str, NDArray[Any]] = dict(np.load(path, allow_pickle=False))
     for name, content in arrays.items():
         if not isinstance(content, np.ndarray):  # without a header numpy returns bytes

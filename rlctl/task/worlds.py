@@ -216,7 +216,8 @@ class TaskWorlds:
     ) -> Observation:
         """Begin the episodes of `seeds` in `worlds`; return their first observations, shape (k, size).
 
-        `levels`, shape (k,), is how hard they are; `generators` replace those of the seeds in the tasks' resets. Equal seeds give equal episodes, whatever was simulated before.
+        `levels`, shape (k,), is how hard they are; `generators` replace those of the seeds in the task's reset. Equal
+        seeds give equal episodes, whatever was simulated before.
         """
         if self._is_all(worlds):
             worlds = self._all

@@ -61,6 +61,8 @@ ROWS = {
     "diagnose-quadruped": "diagnosing:quadruped",
     "diagnose-gear-arm": "diagnosing:gear_arm",
     "diagnose-walk": "diagnosing:walk",
+    "diagnose-swaps-reach": "swaps:reach",
+    "diagnose-swaps-walk": "swaps:walk",
     "zoo-ppo-reach": "zoo:ppo_reach",
     "zoo-ppo-half-cheetah": "zoo:ppo_half_cheetah",
     "zoo-sac-half-cheetah": "zoo:sac_half_cheetah",

@@ -60,6 +60,23 @@ class Lost(Block):
         return self.distance() >= self.limit
 
 
+@dataclass
+class Brittle(Block):
+    """Its numbers are not finite above a stiffness, nor its world loadable below 0."""
+
+    stiffness: float = 1.0
+
+    def build(self, sim: Sim) -> None:
+        """Load the world."""
+        if self.stiffness < 0:
+            raise ValueError("negative stiffness")
+        super().build(sim)
+
+    def distance(self) -> float:
+        """As the block's, or infinite."""
+        return float("inf") if self.stiffness > 2 else super().distance()
+
+
 class Chain(gymnasium.Env):
     """A plain environment with parameters of several kinds."""
 

@@ -14,6 +14,7 @@ from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.evaluation.robustness import apply_axes, read, read_axes
 from rlctl.evaluation.vary import check_gates, format_command, measure_robustness
 from rlctl.output import format_duration
+from rlctl.runs.report.plots import plot_robustness
 from tests.evaluation.conftest import ENVS, write_run
 
 BLOCK = EnvSpec(f"{ENVS}:Block")
@@ -281,3 +282,30 @@ def test_what_mujoco_has_not_is_said_before_an_episode_is_played(rlctl):
     done = rlctl("eval", "kuka-grasp", "--pretrained", "--sim", "mujoco")
     assert done.returncode == 3
     assert done.stderr.endswith("kuka_with_gripper2.sdf: MuJoCo reads URDF and MJCF (.xml) files\n")
+
+
+@pytest.mark.pybullet
+def test_a_cell_that_fails_is_a_failed_cell(rlctl, tmp_path):
+    run = write_run(tmp_path / "run", f"{ENVS}:Brittle")
+    arguments = ("eval", run.path, "--episodes", 2, "--vary", "stiffness=-2:4:4")
+    done = rlctl(*arguments)
+    assert done.returncode == 0, done.stderr
+    result = read(run.robustness_file)
+    assert [(cell.values, "negative stiffness" in cell.failure) for cell in result.maps[0].failed] == [
+        ([-2.0], True), ([4.0], False)
+    ]  # fmt: skip
+    assert [cell.values for cell in result.maps[0].played] == [[0.0], [2.0]]
+    lines = done.stdout.splitlines()
+    assert [line.split()[-1] for line in (lines[5], lines[8])] == ["failed", "failed"]
+    assert lines[-1].startswith("failed: stiffness 4: task '")
+    assert "inf" in lines[-1]
+    assert plot_robustness(result.maps[0]).startswith("<svg")
+    gated = rlctl(*arguments, "--min-success", "0.1")
+    assert gated.returncode == 1
+    assert gated.stderr.splitlines()[-1].startswith(
+        "error: gate missed: the episodes could not be played at stiffness -2: task '"
+    )
+    everywhere = rlctl(*arguments[:-1], "stiffness=3:4:2")
+    assert everywhere.returncode == 3
+    assert "so it is in every cell of --vary" in everywhere.stderr
+    assert read(run.robustness_file).maps == result.maps

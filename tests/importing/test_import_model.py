@@ -195,6 +195,30 @@ def test_other_files_are_refused(save, tmp_path, monkeypatch):
         import_model(Path("agents/best_model.zip"), "reach")
 
 
+def damage_archive(path, encrypted):
+    """Mark all members as encrypted, or change a byte in the middle of what is packed."""
+    content = bytearray(path.read_bytes())
+    if encrypted:
+        for signature, offset in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
+            start = content.find(signature)
+            while start >= 0:
+                content[start + offset] |= 1
+                start = content.find(signature, start + 4)
+    else:
+        content[content.find(b"policy.pth") + 200] ^= 0xFF
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(("encrypted", "reason"), [(True, "is encrypted"), (False, "Bad CRC-32 for file 'policy.pth'")])
+def test_a_damaged_or_encrypted_archive(save, tmp_path, encrypted, reason):
+    _, _, request = save()
+    path = tmp_path / "model.zip"
+    path.write_bytes(request["file"].read_bytes())
+    damage_archive(path, encrypted)
+    with pytest.raises(ArtifactError, match=rf"model\.zip: not a model of Stable-Baselines3, or damaged: .*{reason}"):
+        read_model(path)
+
+
 def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path):
     with zipfile.ZipFile(tmp_path / "bomb.zip", "w") as archive:
         archive.writestr("data", b" ")

@@ -60,3 +60,29 @@ def test_objects_are_data():
     assert str(read["call"].function) == "builtins.len"
     assert read["call"].arguments == ("hello",)
     assert read["list"] == [1, (2.5, "x")]
+
+
+def make_bomb(grow: bytes, last: bytes) -> bytes:
+    """A pickle of 40 values, each of which has the one before twice: 2^40 in all."""
+    steps = b"".join(b"h%c" % k + b"h%c" % k + grow + b"q%c" % (k + 1) for k in range(40))
+    return b"(tq\x00" + steps + last
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        make_bomb(b"\x86", b"."),  # tuples of tuples
+        make_bomb(b"\x86", b"}h\x28Ns."),  # as the key of a dict, whose hash would take forever
+        make_bomb(b"\x86", b"\x8f(h\x28\x90."),  # in a set
+        make_bomb(b"\x86", b"h\x28\x8c\x01a\x93."),  # as a name, whose text would
+        b"]q\x00h\x00a.",  # a list in itself
+    ],
+)
+def test_what_is_small_in_the_file_only_is_refused(content):
+    with pytest.raises(NotPlainData):
+        pickle_data.read(content)
+
+
+def test_a_value_that_is_mentioned_twice():
+    shared = [1, 2]
+    assert pickle_data.read(pickle.dumps({"a": shared, "b": (shared, shared)})) == {"a": [1, 2], "b": ([1, 2], [1, 2])}

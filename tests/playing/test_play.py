@@ -3,15 +3,21 @@
 import json
 import urllib.error
 import urllib.request
+from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rlctl.errors import UsageError
+from rlctl.errors import TaskError, UsageError
 from rlctl.playing.controls import Controls
 from rlctl.playing.page_server import PageServer
-from rlctl.replaying.sources import load_located
+from rlctl.playing.play import Game
+from rlctl.replaying.drawable import make_drawable
+from rlctl.replaying.request import ReplayRequest
+from rlctl.replaying.sources import PolicySource, load_located
 from rlctl.run.episode import load_episode
+from tests.evaluation.conftest import write_run
 from tests.playing.pages import play
 
 
@@ -68,12 +74,26 @@ def test_a_goal_is_moved_and_recorded(tmp_path):
         load_located(recording.with_suffix(".npz"))
 
 
+def test_what_was_recorded_before_an_error_is_written(tmp_path):
+    run = write_run(tmp_path / "run", f"{Path(__file__).with_name('envs.py')}:Breaks")
+    source = PolicySource(ReplayRequest(str(run.path), sim="mujoco", output=tmp_path / "films"))
+    controls = Controls(record=True)
+    server = PageServer(0, controls)
+    server.start()
+    with closing(make_drawable(source.spec)) as env, pytest.raises(TaskError, match="it broke"):
+        Game(env, source.spec, source, controls, server).play(0)
+    server.close()
+    episode = load_episode(tmp_path / "films/000000.npz")
+    assert len(episode.rewards) == 10
+    assert (tmp_path / "films/000000.rrd").stat().st_size > 0
+
+
 @pytest.mark.parametrize(
     ("message", "problem"),
     [
-        ('{"speed": 100}', "Input should be less than or equal to 2"),
-        ('{"commands": {"lin_vel_x": NaN}}', "Input should be a finite number"),
-        ('{"comands": {}}', "Extra inputs are not permitted"),
+        ('{"speed": 100}', "speed: Input should be less than or equal to 2"),
+        ('{"commands": {"lin_vel_x": NaN}}', "commands.lin_vel_x: Input should be a finite number"),
+        ('{"comands": {}}', "comands: Extra inputs are not permitted"),
         ("[", "Invalid JSON: EOF while parsing a list at line 1 column 1"),
     ],
 )

@@ -106,3 +106,12 @@ def test_rough_ground_is_in_the_world_frame():
     [part] = about["parts"]
     assert part["link"] == -1
     assert len(part["triangles"]) == 6
+
+
+@pytest.mark.parametrize("direction", [(1e308, 1e308), (5e-324, 5e-324), (-3.0, -3.0)])
+def test_a_push_has_a_direction_only(direction):
+    with closing(EnvSpec("reach", sim="mujoco").make()) as env:
+        env.reset(seed=0)
+        world = RobotWorld(env)
+        mass = max(body.total_mass() for body in env.unwrapped.sim.bodies.values() if body.joint_names)
+        assert world.apply(Wishes(push=direction)) == [f"push of {5 * mass:.3g} N for 0.1 s"]

@@ -108,7 +108,7 @@ def test_foreign_file(tmp_path):
     graph = helper.make_graph([helper.make_node("Tanh", ["obs"], ["action"])], "foreign", ports[:1], ports[1:])
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     onnx.save(model, tmp_path / "foreign.onnx")
-    with pytest.raises(ArtifactError, match=r"foreign\.onnx: not an ONNX file of rlctl: .* rlctl export --onnx"):
+    with pytest.raises(ArtifactError, match=r"foreign\.onnx: an ONNX file of another program: .* rlctl eval TASK"):
         OnnxPolicy.load(tmp_path / "foreign.onnx")
 
 

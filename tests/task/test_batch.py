@@ -5,13 +5,13 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from rlctl.task.batch_env import BatchEnv
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ShapeError, TaskError, UsageError, WorldFailed
 from rlctl.task import BatchTask
 from rlctl.task.batch import WorldRngs
 from rlctl.task.env import TaskEnv
+from rlctl.task.worlds import TaskWorlds
 from tests.task.batches import Stool
 
 pytest.importorskip("mujoco")
@@ -159,8 +159,7 @@ class Meddler(Stool):
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_others_keep_their_model_and_a_failed_step_leaves_them_alone_too(fails):
-    single = TaskEnv(Meddler(), sim="mujoco")
-    with closing(single), closing(BatchEnv(Meddler(), 4, single, "mujoco")) as batch:
+    with closing(TaskWorlds(Meddler(), 4, sim="mujoco")) as batch:
         batch.reset(np.arange(4), range(4))
         batch.step(np.full((4, 2), 0.4, np.float32))
         others = np.array([0, 2])

@@ -59,6 +59,7 @@ def _list_of_term(
     size = len(values.mean)
     joints = list(info.joints.names) if info.joints is not None and len(info.joints.names) == size else []
     yield from _list_orders(name, size, joints)
+    yield from _list_raw_orders(name, values, joints, info)
     yield from _list_signs(name, size)
     yield from _list_factors(name, size)
     for delay in range(1, MAX_DELAY + 1):
@@ -118,6 +119,43 @@ def _inverse_text(order: Sequence[int]) -> str:
 def _list_orders(name: str, size: int, joints: Sequence[str]) -> Iterator[Correction]:
     for order, text in list_permutations(size, joints).items():
         yield Correction(name, "order", text, order=order)
+
+
+def _list_raw_orders(name: str, values: TermStatistics, joints: Sequence[str], info: EnvInfo) -> Iterator[Correction]:
+    """Yield orders of the angles that a program measures or commands, of which the policy's differ by the stance.
+
+    A program confuses its own angles: it takes the stance off afterwards, and adds it before. Of angles without a
+    stance, and of joints with equal default positions, these are the orders of `_list_orders`.
+    """
+    stance = _find_stance(name, values, info)
+    if stance is None:
+        return
+    pose, scale = stance
+    for order, text in list_permutations(len(pose), joints).items():
+        # program's angle = pose + scale * value, so value = (pose[order] + scale[order] * logged[order] - pose) / scale
+        there = list(order)
+        offset = (pose[there] - pose) / scale
+        factor = scale[there] / scale
+        if not np.allclose(offset, 0.0) or not np.allclose(factor, 1.0):
+            factors = () if np.allclose(factor, 1.0) else tuple(factor.tolist())
+            what = "among the joints' targets" if name == ACTIONS else "before the stance is subtracted"
+            yield Correction(
+                name, "order", f"{text}, {what}", order=order, factor=factors, offset=tuple(offset.tolist())
+            )
+
+
+def _find_stance(name: str, values: TermStatistics, info: EnvInfo) -> tuple[Array, Array] | None:
+    """Return the angles [rad or m] for which a term is 0, and for which it is 1 more; None if it is no such term."""
+    joints = info.joints
+    if joints is None or len(joints.default_positions) != len(values.mean):
+        return None
+    pose = np.array(joints.default_positions)
+    if name == ACTIONS:
+        return (pose, np.array(joints.action_scale)) if joints.action_scale else None
+    # Angles themselves are near the stance in simulation, differences from it near 0.
+    is_difference = np.linalg.norm(values.mean) < np.linalg.norm(values.mean - pose)
+    is_angle = name == joints.measured or info.observation_units.get(name) in ("rad", "m")
+    return (pose, np.ones(len(pose))) if is_angle and is_difference else None
 
 
 def _list_signs(name: str, size: int) -> Iterator[Correction]:

@@ -56,19 +56,22 @@ def read_header(path: Path) -> TableHeader:
     """
     if path.suffix.lower() == ".npz":
         with _open_archive(path) as archive:
-            members = [_read_member_header(path, archive, name) for name in archive.namelist()]
-        names = [name for member in members for name in member.column_names()]
+            names = [name for member in _read_members(path, archive) for name in member.column_names()]
     elif path.suffix.lower() in (".csv", ".txt"):
         with untrusted.open_file(path) as file:
             names = [name.strip() for name in _split_line(path, _read_line(path, file), 1)]
+        if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+            raise ArtifactError(
+                f"{path}, line 1: columns are separated by semicolons or tabs; "
+                "write commas between columns, and points in numbers"
+            )
         if twice := [name for name in names if names.count(name) > 1]:
             raise ArtifactError(f"{path}, line 1: column {twice[0]!r} is given twice")
     else:
         raise ArtifactError(f"{path}: not a log that diagnose reads: give a .csv, .npz or .rrd file")
     if not names:
         raise ArtifactError(f"{path}: it has no columns")
-    if len(names) > _MOST_COLUMNS:
-        raise ArtifactError(f"{path}: {len(names):,} columns, the limit is {_MOST_COLUMNS:,}")
+    _check_width(path, len(names))
     return TableHeader(path, tuple(names))
 
 
@@ -77,6 +80,11 @@ def read_table(header: TableHeader, used: Collection[str]) -> LogTable:
     if header.path.suffix.lower() == ".npz":
         return _read_npz(header.path, used)
     return _read_csv(header, used)
+
+
+def _check_width(path: Path, columns: int) -> None:
+    if columns > _MOST_COLUMNS:
+        raise ArtifactError(f"{path}: {columns:,} columns, the limit is {_MOST_COLUMNS:,}")
 
 
 def _read_line(path: Path, file: BinaryIO) -> str:
@@ -139,15 +147,22 @@ def _read_row(path: Path, header: TableHeader, line: str, number: int, indices: 
         raise ArtifactError(f"{path}, line {number}: {len(row)} values for {len(header.names)} columns")
     numbers = []
     for name, index in indices.items():
-        try:
-            value = float(row[index])
-        except ValueError:
-            value = math.nan
+        value = _read_number(row[index])
         if not math.isfinite(value):
             text = short_repr(row[index].strip())
             raise ArtifactError(f"{path}, line {number}, column {name}: {text!r} is not a finite number")
         numbers.append(value)
     return numbers
+
+
+def _read_number(text: str) -> float:
+    """Return a number, NaN for text that is none; `1_7`, which Python takes for 17, is none in a file."""
+    if "_" in text:
+        return math.nan
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,11 +172,16 @@ class _Member:
     fortran: bool
     dtype: np.dtype[Any]
 
-    def column_names(self) -> list[str]:
-        """Names of the columns of a vector or a matrix of numbers; none for anything else."""
+    @property
+    def width(self) -> int:
+        """Number of columns of a vector or a matrix of numbers; 0 for anything else."""
         if self.dtype.kind not in "biuf" or len(self.shape) not in (1, 2):
-            return []
-        return [self.name] if len(self.shape) == 1 else [f"{self.name}_{index}" for index in range(self.shape[1])]
+            return 0
+        return 1 if len(self.shape) == 1 else self.shape[1]
+
+    def column_names(self) -> list[str]:
+        """Names of the columns, as many as the width."""
+        return [self.name] if len(self.shape) == 1 else [f"{self.name}_{index}" for index in range(self.width)]
 
 
 def _open_archive(path: Path) -> zipfile.ZipFile:
@@ -169,18 +189,27 @@ def _open_archive(path: Path) -> zipfile.ZipFile:
         pass  # a regular file that can be read
     try:
         archive = zipfile.ZipFile(path)
-    except (zipfile.BadZipFile, OSError, ValueError) as error:
+    except untrusted.ZIP_ERRORS as error:
         raise ArtifactError(f"{path}: damaged, or not an .npz file: {error}") from None
     if not all(name.endswith(".npy") for name in archive.namelist()):
         raise ArtifactError(f"{path}: not an .npz file: it holds other files than arrays")
     return archive
 
 
+def _read_members(path: Path, archive: zipfile.ZipFile) -> list[_Member]:
+    """Read what the arrays declare; raises `ArtifactError` before anything of a declared size is made."""
+    members = []
+    for name in archive.namelist():
+        members.append(_read_member_header(path, archive, name))
+        _check_width(path, sum(member.width for member in members))
+    return members
+
+
 def _read_member_header(path: Path, archive: zipfile.ZipFile, name: str) -> _Member:
     try:
         with archive.open(name) as file:
             return _parse_header(name, file)
-    except (ValueError, OSError, zipfile.BadZipFile, NotImplementedError) as error:
+    except untrusted.ZIP_ERRORS as error:
         raise ArtifactError(f"{path}: {name}: damaged: {error}") from None
 
 
@@ -188,13 +217,15 @@ def _parse_header(name: str, file: Any) -> _Member:
     version = npy.read_magic(file)
     read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
     shape, fortran, dtype = read(file)
+    if min(shape, default=0) < 0:
+        raise ValueError(f"an array of shape {shape}")
     return _Member(name.removesuffix(".npy"), tuple(shape), fortran, dtype)
 
 
 def _read_npz(path: Path, used: Collection[str]) -> LogTable:
     columns: dict[str, Array] = {}
     with _open_archive(path) as archive:
-        members = [_read_member_header(path, archive, name) for name in archive.namelist()]
+        members = _read_members(path, archive)
         members = [one for one in members if any(name in used for name in one.column_names())]
         count = min((one.shape[0] for one in members), default=0)
         for one in members:
@@ -225,6 +256,7 @@ def _read_rows(path: Path, archive: zipfile.ZipFile, one: _Member, starts: Seque
     if one.fortran and width > 1 and one.shape[0] > _WHOLE_ROWS:
         raise ArtifactError(f"{path}: {one.name} is stored by column and too large; save it as np.ascontiguousarray")
     row_bytes = width * one.dtype.itemsize
+    untrusted.check_size(path, len(starts) * length * row_bytes, "unpacked ")
     parts = []
     try:
         with archive.open(f"{one.name}.npy") as file:
@@ -237,7 +269,7 @@ def _read_rows(path: Path, archive: zipfile.ZipFile, one: _Member, starts: Seque
                 _skip(file, (start - position) * row_bytes)
                 parts.append(np.frombuffer(file.read(length * row_bytes), one.dtype).reshape(length, width))
                 position = start + length
-    except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
+    except untrusted.ZIP_ERRORS as error:
         raise ArtifactError(f"{path}: {one.name}: damaged: {error}") from None
     return np.concatenate(parts).astype(np.float64)
 

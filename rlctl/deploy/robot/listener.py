@@ -15,6 +15,7 @@ from rlctl.errors import AnswerIsNo, UsageError
 if TYPE_CHECKING:
     from rlctl.deploy.robot.websocket import Door
 
+_ACCEPTED_AT_ONCE = 32  # connections that are accepted before the oldest ones are closed
 _PORT_TRIES = 20  # until TCP and UDP have the same free port
 
 
@@ -88,7 +89,9 @@ async def _open(request: RobotRequest, door: Door | None, udp: UdpController | N
         opened = _Opened()
         try:
             if door is not None:
-                opened.listener = await loop.create_server(door.server, request.host, request.port)
+                opened.listener = await loop.create_server(
+                    door.accept, request.host, request.port, backlog=_ACCEPTED_AT_ONCE
+                )
             if udp is not None:
                 port = request.port if door is None else opened.port
                 opened.transport, _ = await loop.create_datagram_endpoint(lambda: udp, local_addr=(request.host, port))

@@ -15,6 +15,8 @@ from rlctl.deploy.server.request import LOOPBACK
 from rlctl.errors import short_repr
 
 _LARGEST_COMMAND = 2**20  # [bytes]
+_MOST_WAITING = 64
+"""Connections without a program that stay open; the loop waits with select, which takes no descriptor above 1023."""
 
 
 class WebSocketController(ControlProgram):
@@ -72,7 +74,19 @@ class Door:
         self._metadata = messages.pack(metadata)
         self.server = web.Server(self.answer, access_log=None)
         self.taken = False
+        self._is_opening = False  # whether a WebSocket is being opened
+        self._program: asyncio.Protocol | None = None  # the connection of the program under test
         self.connected: asyncio.Future[ControlProgram] = asyncio.get_running_loop().create_future()
+
+    def accept(self) -> asyncio.Protocol:
+        """Return what handles a new connection; the oldest without the program give their places to newer ones."""
+        asyncio.get_running_loop().call_soon(self._close_oldest)  # `connections` has those that are open
+        return self.server()
+
+    def _close_oldest(self) -> None:
+        waiting = [connection for connection in self.server.connections if connection is not self._program]
+        for connection in waiting[:-_MOST_WAITING]:
+            connection.force_close()
 
     async def answer(self, request: web.BaseRequest) -> web.StreamResponse:
         """Answer a request."""
@@ -80,12 +94,19 @@ class Door:
             return web.json_response({"error": problem[1]}, status=problem[0])
         if not is_websocket(request):
             return web.json_response({"error": "this is rlctl robot: connect by WebSocket or UDP"}, status=426)
-        if self.taken:
+        if self.taken or self._is_opening:
             return web.json_response({"error": "another program is connected"}, status=409)
-        self.taken = True
         socket = web.WebSocketResponse(compress=False, max_msg_size=_LARGEST_COMMAND, timeout=1.0)
-        await socket.prepare(request)
-        await socket.send_bytes(self._metadata)
+        self._is_opening = True
+        try:
+            await socket.prepare(request)  # raises for a handshake that is none, which must not take the place
+            await socket.send_bytes(self._metadata)
+        finally:
+            self._is_opening = False
+        if self.taken:  # a program has connected by UDP meanwhile
+            await socket.close(message=b"another program is connected")
+            return socket
+        self.taken, self._program = True, request.protocol
         controller = WebSocketController(f"ws {request.remote}", asyncio.get_running_loop(), socket)
         self.connected.set_result(controller)
         await controller.receive()

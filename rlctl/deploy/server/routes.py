@@ -147,7 +147,8 @@ class Routes:
             try:
                 return await handler(request)
             except web.HTTPClientError as error:  # an unknown path, another method, too long a body
-                known = [resource.canonical for resource in request.app.router.resources()]
+                paths = [resource.canonical for resource in request.app.router.resources()]
+                known = [path for path in paths if path.removeprefix("/") not in _ORDERS]  # orders are no suggestions
                 hint = did_you_mean(request.path, known) if error.status == 404 else ""
                 return _refuse(error.status, f"{request.method} {request.path}: {error.reason}.{hint}")
         self.server.measurements.refused += 1

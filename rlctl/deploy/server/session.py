@@ -13,7 +13,7 @@ from rlctl.deploy.filter.limits import Limits
 from rlctl.deploy.filter.observation import WHOLE, ObservationError
 from rlctl.deploy.filter.safety_filter import SafetyFilter
 from rlctl.environments.info import EnvInfo
-from rlctl.errors import ArtifactError, RlctlError, short_repr
+from rlctl.errors import ArtifactError, short_repr
 from rlctl.policy.file import DETERMINISTIC, PolicyFile, PolicyInfo
 from rlctl.policy.network import Network
 from rlctl.policy.numpy_policy import NumpyPolicy, check_playable
@@ -112,7 +112,7 @@ class Session:
                 begin = time.perf_counter()
                 try:
                     policy_action = self._actor.predict(observation)
-                except (RlctlError, ValueError, ArithmeticError) as problem:
+                except Exception as problem:  # whatever a network's library raises: the robot holds
                     error = f"the policy cannot act: {short_repr(str(problem), 200)}"
                 infer_s = time.perf_counter() - begin
         self.action = action = self.safety.limit(policy_action)

@@ -2,6 +2,7 @@
 
 import functools
 import io
+import math
 import re
 import textwrap
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 from numpy.typing import NDArray
 
 from rlctl.errors import UsageError
-from rlctl.evaluation.robustness import Axis, PushTest, Robustness, RobustnessMap
+from rlctl.evaluation.robustness import Axis, Cell, FailedCell, PushTest, Robustness, RobustnessMap
 from rlctl.runs.comparison_map import MapComparison, MapDifference
 from rlctl.runs.report.content import RecipeRuns, RunReport, mean_curve
 
@@ -181,7 +182,7 @@ def plot_robustness(result: RobustnessMap) -> str:
 
 
 def _draw_map(figure: Figure, axes: Axes, varied: RobustnessMap) -> None:
-    quantity = "success" if varied.cells[0].success_rate is not None else "return"
+    quantity = "success" if varied.has_success else "return"
     if len(varied.axes) == 1:
         _draw_varied(axes, varied, quantity)
         return
@@ -218,8 +219,7 @@ def _draw_heat(
 
 def _draw_varied(axes: Axes, result: RobustnessMap, quantity: str) -> None:
     (axis,) = result.axes
-    intervals = [cell.success_interval if quantity == "success" else cell.return_interval for cell in result.cells]
-    low, high = np.array(intervals, np.float64).T
+    low, high = np.array([_interval(cell, quantity) for cell in result.cells], np.float64).T
     means = [_value(cell, quantity) for cell in result.cells]
     curve = {"steps": axis.values, "mean": means, "low": low, "high": high, "count": len(means)}
     _draw_curve(axes, curve, quantity, {"marker": "o", "ms": 3})
@@ -241,8 +241,21 @@ def plot_push(test: PushTest) -> str:
     return _finish(figure, axes, "push [N s]", f"episodes: {test.measure}", f"{test.measure.capitalize()} by push")
 
 
-def _value(cell: Any, quantity: str) -> float:
-    return float(cell.success_rate if quantity == "success" else cell.mean_return)
+def _value(cell: Cell | FailedCell, quantity: str) -> float:
+    """Return a score of a cell, NaN where the environment failed: nothing is drawn there."""
+    if isinstance(cell, FailedCell):
+        return math.nan
+    if quantity == "success" and cell.success_rate is not None:
+        return cell.success_rate
+    return cell.mean_return
+
+
+def _interval(cell: Cell | FailedCell, quantity: str) -> tuple[float, float]:
+    if isinstance(cell, FailedCell):
+        return math.nan, math.nan
+    if quantity == "success" and cell.success_interval is not None:
+        return cell.success_interval
+    return cell.return_interval
 
 
 def _make_figure() -> tuple[Figure, Axes]:

@@ -24,6 +24,9 @@ XYZW, WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
 """Indices that reorder MuJoCo's quaternions (w, x, y, z) for rlctl, and back."""
 _RAIL = 100.0  # [m]
 _FAR = 100.0  # [m]
+_SLIPPERY = 0.3
+"""Friction below which contacts need more iterations of the solver than a task for batches takes (3, say)."""
+_SLIPPERY_ITERATIONS = 50  # as PyBullet and MuJoCo take for any task by default
 _LOCK_DAMPING = 1e7  # [N m s/rad or N s/m]; a motor of 100 N m moves such a joint by 1e-5 rad in a second
 
 
@@ -252,6 +255,8 @@ class MujocoBody(MujocoMotors):
         self._fields.model("friction")[..., numbers] = friction
         if self._sim.world.batch is None and self._sim.world._saved is None:
             self.parts.built_friction |= {self.parts.link_names[number]: friction for number in numbers}
+        if friction < _SLIPPERY:
+            self._sim.world.solve_further(_SLIPPERY_ITERATIONS)
         self._sim.spread_friction()
 
     def scale_mass(self, factor: float, links: Sequence[str] = ()) -> None:

@@ -2,7 +2,7 @@
 
 Contacts are soft: `solref` [s] is their time constant, at least two physics steps. Only the links of different bodies
 collide, and those of one body that is loaded with `self_collision`; the friction of a contact is the product of the
-frictions of its links, as in PyBullet.
+frictions of its links, as in PyBullet, and at least 0.001.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ from rlctl.task.mujoco.pictures import Marker, draw
 from rlctl.task.mujoco.scene import MujocoScene
 from rlctl.task.mujoco.world import Array, Fields, MujocoWorld, Rows
 from rlctl.task.sim import Sim
+
+_LEAST_FRICTION = 1e-3
+"""Of a contact: MuJoCo divides by it, and with less a falling robot's numbers become infinite."""
 
 
 def read_solref(sim: str) -> float | None:
@@ -217,7 +220,8 @@ class MujocoSim(Sim):
         product = friction[..., one] * friction[..., two]
         turning = spin[..., one] * friction[..., two] + spin[..., two] * friction[..., one]
         pairs = self.fields.model("pair_friction")
-        pairs[..., :3] = np.maximum(np.stack([product, product, turning], axis=-1), self.mujoco.mjMINMU)
+        pairs[..., :2] = np.maximum(product, _LEAST_FRICTION)[..., None]
+        pairs[..., 2] = np.maximum(turning, self.mujoco.mjMINMU)
         roll = self.fields.model("roll")
         rolling = roll[..., one] * friction[..., two] + roll[..., two] * friction[..., one]
         if rolling.any():

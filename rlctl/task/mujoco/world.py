@@ -65,6 +65,7 @@ class MujocoWorld:
         self._rows: dict[str, Array] = {}  # arrays of `extra` with a row per world
         self._of_steps: dict[str, Array] = {}  # arrays of `_OF_STEPS` of a batch, since the last step or reset
         self._saved: Array | None = None
+        self._iterations = 0  # of the solver in the built world
         self._is_fresh = False  # whether all that depends on positions and velocities is up to date
         self._stale: set[int] = set()  # worlds of a batch for which it is not
 
@@ -204,6 +205,15 @@ class MujocoWorld:
         distances: Array = self.mj_data.contact.dist.copy()
         return distances
 
+    def solve_further(self, iterations: int) -> None:
+        """Let the solver of a single world take at least so many iterations, until the next reset.
+
+        The worlds of a batch share their options, which do not change.
+        """
+        if self.batch is None and self._saved is not None:
+            option = self.mj_model.opt
+            option.iterations = max(option.iterations, iterations)
+
     def save(self) -> None:
         """Save the built world for `restore`, and make `count` copies of it."""
         mujoco = self.mujoco
@@ -211,6 +221,7 @@ class MujocoWorld:
         self._saved = np.empty(mujoco.mj_stateSize(self.mj_model, kind))
         mujoco.mj_getState(self.mj_model, self.mj_data, self._saved, kind)
         self._built.clear()
+        self._iterations = self.mj_model.opt.iterations
         if self.count is not None and self.count > 1:
             from mujoco.batch import Batch
 
@@ -233,6 +244,7 @@ class MujocoWorld:
                 values[rows] = 0.0
         else:
             mujoco = self.mujoco
+            self.mj_model.opt.iterations = self._iterations
             mujoco.mj_resetData(self.mj_model, self.mj_data)
             kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_setState(self.mj_model, self.mj_data, self._saved, kind)

@@ -1,5 +1,7 @@
 """Reading logs: columns by name, and errors that name row and column."""
 
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -70,12 +72,19 @@ def test_what_cannot_be_decided_needs_a_file(tmp_path, info, rows):
         read_robot_log(path, info, columns)
 
 
-@pytest.mark.parametrize("value", ["off", "nan", "inf", ""])
+@pytest.mark.parametrize("value", ["off", "nan", "inf", "", "1_7"])
 def test_text_in_a_number_names_line_and_column(tmp_path, info, rows, value):
     rows = rows.astype(object)
     rows[41, 4] = value
     with pytest.raises(ArtifactError, match=rf"line 43, column goal_y: '{value}' is not a finite number"):
         read_robot_log(write(tmp_path / "log.csv", rows), info)
+
+
+def test_semicolons_are_named(tmp_path, info):
+    path = tmp_path / "log.csv"
+    path.write_text("time;positions_0;positions_1\n0,1;2,5;3\n")
+    with pytest.raises(ArtifactError, match="line 1: columns are separated by semicolons or tabs; write commas"):
+        read_robot_log(path, info)
 
 
 def test_a_short_line_is_named(tmp_path, info, rows):
@@ -133,6 +142,27 @@ def test_arrays_of_an_npz(tmp_path, info, rows):
         read_robot_log(path, info)
 
 
+@pytest.mark.parametrize("shape", ["(3, 1000000000000)", "(1000000000000, 9999)", "(3, -1)"])
+def test_an_npz_declares_more_than_it_has(tmp_path, info, shape):
+    path = tmp_path / "log.npz"
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("positions.npy", b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header + bytes(72))
+    with pytest.raises(ArtifactError, match=r"log\.npz: "):
+        read_robot_log(path, info)
+
+
+def test_an_encrypted_npz(tmp_path, info, rows):
+    path = tmp_path / "log.npz"
+    np.savez(path, positions=rows)
+    content = bytearray(path.read_bytes())
+    content[6] |= 1
+    content[content.rfind(b"PK\1\2") + 8] |= 1
+    path.write_bytes(content)
+    with pytest.raises(ArtifactError, match=r"log\.npz: positions\.npy: damaged: .* is encrypted"):
+        read_robot_log(path, info)
+
+
 def test_pickles_are_never_loaded(tmp_path, info, rows):
     path = tmp_path / "log.npz"
     np.savez(path, observations=np.array([object()] * 3), actions=rows[:, 6:])
@@ -182,3 +212,20 @@ def test_a_command_is_not_corrected(info):
     statistics = {name: TermStatistics(np.zeros(3), np.ones(3)) for name in ("command", "goal", "hand")}
     info = info.model_copy(update={"command_ranges": {f"goal_{axis}": (0.0, 1.0) for axis in "xyz"}})
     assert {one.term for one in list_candidates(info, statistics)} == {"hand"}
+
+
+def test_a_swap_of_a_programs_own_angles(info):
+    # The stance is 0.1 and -0.5 rad; an action of 1 is 0.5 rad and 0.25 rad.
+    joints = Joints(["shoulder", "elbow"], default_positions=[0.1, -0.5], action_scale=[0.5, 0.25])
+    info = info.model_copy(update={"joints": joints, "observation_units": {"positions": "rad", "speeds": "rad/s"}})
+    statistics = {name: TermStatistics(np.zeros(2), np.ones(2)) for name in ("positions", "speeds", "actions")}
+    swaps = {one.term: one for one in list_candidates(info, statistics) if one.kind == "order" and one.offset}
+    assert list(swaps) == ["positions", "actions"]
+    # Angles 0.3, 0.2: from the stance 0.2, 0.7. Exchanged, the program has 0.2, 0.3, and takes them for 0.1, 0.8.
+    assert swaps["positions"].change(np.array([0.1, 0.8])) == pytest.approx([0.2, 0.7])
+    # Actions 1, 2 are targets 0.6, 0. The robot goes to 0, 0.6: -0.2 and 4.4 are the actions for that.
+    assert swaps["actions"].change(np.array([1.0, 2.0])) == pytest.approx([-0.2, 4.4])
+    assert swaps["actions"].text == "elements 0 and 1 are swapped, among the joints' targets"
+    # Where angles themselves are observed, near the stance, a swap of the values is the same.
+    near = {"positions": TermStatistics(np.array([0.1, -0.5]), np.ones(2))}
+    assert not [one for one in list_candidates(info, near) if one.kind == "order" and one.offset]

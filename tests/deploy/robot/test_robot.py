@@ -313,3 +313,20 @@ def test_who_may_control_it(tmp_path):
     with pytest.raises(AnswerIsNo, match=r"^no program has connected for 0.3 s; 1 UDP packets were refused; --timeo"):
         run_robot(request, start, changes=UNCHANGED, gates=NO_GATES)
     start.join()
+
+
+def test_clients_that_are_none_do_not_lock_a_program_out():
+    def control(port, act):
+        with contextlib.ExitStack() as stack:
+            idle = [stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(100)]
+            first = idle[0]
+            first.settimeout(10)
+            assert first.recv(1) == b""  # it has given its place to a later one
+            request = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\r\n"
+            idle[-1].settimeout(10)
+            idle[-1].sendall(request.encode())  # a handshake without its key
+            assert idle[-1].recv(12) == b"HTTP/1.1 400"
+            return control_by_websocket(port, act)
+
+    report = play(control, answer)
+    assert report.scores[0].outcome.success_rate == 1.0

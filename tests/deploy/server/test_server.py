@@ -13,6 +13,7 @@ from rlctl.deploy.server.client import PolicyClient
 from rlctl.deploy.server.request import ServeRequest
 from rlctl.deploy.server.serve import make_server
 from rlctl.errors import ArtifactError, PolicyError, UsageError
+from rlctl.policy.numpy_policy import NumpyPolicy
 from tests.deploy.server.serving import (
     FLAT,
     OBSERVATION,
@@ -298,3 +299,21 @@ def test_a_key_file_that_is_no_text(tmp_path):
     (tmp_path / "key").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ArtifactError, match="not a key: it is no text"):
         make_server(write_policy(tmp_path / "policy.safetensors"), ServeRequest(key_file=tmp_path / "key"))
+
+
+def test_an_order_is_no_suggestion(serve):
+    server = serve()
+    assert "Did you mean" not in server.post("/nope")[1]
+
+
+def test_the_robot_holds_whatever_the_policy_raises(serve, monkeypatch):
+    server = serve()
+
+    def fail(self, observation, **options):
+        raise RuntimeError("out of memory")
+
+    with server.client() as client:
+        client.act({"observation": FLAT})
+        monkeypatch.setattr(NumpyPolicy, "predict", fail)
+        answer = client.act({"observation": FLAT})
+    assert answer["error"] == "the policy cannot act: out of memory"

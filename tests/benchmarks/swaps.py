@@ -1,0 +1,72 @@
+"""How many swaps of two joints with different default positions `rlctl diagnose` names: all pairs of two robots."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from rlctl.deploy.diagnose.diagnose import Doctor
+from rlctl.deploy.diagnose.signals import LoggedSignals
+from tests.benchmarks.broken_logs import Robot, Wrong
+from tests.benchmarks.diagnosing import is_named
+from tests.benchmarks.row import Row
+
+SECONDS = float(os.environ.get("SWAP_SECONDS", "30"))
+NAMED = 0.95  # of the pairs
+IS_DIFFERENCE = {"walk": True, "reach": False}  # whether the policy observes and commands angles from the stance
+
+
+def make_swap(robot: Robot, term: str, one: int, other: int) -> Wrong:
+    """Return what the policy sees, or the robot does, when a program exchanges two of its own angles."""
+    joints = robot.info.env.joints
+    pose = np.array(joints.default_positions)
+    order = list(range(len(pose)))
+    order[one], order[other] = other, one
+    offset: tuple[float, ...] = ()
+    if IS_DIFFERENCE[robot.task]:
+        scale: Any = np.array(joints.action_scale) if term == "actions" else 1.0
+        offset = tuple(((pose[order] - pose) / scale).tolist())
+    return Wrong(term, "swap of angles", order=tuple(order), offset=offset)
+
+
+def count_named(task: str) -> tuple[int, int]:
+    """Return how many swaps are named first, and how many there are."""
+    robot = Robot(task)
+    doctor = Doctor(robot.policy_file, robot.spec)
+    pose = robot.info.env.joints.default_positions
+    pairs = [pair for pair in itertools.combinations(range(len(pose)), 2) if pose[pair[0]] != pose[pair[1]]]
+    named = total = 0
+    for number, (one, other) in enumerate(pairs):
+        for term in ("joint_positions", "actions"):
+            wrong = make_swap(robot, term, one, other)
+            log = robot.log([wrong], SECONDS, 40_000 + number, randomized=bool(number % 2))
+            found = doctor.diagnose(LoggedSignals(log.observations, log.actions, log.lengths, log.sizes))[0]
+            right = bool(found) and is_named(wrong, found[0], len(pose))
+            named += right
+            total += 1
+            if not right:
+                texts = " | ".join(f"{finding.evidence:.0f} {finding.text}" for finding in found)
+                print(f"MISSED {term} {one} {other}: {texts or 'nothing'}", file=sys.stderr, flush=True)
+    return named, total
+
+
+def _row(task: str, repeat: int) -> Row:
+    named, total = count_named(task)
+    return Row(
+        f"diagnose swaps {task}",
+        f"{named} of {total} named",
+        "",
+        "",
+        f">= {NAMED:.0%}",
+        named >= NAMED * total,
+        "all pairs of joints with different default positions, of measured angles and of targets, in the closed loop",
+    )
+
+
+reach = partial(_row, "reach")
+walk = partial(_row, "walk")
