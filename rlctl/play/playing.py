@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from gymnasium import spaces
@@ -35,7 +36,8 @@ class Worlds(Protocol):
         """Return what the running episode of a world has added up to."""
 
 
-class Rows(NamedTuple):
+@dataclasses.dataclass(slots=True)
+class Rows:
     """The rows that act: `index` of each world, `seed` of its episode, and its `step`, counted from 0; shape (k,).
 
     The arrays are valid until the worlds step.
@@ -58,7 +60,8 @@ class RowsActor(Protocol):
         """Return the actions to store, shape (k, elements), and those for the environments, shape (k, ...)."""
 
 
-class Played(NamedTuple):
+@dataclasses.dataclass(slots=True)
+class Played:
     """A step of some worlds."""
 
     index: Index  # of the worlds, shape (k,)

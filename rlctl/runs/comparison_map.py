@@ -95,6 +95,7 @@ def subtract(names: tuple[str, str], one: Robustness, two: Robustness) -> MapCom
             [
                 CellDifference(cell.values, cell.nominal, cell, other)
                 for cell, other in zip(before.cells, after.cells, strict=True)
+                if isinstance(cell, Cell) and isinstance(other, Cell)
             ],
         )
         for before, after in zip(one.maps, two.maps, strict=True)
