@@ -8,14 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import SINGLE
-from rlctl.errors import in_world
 from rlctl.play import messages
 from rlctl.play.messages import EpisodeResult, FailedInEpisode
 from rlctl.play.seeds import list_training_seeds
 from rlctl.play.shared_arrays import CRITIC, SharedArrays
-from rlctl.play.teaching import BatchTeacher
-from rlctl.policy.players.player import Player
-from rlctl.policy.rows import RowsPolicy
+from rlctl.policy.actor import Actor, Rows
 from rlctl.printed_lines import print_line
 from rlctl.task.batch_env import BatchEnv, BatchStep
 
@@ -33,11 +30,13 @@ class BatchEpisodes:
         self._sums = np.zeros((count, len(env.weights)))
         self._deepest = np.full(count, np.nan)  # how far bodies overlapped at most [m]; NaN: it was not measured
         self._weights = np.array([*env.weights.values()])
-        self.teacher: BatchTeacher | None = None
+        self.teacher: Actor | None = None
 
     def begin(self, arrays: SharedArrays, worlds: Worlds, seeds: Sequence[int]) -> NDArray[np.float32]:
         """Begin episodes; return their first observations, which are written into the shared arrays too."""
         self.seeds[worlds] = seeds
+        if self.teacher is not None:
+            self.teacher.begin(self._rows(worlds))
         self._return[worlds] = 0.0
         self._sums[worlds] = 0.0
         self._time[worlds] = 0.0
@@ -82,7 +81,7 @@ class BatchEpisodes:
             if not len(running):
                 break
             if self.teacher is not None:
-                self.teacher.act(self.seeds[running], running)  # it may have a recurrent state
+                self._teach(self.teacher, running)  # it may have a recurrent state
             result = self._step(np.stack([actions[env][step] for env in running.tolist()]), running)
             arrays.observation[SINGLE][self._first + running] = result.observation
             self._show_critic(arrays.observation, running, self._first + running)
@@ -113,14 +112,32 @@ class BatchEpisodes:
         world = getattr(error, "world", world)  # of `WorldFailed` and `in_world`
         raise FailedInEpisode(self._first + world, int(self.seeds[world]), int(self.env.step_of[world])) from error
 
-    def play(self, arrays: SharedArrays, asked: messages.Play, players: "Players") -> list[EpisodeResult]:
-        """Play a segment in the environments of `asked.begin`; return the episodes that ended."""
+    def _rows(self, worlds: Worlds) -> Rows:
+        return Rows(worlds, self.seeds[worlds], self.env.step_of[worlds])
+
+    def _teach(self, teacher: Actor, worlds: Worlds) -> NDArray[Any]:
+        """Return the teacher's actions in the present step of some worlds, shape (k, ...)."""
+        return teacher.act(self.env.for_teacher[worlds], self._rows(worlds))[1]
+
+    def play(
+        self,
+        arrays: SharedArrays,
+        asked: messages.Play,
+        actor: Actor,
+        states: NDArray[np.float32] | None,
+    ) -> list[EpisodeResult]:
+        """Play a segment in the environments of `asked.begin`; return the episodes that ended.
+
+        `states` are the recurrent states that the main process sees, shape (worlds, 2, layers, hidden).
+        """
         envs = np.array(sorted(asked.begin), np.int64)
         worlds, seeds = envs - self._first, [asked.begin[int(env)] for env in envs]
         new = np.array([seed >= 0 for seed in seeds])
         if new.any():
             self.begin(arrays, worlds[new], [seed for seed in seeds if seed >= 0])
-            players.begin_episodes(worlds[new])
+            actor.begin(self._rows(worlds[new]))
+            if states is not None:
+                states[worlds[new]] = 0.0
         played = worlds
         following = {
             env: list_training_seeds(asked.run_seed, env, number) for env, number in asked.next_episodes.items()
@@ -130,13 +147,15 @@ class BatchEpisodes:
             rows[envs, 0] = arrays.observation[key][envs]
         inside = arrays.inside
         inside[envs, 0] = self.seeds[worlds]
-        players.begin_segment(self.seeds, self.env.step_of, worlds)
+        if states is not None and actor.state is not None:
+            actor.state[played] = states[played]
+        actor.prepare()
         ended: list[EpisodeResult] = []
         for row in range(asked.steps):
             began = perf_counter()
-            stored, action = self._choose(players, now[envs, row], worlds)
+            stored, action = self._choose(actor, now[envs, row], worlds)
             if self.teacher is not None:
-                segment.label[envs, row] = label = self.teacher.act(self.seeds[worlds], worlds)
+                segment.label[envs, row] = label = self._teach(self.teacher, worlds)
                 taught = np.isin(envs, asked.taught)
                 stored[taught], action[taught] = label.reshape(stored.shape)[taught], label[taught]
             acted = perf_counter()
@@ -155,7 +174,7 @@ class BatchEpisodes:
             if done.any():
                 for k in np.flatnonzero(done).tolist():
                     world = int(worlds[k])
-                    ended.append(self._summarize(k, world, row, result, players.report(world)))
+                    ended.append(self._summarize(k, world, row, result, actor.report(world)))
                 for key, rows in segment.final.items():
                     rows[envs[done], row] = segment.observation[key][envs[done], row + 1]
                 if following:
@@ -167,7 +186,7 @@ class BatchEpisodes:
                     self.begin(arrays, worlds[done], fresh)
                     for key, rows in segment.observation.items():
                         rows[envs[done], row + 1] = arrays.observation[key][envs[done]]
-                    players.begin_episodes(worlds[done])
+                    actor.begin(self._rows(worlds[done]))
                 else:
                     arrays.observation[SINGLE][envs[done]] = result.observation[done]
                     envs, worlds = envs[~done], worlds[~done]
@@ -176,16 +195,15 @@ class BatchEpisodes:
         for key, rows in segment.observation.items():
             arrays.observation[key][envs] = rows[envs, asked.steps]
         inside[self._first : self._first + self.env.worlds, 1] = -1
-        players.end_segment(played)
+        if states is not None and actor.state is not None:
+            states[played] = actor.state[played]
         return sorted(
             ended, key=lambda result: result.env
         )  # in the order of environments that play one after the other
 
-    def _choose(
-        self, players: "Players", observations: NDArray[Any], worlds: Worlds
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
+    def _choose(self, actor: Actor, observations: NDArray[Any], worlds: Worlds) -> tuple[NDArray[Any], NDArray[Any]]:
         try:
-            return players.act(observations, self.seeds[worlds], self.env.step_of[worlds], worlds)
+            return actor.act(observations, self._rows(worlds))
         except BaseException as error:  # a user's function may raise anything, SystemExit too
             self._fail(error, int(worlds[0]))
 
@@ -217,66 +235,3 @@ class BatchEpisodes:
     def close(self) -> None:
         """End the simulation."""
         self.env.close()
-
-
-class Players:
-    """What chooses the actions of the worlds: one pass for all rows, or a player per world where there is none."""
-
-    def __init__(
-        self, rows: RowsPolicy | None, single: Sequence[Player] = (), states: NDArray[np.float32] | None = None
-    ) -> None:
-        self._rows, self._single = rows, single
-        self._states = states  # recurrent states that the main process sees, shape (worlds, 2, layers, hidden)
-        self._exploration: Any = None
-
-    def explore(self, exploration: Any) -> None:
-        """Use this exploration from now on."""
-        self._exploration = exploration
-        for player in self._single:
-            player.explore(exploration)
-
-    def begin_segment(self, seeds: Worlds, steps: Worlds, worlds: Worlds) -> None:
-        """Continue the episodes; the policy's weights may have changed."""
-        if self._rows is not None:
-            self._rows.begin_segment()
-        for world in worlds.tolist() if self._single else ():
-            player = self._single[world]
-            if player.state is not None and self._states is not None:
-                player.state[:] = self._states[world]
-            player.begin_segment(int(seeds[world]), int(steps[world]))
-
-    def end_segment(self, worlds: Worlds) -> None:
-        """Let the main process see the recurrent states."""
-        if self._states is not None:
-            for world in worlds.tolist():
-                self._states[world] = self._single[world].state
-
-    def begin_episodes(self, worlds: Worlds) -> None:
-        """Forget the recurrent states."""
-        for world in worlds.tolist() if self._single else ():
-            state = self._single[world].state
-            if state is not None:
-                state[:] = 0.0
-            if self._states is not None:
-                self._states[world] = 0.0
-
-    def report(self, world: int) -> dict[str, Any]:
-        """Return the player's report of the episode that ended in a world."""
-        return self._single[world].report() if self._single else {}
-
-    def act(
-        self, observations: NDArray[Any], seeds: Worlds, steps: Worlds, worlds: Worlds
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the actions to store, shape (k, elements), and those for the environments, shape (k, ...)."""
-        if self._rows is not None:
-            return self._rows.act(observations, seeds, steps, worlds, self._exploration)
-        chosen = []
-        for row, world in enumerate(worlds.tolist()):
-            with in_world(world):
-                chosen.append(self._single[world].act(observations[row], int(seeds[row]), int(steps[row])))
-        return np.stack([np.ravel(stored) for stored, _ in chosen]), np.stack([action for _, action in chosen])
-
-    def close(self) -> None:
-        """Release resources."""
-        for player in self._single:
-            player.close()

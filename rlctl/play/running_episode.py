@@ -15,7 +15,6 @@ from rlctl.errors import RecipeError, TaskError, describe_exception, format_plug
 from rlctl.output import format_count
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.shared_arrays import CRITIC, observation_fields
-from rlctl.play.teaching import EpisodeTeacher
 from rlctl.task.env import TaskEnv
 
 _STEP = ("observation", "reward", "terminated", "truncated", "info")
@@ -30,7 +29,6 @@ class RunningEpisode:
         self.index = index  # number of the environment
         self.write: Callable[[Mapping[str, NDArray[Any]], int, Any], None]
         """Writes an observation into row `index` of each array."""
-        self.teacher: EpisodeTeacher | None = None
         self._metrics = metrics  # reward terms of weight 0
         self._is_task = isinstance(env.unwrapped, TaskEnv)
         self._discrete = isinstance(env.action_space, spaces.Discrete)

@@ -7,8 +7,9 @@ policy's parameters are in shared memory.
 import contextlib
 import dataclasses
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -18,11 +19,11 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import SINGLE
 from rlctl.environments.info import EnvInfo, describe
-from rlctl.environments.teacher_view import strip_teacher_view
+from rlctl.environments.teacher_view import find_teacher_view, strip_teacher_view
 from rlctl.errors import describe_exception
 from rlctl.library_output import print_whole_lines
 from rlctl.play import messages
-from rlctl.play.batch_episodes import BatchEpisodes, Players
+from rlctl.play.batch_episodes import BatchEpisodes
 from rlctl.play.messages import Answer, EpisodeResult, FailedInEpisode, Message, describe_failure
 from rlctl.play.running_episode import (
     CriticWriter,
@@ -34,12 +35,12 @@ from rlctl.play.running_episode import (
 from rlctl.play.seeds import list_training_seeds
 from rlctl.play.shared_arrays import SharedArrays, map_arrays
 from rlctl.play.shared_world import make_watched
-from rlctl.play.teaching import BatchTeacher, EpisodeTeacher, check_teacher
+from rlctl.play.teaching import check_teacher
+from rlctl.policy.actor import Actor, Rows, as_rows
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.numpy_policy import PolicyPlayer
-from rlctl.policy.players.named import SERVER, make_player
-from rlctl.policy.players.player import Player
-from rlctl.policy.rows import RowsPolicy
+from rlctl.policy.load import load_actor
+from rlctl.policy.named_actors import SERVER, make_actor
+from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.printed_lines import print_line
 from rlctl.processes.pool import answer_messages
 from rlctl.task.env import TaskEnv
@@ -52,12 +53,13 @@ class Worker:
     def __init__(self, job: messages.WorkerJob) -> None:
         self._job = job
         self._episodes: list[RunningEpisode] = []
-        self._player: Player | None = None
+        self._actor: Actor | None = None
+        """Its rows are the environments of this worker."""
+        self._teacher: Actor | None = None
         self._batch: BatchEpisodes | None = None
         """The worlds of a `BatchTask`; then `_episodes` has one environment that only describes them."""
-        self._players: Players | None = None
-        self._make_player: Callable[[], Player]
         self._states: NDArray[np.float32] | None = None
+        """Recurrent states of the rows, which the main process sees too, shape (n, 2, layers, hidden)."""
         self._info: EnvInfo
         self._privileged: dict[str, int] = {}  # sizes of what only the critic sees
         self._arrays: SharedArrays
@@ -97,12 +99,14 @@ class Worker:
         else:
             first = spec.make(teacher=taught_by, visuals=False)
         envs = [first]
+        self._teacher = None
         if teacher is not None:
             check_teacher(teacher, first)
+            self._teacher = load_actor(Path(teacher.policy), self._job.count)
         self._privileged = {} if privileged is None else show_critic(spec, first, privileged)
         if (batch := spec.make_batch(first, self._job.count)) is not None:
             self._batch = BatchEpisodes(batch, self._job.first)
-            self._batch.teacher = None if teacher is None else BatchTeacher(teacher, batch)
+            self._batch.teacher = self._teacher
         elif shared_world is None:
             envs += [spec.make(teacher=taught_by, visuals=False) for _ in range(self._job.count - 1)]
             for env in envs[1:] if privileged is not None else ():
@@ -110,9 +114,6 @@ class Worker:
         self._info = describe(envs[0])
         metrics = [name for name, weight in self._info.reward_weights.items() if weight == 0]
         self._episodes = [RunningEpisode(env, self._job.first + index, metrics) for index, env in enumerate(envs)]
-        if teacher is not None and self._batch is None:
-            for episode in self._episodes:
-                episode.teacher = EpisodeTeacher(teacher, episode.env)
         space = envs[0].observation_space
         # A task's environment checks its observations itself.
         checked = isinstance(strip_teacher_view(envs[0]), TaskEnv) and not isinstance(space, spaces.Dict)
@@ -141,35 +142,30 @@ class Worker:
 
     def _load_policy(self, message: messages.LoadPolicy) -> None:
         self._states = None
-        policy: PolicyFile | None = None
+        policy = None
         if message.info is not None:
             layout = {name: (shape, np.dtype(dtype)) for name, shape, dtype in message.layout}
             tensors = map_arrays(self._job.numbers, layout)
-            self._states = tensors.pop("state", None)
+            states = tensors.pop("state", None)
+            self._states = None if states is None else states[self._job.first :]
             policy = PolicyFile(message.info, tensors)
-        env, other = self._episodes[0].env, message.other
-        self._set_players(lambda: make_player_of(other, env) if policy is None else PolicyPlayer(policy), policy)
-
-    def _set_players(self, make: Callable[[], Player], policy: PolicyFile | None = None) -> None:
-        self._close_player()
-        self._make_player, self._player = make, make()
-        if self._batch is not None and policy is not None and RowsPolicy.supports(policy):
-            self._players = Players(RowsPolicy(policy, self._job.count))
-        elif self._batch is not None:
-            own = None if self._states is None else self._states[self._job.first :]
-            self._players = Players(None, [make() for _ in range(self._job.count)], own)
+        self._close_actor()
+        if policy is None:
+            self._actor = make_actor_of(message.other, self._episodes[0].env, self._job.count)
+        else:
+            self._actor = NumpyActor(policy, self._job.count)
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
-        from rlctl.deploy.filter.limited_player import LimitedPlayer  # few evaluations need it
+        from rlctl.deploy.filter.limited import Limited  # few evaluations need it
         from rlctl.deploy.filter.limits import Limits
 
-        make, limits = self._make_player, Limits.model_validate(message.limits)
-        self._set_players(lambda: LimitedPlayer(make(), self._info, limits))
+        limits = Limits.model_validate(message.limits)
+        self._actor = Limited(self._loaded_actor, self._info, limits, self._job.count)
 
     @property
-    def _loaded_player(self) -> Player:
-        assert self._player is not None  # a policy is loaded before anything is played
-        return self._player
+    def _loaded_actor(self) -> Actor:
+        assert self._actor is not None  # a policy is loaded before anything is played
+        return self._actor
 
     def _begin_episodes(self, message: messages.BeginEpisodes) -> list[int]:
         """Begin episodes and replay their actions; return the environments whose episode ended or failed."""
@@ -192,6 +188,10 @@ class Worker:
         return left
 
     def _begin(self, episode: RunningEpisode, seed: int) -> None:
+        rows = Rows.one(seed, index=episode.index - self._job.first)
+        for actor in (self._actor, self._teacher):
+            if actor is not None:
+                actor.begin(rows)
         self._arrays.inside[episode.index] = seed, 0, -1
         first = episode.start(seed, float(self._arrays.level[episode.index]))
         episode.write(self._arrays.observation, episode.index, first)
@@ -199,8 +199,7 @@ class Worker:
     def _replay(self, episode: RunningEpisode, actions: NDArray[np.generic]) -> bool:
         """Take steps with recorded actions; return whether the episode ended."""
         for action in actions:
-            if episode.teacher is not None:
-                episode.teacher.act(episode.seed, episode.step)  # it may have a recurrent state
+            self._teach(episode)  # the teacher may have a recurrent state
             episode.step += 1
             self._arrays.inside[episode.index, 1] = episode.step
             observation, _, terminated, truncated, _ = episode.take_step(action)
@@ -209,14 +208,20 @@ class Worker:
                 return True
         return False
 
+    def _teach(self, episode: RunningEpisode) -> Any:
+        """Return the teacher's action in the present step; None without a teacher. Call it at every step."""
+        if self._teacher is None:
+            return None
+        seen = as_rows(find_teacher_view(episode.env).seen)
+        rows = Rows.one(episode.seed, episode.step, episode.index - self._job.first)
+        return self._teacher.act(seen, rows)[1][0]
+
     def _play(self, message: messages.Play) -> list[EpisodeResult]:
         """Play a segment in some environments, one after the other; return the episodes that ended."""
         ended: list[EpisodeResult] = []
+        self._loaded_actor.explore(message.exploration)
         if self._batch is not None:
-            assert self._players is not None  # a policy is loaded before anything is played
-            self._players.explore(message.exploration)
-            return self._batch.play(self._arrays, message, self._players)
-        self._loaded_player.explore(message.exploration)
+            return self._batch.play(self._arrays, message, self._loaded_actor, self._states)
         for env, seed in message.begin.items():
             episode = self._episodes[env - self._job.first]
             number = message.next_episodes.get(env)
@@ -225,7 +230,7 @@ class Worker:
                 if seed >= 0:
                     self._begin(episode, seed)
                     if self._states is not None:
-                        self._states[env] = 0.0
+                        self._states[env - self._job.first] = 0.0
                 ended += self._play_one(episode, message, next_seeds)
         return ended
 
@@ -233,31 +238,36 @@ class Worker:
         self, episode: RunningEpisode, asked: messages.Play, next_seeds: Iterator[int] | None
     ) -> list[EpisodeResult]:
         """Play a segment of one environment; without `next_seeds` it stops when an episode ends."""
-        arrays, index, player, write = self._arrays, episode.index, self._loaded_player, episode.write
+        arrays, index, actor, write = self._arrays, episode.index, self._loaded_actor, episode.write
+        rows = Rows.one(episode.seed, episode.step, index - self._job.first)
         segment, inside = arrays.segment.of(index), arrays.inside[index]
         now = segment.observation
         single = now.get(SINGLE)
-        state = None if self._states is None else self._states[index]
-        if player.state is not None and state is not None:
-            player.state[:] = state
-        for key, rows in now.items():
-            rows[0] = arrays.observation[key][index]
-        player.begin_segment(episode.seed, episode.step)
+        if self._states is not None and actor.state is not None:
+            actor.state[rows.index] = self._states[rows.index]
+        for key, observed in now.items():
+            observed[0] = arrays.observation[key][index]
+        actor.prepare()
         inside[0] = episode.seed
         ended: list[EpisodeResult] = []
         row = 0
         while row < asked.steps and not (ended and next_seeds is None):
-            observation = single[row] if single is not None else {key: rows[row] for key, rows in now.items()}
+            observation: Any
+            if single is not None:
+                observation = single[row : row + 1]
+            else:
+                observation = {key: observed[row : row + 1] for key, observed in now.items()}
             began = perf_counter()
-            chosen, action = player.act(observation, episode.seed, episode.step)
-            if episode.teacher is not None:
-                segment.label[row] = episode.teacher.act(episode.seed, episode.step)
+            stored, action = actor.act(observation, rows)
+            if self._teacher is not None:
+                segment.label[row] = self._teach(episode)
                 if index in asked.taught:
-                    chosen = action = segment.label[row]
+                    stored = action = segment.label[row][None]
             acted = perf_counter()
-            segment.stored[row] = np.ravel(chosen)
-            segment.action[row] = action
+            segment.stored[row] = stored.ravel()
+            segment.action[row] = action[0]
             episode.step += 1
+            rows.step[0] = episode.step
             inside[1], inside[2] = episode.step, row
             observation, reward, terminated, truncated, info = episode.take_step(segment.action[row])
             episode.acting_s += acted - began
@@ -270,7 +280,7 @@ class Worker:
                 episode.measure_contact()
             row += 1
             if terminated or truncated:
-                ended.append(episode.summarize(info, row - 1, player.report()))
+                ended.append(episode.summarize(info, row - 1, actor.report(index - self._job.first)))
                 if next_seeds is not None:
                     write(segment.final, row - 1, observation)
                     seed = next(next_seeds)
@@ -278,13 +288,15 @@ class Worker:
                     if asked.levels is not None:
                         arrays.level[index] = asked.levels.follow(float(arrays.level[index]), ended[-1].success)
                     observation = episode.start(seed, float(arrays.level[index]))
-                    if player.state is not None:
-                        player.state[:] = 0.0
+                    rows.seed[0], rows.step[0] = seed, 0
+                    actor.begin(rows)
+                    if self._teacher is not None:
+                        self._teacher.begin(rows)
             write(now, row, observation)
-        for key, rows in now.items():
-            arrays.observation[key][index] = rows[row]
-        if player.state is not None and state is not None:
-            state[:] = player.state
+        for key, observed in now.items():
+            arrays.observation[key][index] = observed[row]
+        if self._states is not None and actor.state is not None:
+            self._states[rows.index] = actor.state[rows.index]
         return ended
 
     @contextlib.contextmanager
@@ -296,15 +308,14 @@ class Worker:
             raise FailedInEpisode(episode.index, episode.seed, episode.step) from error
         self._arrays.inside[episode.index, 1] = -1
 
-    def _close_player(self) -> None:
-        for player in (self._player, self._players):
-            if player is not None:
-                player.close()
-        self._player = self._players = None
+    def _close_actor(self) -> None:
+        if self._actor is not None:
+            self._actor.close()
+        self._actor = None
 
     def close(self) -> None:
         """Close the environments and the policy."""
-        self._close_player()
+        self._close_actor()
         for episode in self._episodes:
             try:
                 episode.env.close()
@@ -316,13 +327,13 @@ class Worker:
         self._batch = None
 
 
-def make_player_of(name: str, env: Any) -> Player:
-    """Return the player of a policy server (`ws://...`), or of any other name as `make_player` does."""
+def make_actor_of(name: str, env: Any, count: int = 1) -> Actor:
+    """Return the actor of a policy server (`ws://...`), or of any other name as `make_actor` does."""
     if not name.startswith(SERVER):
-        return make_player(name, env.action_space)
-    from rlctl.deploy.server.client import RemotePlayer  # only here: it imports aiohttp
+        return make_actor(name, env.action_space, count)
+    from rlctl.deploy.server.client import RemoteActor  # only here: it imports aiohttp
 
-    return RemotePlayer(name, env.observation_space, env.action_space)
+    return RemoteActor(name, env.observation_space, env.action_space)
 
 
 def main(connection: Connection, job: messages.WorkerJob) -> None:
