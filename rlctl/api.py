@@ -134,7 +134,7 @@ def load_policy(path: str | os.PathLike[str], /) -> Policy:
     """
     from rlctl.environments import installed
     from rlctl.hub import store
-    from rlctl.policy import numpy_policy
+    from rlctl.policy import load
     from rlctl.policy.shipped import find_shipped_policy
     from rlctl.run.directory import RunDirectory
 
@@ -145,4 +145,4 @@ def load_policy(path: str | os.PathLike[str], /) -> Policy:
         file = find_shipped_policy(name)
     if RunDirectory(file).status_file.is_file():
         file = RunDirectory(file).policy_file()
-    return numpy_policy.load_policy(file)
+    return load.load_policy(file)

@@ -23,7 +23,7 @@ def test_train_and_evaluate_with_the_keys_of_a_recipe(tmp_path):
     assert sum(episode["return"] for episode in evaluation.episodes) / 3 == pytest.approx(evaluation.returns.mean)
     assert repr(evaluation).startswith(f"Evaluation({ENVS}:Line, 3 episodes: ")
     assert repr(result) == f"TrainResult({ENVS}:Line, ppo, 64 steps, run {str(result.run.path)!r})"
-    assert repr(rlctl.load_policy(result.run.path)) == f"NumpyPolicy({ENVS}:Line, ppo, 64 steps)"
+    assert repr(rlctl.load_policy(result.run.path)) == f"Policy({ENVS}:Line, ppo, 64 steps)"
     assert rlctl.evaluate(result.run.path, episodes=3, seed=4).returns == evaluation.returns
 
 

@@ -11,7 +11,8 @@ import pytest
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.exporting.controller.source import ControllerSource
-from rlctl.policy.numpy_policy import NumpyPolicy
+from rlctl.policy.numpy_actor import NumpyActor
+from rlctl.policy.policy import Policy
 from tests.exporting import controlled
 from tests.exporting.controllers import make_policy
 
@@ -58,7 +59,7 @@ def test_commands_are_those_of_the_policy(policy, program):
     updates = [line.split() for line in lines[1:]]
     # At 20 Hz the policy acts in every second update. Without a goal nothing is commanded.
     assert updates[:2] == [["ok", "9", "9"]] * 2
-    acting, places, goal, last = NumpyPolicy(policy), np.array([0.25, -0.5]), np.array([0.5, -0.25]), np.zeros(2)
+    acting, places, goal, last = Policy(NumpyActor(policy)), np.array([0.25, -0.5]), np.array([0.5, -0.25]), np.zeros(2)
     for update in (2, 4, 6):
         observation = np.concatenate([*[places] * 3, goal - places, last]).astype(np.float32)
         last = acting.predict(observation)

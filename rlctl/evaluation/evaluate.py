@@ -20,8 +20,8 @@ from rlctl.play.collect import Episode, play_episodes
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers, count_envs
+from rlctl.policy.actor import Exploration
 from rlctl.policy.file import PolicyInfo
-from rlctl.policy.players.player import Exploration
 from rlctl.policy.shipped import MeasuredScore
 from rlctl.run.episode import save_episode
 

@@ -1,4 +1,4 @@
-"""The players of an evaluation or a replay, and the environment that each plays in."""
+"""What acts in an evaluation or a replay, and the environment that it acts in."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -10,10 +10,10 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, explain_missing_package
 from rlctl.evaluation.request import EvalRequest
 from rlctl.play.workers import Workers
+from rlctl.policy.actor import Actor
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.policy.numpy_policy import check_playable, load_policy
-from rlctl.policy.players.named import BASELINES, SERVER, load_function
-from rlctl.policy.players.player import Player
+from rlctl.policy.load import check_playable, load_policy
+from rlctl.policy.named_actors import BASELINES, SERVER, load_function
 from rlctl.run import lookup
 
 
@@ -75,7 +75,7 @@ def find_player(
 
 @dataclasses.dataclass(frozen=True)
 class Baseline:
-    """Zero or random actions, a policy server, or a user's function, by the name that `make_player` takes."""
+    """Zero or random actions, a policy server, or a user's function, by the name that `make_actor` takes."""
 
     name: str
     info: None = None
@@ -84,11 +84,11 @@ class Baseline:
         """Let workers act with the baseline."""
         workers.set_other_policy(self.name)
 
-    def make_player(self, env: Any) -> Player:
-        """Return a player for an environment in this process."""
-        from rlctl.play.worker import make_player_of
+    def make_actor(self, env: Any) -> Actor:
+        """Return an actor for an environment in this process."""
+        from rlctl.play.worker import make_actor_of
 
-        return make_player_of(self.name, env)
+        return make_actor_of(self.name, env)
 
     @property
     def title(self) -> str:

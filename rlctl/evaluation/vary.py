@@ -27,7 +27,7 @@ from rlctl.play.collect import play_episodes
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers
-from rlctl.policy.players.player import Exploration
+from rlctl.policy.actor import Exploration
 from rlctl.storage import files
 from rlctl.version import collect_versions
 

@@ -49,7 +49,7 @@ def emit_actor(graph: Graph, policy: PolicyFile, inputs: Mapping[str, tuple[str,
     else:
         value = _emit_own(graph, inputs, network.own)
     if (lstm := network.lstm) is not None:
-        names, shape = onnx_policy.STATE_INPUTS, (len(lstm.layers), BATCH, lstm.state.shape[2])
+        names, shape = onnx_policy.STATE_INPUTS, (len(lstm.layers), BATCH, lstm.hidden_size)
         hidden, cell = (graph.input(name, np.float32, shape, _STATE_MEANING) for name in names)
         value, state = emit_lstm(graph, value, (hidden, cell), lstm)
     value = emit(graph, value, [*network.trunk, *network.head])

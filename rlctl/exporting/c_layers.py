@@ -86,7 +86,7 @@ class CWriter:
         return value, size
 
     def _write_lstm(self, lstm: Lstm, value: str, size: int) -> tuple[str, int]:
-        count = lstm.state.shape[2]
+        count = lstm.hidden_size
         for number, layer in enumerate(lstm.layers):
             hidden, cell = (f"state->{member} + {number * count}" for member in ("hidden", "cell"))
             gates = self._declare("gates", 4 * count)

@@ -19,9 +19,10 @@ from rlctl.environments.dict_spaces import SINGLE, split_space
 from rlctl.errors import AnswerIsNo, UsageError, short_repr
 from rlctl.exporting.c_layers import CWriter, write_array, write_number
 from rlctl.policy import own_modules
-from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type, observation_type
+from rlctl.policy.c_policy import action_type, observation_type
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.layers import ScaleImage
+from rlctl.policy.load import LIBRARY_SUFFIX
 from rlctl.policy.network import Network
 from rlctl.version import __version__
 
@@ -162,8 +163,8 @@ def write_c(policy: PolicyFile, file_name: str) -> CSource:
     state = []
     if layout.frames > 1:
         state += [f"{layout.type} frames[{layout.frames * layout.size}]; /* oldest first */", "int begun;"]
-    if network.lstm is not None:
-        state += [f"float {member}[{network.lstm.state[0].size}];" for member in ("hidden", "cell")]
+    if (lstm := network.lstm) is not None:
+        state += [f"float {member}[{len(lstm.layers) * lstm.hidden_size}];" for member in ("hidden", "cell")]
     state_argument = f"{name}_state *state, " if state else ""
     values: dict[str, Any] = {
         "name": name,

@@ -19,9 +19,8 @@ from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLo
 from rlctl.hub import store
 from rlctl.play.workers import Workers, count_envs
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.policy.numpy_policy import check_playable
+from rlctl.policy.load import check_playable
 from rlctl.policy.own_modules import KEYS, import_named
-from rlctl.policy.policy import Policy
 from rlctl.policy.shipped import PRETRAINED
 from rlctl.run import lookup
 from rlctl.run.directory import refuse_links_out
@@ -32,7 +31,9 @@ if TYPE_CHECKING:
     import onnx
 
     from rlctl.exporting.c_source import CSource
-    from rlctl.policy.torch_policy import TorchPolicy
+    from rlctl.policy.c_policy import CActor
+    from rlctl.policy.onnx_policy import OnnxActor
+    from rlctl.policy.torch_policy import TorchActor
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -178,12 +179,12 @@ def _export(source: FoundPolicy, targets: list[Path], sim: str | None) -> list[E
     with Workers(spec, n_envs) as workers:
         from rlctl.exporting.actor import build
         from rlctl.exporting.c_source import write_c
-        from rlctl.policy.torch_policy import TorchPolicy, pin_threads
+        from rlctl.policy.torch_policy import TorchActor, pin_threads
 
         pin_threads()
         models = [(target, build(policy)) for target in targets if target.suffix == ".onnx"]
         sources = [(target, write_c(policy, target.stem)) for target in targets if target.suffix == ".c"]
-        torch_policy = TorchPolicy.load(source.file)
+        torch_policy = TorchActor.load(source.file)
         _check_environment(source.file, info, workers)
         return [
             *(_export_onnx(torch_policy, workers, target, model) for target, model in models),
@@ -214,15 +215,15 @@ def check_environment(policy_file: Path, info: PolicyInfo, built: EnvInfo) -> No
         )
 
 
-def _export_onnx(policy: TorchPolicy, workers: Workers, target: Path, model: onnx.ModelProto) -> ExportReport:
-    from rlctl.policy.onnx_policy import OnnxPolicy, encode
+def _export_onnx(policy: TorchActor, workers: Workers, target: Path, model: onnx.ModelProto) -> ExportReport:
+    from rlctl.policy.onnx_policy import OnnxActor, encode
 
     content = encode(model)
     fields: dict[str, Any] = {}
 
     def write(part: Path) -> None:
         part.write_bytes(content)
-        exported = OnnxPolicy.load(part)
+        exported = OnnxActor.load(part)
         ports = {"inputs": exported.session.get_inputs(), "outputs": exported.session.get_outputs()}
         fields["details"] = {"opset": model.opset_import[0].version} | {
             kind: [{"name": port.name, "dtype": port.type[len("tensor(") : -1], "shape": port.shape} for port in some]
@@ -234,9 +235,9 @@ def _export_onnx(policy: TorchPolicy, workers: Workers, target: Path, model: onn
     return ExportReport(**describe_policy(policy, target), **fields, size=len(content))
 
 
-def _export_c(policy: TorchPolicy, workers: Workers, target: Path, code: CSource) -> ExportReport:
+def _export_c(policy: TorchActor, workers: Workers, target: Path, code: CSource) -> ExportReport:
     from rlctl.exporting.c_source import build_library, find_compiler
-    from rlctl.policy.c_policy import CPolicy
+    from rlctl.policy.c_policy import CActor
 
     compiler = find_compiler()
     # The source includes the header by the identifier: policy-1.c includes policy_1.h.
@@ -246,7 +247,7 @@ def _export_c(policy: TorchPolicy, workers: Workers, target: Path, code: CSource
     if compiler is not None:
         with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
             library = build_library(code, policy.info, Path(folder), compiler)
-            fields = _verify(policy, workers, target, CPolicy.load(library), library)
+            fields = _verify(policy, workers, target, CActor.load(library), library)
     files.write_text(header, code.header)
     files.write_text(target, code.source)
     size = len(code.source.encode()) + len(code.header.encode())
@@ -254,7 +255,7 @@ def _export_c(policy: TorchPolicy, workers: Workers, target: Path, code: CSource
     return ExportReport(**describe_policy(policy, target), **fields, size=size, details=details)
 
 
-def describe_policy(policy: TorchPolicy, target: Path) -> dict[str, Any]:
+def describe_policy(policy: TorchActor, target: Path) -> dict[str, Any]:
     """Return the fields of a report that describe the policy and the file."""
     info = policy.info
     about = {"task": info.spec.task, "algo": info.algo, "training_steps": info.training_steps}
@@ -272,7 +273,9 @@ def check_verified(path: Path, policy: Path | None, agreement: Agreement, loop: 
     raise AnswerIsNo(f"{path}: not verified, not written: {why}\n{numbers}")
 
 
-def _verify(policy: TorchPolicy, workers: Workers, target: Path, exported: Policy, file: Path) -> dict[str, Any]:
+def _verify(
+    policy: TorchActor, workers: Workers, target: Path, exported: OnnxActor | CActor, file: Path
+) -> dict[str, Any]:
     """Return how a file was verified, as fields of its report; raises `AnswerIsNo` if it acts differently."""
     agreement, loop = verify(policy, exported, file, workers)
     check_verified(target, policy.file.path, agreement, loop)

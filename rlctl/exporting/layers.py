@@ -195,7 +195,7 @@ def emit_lstm(graph: Graph, value: str, state: tuple[str, str], lstm: layers.Lst
     for number, layer in enumerate(lstm.layers):
         constants = _add_lstm_constants(graph, layer, f"{lstm.name}.{number}")
         inputs = [sequence, *constants, "", *(part[number] for part in before)]
-        outputs, hidden, cell = graph.add_with_outputs("LSTM", inputs, 3, hidden_size=lstm.state.shape[2])
+        outputs, hidden, cell = graph.add_with_outputs("LSTM", inputs, 3, hidden_size=lstm.hidden_size)
         sequence = graph.add("Squeeze", outputs, graph.constant(f"{lstm.name}.direction", np.array([1])))
         after[0].append(hidden)
         after[1].append(cell)

@@ -13,7 +13,7 @@ from rlctl.evaluation.report import describe_score
 from rlctl.evaluation.request import EvalRequest
 from rlctl.exporting.request import ExportRequest
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.players.named import BASELINES
+from rlctl.policy.named_actors import BASELINES
 from rlctl.policy.shipped import Provenance
 from rlctl.run import lookup
 from rlctl.run.lookup import FoundPolicy

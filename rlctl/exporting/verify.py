@@ -18,13 +18,14 @@ from rlctl.environments.dict_spaces import map_parts, stack, take_row
 from rlctl.play.collect import Episode, play_episodes
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers
-from rlctl.policy.c_policy import CPolicy
+from rlctl.policy.actor import Rows
+from rlctl.policy.c_policy import CActor
 from rlctl.policy.file import PolicyFile, Tensors
-from rlctl.policy.onnx_policy import OnnxPolicy
+from rlctl.policy.onnx_policy import OnnxActor
 from rlctl.policy.policy import Policy
 
 if TYPE_CHECKING:
-    from rlctl.policy.torch_policy import TorchPolicy
+    from rlctl.policy.torch_policy import TorchActor
 
 MAX_DIFFERENCE = 1e-5  # limit of |difference| of an action element; relative for elements larger than 1
 MAX_RETURN_DIFFERENCE = 1e-3  # limit of the relative difference of an episode's return
@@ -59,14 +60,14 @@ class Agreement:
 class Comparison:
     """Collects differences of the actions of a policy and its export."""
 
-    def __init__(self, torch_policy: TorchPolicy, exported: Policy) -> None:
-        self.torch_policy, self.exported = torch_policy, exported
+    def __init__(self, torch_actor: TorchActor, exported: OnnxActor | CActor) -> None:
+        self.torch_actor, self.exported = torch_actor, exported
         self.agreement = Agreement()
-        self._space = torch_policy.action_space
+        self._space = torch_actor.info.env.spaces()[1]
         self._logits: NDArray[np.float32]
         if not isinstance(self._space, spaces.Box):
-            network: Any = torch_policy.network
-            head = network.q_net.q_net[-1] if torch_policy.info.algo == "dqn" else network.action_net
+            network: Any = torch_actor.network
+            head = network.q_net.q_net[-1] if torch_actor.info.algo == "dqn" else network.action_net
             self._hook = head.register_forward_hook(self._keep_logits)
 
     def _keep_logits(self, module: Any, inputs: Any, output: Any) -> None:
@@ -76,20 +77,23 @@ class Comparison:
         """Compare the actions of both policies on all observations of episodes."""
         for episode in episodes:
             observations, length = episode.recorded.observations, len(episode.recorded.actions)
-            self.torch_policy.reset()
-            self.exported.reset()
-            rows = 1 if self.torch_policy.is_recurrent else length
-            for low in range(0, length, rows):
-                batch = map_parts(operator.itemgetter(slice(low, low + rows)), observations)
-                actions = [self.exported.predict(take_row(batch, row)) for row in range(rows)]
-                self.add(self.torch_policy.act(batch), np.stack(actions))
+            row = Rows.one()
+            self.torch_actor.begin(row)
+            self.exported.begin(row)
+            count = 1 if self.torch_actor.is_recurrent else length
+            for low in range(0, length, count):
+                batch = map_parts(operator.itemgetter(slice(low, low + count)), observations)
+                steps = [map_parts(operator.itemgetter(slice(k, k + 1)), batch) for k in range(count)]
+                actions = [self.exported.act(step, row)[1] for step in steps]
+                self.add(self.torch_actor.act(batch, Rows.first(count))[1], np.concatenate(actions))
             self.agreement.observations += length
 
-    def add_batch(self, exported: OnnxPolicy, episodes: Sequence[Episode]) -> None:
+    def add_batch(self, exported: OnnxActor, episodes: Sequence[Episode]) -> None:
         """Compare the actions of both policies on the first observations of episodes, in one batch."""
         first = stack([take_row(episode.recorded.observations, 0) for episode in episodes])
-        self.torch_policy.reset()
-        self.add(self.torch_policy.act(first), exported.start_episodes(first))
+        rows = Rows.first(len(episodes))
+        self.torch_actor.begin(rows)
+        self.add(self.torch_actor.act(first, rows)[1], exported.act_together(first))
         self.agreement.batch_sizes.append(len(episodes))
 
     def add(self, expected: NDArray[Any], actions: NDArray[Any]) -> None:
@@ -164,20 +168,22 @@ class Latency:
         return self.sb3_us / self.exported_us
 
 
-def verify(torch_policy: TorchPolicy, exported: Policy, file: Path, workers: Workers) -> tuple[Agreement, ClosedLoop]:
+def verify(
+    torch_actor: TorchActor, exported: OnnxActor | CActor, file: Path, workers: Workers
+) -> tuple[Agreement, ClosedLoop]:
     """Play the same episodes with both policies, and compare their actions on every observation of both.
 
     `file` is the exported file, ONNX or a compiled library. Plays more episodes until enough observations are compared.
     If all actions agree but the episodes differ, the original policy plays again, to test whether the environment
     repeats its episodes, and whether they are chaotic. Raises `TaskError` if the environment fails.
     """
-    min_observations = _MIN_OBSERVATIONS["onnx" if isinstance(exported, OnnxPolicy) else "c"]
-    comparison = Comparison(torch_policy, exported)
+    min_observations = _MIN_OBSERVATIONS["onnx" if isinstance(exported, OnnxActor) else "c"]
+    comparison = Comparison(torch_actor, exported)
     seeds = episode_seeds(0, Stream.VERIFY, EPISODES)
-    workers.set_policy(torch_policy.file)
+    workers.set_policy(torch_actor.file)
     expected = play_episodes(workers, seeds, record=True)
     comparison.add_episodes(expected)
-    if isinstance(exported, OnnxPolicy):
+    if isinstance(exported, OnnxActor):
         comparison.add_batch(exported, expected)
     while (observations := comparison.agreement.observations) < min_observations:
         missing = max(1, round(1.1 * len(seeds) * (min_observations / observations - 1.0)))
@@ -190,8 +196,8 @@ def verify(torch_policy: TorchPolicy, exported: Policy, file: Path, workers: Wor
     comparison.close()
     loop = compare_episodes(expected, actual)
     if comparison.agreement.agrees and not loop.agrees:
-        repeats = _repeats_episodes(torch_policy.file, workers, expected)
-        magnified = repeats and _magnifies_rounding(torch_policy.file, workers, expected)
+        repeats = _repeats_episodes(torch_actor.file, workers, expected)
+        magnified = repeats and _magnifies_rounding(torch_actor.file, workers, expected)
         loop = dataclasses.replace(loop, repeats=repeats, magnified=magnified)
     return comparison.agreement, loop
 
@@ -250,25 +256,25 @@ def compare_episodes(expected: Sequence[Episode], actual: Sequence[Episode]) -> 
     )
 
 
-def measure_latency(torch_policy: TorchPolicy, exported: Policy) -> Latency:
+def measure_latency(torch_actor: TorchActor, exported: OnnxActor | CActor) -> Latency:
     """Time both policies on one observation."""
-    space = torch_policy.observation_space
+    policy = Policy(exported)
+    space = policy.observation_space
     space.seed(0)
     observation = space.sample()
-    exported.reset()
-    if isinstance(exported, CPolicy):
+    if isinstance(exported, CActor):
         exported_us = _measure_median_us(lambda: exported.repeat(observation, _CALLS)) / _CALLS
     else:
-        exported_us = _measure_median_us(lambda: exported.predict(observation))
-    return Latency(exported_us, measure_sb3(torch_policy))
+        exported_us = _measure_median_us(lambda: policy.predict(observation))
+    return Latency(exported_us, measure_sb3(torch_actor))
 
 
-def measure_sb3(torch_policy: TorchPolicy) -> float:
+def measure_sb3(torch_actor: TorchActor) -> float:
     """Return the time that SB3 takes for one normalised observation [us]."""
-    space = torch_policy.observation_space
+    space = torch_actor.info.env.spaces()[0]
     space.seed(0)
-    normalized: Any = torch_policy.normalize(space.sample())
-    return _measure_median_us(lambda: torch_policy.network.predict(normalized, deterministic=True))
+    normalized: Any = torch_actor.normalize(space.sample())
+    return _measure_median_us(lambda: torch_actor.network.predict(normalized, deterministic=True))
 
 
 def _measure_median_us(call: Callable[[], Any]) -> float:

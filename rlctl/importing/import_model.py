@@ -16,7 +16,7 @@ from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.importing.sb3_model import SavedModel, read_model, read_normalization
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.policy.numpy_policy import load_policy
+from rlctl.policy.load import load_policy
 from rlctl.storage import files
 from rlctl.version import collect_versions
 
@@ -126,13 +126,13 @@ def _describe_shape(space: spaces.Space[Any]) -> Any:
 
 def _write_checked(target: Path, source: str, policy: PolicyFile) -> None:
     """Write the file under a temporary name, and rename it if it loads and acts; errors name `source`."""
-    from rlctl.policy.torch_policy import TorchPolicy
+    from rlctl.policy.torch_policy import TorchActor
 
     def write(part: Path) -> None:
         policy.write(part)
         try:
             load_policy(part)
-            TorchPolicy.load(part)  # checks the names of all tensors, too
+            TorchActor.load(part)  # checks the names of all tensors, too
         except ArtifactError as error:
             raise ArtifactError(str(error).replace(str(part), source)) from None
 

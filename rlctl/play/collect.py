@@ -13,7 +13,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import EpisodeFailed, TaskError
 from rlctl.play.messages import EpisodeResult, Play
 from rlctl.play.workers import Workers
-from rlctl.policy.players.player import Exploration
+from rlctl.policy.actor import Exploration
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode, Trajectory
 from rlctl.version import collect_versions
 

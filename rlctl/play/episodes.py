@@ -10,23 +10,25 @@ from numpy.typing import NDArray
 from rlctl.environments.dict_spaces import SINGLE, join, split
 from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
 from rlctl.play import messages
-from rlctl.play.actors import RowsOfPlayers
 from rlctl.play.messages import EpisodeResult, FailedInEpisode
-from rlctl.play.playing import Index, Playing, RecordedActions, Rows
+from rlctl.play.playing import Index, Playing, RecordedActions
 from rlctl.play.seeds import list_training_seeds
 from rlctl.play.shared_arrays import CRITIC, SharedArrays
-from rlctl.play.teaching import Teacher
+from rlctl.policy.actor import Actor, Array, Rows
 from rlctl.printed_lines import print_line
 
 
 class Episodes:
-    """The episodes of some worlds; world 0 is the environment `first` of all.
+    """The episodes of some worlds; world 0 is the environment `first` of all, and the row `row` of actors.
 
     What worlds and actors raise is raised as `FailedInEpisode`, with the episode.
     """
 
-    def __init__(self, worlds: Any, first: int, *, has_critic: bool, teacher: Teacher | None) -> None:
+    def __init__(
+        self, worlds: Any, first: int, row: int = 0, *, has_critic: bool = False, teacher: Actor | None = None
+    ) -> None:
         self.worlds, self.first, self.teacher = worlds, first, teacher
+        self._row = row
         self._has_critic = has_critic
         self._playing = Playing(worlds)
         self._time = np.zeros((worlds.count, 2))  # of policy and environment in each episode [s]
@@ -41,6 +43,27 @@ class Episodes:
         world = getattr(error, "world", world)  # of `WorldFailed` and `in_world`
         seed, step = int(self._playing.seeds[world]), int(self.worlds.step_of[world])
         raise FailedInEpisode(self.first + world, seed, step) from error
+
+    def row_of(self, world: int) -> int:
+        """Return the row of actors in which a world is."""
+        return self._row + world
+
+    def as_rows(self, rows: Rows) -> Rows:
+        """Return rows of worlds as those of actors."""
+        if not self._row:
+            return rows
+        return Rows(rows.index + self._row, rows.seed, rows.step)
+
+    def begin_rows(self, actor: Actor | None, index: Index) -> None:
+        """Let an actor begin the episodes of worlds."""
+        if actor is not None:
+            actor.begin(self.as_rows(self._playing.select(index)))
+
+    def teach(self, rows: Rows) -> Any:
+        """Return the teacher's actions in the present step; None without a teacher. Call it at every step."""
+        if self.teacher is None:
+            return None
+        return self.teacher.act(self.worlds.teacher_sees(rows.index), self.as_rows(rows))[1]
 
     def _begin(self, arrays: SharedArrays, index: Index, seeds: Sequence[int]) -> dict[str, Any]:
         """Begin episodes; return their first observations by key, with what only the critic sees."""
@@ -87,6 +110,7 @@ class Episodes:
         has_actions = lengths[index] > 0
         first = {key: part[has_actions] for key, part in shown.items() if key != CRITIC}
         recorder = _Replayer(RecordedActions(actions), self, arrays)
+        self.begin_rows(self.teacher, index)
         left: list[int] = []
         try:
             for played in self._playing.play(recorder, index[has_actions], join(first)):
@@ -104,7 +128,7 @@ class Episodes:
             arrays.observation[key][self.first + index] = part
 
     def play(
-        self, arrays: SharedArrays, asked: messages.Play, begin: Mapping[int, int], actor: RowsOfPlayers
+        self, arrays: SharedArrays, asked: messages.Play, begin: Mapping[int, int], actor: Actor
     ) -> list[EpisodeResult]:
         """Play a segment in the environments of `begin`; return the episodes that ended, by environment and row."""
         index = np.array(sorted(begin), np.int64) - self.first
@@ -117,24 +141,23 @@ class Episodes:
             self._fail(error, int(segment.index[0]))
 
 
-class _Replayer:
+class _Replayer(Actor):
     """An actor that acts as another, and lets the teacher see every step: it may have a recurrent state."""
 
     def __init__(self, actor: RecordedActions, episodes: Episodes, arrays: SharedArrays) -> None:
         self._actor, self._episodes, self._arrays = actor, episodes, arrays
 
-    def act(self, observations: Any, rows: Rows) -> tuple[Any, Any]:
+    def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
         """Return the actor's actions."""
-        if self._episodes.teacher is not None:
-            self._episodes.teacher.act(self._episodes.worlds, rows)
+        self._episodes.teach(rows)
         self._arrays.inside[self._episodes.first + rows.index, 1] = rows.step + 1
         return self._actor.act(observations, rows)
 
 
-class _Segment:
+class _Segment(Actor):
     """A segment that is played and written; as an actor it writes what was chosen before the worlds step."""
 
-    def __init__(self, episodes: Episodes, arrays: SharedArrays, asked: messages.Play, actor: RowsOfPlayers) -> None:
+    def __init__(self, episodes: Episodes, arrays: SharedArrays, asked: messages.Play, actor: Actor) -> None:
         self._episodes, self._arrays, self._asked, self._actor = episodes, arrays, asked, actor
         self._worlds, self._first = episodes.worlds, episodes.first
         own = slice(self._first, self._first + self._worlds.count)
@@ -163,19 +186,18 @@ class _Segment:
         """Begin the episodes whose seeds are not negative, and play."""
         arrays, asked, segment = self._arrays, self._asked, self._segment
         episodes, playing = self._episodes, self._episodes._playing
-        self._actor.explore(asked.exploration)
         self.index = index
         new = index[seeds >= 0]
         if len(new):
             shown = episodes._begin(arrays, new, seeds[seeds >= 0].tolist())
             episodes._write_current(arrays, new, shown)
-            self._actor.begin(new)
+            episodes.begin_rows(self._actor, new)
+            episodes.begin_rows(episodes.teacher, new)
         envs = self._first + index
         for key, part in segment.observation.items():
             part[0, index] = arrays.observation[key][envs]
         first = {key: part[envs] for key, part in arrays.observation.items() if key != CRITIC}
         self._inside[index, 0] = playing.seeds[index]
-        self._actor.prepare(playing.select(index))
         observations = segment.observation.items()
         only = segment.observation[SINGLE] if list(segment.observation) == [SINGLE] else None
         began = perf_counter()
@@ -207,7 +229,6 @@ class _Segment:
             began = perf_counter()
         self._note_times()
         self._inside[:, 1] = -1
-        self._actor.end_segment(index)
         # In the order of environments that play one after the other.
         return sorted(self._ended, key=lambda ended: ended.env)
 
@@ -222,13 +243,13 @@ class _Segment:
             self._episodes._time[self.index] += self._acting_s * share, self._stepping_s * share
         self._acting_s = self._stepping_s = 0.0
 
-    def act(self, observations: Any, rows: Rows) -> tuple[Any, Any]:
+    def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
         """Return the actor's actions, or those of the teacher where it acts, as they are written."""
         segment, row = self._segment, self._row
         at = self._at(row, rows.index)
-        stored, action = self._actor.act(observations, rows)
+        stored, action = self._actor.act(observations, self._episodes.as_rows(rows))
         if self._episodes.teacher is not None:
-            label = self._episodes.teacher.act(self._worlds, rows)
+            label = self._episodes.teach(rows)
             segment.label[at] = label
             taught = np.isin(self._first + rows.index, self._asked.taught)
             stored[taught], action[taught] = label.reshape(stored.shape)[taught], label[taught]
@@ -267,7 +288,8 @@ class _Segment:
         shown = self._episodes._begin(arrays, ended, [next(self._seeds[env]) for env in envs.tolist()])
         for key, part in shown.items():
             segment.observation[key][row + 1, ended] = part
-        self._actor.begin(ended)
+        self._episodes.begin_rows(self._actor, ended)
+        self._episodes.begin_rows(self._episodes.teacher, ended)
 
     def _summarize(self, world: int) -> EpisodeResult:
         totals = self._worlds.totals(world)
@@ -282,7 +304,7 @@ class _Segment:
             terms=totals.terms,
             final_distance=totals.distance,
             row=self._row,
-            report=self._actor.report(world),
+            report=self._actor.report(self._episodes.row_of(world)),
             deepest_contact=None if np.isnan(deepest) else deepest,
             acting=acting / max(acting + stepping, 1e-9),
             metrics=totals.metrics,

@@ -20,8 +20,8 @@ from rlctl.errors import (
     describe_exception,
     format_plugin_traceback,
 )
+from rlctl.policy.actor import Exploration
 from rlctl.policy.file import PolicyInfo
-from rlctl.policy.players.player import Exploration
 from rlctl.processes.pool import WorkerException
 
 
@@ -82,7 +82,7 @@ class LoadPolicy:
 
     info: PolicyInfo | None = None
     layout: Sequence[tuple[str, tuple[int, ...], str]] = ()  # name, shape and dtype of each array of numbers
-    other: str = ""  # an exported file, or a baseline; see `players.named.make_player`
+    other: str = ""  # an exported file, or a baseline; see `policy.named_actors.make_actor`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +145,7 @@ class EpisodeResult:
     final_distance: float | None
     row: int = dataclasses.field(default=-1, compare=False)  # the row of the segment in which it ended
     report: dict[str, Any] = dataclasses.field(default_factory=dict, compare=False)
-    """The player's report of the episode; see `Player.report`."""
+    """The actor's report of the episode; see `Actor.report`."""
     deepest_contact: float | None = None  # how far two bodies overlapped at most [m]; None if it was not measured
     acting: float = dataclasses.field(default=0.0, compare=False)
     """Fraction of the episode's time that the policy took; the environment took the rest."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
@@ -12,6 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import map_parts, split
+from rlctl.policy.actor import Actor, Array, Rows, act_one_by_one
 from rlctl.task.worlds import EpisodeTotals, Step
 
 Index = NDArray[np.int64]
@@ -34,30 +34,6 @@ class Worlds(Protocol):
 
     def totals(self, world: int) -> EpisodeTotals:
         """Return what the running episode of a world has added up to."""
-
-
-@dataclasses.dataclass(slots=True)
-class Rows:
-    """The rows that act: `index` of each world, `seed` of its episode, and its `step`, counted from 0; shape (k,).
-
-    The arrays are valid until the worlds step.
-    """
-
-    index: Index
-    seed: Index
-    step: Index
-
-    @property
-    def listed(self) -> Iterator[tuple[int, int, int]]:
-        """Index, seed and step of each row."""
-        return zip(self.index.tolist(), self.seed.tolist(), self.step.tolist(), strict=True)
-
-
-class RowsActor(Protocol):
-    """What chooses the actions of rows."""
-
-    def act(self, observations: Any, rows: Rows) -> tuple[Any, Any]:
-        """Return the actions to store, shape (k, elements), and those for the environments, shape (k, ...)."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -99,7 +75,7 @@ class Playing:
             return Rows(index, self.seeds, self.worlds.step_of)
         return Rows(index, self.seeds[index], self.worlds.step_of[index])
 
-    def play(self, actor: RowsActor, index: Index, observations: Any) -> Iterator[Played]:
+    def play(self, actor: Actor, index: Index, observations: Any) -> Iterator[Played]:
         """Continue the episodes of worlds, in ascending order, whose `observations` are given; yield each step.
 
         An episode that ends leaves, unless another has begun there. Exceptions are those of worlds and actor.
@@ -128,28 +104,12 @@ class Playing:
             self._observations = map_parts(lambda part: part[staying], self._observations)
 
 
-class RecordedActions:
-    """An actor that acts as recorded; `actions` has those of each world."""
+class RecordedActions(Actor):
+    """Acts as recorded; `actions` has those of each row."""
 
     def __init__(self, actions: dict[int, NDArray[Any]]) -> None:
         self._actions = actions
 
-    def act(self, observations: Any, rows: Rows) -> tuple[Any, Any]:
+    def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
         """Return the recorded action of each row; raises `IndexError` after the last one."""
-        actions = np.stack([self._actions[world][step] for world, _, step in rows.listed])
-        return actions, actions
-
-
-class RandomActions:
-    """An actor with uniformly random actions, which depend on the seed of the episode and the step only."""
-
-    def __init__(self, space: spaces.Space[Any]) -> None:
-        self._space = copy.deepcopy(space)  # its generator is not the environment's
-
-    def act(self, observations: Any, rows: Rows) -> tuple[Any, Any]:
-        """Return an action for each row."""
-        actions = []
-        for _, seed, step in rows.listed:
-            self._space.seed(int(np.random.SeedSequence((seed, step)).generate_state(1)[0]))
-            actions.append(self._space.sample())
-        return actions, actions
+        return act_one_by_one(observations, rows, lambda _, row, seed, step: self._actions[row][step])

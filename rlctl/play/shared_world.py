@@ -18,8 +18,9 @@ from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.play.messages import SharedWorld
-from rlctl.play.playing import Playing, RandomActions, Worlds
+from rlctl.play.playing import Playing, Worlds
 from rlctl.play.seeds import Stream, episode_seed
+from rlctl.policy.named_actors import make_actor
 
 _HARMLESS = re.compile(r"setAdditionalSearchPath|\w*Debug\w*|get(Keyboard|Mouse)Events")
 """Functions that neither change nor read what a world simulates."""
@@ -99,7 +100,9 @@ def _try(worlds: Worlds) -> None:
     playing = Playing(worlds)
     try:
         observation = playing.begin(first, [seed])
-        for number, _ in enumerate(playing.play(RandomActions(worlds.action_space), first, observation), start=1):
+        for number, _ in enumerate(
+            playing.play(make_actor("random", worlds.action_space), first, observation), start=1
+        ):
             if number == _STEPS:
                 return
     except BaseException:  # the first episode raises it again, with its seed and step

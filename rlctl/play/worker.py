@@ -5,8 +5,9 @@ policy's parameters are in shared memory.
 """
 
 import gc
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,17 +20,16 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError, describe_exception
 from rlctl.library_output import print_whole_lines
 from rlctl.play import messages
-from rlctl.play.actors import RowsOfPlayers
 from rlctl.play.episodes import Episodes, compute_rewards
 from rlctl.play.messages import Answer, EpisodeResult, Message, describe_failure
 from rlctl.play.shared_arrays import SharedArrays, map_arrays
 from rlctl.play.shared_world import make_watched
-from rlctl.play.teaching import Teacher, check_teacher
+from rlctl.play.teaching import check_teacher
+from rlctl.policy.actor import Actor
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.numpy_policy import PolicyPlayer
-from rlctl.policy.players.named import SERVER, make_player
-from rlctl.policy.players.player import Player
-from rlctl.policy.rows import RowsPolicy
+from rlctl.policy.load import load_actor
+from rlctl.policy.named_actors import SERVER, make_actor
+from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.printed_lines import print_line
 from rlctl.processes.pool import answer_messages
 from rlctl.task.events import Event, EventSettings, push
@@ -46,10 +46,9 @@ class Worker:
     def __init__(self, job: messages.WorkerJob) -> None:
         self._job = job
         self._groups: list[Episodes] = []
-        self._actors: list[RowsOfPlayers] = []  # one per group
-        self._make_player: Callable[[], Player]
+        self._actor: Actor | None = None  # its rows are the environments of the worker
         self._states: NDArray[np.float32] | None = None
-        self._lockstep = False  # whether the worlds of a `BatchTask` play together
+        """Recurrent states of the rows, which the main process sees too, shape (n, 2, layers, hidden)."""
         self._info: EnvInfo
         self._privileged: dict[str, int] = {}  # sizes of what only the critic sees
         self._arrays: SharedArrays
@@ -83,18 +82,19 @@ class Worker:
             gc.collect()  # environments may hold themselves in cycles
         worlds, shared_world = self._make_worlds(message)
         teacher = message.teacher
+        taught_by: Actor | None = None
         if teacher is not None:
             check_teacher(teacher, worlds[0])
+            taught_by = load_actor(Path(teacher.policy), self._job.count)
         if message.privileged is not None:
             for some in worlds:
                 self._privileged = show_critic(message.spec, some, message.privileged)
-        self._lockstep = message.spec.is_batch
         first = self._job.first
         self._groups = []
         for some in worlds:
-            taught_by = None if teacher is None else Teacher(teacher, some, lockstep=self._lockstep)
             has_critic = message.privileged is not None
-            self._groups.append(Episodes(some, first, has_critic=has_critic, teacher=taught_by))
+            row = first - self._job.first
+            self._groups.append(Episodes(some, first, row, has_critic=has_critic, teacher=taught_by))
             first += some.count
         self._info = describe_worlds(worlds[0])
         gc.freeze()  # present objects live long: later collections skip them
@@ -103,7 +103,7 @@ class Worker:
             mirror = worlds[0].task.mirror
         return Answer(
             info=self._info,
-            lockstep=self._lockstep,
+            lockstep=message.spec.is_batch,
             shared_world=shared_world,
             privileged=self._privileged,
             mirror=mirror,
@@ -141,46 +141,51 @@ class Worker:
         if message.info is not None:
             layout = {name: (shape, np.dtype(dtype)) for name, shape, dtype in message.layout}
             tensors = map_arrays(self._job.numbers, layout)
-            self._states = tensors.pop("state", None)
+            states = tensors.pop("state", None)
+            self._states = None if states is None else states[self._job.first :]
             policy = PolicyFile(message.info, tensors)
-        worlds, other = self._groups[0].worlds, message.other
-        self._set_players(lambda: make_player_of(other, worlds) if policy is None else PolicyPlayer(policy), policy)
-
-    def _set_players(self, make: Callable[[], Player], policy: PolicyFile | None = None) -> None:
-        self._close_actors()
-        self._make_player = make
-        for group in self._groups:
-            count = group.worlds.count
-            states = None if self._states is None else self._states[group.first : group.first + count]
-            if self._lockstep and policy is not None and RowsPolicy.supports(policy):
-                self._actors.append(RowsOfPlayers(RowsPolicy(policy, count), None, count))
-            else:
-                self._actors.append(RowsOfPlayers(None, make, count, states))
+        self._close_actor()
+        if policy is None:
+            self._actor = make_actor_of(message.other, self._groups[0].worlds, self._job.count)
+        else:
+            self._actor = NumpyActor(policy, self._job.count)
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
-        from rlctl.deploy.filter.limited_player import LimitedPlayer  # few evaluations need it
+        from rlctl.deploy.filter.limited import Limited  # few evaluations need it
         from rlctl.deploy.filter.limits import Limits
 
-        make, limits = self._make_player, Limits.model_validate(message.limits)
-        self._set_players(lambda: LimitedPlayer(make(), self._info, limits))
+        limits = Limits.model_validate(message.limits)
+        self._actor = Limited(self._loaded_actor, self._info, limits, self._job.count)
+
+    @property
+    def _loaded_actor(self) -> Actor:
+        assert self._actor is not None  # a policy is loaded before anything is played
+        return self._actor
 
     def _play(self, message: messages.Play) -> list[EpisodeResult]:
         """Play a segment; return the episodes that ended."""
         ended: list[EpisodeResult] = []
-        for group, actor in zip(self._groups, self._actors, strict=True):
+        actor = self._loaded_actor
+        actor.explore(message.exploration)
+        if self._states is not None and actor.state is not None:
+            actor.state[:] = self._states[: self._job.count]
+        actor.prepare()
+        for group in self._groups:
             begin = {env: message.begin[env] for env in group.envs if env in message.begin}
             if begin:
                 ended += group.play(self._arrays, message, begin, actor)
+        if self._states is not None and actor.state is not None:
+            self._states[: self._job.count] = actor.state
         return ended
 
-    def _close_actors(self) -> None:
-        for actor in self._actors:
-            actor.close()
-        self._actors = []
+    def _close_actor(self) -> None:
+        if self._actor is not None:
+            self._actor.close()
+        self._actor = None
 
     def close(self) -> None:
         """Close the environments and the policy."""
-        self._close_actors()
+        self._close_actor()
         for group in self._groups:
             try:
                 group.worlds.close()
@@ -208,13 +213,13 @@ def show_critic(spec: EnvSpec, worlds: Any, privileged: Mapping[str, bool]) -> d
     return of_task.critic.sizes
 
 
-def make_player_of(name: str, worlds: Any) -> Player:
-    """Return the player of a policy server (`ws://...`), or of any other name as `make_player` does."""
+def make_actor_of(name: str, worlds: Any, count: int = 1) -> Actor:
+    """Return the actor of a policy server (`ws://...`), or of any other name as `make_actor` does."""
     if not name.startswith(SERVER):
-        return make_player(name, worlds.action_space)
-    from rlctl.deploy.server.client import RemotePlayer  # only here: it imports aiohttp
+        return make_actor(name, worlds.action_space, count)
+    from rlctl.deploy.server.client import RemoteActor  # only here: it imports aiohttp
 
-    return RemotePlayer(name, worlds.observation_space, worlds.action_space)
+    return RemoteActor(name, worlds.observation_space, worlds.action_space)
 
 
 def main(connection: Connection, job: messages.WorkerJob) -> None:

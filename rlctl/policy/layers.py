@@ -1,6 +1,7 @@
-"""The layers of a policy's actor. NumPy applies them to one observation; `rlctl.exporting` writes them as ONNX or C.
+"""The layers of a policy's actor. NumPy applies them to rows; `rlctl.exporting` writes them as ONNX or C.
 
-Arrays are not copied: new weights in shared memory take effect when `prepare` is called.
+The first axis of every input and output is that of the rows, (k, ...). The bits of a row's output do not depend on the
+other rows. Arrays are not copied: new weights in shared memory take effect when `prepare` is called.
 """
 
 import abc
@@ -22,10 +23,22 @@ class Layer(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, value: Any) -> Array:
-        """Return the layer's output for one input, without a batch dimension."""
+        """Return the layer's output, a row for each row of the input."""
 
     def prepare(self) -> None:  # noqa: B027 (most layers have nothing to compute)
         """Compute values that depend only on the weights; call it again when the weights have changed."""
+
+
+def multiply(rows: Array, weight: Array) -> Array:
+    """Return the product of a matrix of shape (outputs, inputs) with each row, shape (k, outputs).
+
+    BLAS has other code for a product of two matrices, whose last bits depend on where a row is in the matrix.
+    """
+    if len(rows) == 1:
+        one: Array = rows.dot(weight.T)  # the same bits in half the time
+        return one
+    product: Array = np.matmul(weight, rows[:, :, None])[:, :, 0]
+    return product
 
 
 def apply(layers: Iterable[Layer], value: Any) -> Array:
@@ -43,7 +56,7 @@ class Linear(Layer):
     bias: Array
 
     def __call__(self, value: Array) -> Array:
-        result: Array = self.weight.dot(value)
+        result = multiply(value, self.weight)
         result += self.bias
         return result
 
@@ -58,11 +71,13 @@ class Convolution(Layer):
 
     def __call__(self, value: Array) -> Array:
         count, channels, height, width = self.weight.shape
-        windows = np.lib.stride_tricks.sliding_window_view(value, (height, width), axis=(1, 2))
-        windows = windows[:, :: self.stride, :: self.stride]
-        rows, columns = windows.shape[1:3]
-        patches = windows.transpose(0, 3, 4, 1, 2).reshape(channels * height * width, rows * columns)
-        return (self.weight.reshape(count, -1) @ patches + self.bias[:, None]).reshape(count, rows, columns)
+        windows = np.lib.stride_tricks.sliding_window_view(value, (height, width), axis=(2, 3))
+        windows = windows[:, :, :: self.stride, :: self.stride]
+        pictures, _, high, wide = windows.shape[:4]
+        patches = windows.transpose(0, 1, 4, 5, 2, 3).reshape(pictures, channels * height * width, high * wide)
+        # A product of matrices for each picture: its bits do not depend on the other pictures.
+        result = self.weight.reshape(count, -1) @ patches + self.bias[:, None]
+        return result.reshape(pictures, count, high, wide)
 
 
 @dataclasses.dataclass(slots=True)
@@ -122,8 +137,9 @@ class OneHot(Layer):
         self._offsets, self._total = np.cumsum(sizes) - sizes, int(sizes.sum())
 
     def __call__(self, value: Any) -> Array:
-        result = np.zeros(self._total, np.float32)
-        result[self._offsets + np.ravel(value)] = 1.0
+        count = len(value)
+        result = np.zeros((count, self._total), np.float32)
+        result[np.arange(count)[:, None], self._offsets + np.reshape(value, (count, -1))] = 1.0
         return result
 
 
@@ -134,16 +150,16 @@ class ScaleImage(Layer):
     channels_last: bool
 
     def __call__(self, value: Any) -> Array:
-        pixels = np.asarray(value).transpose(2, 0, 1) if self.channels_last else np.asarray(value)
+        pixels = np.asarray(value).transpose(0, 3, 1, 2) if self.channels_last else np.asarray(value)
         return np.asarray(pixels, np.float32) / np.float32(255.0)
 
 
 @dataclasses.dataclass(slots=True)
 class Flatten(Layer):
-    """Flattens an array to one dimension, in float32."""
+    """Flattens each row to one dimension, in float32."""
 
     def __call__(self, value: Any) -> Array:
-        return np.asarray(value, np.float32).ravel()
+        return np.asarray(value, np.float32).reshape(len(value), -1)
 
 
 @dataclasses.dataclass(slots=True)
@@ -173,24 +189,32 @@ class LstmLayer:
     biases: list[Array]  # two, shape (4 x hidden,); or none
 
 
+@dataclasses.dataclass(slots=True)
 class Lstm:
-    """The layers of an LSTM, and their state: hidden and cell, shape (2, layers, hidden)."""
+    """The layers of an LSTM."""
 
-    def __init__(self, name: str, layers: list[LstmLayer]) -> None:
-        self.name = name
-        self.layers = layers
-        self.state = np.zeros((2, len(layers), layers[0].of_hidden.shape[1]), np.float32)
+    name: str
+    layers: list[LstmLayer]
 
-    def step(self, value: Array) -> Array:
-        """Advance the state by one step and return the output of the last layer, shape (hidden,)."""
-        state = self.state
+    @property
+    def hidden_size(self) -> int:
+        """The number of outputs of each layer."""
+        return int(self.layers[0].of_hidden.shape[1])
+
+    def make_state(self, count: int) -> Array:
+        """Return the state at the begin of `count` episodes: hidden and cell, shape (count, 2, layers, hidden)."""
+        return np.zeros((count, 2, len(self.layers), self.hidden_size), np.float32)
+
+    def step(self, value: Array, state: Array) -> Array:
+        """Advance the states of the rows by one step, and return the output of the last layer, shape (k, hidden)."""
         for number, layer in enumerate(self.layers):
-            gates = layer.of_input.dot(value) + layer.of_hidden.dot(state[0, number])
+            hidden, cell = state[:, 0, number], state[:, 1, number]
+            gates = multiply(value, layer.of_input) + multiply(hidden, layer.of_hidden)
             for bias in layer.biases:
                 gates += bias
-            i, f, g, o = np.split(gates, 4)
-            state[1, number] = _sigmoid(f) * state[1, number] + _sigmoid(i) * np.tanh(g)
-            value = state[0, number] = _sigmoid(o) * np.tanh(state[1, number])
+            i, f, g, o = np.split(gates, 4, axis=1)
+            cell[:] = _sigmoid(f) * cell + _sigmoid(i) * np.tanh(g)
+            value = hidden[:] = _sigmoid(o) * np.tanh(cell)
         return value
 
 

@@ -1,4 +1,4 @@
-"""The network of an actor, read from a policy file: from one raw observation to the parameters of the action.
+"""The network of an actor, read from a policy file: from raw observations to the parameters of the actions.
 
 The tensors have the names of SB3's `state_dict`; the layers are derived from these names.
 """
@@ -6,7 +6,7 @@ The tensors have the names of SB3's `state_dict`; the layers are derived from th
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
@@ -71,21 +71,22 @@ class Network:
         if self.log_std is not None:
             self.std = _expln(self.log_std) if self._uses_expln else np.exp(self.log_std)
 
-    def compute_latent(self, observation: object) -> Array:
-        """Return the head's input, shape (size,); advances a recurrent state by one step."""
+    def compute_latent(self, observations: Any, states: Array | None = None) -> Array:
+        """Return the head's input, shape (k, size); advances the states of an LSTM by one step."""
         parts = self.parts
         if self.own is not None:
-            value = self.own(observation)
+            value = self.own(observations)
         elif "" in parts:
-            value = apply(parts[""], observation)
+            value = apply(parts[""], observations)
         else:
-            value = np.concatenate([apply(part, observation[key]) for key, part in parts.items()])  # type: ignore[index]
+            value = np.concatenate([apply(part, observations[key]) for key, part in parts.items()], axis=1)
         if self.lstm is not None:
-            value = self.lstm.step(value)
+            assert states is not None
+            value = self.lstm.step(value, states)
         return apply(self.trunk, value)
 
     def compute_std(self, latent: Array) -> Array:
-        """Return the standard deviation of a Gaussian action, shape (elements,)."""
+        """Return the standard deviations of Gaussian actions, shape (k, elements), or (elements,) if all are equal."""
         if self._log_std_layer is not None:
             return np.exp(np.clip(self._log_std_layer(latent), -20.0, 2.0))
         assert self.std is not None  # called for Gaussian heads only

@@ -13,11 +13,12 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from rlctl.environments.dict_spaces import Observations, split
+from rlctl.environments.dict_spaces import split, split_space
 from rlctl.errors import PLAY_OTHERS, ArtifactError, UsageError, short_repr
+from rlctl.policy.actor import Array, Exploration, Rows, act_one_by_one
 from rlctl.policy.file import GRAPH, PolicyInfo, Tensors, parse_info
 from rlctl.policy.layers import Normalize
-from rlctl.policy.policy import Policy
+from rlctl.policy.policy import FileActor, Policy
 from rlctl.storage import files, untrusted
 
 if TYPE_CHECKING:
@@ -108,22 +109,24 @@ def open_session(content: bytes) -> onnxruntime.InferenceSession:
         raise ValueError(f"onnxruntime {onnxruntime.__version__} cannot read it: {problem}") from None
 
 
-class OnnxPolicy(Policy):
-    """An ONNX file written by `rlctl export`, with its description. Deterministic."""
+class OnnxActor(FileActor):
+    """An ONNX file written by `rlctl export`, with its description, in `count` environments. Deterministic."""
 
-    def __init__(self, info: PolicyInfo, session: onnxruntime.InferenceSession) -> None:
-        super().__init__(info)
-        self.session = session
+    def __init__(self, info: PolicyInfo, session: onnxruntime.InferenceSession, count: int = 1) -> None:
+        self.info, self.session = info, session
         inputs = {port.name: port.shape for port in session.get_inputs()}
-        for key, (shape, _) in self._parts.items():
+        self._types: dict[str, Any] = {}
+        for key, space in split_space(info.env.spaces()[0]).items():
+            shape, self._types[key] = space.shape or (), space.dtype
             if inputs.get(key or SINGLE_INPUT, [None])[1:] != list(shape):
                 raise ValueError(f"no input {key or SINGLE_INPUT!r} of shape {('batch', *shape)}")
-        self._state_shapes = {name: inputs[name] for name in STATE_INPUTS if name in inputs}
-        self._outputs = [ACTION, *STATE_OUTPUTS] if self._state_shapes else [ACTION]
-        self._state: dict[str, NDArray[np.float32]] = self._make_state(1)
+        self._is_recurrent = STATE_INPUTS[0] in inputs
+        self._outputs = [ACTION, *STATE_OUTPUTS] if self._is_recurrent else [ACTION]
+        layers, hidden = inputs[STATE_INPUTS[0]][::2] if self._is_recurrent else (0, 0)
+        self._state = np.zeros((count, 2, layers, hidden), np.float32)
 
     @classmethod
-    def load(cls, path: Path) -> OnnxPolicy:
+    def load(cls, path: Path, count: int = 1) -> OnnxActor:
         """Read an exported file; raises `ArtifactError` if it is missing, damaged, foreign or of a newer format."""
         content = untrusted.read_bytes(path)
         try:
@@ -145,42 +148,58 @@ class OnnxPolicy(Policy):
             raise ArtifactError(f"{path}: damaged: {error}") from None
         info = parse_info(text, path)
         try:
-            policy = cls(info, session)
-            policy.try_once()
+            actor = cls(info, session, count)
+            Policy(actor).try_once()
         except (ArtifactError, ValueError, TypeError, LookupError, MemoryError) as error:
             problem = short_repr(str(error), 200)
             raise ArtifactError(f"{path}: its graph does not fit its description: {problem}; export it again") from None
-        return policy
+        return actor
 
-    def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
-        """Return the deterministic action for one observation; a recurrent state is kept until `reset`."""
-        if not deterministic:
+    @property
+    def state(self) -> Array | None:
+        """Hidden and cell states, shape (n, 2, layers, hidden); None without an LSTM."""
+        return self._state if self._is_recurrent else None
+
+    def explore(self, exploration: Exploration) -> None:
+        """Raise `UsageError` for exploration: the file has only the deterministic action."""
+        if exploration.stochastic:
             raise UsageError("an exported policy cannot sample: the ONNX file has only its deterministic action")
-        batch = {key or SINGLE_INPUT: part[None] for key, part in self.read_observation(observation).items()}
-        (action,), *after = self._run({**batch, **self._state})
-        self._state = dict(zip(self._state, after, strict=True))
-        return np.asarray(action)
 
-    def start_episodes(self, observations: Observations) -> NDArray[Any]:
+    def begin(self, rows: Rows) -> None:
+        """Forget the recurrent states."""
+        self._state[rows.index] = 0.0
+
+    def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
+        """Return the deterministic actions; each row is a call, because the bits of a batch depend on its size."""
+        return act_one_by_one(observations, rows, self._act_one)
+
+    def _act_one(self, observation: Any, row: int, seed: int, step: int) -> Any:
+        batch = {key: np.asarray(part)[None] for key, part in split(observation).items()}
+        return self._run(batch, self._state[row : row + 1])[0]
+
+    def act_together(self, observations: Any) -> Array:
         """Return the actions for the first observations of several episodes, in one call."""
-        batch = {key or SINGLE_INPUT: part for key, part in split(observations).items()}
+        batch = split(observations)
         count = len(next(iter(batch.values())))
-        return np.asarray(self._run({**batch, **self._make_state(count)})[0])
+        return self._run(batch, np.zeros((count, *self._state.shape[1:]), np.float32))
 
-    def reset(self) -> None:
-        """Begin an episode: forget the recurrent state."""
-        self._state = self._make_state(1)
+    def _run(self, batch: dict[str, Any], states: Array) -> Array:
+        """Return the actions for a batch, and advance its states, shape (k, 2, layers, hidden)."""
+        feed = {key or SINGLE_INPUT: np.asarray(batch[key], dtype) for key, dtype in self._types.items()}
+        if self._is_recurrent:
+            feed |= {name: states[:, part].swapaxes(0, 1) for part, name in enumerate(STATE_INPUTS)}
+        actions, *after = _run_session(self.session, self._outputs, feed)
+        for part, value in enumerate(after):
+            states[:, part] = value.swapaxes(0, 1)
+        return np.asarray(actions)
 
-    def _run(self, feed: dict[str, NDArray[Any]]) -> list[NDArray[Any]]:
-        try:
-            results: list[NDArray[Any]] = self.session.run(self._outputs, feed)
-        except Exception as error:  # onnxruntime's own errors have no public base class
-            raise ArtifactError(f"the exported policy cannot act: {short_repr(str(error), 200)}") from None
-        return results
 
-    def _make_state(self, rows: int) -> dict[str, NDArray[np.float32]]:
-        shapes = self._state_shapes.items()
-        return {name: np.zeros((layers, rows, hidden), np.float32) for name, (layers, _, hidden) in shapes}
+def _run_session(session: onnxruntime.InferenceSession, outputs: list[str], feed: dict[str, Any]) -> list[Array]:
+    try:
+        results: list[Array] = session.run(outputs, feed)
+    except Exception as error:  # onnxruntime's own errors have no public base class
+        raise ArtifactError(f"the exported policy cannot act: {short_repr(str(error), 200)}") from None
+    return results
 
 
 class OwnGraph:
@@ -204,12 +223,13 @@ class OwnGraph:
         for layer in self.normalize.values():
             layer.prepare()
 
-    def __call__(self, observation: Any) -> NDArray[Any]:
-        """Return the latent, shape (size,), of a raw observation."""
-        parts, feed = split(observation), dict(self.weights)
-        for key in self._keys:
-            value = parts[key]
-            if key in self.normalize:
-                value = self.normalize[key](value)
-            feed[OWN_INPUT + key] = np.asarray(value)[None]
-        return self._session.run([OWN_OUTPUT], feed)[0][0]
+    def __call__(self, observations: Any) -> NDArray[Any]:
+        """Return the latents, shape (k, size), of raw observations; a call for each row, as `OnnxActor` does."""
+        parts = {key: split(observations)[key] for key in self._keys}
+        parts |= {key: normalize(parts[key]) for key, normalize in self.normalize.items() if key in parts}
+        count = len(next(iter(parts.values())))
+        return np.concatenate([self._run(parts, k) for k in range(count)])
+
+    def _run(self, parts: dict[str, Any], row: int) -> NDArray[Any]:
+        inputs = {OWN_INPUT + key: np.asarray(part[row : row + 1]) for key, part in parts.items()}
+        return _run_session(self._session, [OWN_OUTPUT], {**self.weights, **inputs})[0]

@@ -1,6 +1,5 @@
-"""What every policy that acts has: an observation in, an action out, both as NumPy arrays."""
+"""The Python API of what acts: one observation in, an action out, both as NumPy arrays."""
 
-import abc
 from typing import Any
 
 import numpy as np
@@ -8,33 +7,54 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import join, map_parts, split, split_space
 from rlctl.environments.spec import EnvSpec
+from rlctl.policy.actor import Actor, Exploration, Rows
 from rlctl.policy.file import PolicyInfo
 
+_MEAN, _SAMPLE = Exploration(), Exploration(stochastic=True)
 
-class Policy(abc.ABC):
-    """A policy that acts for one environment at a time."""
 
-    def __init__(self, info: PolicyInfo) -> None:
+class FileActor(Actor):
+    """An actor that was read from a file, which describes it."""
+
+    info: PolicyInfo
+
+
+class Policy:
+    """A policy that acts in one environment: the first row of an actor."""
+
+    def __init__(self, actor: FileActor) -> None:
+        self.actor, info = actor, actor.info
         self.info = info
         self.observation_space, self.action_space = info.env.spaces()
         parts = split_space(self.observation_space)
         self._parts = {key: (space.shape or (), space.dtype) for key, space in parts.items()}
+        self._is_deterministic = True
+        self.reset()
 
     def __repr__(self) -> str:
         info = self.info
         return f"{type(self).__name__}({info.spec.task}, {info.algo}, {info.training_steps:,} steps)"
 
-    @abc.abstractmethod
     def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
         """Return the action for one observation, in the environment's action space.
 
-        Call `reset` when an episode begins: a recurrent policy keeps a state. Raises `ValueError` for an observation
-        of another shape.
+        Call `reset` when an episode begins: a recurrent policy keeps a state. `deterministic=False` samples the action,
+        with new noise in every episode. Raises `ValueError` for an observation of another shape, `UsageError` if an
+        exported policy shall sample.
         """
+        rows = join({key: part[None] for key, part in self.read_observation(observation).items()})
+        if deterministic is not self._is_deterministic:
+            self.actor.explore(_MEAN if deterministic else _SAMPLE)
+            self._is_deterministic = deterministic
+        action = self.actor.act(rows, self._row)[1][0]
+        self._row.step[0] += 1
+        return np.asarray(action)
 
-    @abc.abstractmethod
     def reset(self) -> None:
-        """Clear the recurrent state; call it when an episode begins."""
+        """Begin an episode: forget the recurrent state."""
+        self._row = Rows.one(seed=int(np.random.SeedSequence().generate_state(1)[0]))
+        self.actor.prepare()
+        self.actor.begin(self._row)
 
     def read_observation(self, observation: Any) -> dict[str, NDArray[Any]]:
         """Return the parts of an observation by key, in their dtypes; raises `ValueError` for another shape."""

@@ -3,12 +3,10 @@
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
 import sb3_contrib
 import stable_baselines3
 import torch
 from gymnasium import spaces
-from numpy.typing import NDArray
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -19,9 +17,10 @@ from threadpoolctl import threadpool_limits
 from rlctl.environments.dict_spaces import Observations, join, split
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.policy import own_modules
+from rlctl.policy.actor import Array, Rows, as_stored
 from rlctl.policy.file import PolicyFile, PolicyInfo, list_actor_tensors
 from rlctl.policy.network import read_normalization
-from rlctl.policy.policy import Policy
+from rlctl.policy.policy import FileActor, Policy
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": stable_baselines3.PPO,
@@ -129,12 +128,14 @@ def build_network(info: PolicyInfo) -> BasePolicy:
     return cls(network_space(observation_space), action_space, lr_schedule=lambda _: 0.0, **kwargs)
 
 
-class TorchPolicy(Policy):
-    """A policy file that acts with SB3's network, as in training. Deterministic."""
+class TorchActor(FileActor):
+    """A policy file that acts with SB3's network, as in training. Deterministic.
+
+    A recurrent policy must act on the same rows in every step of their episodes.
+    """
 
     def __init__(self, policy: PolicyFile, network: BasePolicy) -> None:
-        super().__init__(policy.info)
-        self.file = policy
+        self.info, self.file = policy.info, policy
         self.network = network
         self._normalize = read_normalization(policy)
         self.is_recurrent = policy.info.algo == "recurrent_ppo"
@@ -158,34 +159,29 @@ class TorchPolicy(Policy):
         network = build_network(policy.info)
         weights = policy.weights
         if policy.info.privileged:  # the critic's have other inputs than this network
-            actor = policy.actor_only().weights
-            weights = {name: value for name, value in actor.items() if "mlp_extractor.value_net" not in name}
+            own = policy.actor_only().weights
+            weights = {name: value for name, value in own.items() if "mlp_extractor.value_net" not in name}
         state = {name: torch.from_numpy(value.copy()) for name, value in weights.items()}
         mismatch = network.load_state_dict(state, strict=False)
         # A shipped policy has no critic, and acting needs none.
         missing = list_actor_tensors(policy.info.algo, [f"policy/{name}" for name in mismatch.missing_keys])
         if missing or mismatch.unexpected_keys:
             raise ValueError(f"tensors missing: {missing}, unknown: {mismatch.unexpected_keys}")
-        torch_policy = cls(policy, network)
-        torch_policy.try_once()
-        return torch_policy
+        actor = cls(policy, network)
+        Policy(actor).try_once()
+        return actor
 
     def normalize(self, observations: Observations) -> Observations:
-        """Return one or several observations, normalised."""
+        """Return observations, normalised."""
         parts = split(observations)
         changed = {key: normalize(parts[key]) for key, normalize in self._normalize.items()}
         return join({**parts, **changed})
 
-    def act(self, observations: Observations) -> NDArray[Any]:
-        """Return the actions for a batch of observations; a recurrent policy keeps one state per row."""
-        actions, self._state = self.network.predict(self.normalize(observations), self._state, deterministic=True)
-        return actions
-
-    def predict(self, observation: Any, *, deterministic: bool = True) -> NDArray[Any]:
-        """Return the action for one observation; a recurrent state is kept until `reset`."""
-        parts = self.read_observation(observation)
-        return np.asarray(self.act(join({key: part[None] for key, part in parts.items()}))[0])
-
-    def reset(self) -> None:
-        """Begin an episode: forget the recurrent state."""
+    def begin(self, rows: Rows) -> None:
+        """Forget the recurrent states of all rows."""
         self._state = None
+
+    def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
+        """Return the actions for a batch of observations."""
+        actions, self._state = self.network.predict(self.normalize(observations), self._state, deterministic=True)
+        return as_stored(actions), actions

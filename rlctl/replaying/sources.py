@@ -13,9 +13,9 @@ from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import UsageError
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, load_baseline, load_player
 from rlctl.play.seeds import Stream, episode_seeds
-from rlctl.policy.numpy_policy import load_policy
-from rlctl.policy.players.named import SERVER
-from rlctl.policy.players.player import Player
+from rlctl.policy.actor import Actor, Rows, as_rows
+from rlctl.policy.load import load_policy
+from rlctl.policy.named_actors import SERVER
 from rlctl.recipe.sources import parse_changes
 from rlctl.replaying.choice import choose_episodes
 from rlctl.replaying.drawable import make_drawable
@@ -174,21 +174,23 @@ class TaskSource(_NewEpisodes):
         self._baseline = load_baseline(policy)
         self.name = self.described = self._baseline.title
         self._other_clients = find_clients()
-        self._player: Player | None = None
+        self._actor: Actor | None = None
         self._world: WorldWatch | None = None
         super().__init__(request, _choose_sim(spec, request), self._baseline)
 
     def begin(self, env: Env, seed: int) -> Choose:
         """Return the function that chooses the actions of an episode."""
         self._env, self._seed = env, seed
-        player = self._player = self._player or self._baseline.make_player(env)
+        actor = self._actor = self._actor or self._baseline.make_actor(env)
+        actor.begin(Rows.one(seed))
         longest = _LONGEST if describe(env).max_steps is None else None
 
         def choose(observation: object, step: int) -> object:
             if step == longest:
                 print_warning(f"seed {seed}: cut after {_LONGEST:,} steps, because no time limit is known")
                 return None
-            return player.act(copy_observation(observation, env.observation_space), seed, step)[1]
+            rows = as_rows(copy_observation(observation, env.observation_space))
+            return actor.act(rows, Rows.one(seed, step))[1][0]
 
         return choose
 
@@ -204,8 +206,8 @@ class TaskSource(_NewEpisodes):
     def report(self, episodes: list[ReplayedEpisode]) -> ReplayResult:
         """Return the result, with what was seen of the world."""
         result = super().report(episodes)
-        if self._player is not None:
-            self._player.close()
+        if self._actor is not None:
+            self._actor.close()
         if self._world is None:
             if episodes:
                 output.print_notes(["bodies and joints are unknown: it simulates with neither PyBullet nor MuJoCo"])

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from rlctl.policy.numpy_policy import load_policy
+from rlctl.policy.load import load_policy
 from rlctl.run.directory import RunDirectory
 from rlctl.storage import files
 

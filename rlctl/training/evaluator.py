@@ -13,8 +13,8 @@ from rlctl.evaluation.episode_statistics import mean_return, success_rate
 from rlctl.play.collect import Episode, play_episodes
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers
+from rlctl.policy.actor import Exploration
 from rlctl.policy.file import PolicyFile, PolicyInfo, Score
-from rlctl.policy.players.player import Exploration
 from rlctl.run.episode import STEP_LABEL, EpisodeInfo, RecordedEpisode, save_episode
 from rlctl.runs.diagnosis.findings import Grade, diagnose
 from rlctl.runs.summary import is_better, read_table

@@ -14,8 +14,8 @@ from stable_baselines3.her import HerReplayBuffer
 from rlctl.environments.dict_spaces import join, split_space
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RecipeError
+from rlctl.policy.actor import Exploration
 from rlctl.policy.file import DETERMINISTIC
-from rlctl.policy.players.player import Exploration
 from rlctl.recipe.hindsight import find_problem
 from rlctl.recipe.recipe import Hindsight, Recipe
 from rlctl.training.rollouts import Check, Rollouts, WorkerVecEnv, to_network_layout

@@ -11,7 +11,7 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 
 from rlctl.environments.dict_spaces import join, split, split_space
 from rlctl.play.shared_arrays import SegmentArrays
-from rlctl.policy.players.player import Exploration
+from rlctl.policy.actor import Exploration
 from rlctl.training.rollouts import Check, Rollouts, Statistics, to_network_layout
 from rlctl.training.updates.ppo import PpoUpdate
 

@@ -13,10 +13,11 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from rlctl.environments.dict_spaces import SINGLE, join, split, split_space
 from rlctl.errors import RecipeError, describe_exception, short_repr
 from rlctl.exporting.layers import OPSET
+from rlctl.policy.actor import Rows, as_rows
 from rlctl.policy.file import ACTOR_CRITIC, GRAPH, PolicyFile, Tensors
-from rlctl.policy.numpy_policy import PolicyPlayer
+from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.onnx_policy import OWN_INPUT, OWN_OUTPUT
-from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy, is_own
+from rlctl.policy.torch_policy import ACTIVATIONS, TorchActor, is_own
 from rlctl.training.privileged import has_privileged_critic
 
 _COMPARED = 10  # number of random observations
@@ -42,10 +43,10 @@ def check_policy_class(model: Any, algo: str, policy: PolicyFile) -> None:
             for method in ("_get_action_dist_from_latent", "get_action_dist_params"):
                 if (own := getattr(owner, method, None)) is not None and is_own(own):
                     raise ValueError(f"it overrides {method}")
-        reference, player = TorchPolicy(policy, network), PolicyPlayer(policy.actor_only())
+        reference, actor = TorchActor(policy, network), NumpyActor(policy.actor_only())
         for step in range(_COMPARED):
-            sample = space.sample()
-            expected, action = reference.predict(sample), player.act(sample, 0, step)[1]
+            sample, row = as_rows(space.sample()), Rows.one(step=step)
+            expected, action = reference.act(sample, row)[1][0], actor.act(sample, row)[1][0]
             if not np.allclose(action, expected, rtol=1e-4, atol=1e-5):
                 raise ValueError(f"it chooses the action {short_repr(expected)}, its graph {short_repr(action)}")
     except Exception as error:  # any exception from the user's class

@@ -20,8 +20,8 @@ from rlctl.play.messages import EpisodeResult, LevelRule, Play
 from rlctl.play.seeds import Stream, episode_seed
 from rlctl.play.shared_arrays import SegmentArrays
 from rlctl.play.workers import Workers
+from rlctl.policy.actor import Exploration
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import Recipe
 from rlctl.task.mirror import Mirror
 from rlctl.training.own_networks import write_graph

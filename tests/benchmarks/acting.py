@@ -20,8 +20,8 @@ from rlctl.play.collect import play_episodes
 from rlctl.play.messages import Play
 from rlctl.play.seeds import Stream, episode_seed
 from rlctl.play.workers import Workers, available_cores
+from rlctl.policy.actor import Exploration
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.policy.players.player import Exploration
 from tests.benchmarks.row import Row, side_by_side
 
 MANY = 64

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.numpy_policy import NumpyPolicy
+from rlctl.policy.numpy_actor import NumpyActor
+from rlctl.policy.policy import Policy
 from rlctl.policy.shipped import find_shipped_policy
 from rlctl.task.events import EventSettings, delay
 
@@ -91,7 +92,7 @@ class Robot:
         self.info = self.policy_file.info
         self.spec = dataclasses.replace(self.info.derive_spec(), **({"sim": sim} if sim else {}))
         self.env: Any = self.spec.make()
-        self.policy = NumpyPolicy(self.policy_file)
+        self.policy = Policy(NumpyActor(self.policy_file))
         self.sizes = dict(self.info.env.observation_sizes)
         self.events = {
             name: {} for name, event in self.env.unwrapped.task.events.items() if event.function is not delay

@@ -33,7 +33,7 @@ def onnx_runtime(repeat: int) -> Row:
     def theirs() -> float:
         return _seconds(lambda: sb3.network.predict(sb3.normalize(observation), deterministic=True))
 
-    bare = side_by_side(lambda: _seconds(lambda: exported.session.run(["action"], batch)), theirs, 3 * repeat)
+    bare = side_by_side(lambda: _seconds(lambda: exported.actor.session.run(["action"], batch)), theirs, 3 * repeat)
     pair = side_by_side(lambda: _seconds(lambda: exported.predict(observation)), theirs, 3 * repeat)
     faster = 1 / pair.ratio
     return Row(
@@ -50,7 +50,8 @@ def onnx_runtime(repeat: int) -> Row:
 def c_function(repeat: int) -> Row:
     """Time C for one observation, called through ctypes, beside onnxruntime's own `session.run`; both from Python."""
     from rlctl.exporting.c_source import build_library, find_compiler, write_c
-    from rlctl.policy.c_policy import CPolicy
+    from rlctl.policy.c_policy import CActor
+    from rlctl.policy.policy import Policy
 
     run = short_run()
     rlctl_command("export", str(run), "--onnx")
@@ -61,15 +62,16 @@ def c_function(repeat: int) -> Row:
     assert compiler is not None, "no C compiler"
     code = write_c(policy, "policy")
     with tempfile.TemporaryDirectory() as folder:
-        policy = CPolicy.load(build_library(code, info, Path(folder), compiler))
+        actor = CActor.load(build_library(code, info, Path(folder), compiler))
+        policy = Policy(actor)
     observation = np.zeros(exported.observation_space.shape, np.float32)
     batch = {"obs": observation[None]}
 
     def theirs() -> float:
-        return _seconds(lambda: exported.session.run(["action"], batch))
+        return _seconds(lambda: exported.actor.session.run(["action"], batch))
 
     pair = side_by_side(lambda: _seconds(lambda: policy.predict(observation)), theirs, 3 * repeat)
-    alone = side_by_side(lambda: _seconds(lambda: policy.repeat(observation, 10)) / 10, theirs, 3 * repeat)
+    alone = side_by_side(lambda: _seconds(lambda: actor.repeat(observation, 10)) / 10, theirs, 3 * repeat)
     faster = 1 / alone.ratio
     return Row(
         "C, one observation",
@@ -83,11 +85,11 @@ def c_function(repeat: int) -> Row:
 
 
 def _torch_policy(run: Path) -> Any:
-    from rlctl.policy.torch_policy import TorchPolicy, pin_threads
+    from rlctl.policy.torch_policy import TorchActor, pin_threads
 
     # The best case for so small a network.
     pin_threads()
-    return TorchPolicy.load(run / "policies" / "best.safetensors")
+    return TorchActor.load(run / "policies" / "best.safetensors")
 
 
 def _seconds(call: Callable[[], object]) -> float:

@@ -15,7 +15,7 @@ import rlctl
 from rlctl.environments.spec import EnvSpec
 from rlctl.play.messages import Play
 from rlctl.play.workers import Workers, available_cores
-from rlctl.policy.players.player import Exploration
+from rlctl.policy.actor import Exploration
 from rlctl.task.model_files import MODELS
 from rlctl.task.pybullet.library import pybullet
 from tests.benchmarks.acting import make_policy

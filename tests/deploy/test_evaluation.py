@@ -13,12 +13,13 @@ from gymnasium import spaces
 
 from rlctl import output
 from rlctl.deploy.server import messages
-from rlctl.deploy.server.client import PolicyClient, RemotePlayer
+from rlctl.deploy.server.client import PolicyClient, RemoteActor
 from rlctl.errors import PolicyError, RecipeError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.report import as_json, count_interventions, show
 from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.self_test import run_self_test
+from rlctl.policy.actor import Rows
 from rlctl.policy.shipped import PRETRAINED
 from tests.deploy.server.serving import RunningServer
 
@@ -110,10 +111,11 @@ def test_a_server_that_is_not_there_or_of_another_task(reach_server, capfd):
 @pytest.mark.parametrize("actions", [None, 0.5, [], [["left", "right"]], [[0.1], [0.1, 0.2]], [[0.1, 0.2, 0.3]]])
 def test_a_server_that_is_not_ours_and_gives_no_action(actions):
     with serve_answer({"env": {}, "control_dt": "10 ms"}, {"actions": actions}) as url:
-        player = RemotePlayer(url, spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,)))
+        actor, row = RemoteActor(url, spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,))), Rows.one()
+        actor.begin(row)
         with pytest.raises(PolicyError, match=r"actions are .*, expected a list of one action, shape \(2,\)$"):
-            player.act(np.zeros(3), 0, 0)
-        player.close()
+            actor.act(np.zeros((1, 3)), row)
+        actor.close()
 
 
 @contextlib.contextmanager

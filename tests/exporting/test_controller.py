@@ -14,9 +14,10 @@ from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.graph import build_graph
 from rlctl.exporting.controller.players import OnnxController
 from rlctl.exporting.controller.source import ControllerSource
-from rlctl.policy.numpy_policy import NumpyPolicy
-from rlctl.policy.onnx_policy import OnnxPolicy, encode
-from rlctl.policy.torch_policy import TorchPolicy
+from rlctl.policy.numpy_actor import NumpyActor
+from rlctl.policy.onnx_policy import OnnxActor, encode
+from rlctl.policy.policy import Policy
+from rlctl.policy.torch_policy import TorchActor
 from rlctl.task import Joints, terms
 from rlctl.task.history import History
 from rlctl.task.rotations import normalize
@@ -101,7 +102,7 @@ def test_terms_and_histories(history, start, tmp_path):
     source, in_c = build_controller(policy, tmp_path)
     onnx = OnnxController(encode(build_graph(policy)))
     assert [quantity.name for quantity in source.layout.quantities] == ["orientation", "angles", "hand", "goal", "int"]
-    assert play(NumpyPolicy(policy), [in_c, onnx], env) < 1e-5
+    assert play(Policy(NumpyActor(policy)), [in_c, onnx], env) < 1e-5
     assert in_c.may_send
 
 
@@ -109,9 +110,10 @@ def test_terms_and_histories(history, start, tmp_path):
 def test_a_stack_of_frames_and_an_lstm(small, train, write, tmp_path):
     spec = dataclasses.replace(small("vector", "box"), frame_stack=2)
     path = write(train("recurrent_ppo", spec, steps=0, policy_kwargs={"lstm_hidden_size": 8}), "recurrent_ppo", spec)
-    policy = TorchPolicy.load(path)
-    _, in_c = build_controller(policy.file, tmp_path)
-    controllers = [in_c, OnnxController(encode(build_graph(policy.file)))]
+    actor = TorchActor.load(path)
+    policy = Policy(actor)
+    _, in_c = build_controller(actor.file, tmp_path)
+    controllers = [in_c, OnnxController(encode(build_graph(actor.file)))]
     rng = np.random.default_rng(0)
     for _ in range(2):
         policy.reset()
@@ -205,7 +207,7 @@ def test_the_last_action_is_the_limited_one(tmp_path):
     )
     policy = make_policy(env, seed=1)
     source, controller = build_controller(policy, tmp_path, Limits.model_validate({"limits": {"all": {"rate": 1.0}}}))
-    reference, last = NumpyPolicy(policy), np.zeros(1, np.float32)
+    reference, last = Policy(NumpyActor(policy)), np.zeros(1, np.float32)
     for step in range(5):
         place = np.array([5.0 * step, -3.0], np.float32)
         wanted = reference.predict(np.concatenate([place, last]))
@@ -226,7 +228,7 @@ def test_a_quantity_with_the_name_of_an_output():
     assert {entry.key: entry.value for entry in model.metadata_props}["input_names"] == "positions,target_input"
     inputs = {"positions": np.ones(2), "target": np.zeros(3)}
     action, _ = OnnxController(encode(model)).step(inputs)
-    assert action == pytest.approx(NumpyPolicy(policy).predict(np.array([1, 1, 0, 0, 0], np.float32)), abs=1e-6)
+    assert action == pytest.approx(Policy(NumpyActor(policy)).predict(np.array([1, 1, 0, 0, 0], np.float32)), abs=1e-6)
 
 
 def test_the_header_and_the_metadata_name_everything(tmp_path):
@@ -251,7 +253,7 @@ def test_the_header_and_the_metadata_name_everything(tmp_path):
     path = tmp_path / "controller.onnx"
     path.write_bytes(encode(model))
     with pytest.raises(ArtifactError, match="a controller takes what a robot measures; give the policy"):
-        OnnxPolicy.load(path)
+        OnnxActor.load(path)
 
 
 def test_what_cannot_be_a_controller():

@@ -16,8 +16,9 @@ from rlctl.exporting.verify import Comparison, compare_episodes, verify
 from rlctl.play.collect import Episode
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.workers import Workers
-from rlctl.policy.onnx_policy import OnnxPolicy
-from rlctl.policy.torch_policy import TorchPolicy
+from rlctl.policy.actor import Rows
+from rlctl.policy.onnx_policy import OnnxActor
+from rlctl.policy.torch_policy import TorchActor
 
 
 def export(path, output=None, formats=("onnx",)):
@@ -163,7 +164,7 @@ def test_other_weights_are_noticed(small, train, write, tmp_path):
     model.policy.action_net.bias.data[0] += 0.001
     exported = export(write(model, "ppo", small(), name="other")).path
     with Workers(small(), 10) as workers:
-        agreement, _ = verify(TorchPolicy.load(original), OnnxPolicy.load(exported), exported, workers)
+        agreement, _ = verify(TorchActor.load(original), OnnxActor.load(exported), exported, workers)
     assert not agreement.agrees
     assert agreement.max_difference == pytest.approx(0.001, rel=0.01)
     assert agreement.beyond_limit > 1000
@@ -175,7 +176,7 @@ def logits_policy(train, write, small, action, logits):
     model = train("ppo", spec, steps=0)
     model.policy.action_net.weight.data.zero_()
     model.policy.action_net.bias.data[:] = model.policy.action_net.bias.data.new_tensor(logits)
-    return TorchPolicy.load(write(model, "ppo", spec))
+    return TorchActor.load(write(model, "ppo", spec))
 
 
 @pytest.mark.parametrize(
@@ -192,7 +193,7 @@ def logits_policy(train, write, small, action, logits):
 def test_only_near_ties_may_be_chosen_differently(action, logits, other, near_tie, small, train, write):
     policy = logits_policy(train, write, small, action, logits)
     comparison = Comparison(policy, policy)
-    expected = policy.act(np.zeros((1, 3), np.float32))
+    expected = policy.act(np.zeros((1, 3), np.float32), Rows.one())[1]
     comparison.add(expected, np.array(other))
     seen = comparison.agreement
     assert (seen.near_ties, seen.beyond_limit) == ((1, 0) if near_tie else (0, 1))
@@ -200,7 +201,7 @@ def test_only_near_ties_may_be_chosen_differently(action, logits, other, near_ti
 
 
 def test_not_a_number_is_beyond_the_limit(small, train, write):
-    policy = TorchPolicy.load(write(train("ppo", small(), steps=0), "ppo", small()))
+    policy = TorchActor.load(write(train("ppo", small(), steps=0), "ppo", small()))
     comparison = Comparison(policy, policy)
     comparison.add(np.zeros((2, 2), np.float32), np.array([[np.nan, 0.0], [0.0, 0.0]], np.float32))
     assert comparison.agreement.beyond_limit == 1

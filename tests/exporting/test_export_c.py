@@ -13,9 +13,10 @@ from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.exporting.c_source import FLAGS, build_library, find_compiler, write_c
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.request import ExportRequest
-from rlctl.policy.c_policy import CPolicy
+from rlctl.policy.c_policy import CActor
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.torch_policy import ACTIVATIONS, TorchPolicy
+from rlctl.policy.policy import Policy
+from rlctl.policy.torch_policy import ACTIVATIONS, TorchActor
 from rlctl.task.joints import Joints
 from tests.exporting.test_export_graph import random_observations
 
@@ -34,14 +35,14 @@ def compiled(tmp_path):
 
     def compile_policy(path):
         info, code = write_source(path)
-        return CPolicy.load(build_library(code, info, tmp_path, [*find_compiler(), "-Werror"]))
+        return Policy(CActor.load(build_library(code, info, tmp_path, [*find_compiler(), "-Werror"])))
 
     return compile_policy
 
 
 def difference(path, policy):
     """Largest difference between the policy file and C over an episode of random observations."""
-    torch_policy = TorchPolicy.load(path)
+    torch_policy = Policy(TorchActor.load(path))
     space = torch_policy.observation_space
     stacked = torch_policy.info.spec.frame_stack
     observations = random_observations(space, STEPS)

@@ -11,7 +11,7 @@ from rlctl.environments.info import describe
 from rlctl.errors import UsageError
 from rlctl.exporting.actor import build
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.onnx_policy import OnnxPolicy, encode
+from rlctl.policy.onnx_policy import OnnxActor, encode
 from rlctl.policy.torch_policy import ACTIVATIONS
 
 ALGORITHMS = ["ppo", "a2c", "sac", "td3", "ddpg", "tqc", "crossq", "recurrent_ppo", "dqn"]
@@ -209,7 +209,7 @@ def test_file_says_what_it_is(train, tmp_path):
     assert "stable-baselines3 " in metadata["versions"]
     path = tmp_path / "policy.onnx"
     path.write_bytes(encode(proto))
-    assert OnnxPolicy.load(path).info == info
+    assert OnnxActor.load(path).info == info
 
 
 def test_batch_is_the_only_free_dimension(small, train, write):

@@ -10,8 +10,9 @@ from rlctl.exporting.controller.graph import build_graph
 from rlctl.exporting.controller.players import CController, MappedController, OnnxController, compile_controller
 from rlctl.exporting.controller.program_mapping import read_mapping
 from rlctl.exporting.controller.source import ControllerSource
-from rlctl.policy.numpy_policy import NumpyPolicy
+from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.onnx_policy import encode
+from rlctl.policy.policy import Policy
 from rlctl.task import Joints, terms
 from tests.exporting.controllers import make_arm, make_policy
 
@@ -55,7 +56,7 @@ def test_a_controller_maps_its_inputs(policy, mapping, tmp_path, form):
         controller = CController(source.layout, compile_controller(code, tmp_path, find_compiler()), has_target=False)
     right = {"positions": np.array([0.1, 0.2]), "goal": np.array([10.0, -30.0, 23.0])}
     wrong = {"positions": right["positions"], "goal": np.array([10.0, 20.0, 30.0])}
-    expected = NumpyPolicy(policy).predict(np.concatenate([*right.values()]).astype(np.float32))
+    expected = Policy(NumpyActor(policy)).predict(np.concatenate([*right.values()]).astype(np.float32))
     assert np.ravel(controller.step(wrong)[0]) == pytest.approx(expected, abs=1e-5)
     controller.begin()
     assert np.ravel(MappedController(controller, mapping).step(right)[0]) == pytest.approx(expected, abs=1e-5)

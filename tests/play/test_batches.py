@@ -10,9 +10,9 @@ from rlctl.errors import DivergedError, EpisodeFailed, PolicyError
 from rlctl.play.collect import play_episodes
 from rlctl.play.messages import Play
 from rlctl.play.seeds import Stream, episode_seed
+from rlctl.policy.actor import Exploration, Rows, as_rows
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.numpy_policy import PolicyPlayer
-from rlctl.policy.players.player import Exploration
+from rlctl.policy.numpy_actor import NumpyActor
 from tests.play.policies import linear
 
 pytest.importorskip("mujoco")
@@ -64,15 +64,15 @@ def test_equal_however_worlds_and_steps_are_spread(spec, start, n_workers):
 def test_workers_play_as_one_world_does(spec, start):
     workers = start(spec, 4, n_workers=1)
     played, ended = play(workers, 1, 40)
-    env, player = spec.make(), PolicyPlayer(linear(workers.info, WEIGHT, log_std=-1.0))
-    player.explore(SAMPLES)
+    env, actor = spec.make(), NumpyActor(linear(workers.info, WEIGHT, log_std=-1.0))
+    actor.explore(SAMPLES)
     results = [(row, result) for row, result in ended if result.env == 1]
     episode, step, total = 0, 0, 0.0
     observation, _ = env.reset(seed=seed(1, 0))
     for row in range(40):
         np.testing.assert_array_equal(played["observation"][1, row], observation)
-        stored, _ = player.act(observation, seed(1, episode), step)
-        np.testing.assert_allclose(played["stored"][1, row], stored, atol=1e-5)
+        (stored,), _ = actor.act(as_rows(observation), Rows.one(seed(1, episode), step))
+        np.testing.assert_array_equal(played["stored"][1, row], stored)
         observation, reward, terminated, truncated, info = env.step(played["action"][1, row])
         assert played["reward"][1, row] == reward
         step, total = step + 1, total + reward

@@ -7,7 +7,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import DivergedError, EpisodeFailed, TaskError
 from rlctl.play import collect
 from rlctl.play.collect import play_episodes
-from rlctl.policy.players.player import Exploration
+from rlctl.policy.actor import Exploration
 from tests.play.policies import linear
 
 pytestmark = pytest.mark.usefixtures("no_child_left")

@@ -6,8 +6,8 @@ import pytest
 from rlctl.errors import EpisodeFailed
 from rlctl.play.messages import Play
 from rlctl.play.seeds import Stream, episode_seed
-from rlctl.policy.numpy_policy import PolicyPlayer
-from rlctl.policy.players.player import Exploration
+from rlctl.policy.actor import Exploration, Rows, as_rows
+from rlctl.policy.numpy_actor import NumpyActor
 from tests.play.policies import linear
 
 pytestmark = pytest.mark.usefixtures("no_child_left")
@@ -53,14 +53,14 @@ def test_equal_however_environments_and_steps_are_spread(spec, start, n_workers)
 def test_workers_play_as_this_process_does(spec, start):
     workers = start(spec("Walk"), 2)
     played, ended = play(workers, 1, 30)
-    env, player = spec("Walk").make(), PolicyPlayer(linear(workers.info, WEIGHT, log_std=-1.0))
-    player.exploration = SAMPLES
+    env, actor = spec("Walk").make(), NumpyActor(linear(workers.info, WEIGHT, log_std=-1.0))
+    actor.explore(SAMPLES)
     results = [(row, each) for row, each in ended if each.env == 1]
     episode, step, total = 0, 0, 0.0
     observation, _ = env.reset(seed=seed(1, 0))
     for row in range(30):
         np.testing.assert_array_equal(played["observation"][1, row], observation)
-        stored, action = player.act(observation, seed(1, episode), step)
+        (stored,), (action,) = actor.act(as_rows(observation), Rows.one(seed(1, episode), step))
         np.testing.assert_array_equal(played["stored"][1, row], stored)
         np.testing.assert_array_equal(played["action"][1, row], np.clip(stored, -1, 1))
         observation, reward, done, _, info = env.step(action)

@@ -11,7 +11,8 @@ from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyInfo
-from rlctl.policy.onnx_policy import OnnxPolicy, encode
+from rlctl.policy.onnx_policy import OnnxActor, encode
+from rlctl.policy.policy import Policy
 
 BOX = {"type": "Box", "low": "-1.0", "high": "1.0", "shape": [4], "dtype": "float32"}
 ENV = EnvInfo(observation_space=BOX, action_space=BOX)
@@ -45,7 +46,7 @@ def constant(name, values):
 
 def refused(path):
     with pytest.raises(ArtifactError) as caught:
-        OnnxPolicy.load(path)
+        OnnxActor.load(path)
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
     assert len(message.splitlines()) == 1
@@ -53,7 +54,7 @@ def refused(path):
 
 
 def test_a_graph_as_it_should_be(write):
-    policy = OnnxPolicy.load(write([node("Tanh", "obs")]))
+    policy = Policy(OnnxActor.load(write([node("Tanh", "obs")])))
     assert policy.predict(np.zeros(4)).tolist() == [0.0] * 4
 
 
@@ -171,7 +172,7 @@ def test_any_cut_and_any_flipped_byte(write):
             content[place] ^= 1 << rng.integers(8)
         path.write_bytes(content)
         try:
-            OnnxPolicy.load(path)
+            OnnxActor.load(path)
         except ArtifactError as error:
             lines.append(str(error))
     assert len(lines) > 75

@@ -13,9 +13,9 @@ from rlctl import load_policy
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError
-from rlctl.policy.c_policy import CPolicy
+from rlctl.policy.c_policy import CActor
 from rlctl.policy.file import PolicyFile, PolicyInfo, compute_digest
-from rlctl.policy.torch_policy import TorchPolicy, build_network
+from rlctl.policy.torch_policy import TorchActor, build_network
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
 
@@ -93,7 +93,7 @@ BOX_DATA = {"type": "Box", "low": "-1.0", "high": "1.0", "dtype": "float32"}
     ],
 )
 def test_a_network_of_another_size(kwargs, message, changed, described):
-    assert message in refused(changed({**described, "policy_kwargs": kwargs}), TorchPolicy.load)
+    assert message in refused(changed({**described, "policy_kwargs": kwargs}), TorchActor.load)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_tensors_that_cannot_be(tensors, message, changed):
 def test_a_tensor_of_no_network(changed):
     path = changed(**{"policy/more": np.zeros(3, np.float32)})
     assert "its tensors do not fit its description: tensors missing: [], unknown: ['more']" in refused(
-        path, TorchPolicy.load
+        path, TorchActor.load
     )
     assert load_policy(path).predict(np.zeros(5)).shape == (2,)
 
@@ -219,4 +219,4 @@ def test_a_compiled_policy_with_a_wrong_description(tmp_path):
     description = tmp_path / "policy.json"
     description.write_text('{"format": 1, "algo": 3}')
     with pytest.raises(ArtifactError, match=r"policy.json: damaged: algo: expected text, got 3$"):
-        CPolicy.load(tmp_path / "policy.so")
+        CActor.load(tmp_path / "policy.so")

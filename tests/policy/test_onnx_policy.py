@@ -15,7 +15,7 @@ from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.exporting.actor import build
-from rlctl.policy.onnx_policy import OnnxPolicy, encode
+from rlctl.policy.onnx_policy import OnnxActor, encode
 from rlctl.policy.torch_policy import ALGORITHMS, policy_name
 from rlctl.training.snapshot import pack
 
@@ -50,8 +50,8 @@ def observations():
 
 def test_one_observation_gets_the_action_that_it_gets_beside_others(pendulum, observations):
     policy = load_policy(pendulum)
-    assert isinstance(policy, OnnxPolicy)
-    actions = policy.start_episodes(observations)
+    assert isinstance(policy.actor, OnnxActor)
+    actions = policy.actor.act_together(observations)
     assert actions.shape == (50, 1)
     assert actions.dtype == np.float32
     alone = np.stack([policy.predict(observation) for observation in observations])
@@ -73,7 +73,7 @@ def test_recurrent_policy_remembers_until_reset(recurrent, observations):
 def test_several_recurrent_episodes_begin_without_a_state(recurrent, observations):
     policy = load_policy(recurrent)
     policy.predict(observations[0])
-    actions = policy.start_episodes(observations)
+    actions = policy.actor.act_together(observations)
     policy.reset()
     assert np.abs(policy.predict(observations[5]) - actions[5]).max() <= 1e-6
 
@@ -91,7 +91,7 @@ def test_sampling_is_refused(pendulum):
 
 def test_missing_file(tmp_path):
     with pytest.raises(ArtifactError, match=r"none\.onnx: no such file"):
-        OnnxPolicy.load(tmp_path / "none.onnx")
+        OnnxActor.load(tmp_path / "none.onnx")
 
 
 @pytest.mark.parametrize("content", ["cut", "text", "empty"])
@@ -99,7 +99,7 @@ def test_damaged_file(content, pendulum, tmp_path):
     path = tmp_path / "policy.onnx"
     path.write_bytes({"cut": pendulum.read_bytes()[:500], "text": b"not a graph", "empty": b""}[content])
     with pytest.raises(ArtifactError, match=r"policy\.onnx: damaged, or not an ONNX file") as raised:
-        OnnxPolicy.load(path)
+        OnnxActor.load(path)
     assert raised.value.exit_code == 5
 
 
@@ -109,7 +109,7 @@ def test_foreign_file(tmp_path):
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     onnx.save(model, tmp_path / "foreign.onnx")
     with pytest.raises(ArtifactError, match=r"foreign\.onnx: an ONNX file of another program: .* rlctl eval TASK"):
-        OnnxPolicy.load(tmp_path / "foreign.onnx")
+        OnnxActor.load(tmp_path / "foreign.onnx")
 
 
 def with_description(path, target, change):
@@ -125,7 +125,7 @@ def with_description(path, target, change):
 def test_file_of_a_newer_format(pendulum, tmp_path):
     path = with_description(pendulum, tmp_path / "new.onnx", lambda description: description.update(format=99))
     with pytest.raises(ArtifactError, match=r"new\.onnx: policy format 99 is newer .* upgrade rlctl"):
-        OnnxPolicy.load(path)
+        OnnxActor.load(path)
 
 
 def test_description_of_another_graph(pendulum, tmp_path):
@@ -134,7 +134,7 @@ def test_description_of_another_graph(pendulum, tmp_path):
 
     path = with_description(pendulum, tmp_path / "other.onnx", change)
     with pytest.raises(ArtifactError, match=r"its graph does not fit its description: no input 'obs' of shape"):
-        OnnxPolicy.load(path)
+        OnnxActor.load(path)
 
 
 def test_neither_torch_nor_sb3_is_imported(pendulum):

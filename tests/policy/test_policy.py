@@ -16,7 +16,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile, PolicyInfo, compute_digest
 from rlctl.policy.network import Network
-from rlctl.policy.torch_policy import TorchPolicy, build_network, pin_threads
+from rlctl.policy.torch_policy import TorchActor, build_network, pin_threads
 from rlctl.run.directory import RunDirectory
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
@@ -113,7 +113,7 @@ def test_normalisation_by_hand(path):
     assert expected[4] == 10.0
     (normalize, _) = Network(PolicyFile.read(path)).parts[""]
     np.testing.assert_array_equal(normalize(observation), expected.astype(np.float32))
-    np.testing.assert_array_equal(TorchPolicy.load(path).normalize(observation), expected.astype(np.float32))
+    np.testing.assert_array_equal(TorchActor.load(path).normalize(observation), expected.astype(np.float32))
 
 
 def rewrite(path, metadata):
@@ -181,7 +181,7 @@ def test_a_description_that_does_not_fit(path, changes, message):
     info = PolicyFile.read(path).info
     rewrite(path, {"rlctl": info.model_copy(update=changes).model_dump_json()})
     with pytest.raises(ArtifactError) as caught:
-        TorchPolicy.load(path)
+        TorchActor.load(path)
     assert message in str(caught.value)
 
 
@@ -245,7 +245,7 @@ def test_an_actor_alone_acts_as_the_whole_policy(tmp_path, algo):
     del actor[min(name for name in actor if name.endswith(".weight"))]
     PolicyFile(info, actor).write(tmp_path / "part.safetensors")
     with pytest.raises(ArtifactError, match="its tensors do not fit its description: tensors missing: "):
-        TorchPolicy.load(tmp_path / "part.safetensors")
+        TorchActor.load(tmp_path / "part.safetensors")
 
 
 def test_the_folder_of_a_run_is_its_best_policy(path, tmp_path):

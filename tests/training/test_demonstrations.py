@@ -13,7 +13,7 @@ from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.numpy_policy import load_policy
+from rlctl.policy.load import load_policy
 from rlctl.run.directory import RunDirectory
 from rlctl.run.episode import load_episode
 from rlctl.run.train_request import TrainRequest

@@ -13,7 +13,7 @@ from rlctl.errors import ArtifactError, RecipeError
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.request import ExportRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.policy.numpy_policy import load_policy
+from rlctl.policy.load import load_policy
 from rlctl.policy.torch_policy import build_network
 from rlctl.recipe.recipe import merge
 from rlctl.run.directory import RunDirectory

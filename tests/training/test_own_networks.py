@@ -18,9 +18,11 @@ from rlctl.exporting.export import export_policy
 from rlctl.exporting.request import ExportRequest
 from rlctl.policy import own_modules
 from rlctl.policy.file import GRAPH, PolicyFile
-from rlctl.policy.numpy_policy import PolicyPlayer, load_policy
-from rlctl.policy.onnx_policy import OnnxPolicy, encode
-from rlctl.policy.torch_policy import ALGORITHMS, TorchPolicy, policy_name
+from rlctl.policy.load import load_policy
+from rlctl.policy.numpy_actor import NumpyActor
+from rlctl.policy.onnx_policy import OnnxActor, encode
+from rlctl.policy.policy import Policy
+from rlctl.policy.torch_policy import ALGORITHMS, TorchActor, policy_name
 from rlctl.recipe.recipe import NormalizeSettings, validate
 from rlctl.replaying.replay import ReplayRequest, run_replay
 from rlctl.training.algorithms import wrap_normalize
@@ -61,16 +63,16 @@ def test_it_acts_and_exports_as_torch_does(algo, observation, action, own, tmp_p
     model.policy.set_training_mode(False)
     policy = pack(model, algo, spec, describe(spec.make()))
     policy.write(tmp_path / "policy.safetensors")
-    torch_policy = TorchPolicy.load(tmp_path / "policy.safetensors")
-    player = PolicyPlayer(policy.actor_only())
+    torch_policy = Policy(TorchActor.load(tmp_path / "policy.safetensors"))
+    acting = Policy(NumpyActor(policy.actor_only()))
     (tmp_path / "policy.onnx").write_bytes(encode(build(policy)))
-    exported = OnnxPolicy.load(tmp_path / "policy.onnx")
+    exported = Policy(OnnxActor.load(tmp_path / "policy.onnx"))
     space = torch_policy.observation_space
     space.seed(0)
-    for step in range(5):
+    for _ in range(5):
         sample = space.sample()
         expected = torch_policy.predict(sample)
-        np.testing.assert_allclose(player.act(sample, 0, step)[1], expected, atol=2e-6)
+        np.testing.assert_allclose(acting.predict(sample), expected, atol=2e-6)
         np.testing.assert_allclose(exported.predict(sample), expected, atol=2e-6)
     with pytest.raises(UsageError, match=r"^export --c: the [a-z_]+ (Gated|Wave|PReLU) cannot be written as C; use"):
         write_c(policy, "policy")
@@ -119,15 +121,15 @@ def test_a_policy_file_alone_imports_nothing(trained, tmp_path, monkeypatch):
     policy.with_info(policy_kwargs={**policy.info.policy_kwargs, "features_extractor_class": own}).write(file)
     assert np.isfinite(load_policy(file).predict(np.zeros(load_policy(file).observation_space.shape))).all()
     with pytest.raises(ArtifactError, match=r"nets\.py:Gated; a policy file alone never imports it: give the run"):
-        TorchPolicy.load(file)
+        TorchActor.load(file)
     monkeypatch.setenv(own_modules.VARIABLE, str(nets))
-    TorchPolicy.load(file)
+    TorchActor.load(file)
     nets.write_text(nets.read_text() + "# changed\n")
     with pytest.raises(ArtifactError, match=r"policy\.safetensors: .*which has changed; restore the version of the"):
-        TorchPolicy.load(file)
+        TorchActor.load(file)
     nets.unlink()
     with pytest.raises(ArtifactError, match=r"nets\.py:Gated; that file is missing: restore it"):
-        TorchPolicy.load(file)
+        TorchActor.load(file)
 
 
 def test_a_policy_is_replayed_without_its_module(train, tmp_path):

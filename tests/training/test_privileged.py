@@ -14,7 +14,7 @@ from rlctl.play.messages import Play
 from rlctl.play.shared_arrays import CRITIC
 from rlctl.play.workers import Workers
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.numpy_policy import load_policy
+from rlctl.policy.load import load_policy
 from rlctl.recipe.recipe import merge
 from rlctl.task.privileged import CriticSight
 from tests.training.comparing import assert_same_run

@@ -9,7 +9,7 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.play.workers import Workers
-from rlctl.policy.players.player import Exploration
+from rlctl.policy.actor import Exploration
 from rlctl.run.directory import RunDirectory
 from rlctl.training import display
 from rlctl.training.checkpoint import environment_tensors

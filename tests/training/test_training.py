@@ -8,8 +8,9 @@ import pytest
 
 from rlctl import load_policy
 from rlctl.errors import ArtifactError, DivergedError, TaskError, UsageError
+from rlctl.policy.actor import Rows
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.numpy_policy import PolicyPlayer
+from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
 from rlctl.run.directory import RunDirectory
@@ -258,8 +259,9 @@ def test_live_policy_and_saved_policy_act_the_same(finished):
         pytest.fail(f"the newest episode is of {episode.info.policy}")
     actions = np.stack([policy.predict(observation) for observation in episode.observations[:-1]])
     np.testing.assert_allclose(actions, episode.actions, atol=1e-6)
-    player = PolicyPlayer(PolicyFile.read(finished.run.last_policy))
-    played = [player.act(observation, 0, 0)[1] for observation in episode.observations[:-1]]
+    observations = episode.observations[:-1]
+    actor = NumpyActor(PolicyFile.read(finished.run.last_policy), len(observations))
+    played = actor.act(observations, Rows.first(len(observations)))[1]
     np.testing.assert_array_equal(played, episode.actions)
 
 

@@ -8,7 +8,8 @@ from rlctl.deploy.diagnose.signals import Array, LoggedSignals
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.layers import Activation, Clip, Flatten, Linear, Normalize
 from rlctl.policy.network import Network
-from rlctl.policy.numpy_policy import NumpyPolicy
+from rlctl.policy.numpy_actor import NumpyActor
+from rlctl.policy.policy import Policy
 
 _IN_ROWS = (Linear, Activation, Normalize, Flatten, Clip)
 
@@ -37,7 +38,7 @@ class Actor:
         self._layers = [*network.parts.get("", []), *network.trunk, *network.head]
         self.in_rows = network.own is None and network.lstm is None
         self.in_rows = self.in_rows and all(isinstance(layer, _IN_ROWS) for layer in self._layers)
-        self._policy = None if self.in_rows else NumpyPolicy(policy)
+        self._policy = None if self.in_rows else Policy(NumpyActor(policy))
         self.normalize = next((layer for layer in self._layers if isinstance(layer, Normalize)), None)
 
     def variants(self) -> list[Variant]:

@@ -14,7 +14,7 @@ from rlctl.deploy.controller_observation import ControllerObservation
 from rlctl.deploy.filter.observation import ObservationLayout
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import short_repr
-from rlctl.policy.players.named import ZeroPlayer
+from rlctl.policy.named_actors import ZeroActor
 
 Array = NDArray[Any]
 Parts = Mapping[str, Array]
@@ -32,7 +32,7 @@ class Interface(abc.ABC):
         self.shapes: dict[str, tuple[int, ...]] = self._layout.shapes
         """The shape of each part of what is sent, in its order."""
         self.units = dict(info.observation_units)
-        self._zero, _ = ZeroPlayer(self._space).act(None, 0, 0)
+        self._zero = ZeroActor(self._space).action
 
     @property
     def sizes(self) -> tuple[int, int] | None:

@@ -31,7 +31,7 @@ from rlctl.evaluation.request import Gates
 from rlctl.evaluation.robustness import Outcome
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.seeds import Stream, episode_seeds
-from rlctl.policy.numpy_policy import load_policy
+from rlctl.policy.load import load_policy
 from rlctl.policy.policy import Policy
 from rlctl.policy.shipped import PRETRAINED
 from rlctl.run import lookup

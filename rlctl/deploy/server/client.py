@@ -1,4 +1,4 @@
-"""A client of policy servers, and the player that `rlctl eval TASK --policy ws://...` and the self-test use."""
+"""A client of policy servers, and the actor that `rlctl eval TASK --policy ws://...` and the self-test use."""
 
 import asyncio
 import math
@@ -14,14 +14,14 @@ from rlctl.deploy.server import messages
 from rlctl.deploy.server.request import KEY_VARIABLE
 from rlctl.environments.info import space_from_json
 from rlctl.errors import PolicyError, UsageError, describe_exception, short_repr
-from rlctl.policy.players.player import Player
+from rlctl.policy.actor import Actor, Array, Rows, act_one_by_one
 
 _TIMEOUT_S = 10.0
 _MAX_ANSWER = 16 * 2**20  # [bytes]
 
 
 class PolicyClient:
-    """A connection to a policy server; `act` waits for each answer. Sends the key in `RLCTL_API_KEY`, if it is set.
+    """A connection to a policy server; `ask` waits for each answer. Sends the key in `RLCTL_API_KEY`, if it is set.
 
     Raises `UsageError` if no server answers, `PolicyError` for an invalid answer.
     """
@@ -63,7 +63,7 @@ class PolicyClient:
             raise PolicyError(f"{self.url}: the server sent a {type(content).__name__}, expected a map")
         return content
 
-    def act(self, request: dict[str, Any]) -> dict[str, Any]:
+    def ask(self, request: dict[str, Any]) -> dict[str, Any]:
         """Send an observation by name and return the answer; its `actions` have shape (1, ...)."""
         return self.send(messages.pack(request))
 
@@ -85,48 +85,66 @@ class PolicyClient:
         self._loop.close()
 
 
-class RemotePlayer(Player):
-    """Plays the actions of a policy server; reports round-trip times, late answers, and faults."""
+class RemoteActor(Actor):
+    """Takes the actions of a policy server; reports round-trip times, late answers, and faults.
+
+    Each row has a connection of its own, because the server keeps an episode per connection.
+    """
 
     def __init__(self, url: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
-        self._client = PolicyClient(url)
+        first = PolicyClient(url)
+        self._url, self._spare = url, [first]
+        self._clients: dict[int, PolicyClient] = {}  # by row
+        self._begins: set[int] = set()  # rows whose episode begins with the next request
         self._action_space = action_space
-        self._report: dict[str, Any] = {}
-        env = self._client.metadata.get("env")
+        self._reports: dict[int, dict[str, Any]] = {}
+        env = first.metadata.get("env")
         own = {"observation_space": observation_space, "action_space": action_space}
         if isinstance(env, dict) and any(key in env and space_from_json(env[key]) != own[key] for key in own):
-            self._client.close()
+            first.close()
             raise UsageError(f"{url}: the served policy has other observation or action spaces than this task")
-        dt = self._client.metadata.get("control_dt")
+        dt = first.metadata.get("control_dt")
         self._control_dt = dt if isinstance(dt, int | float) else math.inf
 
-    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Return the server's action twice, to record and to step with. Raises `PolicyError` for an invalid one."""
+    def begin(self, rows: Rows) -> None:
+        """Let the next requests begin episodes."""
+        for row in rows.index.tolist():
+            if row not in self._clients:
+                self._clients[row] = self._spare.pop() if self._spare else PolicyClient(self._url)
+            self._begins.add(row)
+            self._reports[row] = {"round_trips_s": [], "misses": 0, "not_running": 0}
+
+    def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
+        """Return the server's actions, to record and to step with. Raises `PolicyError` for an invalid one."""
+        return act_one_by_one(observations, rows, self._ask)
+
+    def _ask(self, observation: Any, row: int, seed: int, step: int) -> Any:
+        client, report = self._clients[row], self._reports[row]
         request = dict(observation) if isinstance(observation, dict) else {"observation": observation}
-        if step == 0:
+        if row in self._begins:
+            self._begins.remove(row)
             request["reset"] = True
-            self._report = {"round_trips_s": [], "misses": 0, "not_running": 0}
         begin = time.perf_counter()
-        answer = self._client.act(request)
+        answer = client.ask(request)
         round_trip_s = time.perf_counter() - begin
-        self._report["round_trips_s"].append(round_trip_s)
-        self._report["misses"] += round_trip_s > self._control_dt
-        self._report["not_running"] += answer.get("state", "running") != "running"
+        report["round_trips_s"].append(round_trip_s)
+        report["misses"] += round_trip_s > self._control_dt
+        report["not_running"] += answer.get("state", "running") != "running"
         if "error" in answer:
-            raise PolicyError(f"{self._client.url}: {short_repr(answer['error'], 300)}")
+            raise PolicyError(f"{self._url}: {short_repr(answer['error'], 300)}")
         values, shape = answer.get("actions"), self._action_space.shape or ()
         try:
-            action = np.asarray(values, self._action_space.dtype)[:1].reshape(shape)
+            return np.asarray(values, self._action_space.dtype)[:1].reshape(shape)
         except (ValueError, TypeError, IndexError, OverflowError):
             raise PolicyError(
-                f"{self._client.url}: actions are {short_repr(values)}, expected a list of one action, shape {shape}"
+                f"{self._url}: actions are {short_repr(values)}, expected a list of one action, shape {shape}"
             ) from None
-        return action, action
 
     def close(self) -> None:
-        """Close the connection."""
-        self._client.close()
+        """Close the connections."""
+        for client in (*self._clients.values(), *self._spare):
+            client.close()
 
-    def report(self) -> dict[str, Any]:
-        """Return this episode's round-trip times [s], how many exceeded `control_dt`, and answers not `running`."""
-        return self._report
+    def report(self, row: int) -> dict[str, Any]:
+        """Return the episode's round-trip times [s], how many exceeded `control_dt`, and answers not `running`."""
+        return self._reports[row]

@@ -14,9 +14,11 @@ from rlctl.deploy.filter.observation import WHOLE, ObservationError
 from rlctl.deploy.filter.safety_filter import SafetyFilter
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError, short_repr
+from rlctl.policy.actor import as_rows
 from rlctl.policy.file import DETERMINISTIC, PolicyFile, PolicyInfo
+from rlctl.policy.load import check_playable
 from rlctl.policy.network import Network
-from rlctl.policy.numpy_policy import NumpyPolicy, check_playable
+from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.policy import Policy
 from rlctl.storage import files, untrusted
 
@@ -40,7 +42,7 @@ class ServedPolicy:
             return float(np.exp(network.log_std).mean())
         if network.lstm is not None or self.info.env.action_space["type"] != "Box":
             return None
-        return float(network.compute_std(network.compute_latent(observation)).mean())
+        return float(network.compute_std(network.compute_latent(as_rows(observation))).mean())
 
     def check_replaces(self, other: EnvInfo) -> None:
         """Raise `ArtifactError` if this policy cannot replace a policy for the environment `other`."""
@@ -58,12 +60,13 @@ def load_served_policy(file: Path) -> ServedPolicy:
     """Load a `.safetensors` or `.onnx` file and act once; raises `ArtifactError` for an invalid policy."""
     sha256 = files.digest(untrusted.read_bytes(file))
     if file.suffix == ".onnx":
-        from rlctl.policy.onnx_policy import OnnxPolicy  # only here: it imports onnxruntime
+        from rlctl.policy.onnx_policy import OnnxActor  # only here: it imports onnxruntime
 
-        policy = OnnxPolicy.load(file)
-        return ServedPolicy(file, policy.info, sha256, lambda: OnnxPolicy(policy.info, policy.session))
+        exported = OnnxActor.load(file)
+        info, session = exported.info, exported.session
+        return ServedPolicy(file, info, sha256, lambda: Policy(OnnxActor(info, session)))
     actor = check_playable(PolicyFile.read(file)).actor_only()
-    return ServedPolicy(file, actor.info, sha256, lambda: NumpyPolicy(actor), Network(actor))
+    return ServedPolicy(file, actor.info, sha256, lambda: Policy(NumpyActor(actor)), Network(actor))
 
 
 _MAX_AGE_S = 1e9

@@ -42,10 +42,10 @@ from rlctl.exporting.export import (
 from rlctl.exporting.request import ExportRequest
 from rlctl.exporting.verify import Latency, change_last_bits, measure_sb3
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.numpy_policy import NumpyPolicy
+from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.onnx_policy import encode
-from rlctl.policy.policy import Policy
-from rlctl.policy.torch_policy import TorchPolicy, pin_threads
+from rlctl.policy.policy import FileActor, Policy
+from rlctl.policy.torch_policy import TorchActor, pin_threads
 from rlctl.storage import files
 
 
@@ -78,21 +78,21 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
     source, target = find_source(request, "controller")
     limits = None if request.limits is None else read_limits(request.limits)
     pin_threads()
-    torch_policy = TorchPolicy.load(source.file)
-    spec = _choose_spec(source.locate(torch_policy.info.spec), request.sim)
+    torch_actor = TorchActor.load(source.file)
+    spec = _choose_spec(source.locate(torch_actor.info.spec), request.sim)
     try:
         env = spec.make()
         built = describe(env)
     except (UsageError, TaskError) as error:
         raise explain_unverifiable(source.file, error) from None
     try:
-        check_environment(source.file, torch_policy.info, built)
+        check_environment(source.file, torch_actor.info, built)
         # Policies that were trained before their task declared its terms do not contain them.
-        policy = torch_policy.file.with_info(env=built)
+        policy = torch_actor.file.with_info(env=built)
         layout = _describe_controller(policy)
         output.print_notes([] if limits is None else list_doubts(limits, policy.info.env))
         mapping = NO_MAPPING if request.mapping is None else read_mapping(request.mapping, layout)
-        export = _Export(torch_policy, policy, verify.TaskPlayer(layout, env, spec.task), limits, mapping)
+        export = _Export(torch_actor, policy, verify.TaskPlayer(layout, env, spec.task), limits, mapping)
         write = {"onnx": export.write_onnx, "c": export.write_c}
         return [write[form](target.with_suffix(f".{form}")) for form in request.formats]
     finally:
@@ -113,7 +113,7 @@ def _choose_spec(spec: EnvSpec, sim: str | None) -> EnvSpec:
 class _Export:
     """A policy, and what its files are compared with. `policy` has the present description of its environment."""
 
-    torch_policy: TorchPolicy
+    torch_actor: TorchActor
     policy: PolicyFile
     player: verify.TaskPlayer
     limits: Limits | None
@@ -178,20 +178,22 @@ class _Export:
         files.write_text(example, write_example(controller, [program.undo(inputs) for inputs in recorded[0].inputs]))
         return example
 
-    def _make_reference(self, policy: Policy, is_limited: bool) -> verify.LimitedPolicy:
-        return verify.LimitedPolicy(_describe_controller(self.policy), policy, self.limits if is_limited else None)
+    def _make_reference(self, actor: FileActor, is_limited: bool) -> verify.LimitedPolicy:
+        return verify.LimitedPolicy(
+            _describe_controller(self.policy), Policy(actor), self.limits if is_limited else None
+        )
 
     @functools.lru_cache(maxsize=2)  # noqa: B019 (for one export)
     def _record(self, is_limited: bool) -> list[verify.Recorded]:
-        return verify.record(self.player, self._make_reference(self.torch_policy, is_limited))
+        return verify.record(self.player, self._make_reference(self.torch_actor, is_limited))
 
     @functools.lru_cache(maxsize=2)  # noqa: B019
     def _check_conclusive(self, is_limited: bool) -> tuple[bool, bool]:
         changed = (
             dataclasses.replace(self.policy, tensors=tensors) for tensors in change_last_bits(self.policy.tensors)
         )
-        others = (self._make_reference(NumpyPolicy(policy), is_limited) for policy in changed)
-        original = self._make_reference(self.torch_policy, is_limited)
+        others = (self._make_reference(NumpyActor(policy), is_limited) for policy in changed)
+        original = self._make_reference(self.torch_actor, is_limited)
         return verify.check_conclusive(self.player, original, others, self._record(is_limited))
 
     def _verify(
@@ -204,7 +206,7 @@ class _Export:
         if agreement.agrees and not loop.agrees:
             repeats, magnified = self._check_conclusive(is_limited)
             loop = dataclasses.replace(loop, repeats=repeats, magnified=magnified)
-        check_verified(path, self.torch_policy.file.path, agreement, loop)
+        check_verified(path, self.torch_actor.file.path, agreement, loop)
         fields = {"agreement": agreement, "closed_loop": loop, "max_target_difference": result.max_target_difference}
         return fields, recorded
 
@@ -221,5 +223,5 @@ class _Export:
         details = {**details, "input_sizes": sizes, "mapping": self.mapping.describe()}
         details["target"] = "" if target is None else target.formula
         if median is not None:
-            fields["latency"] = Latency(median, measure_sb3(self.torch_policy))
-        return ControllerReport(**describe_policy(self.torch_policy, path), **fields, size=size, details=details)
+            fields["latency"] = Latency(median, measure_sb3(self.torch_actor))
+        return ControllerReport(**describe_policy(self.torch_actor, path), **fields, size=size, details=details)

@@ -15,7 +15,8 @@ from rlctl.errors import AnswerIsNo, short_repr
 from rlctl.exporting.c_source import FLAGS, CSource
 from rlctl.exporting.controller.graph import LAST_ACTION, TARGET, name_input
 from rlctl.exporting.controller.program_mapping import ProgramMapping
-from rlctl.policy.c_policy import LIBRARY_SUFFIX, action_type
+from rlctl.policy.c_policy import action_type
+from rlctl.policy.load import LIBRARY_SUFFIX
 from rlctl.policy.onnx_policy import ACTION, open_session
 
 Inputs = Mapping[str, NDArray[Any]]

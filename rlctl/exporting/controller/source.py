@@ -76,7 +76,8 @@ class ControllerSource:
         sizes = {key: part.shape[0] for key, part in layout.parts.items()}  # type: ignore[index]  # vectors
         value, size = writer.write(network, sizes, "state->observation")
         writer.write_action(network, value, size, layout.action_space, described.action_type)
-        hidden = 0 if network.lstm is None else network.lstm.state[0].size
+        lstm = network.lstm
+        hidden = 0 if lstm is None else len(lstm.layers) * lstm.hidden_size
         values: dict[str, Any] = {
             "name": self.name,
             "upper": self.name.upper(),

@@ -13,8 +13,8 @@ from rlctl.evaluation.episode_statistics import mean_return, success_interval, s
 from rlctl.play.collect import Episode, play_episodes
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers, count_envs
+from rlctl.policy.actor import Exploration
 from rlctl.policy.file import PolicyFile
-from rlctl.policy.players.player import Exploration
 from rlctl.recipe.recipe import ON_POLICY, Recipe
 from rlctl.recipe.sources import resolve_with_stages
 from rlctl.run import lookup

@@ -8,7 +8,7 @@ from typing import Any
 from rlctl.errors import ArtifactError
 from rlctl.play import messages
 from rlctl.policy.file import PolicyInfo
-from rlctl.policy.numpy_policy import load_policy
+from rlctl.policy.load import load_policy
 from rlctl.run.directory import RunDirectory
 from rlctl.storage import files
 

@@ -13,7 +13,7 @@ from rlctl.deploy.server.client import PolicyClient
 from rlctl.deploy.server.request import ServeRequest
 from rlctl.deploy.server.serve import make_server
 from rlctl.errors import ArtifactError, PolicyError, UsageError
-from rlctl.policy.numpy_policy import NumpyPolicy
+from rlctl.policy.numpy_actor import NumpyActor
 from tests.deploy.server.serving import (
     FLAT,
     OBSERVATION,
@@ -314,6 +314,6 @@ def test_the_robot_holds_whatever_the_policy_raises(serve, monkeypatch):
 
     with server.client() as client:
         client.act({"observation": FLAT})
-        monkeypatch.setattr(NumpyPolicy, "predict", fail)
+        monkeypatch.setattr(NumpyActor, "act", fail)
         answer = client.act({"observation": FLAT})
     assert answer["error"] == "the policy cannot act: out of memory"

@@ -12,10 +12,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
+from rlctl.policy.actor import Exploration, Rows, as_rows
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.policy.numpy_policy import PolicyPlayer, check_playable
-from rlctl.policy.players.player import Exploration
-from rlctl.policy.torch_policy import ALGORITHMS, TorchPolicy, describe_network, policy_name
+from rlctl.policy.load import check_playable
+from rlctl.policy.numpy_actor import NumpyActor
+from rlctl.policy.torch_policy import ALGORITHMS, TorchActor, describe_network, policy_name
 
 FLAT, BOX = spaces.Box(-np.inf, np.inf, (6,)), spaces.Box(-2, 3, (2,))
 IMAGE = spaces.Box(0, 255, (36, 40, 3), np.uint8)
@@ -56,7 +57,7 @@ class Unused(gym.Env):
 
 @pytest.fixture
 def policy():
-    """Return description, tensors and the torch policy of an untrained model."""
+    """Return description, tensors and the torch actor of an untrained model."""
 
     def make(case):
         algo, observation, action, kwargs = CASES[case]
@@ -81,39 +82,45 @@ def policy():
             spec=EnvSpec("test"),
         )
         policy = PolicyFile(info, tensors)
-        return policy, TorchPolicy(policy, network)
+        return policy, TorchActor(policy, network)
 
     return make
 
 
+def act(actor, observation, seed, step):
+    """Return the stored action and the environment's for one observation."""
+    stored, action = actor.act(as_rows(observation), Rows.one(seed, step))
+    return stored[0], action[0]
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_it_acts_as_torch_does(policy, case):
-    file, torch_policy = policy(case)
-    player = PolicyPlayer(file.actor_only())
-    space = torch_policy.observation_space
+    file, torch_actor = policy(case)
+    actor = NumpyActor(file.actor_only())
+    space = file.info.env.spaces()[0]
     space.seed(0)
     for step in range(8):
         observation = space.sample()
-        _, action = player.act(observation, 0, step)
-        np.testing.assert_allclose(action, torch_policy.predict(observation), atol=2e-6)
+        expected = act(torch_actor, observation, 0, step)[1]
+        np.testing.assert_allclose(act(actor, observation, 0, step)[1], expected, atol=2e-6)
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if "dict" not in case and "image" not in case])
 def test_samples_stay_in_the_space(policy, case):
-    file, torch_policy = policy(case)
-    player = PolicyPlayer(file)
-    observation = torch_policy.observation_space.sample()
+    file, _ = policy(case)
+    actor = NumpyActor(file)
+    observed, space = file.info.env.spaces()
+    observation = observed.sample()
     for exploration in (
         Exploration(stochastic=True, sde_every=2),
         Exploration(stochastic=True, action_noise=0.5, epsilon=0.5),
         Exploration(warmup=True),
     ):
-        player.exploration = exploration
-        player.begin_segment(5, 0)
-        actions = [player.act(observation, 5, step)[1] for step in range(50)]
-        space = torch_policy.action_space
+        actor.explore(exploration)
+        actor.prepare()
+        actions = [act(actor, observation, 5, step)[1] for step in range(50)]
         assert all(space.contains(np.asarray(action).astype(space.dtype)) for action in actions)
-        again = player.act(observation, 5, 7)[1]
+        again = act(actor, observation, 5, 7)[1]
         if "recurrent" not in case and not (exploration.sde_every and "gSDE" in case):
             np.testing.assert_array_equal(again, actions[7])
 
@@ -121,14 +128,30 @@ def test_samples_stay_in_the_space(policy, case):
 def test_a_gaussian_has_the_mean_and_deviation_of_its_numbers(policy):
     file, _ = policy("ppo")
     file.tensors["policy/log_std"][:] = np.log(0.25)
-    player = PolicyPlayer(file)
+    actor = NumpyActor(file)
     observation = np.zeros(6, np.float32)
-    mean, _ = player.act(observation, 0, 0)
-    player.exploration = Exploration(stochastic=True)
-    stored = np.array([player.act(observation, 9, step)[0] for step in range(4000)])
+    mean, _ = act(actor, observation, 0, 0)
+    actor.explore(Exploration(stochastic=True))
+    actor.prepare()
+    stored = np.array([act(actor, observation, 9, step)[0] for step in range(4000)])
     # The error of a mean of 4000 is 0.25 / 63 = 0.004, that of the deviation 0.0028.
     np.testing.assert_allclose(stored.mean(axis=0), mean, atol=0.02)
     np.testing.assert_allclose(stored.std(axis=0), 0.25, atol=0.015)
+
+
+def test_choices_are_sampled_with_their_probabilities(policy):
+    file, _ = policy("a2c, discrete")
+    logits = np.log([0.1, 0.2, 0.4, 0.25, 0.05])
+    file.tensors["policy/action_net.weight"][:] = 0.0
+    file.tensors["policy/action_net.bias"][:] = logits
+    actor = NumpyActor(file, 4000)
+    assert actor.act(np.zeros((1, 6), np.float32), Rows.one())[1] == 2
+    actor.explore(Exploration(stochastic=True))
+    rows = Rows.first(4000)
+    rows.seed[:] = np.arange(4000)
+    _, actions = actor.act(np.zeros((4000, 6), np.float32), rows)
+    # The error of a fraction of 4000 is at most 0.008.
+    np.testing.assert_allclose(np.bincount(actions, minlength=5) / 4000, np.exp(logits), atol=0.03)
 
 
 def test_tensors_that_do_not_fit(policy):

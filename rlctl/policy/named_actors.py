@@ -1,5 +1,6 @@
-"""Players by name: zero and random actions, a function that a user writes, an exported file."""
+"""Actors by name: zero and random actions, a function that a user writes, an exported file."""
 
+import copy
 import inspect
 from collections.abc import Callable
 from pathlib import Path
@@ -20,22 +21,25 @@ from rlctl.errors import (
     find_plugin_line,
     short_repr,
 )
-from rlctl.policy.c_policy import LIBRARY_SUFFIX, CPolicy
-from rlctl.policy.numpy_policy import load_policy
-from rlctl.policy.players.player import Player, make_generator
+from rlctl.policy.actor import Actor, Array, Rows, act_one_by_one, as_stored
+from rlctl.policy.load import load_actor
+from rlctl.policy.noise import make_generator
 
 BASELINES = ("zero", "random")
 SERVER = ("ws://", "wss://")
-"""Prefixes of the address of a policy server; its player is `rlctl.deploy.server.client.RemotePlayer`."""
+"""Prefixes of the address of a policy server; its actor is `rlctl.deploy.server.client.RemoteActor`."""
 
 
-def make_player(name: str, space: spaces.Space[Any]) -> Player:
-    """Return the player for `zero`, `random`, an exported file, or the name of a function, see `load_function`."""
+def make_actor(name: str, space: spaces.Space[Any], count: int = 1) -> Actor:
+    """Return the actor for `zero`, `random`, a file, or the name of a function, see `load_function`.
+
+    `space` is the action space, `count` the number of environments.
+    """
     if name == "zero":
-        return ZeroPlayer(space)
+        return ZeroActor(space)
     if name == "random":
-        return RandomPlayer(space)
-    return FunctionPlayer(name, space) if ":" in Path(name).name else ExportedPlayer(name)
+        return RandomActor(space)
+    return FunctionActor(name, space) if ":" in Path(name).name else load_actor(Path(name), count)
 
 
 Act = Callable[[Any, int], Any]
@@ -81,35 +85,38 @@ def _takes(signature: inspect.Signature, count: int) -> bool:
     return True
 
 
-class ZeroPlayer(Player):
-    """Plays the action 0, clipped to the action space; for discrete actions the first."""
+class ZeroActor(Actor):
+    """Takes the action 0, clipped to the action space; for discrete actions the first."""
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         if isinstance(space, spaces.Box):
-            self._action: Any = np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
+            self.action: Array = np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
         else:
-            self._action = np.full(space.shape or (), getattr(space, "start", 0), np.int64)
+            self.action = np.full(space.shape or (), getattr(space, "start", 0), np.int64)
 
-    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
+    def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
         """Return the same action at every step."""
-        return self._action, self._action
+        actions = np.repeat(self.action[None], len(rows), axis=0)
+        return as_stored(actions), actions
 
 
-class RandomPlayer(Player):
-    """Plays uniformly random actions."""
+class RandomActor(Actor):
+    """Takes uniformly random actions."""
 
     def __init__(self, space: spaces.Space[Any]) -> None:
-        self._space = space
+        self._space = copy.deepcopy(space)  # the environment may draw from its own
 
-    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Return an action that depends only on seed and step."""
+    def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
+        """Return actions that depend only on seed and step."""
+        return act_one_by_one(observations, rows, self._draw)
+
+    def _draw(self, observation: Any, row: int, seed: int, step: int) -> Any:
         self._space.seed(int(make_generator(seed, 0, step).integers(2**31)))
-        action = self._space.sample()
-        return action, action
+        return self._space.sample()
 
 
-class FunctionPlayer(Player):
-    """Plays the actions that a user's function returns; actions of a Box are clipped to its bounds."""
+class FunctionActor(Actor):
+    """Takes the actions that a user's function returns; actions of a Box are clipped to its bounds."""
 
     def __init__(self, name: str, space: spaces.Space[Any]) -> None:
         self._function = load_function(name)
@@ -117,15 +124,17 @@ class FunctionPlayer(Player):
         self._name = f"{Path(place).name}:{function}"
         self._space = space
 
-    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Call the function; raises `PolicyError` if it raises, or if it returns no action of the space."""
+    def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
+        """Call the function for each row; raises `PolicyError` if it raises, or returns no action of the space."""
+        return act_one_by_one(observations, rows, self._call)
+
+    def _call(self, observation: Any, row: int, seed: int, step: int) -> Any:
         try:
             result = self._function(map_parts(np.copy, observation), step)
         except (Exception, SystemExit) as error:
             what = f"{describe_exception(error)}{find_plugin_line(error)}"
             raise PolicyError(f"policy {self._name}, step {step}: {what}") from error
-        action = self._check(result, step)
-        return action, action
+        return self._check(result, step)
 
     def _check(self, result: Any, step: int) -> Any:
         space, shape = self._space, self._space.shape or ()
@@ -142,17 +151,3 @@ class FunctionPlayer(Player):
             elif space.contains(action if space.shape else action[()]):
                 return action
         raise PolicyError(f"policy {self._name}, step {step}: it {returned}; the action space is {format_space(space)}")
-
-
-class ExportedPlayer(Player):
-    """Plays the deterministic action of an exported policy, an ONNX file or compiled C."""
-
-    def __init__(self, path: str) -> None:
-        self._policy = CPolicy.load(Path(path)) if path.endswith(LIBRARY_SUFFIX) else load_policy(Path(path))
-
-    def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
-        """Return the deterministic action; step 0 resets a recurrent policy."""
-        if step == 0:
-            self._policy.reset()
-        action = self._policy.predict(observation)
-        return action, action

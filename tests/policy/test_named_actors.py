@@ -8,7 +8,8 @@ from rlctl.errors import PolicyError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.report import as_json
 from rlctl.evaluation.request import EvalRequest
-from rlctl.policy.players.named import load_function, make_player
+from rlctl.policy.actor import Rows
+from rlctl.policy.named_actors import load_function, make_actor
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 FUNCTIONS = """
@@ -35,7 +36,8 @@ def functions(write_module):
 
 
 def act(name, space, observation=None, step=0):
-    return make_player(str(name), space).act(np.zeros(3) if observation is None else observation, 1, step)[1]
+    observation = np.zeros(3) if observation is None else observation
+    return make_actor(str(name), space).act(observation[None], Rows.one(1, step))[1][0]
 
 
 def test_zero():
@@ -46,8 +48,16 @@ def test_zero():
 
 
 def test_random_follows_from_the_seed_and_the_step():
-    player = make_player("random", spaces.Discrete(1000))
-    assert player.act(None, 1, 0) == player.act(None, 1, 0) != player.act(None, 1, 1)
+    actor, rows = make_actor("random", spaces.Discrete(1000)), Rows(np.arange(3), np.ones(3, int), np.array([0, 0, 1]))
+    first, same, other = actor.act(np.zeros((3, 2)), rows)[1].tolist()
+    assert first == same != other
+
+
+def test_random_does_not_touch_the_random_numbers_of_the_environment():
+    space = spaces.Discrete(1000, seed=7)
+    expected = spaces.Discrete(1000, seed=7).sample()
+    make_actor("random", space).act(np.zeros((1, 2)), Rows.one())
+    assert space.sample() == expected
 
 
 def test_a_function_acts_within_the_space(functions):
