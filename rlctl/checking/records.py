@@ -15,7 +15,6 @@ from rlctl.errors import UsageError
 
 FIRST_SEED, SECOND_SEED = 1000, 1001
 MOST_INFOS = 100  # So many numbers of info are recorded per episode, by name
-SUCCESS = "is_success"  # The name of success in info
 ENDS = ("terminated", "truncated", "both")
 
 
