@@ -1,5 +1,6 @@
 """Players by name: zero and random actions, a function that a user writes, an exported file."""
 
+import copy
 import inspect
 from collections.abc import Callable
 from pathlib import Path
@@ -99,7 +100,7 @@ class RandomPlayer(Player):
     """Plays uniformly random actions."""
 
     def __init__(self, space: spaces.Space[Any]) -> None:
-        self._space = space
+        self._space = copy.deepcopy(space)  # an environment may draw from its own space's generator
 
     def act(self, observation: Any, seed: int, step: int) -> tuple[Any, Any]:
         """Return an action that depends only on seed and step."""
