@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection, wait
 from gymnasium import spaces
 
 from rlctl.checking import families
-from rlctl.checking.instance import Budget, Context, EnvironmentRaised, describe_failure
+from rlctl.checking.instance import Budget, Context, EnvironmentRaised, describe_failure, raised_by_environment
 from rlctl.checking.progress import CallProgress, Position, read_clock, read_clock_of
 from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finished, Mistake, Skipped
 from rlctl.checking.rules import Experiment, NotApplicable, NotJudged, RuleFinding
@@ -90,8 +90,12 @@ def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
         yield describe_failure(error, context.progress)
     except UsageError:
         raise
-    except Exception:  # what the environment raises was caught at the call, so this is a bug of rlctl
-        is_complete, crash = False, traceback.format_exc()
+    except Exception as error:  # what calls of the environment raise was caught at the call
+        is_complete = False
+        if raised_by_environment(error):
+            yield describe_failure(EnvironmentRaised("reading an attribute", error), context.progress)
+        else:
+            crash = traceback.format_exc()
     yield Finished(experiment.name, time.monotonic() - started, is_complete, context.budget.was_cut, crash)
 
 

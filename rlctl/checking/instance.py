@@ -20,10 +20,13 @@ from rlctl.checking.records import CallFailure
 from rlctl.checking.rules import NotJudged
 from rlctl.checking.values import find_leaves, is_task
 from rlctl.environments import registry
-from rlctl.environments.places import find_line, format_place
+from rlctl.environments.graphics import opengl_fix
+from rlctl.environments.mujoco_version import mujoco_fix
+from rlctl.environments.places import find_line, format_place, is_own_file
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import RlctlError, TaskError
+from rlctl.errors import RlctlError, TaskError, read_message
 from rlctl.missing_packages import advise
+from rlctl.version import PACKAGE_FOLDER
 
 _HERE = Path(__file__).parent
 NO_DISPLAY = re.compile(
@@ -54,7 +57,22 @@ def describe_failure(error: EnvironmentRaised, progress: CallProgress) -> CallFa
     at, cause = progress.read(), error.cause
     place = (error.call, at.phase, at.episode, at.seed, at.step)
     trace, file = "".join(traceback.format_exception(cause)), find_missing_file(cause)
-    return CallFailure("raised", *place, describe(cause), trace, file, find_line(cause))
+    text = describe(cause)
+    fix = opengl_fix(text) or mujoco_fix(cause)
+    return CallFailure("raised", *place, text, trace, file, find_line(cause), fix=fix)
+
+
+def raised_by_environment(error: BaseException) -> bool:
+    """Return whether an exception comes from code of the environment, such as a property or `__getattr__`.
+
+    Libraries between that code and the place of the exception do not matter.
+    """
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if is_own_file(frame.filename):
+            return True
+        if PACKAGE_FOLDER in Path(frame.filename).parents:
+            return False
+    return False
 
 
 def describe(error: BaseException) -> str:
@@ -63,7 +81,7 @@ def describe(error: BaseException) -> str:
         return f"{type(error).__name__}: {error}"
     where = find_line(error)
     place = f" ({format_place(*where)})" if where else ""
-    text = " ".join(str(error).split()) or "no message"
+    text = " ".join(read_message(error).split()) or "no message"
     return f"{type(error).__name__}: {text}{place}{advise(error)}"
 
 
@@ -76,13 +94,14 @@ def display_error(failure: CallFailure) -> str:
 def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
     """Describe the file behind an exception, or behind what caused it; None if it is about something else."""
     for cause in get_causes(error):
+        message = read_message(cause)
         name, folders = None, [str(Path.cwd())]
         if isinstance(cause, FileNotFoundError):
-            path = re.search(r"[^\s'\"]*[/\\][^\s'\":]*", str(cause))
-            name = str(cause.filename or (path[0] if path else cause))
-        elif match := _NO_FILE.search(str(cause)):
+            path = re.search(r"[^\s'\"]*[/\\][^\s'\":]*", message)
+            name = str(cause.filename or (path[0] if path else message))
+        elif match := _NO_FILE.search(message):
             name = match[1] or match[2]
-        elif type(cause).__module__ == "pybullet" and "load" in str(cause).lower():
+        elif type(cause).__module__ == "pybullet" and "load" in message.lower():
             name, data = _find_model(cause.__traceback__), sys.modules.get("pybullet_data")
             folders += [data.getDataPath()] if data else []
         if name is not None:
@@ -90,6 +109,19 @@ def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
             found = next((folder for folder in searched[1:] if Path(folder, name).is_file()), "")
             return {"file": name, "searched": searched, "found": found}
     return None
+
+
+def find_first_error(error: BaseException | None) -> BaseException | None:
+    """Return the first exception of the chain that a traceback of this one shows; None if it is the only one."""
+    first = error
+    while first is not None:
+        behind = first.__cause__
+        if behind is None and not first.__suppress_context__:
+            behind = first.__context__
+        if behind is None:
+            break
+        first = behind
+    return None if first is error else first
 
 
 def get_causes(error: BaseException | None) -> list[BaseException]:

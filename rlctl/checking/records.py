@@ -133,6 +133,7 @@ class CallFailure:
     file: Mapping[str, Any] | None = None  # one that was not found, and the searched folders
     where: tuple[str, int] | None = None  # last line of the environment's own code
     process: str = ""  # Which child process: `probe` or `instances`
+    fix: str = ""  # what to do about it, where that is known
 
     @property
     def message(self) -> str:

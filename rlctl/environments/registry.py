@@ -18,6 +18,7 @@ from typing import Any
 from rlctl import errors, missing_packages
 from rlctl.environments import installed, own_ids, suggestions
 from rlctl.environments.graphics import opengl_fix
+from rlctl.environments.mujoco_version import mujoco_fix
 from rlctl.environments.places import describe_exception_place
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError, did_you_mean
 from rlctl.storage import files
@@ -232,7 +233,7 @@ def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
     except BaseException as error:
         where = describe_exception_place(error)
         reason, details = errors.describe_exception(error, where), errors.format_plugin_traceback(error) or None
-        hint = opengl_fix(reason)
+        hint = opengl_fix(reason) or mujoco_fix(error)
         message = f"task {task!r}: {doing}{reason}" + (f"\n{hint}" if hint else "")
         raise TaskError(message, details=details) from error
 
