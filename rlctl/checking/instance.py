@@ -175,6 +175,7 @@ def _evaluate(node: ast.AST, frame: FrameType) -> str | None:
 
 Timer = Callable[..., Any]  # calls its first argument with the others
 
+MOST_STEPS, MOST_RESETS, RESERVE = 14_000, 200, 1.3  # Of all experiments of a process, about; for what is not a step
 MOST_FAILURES = 3  # An experiment stops after so many episodes that raised
 
 
@@ -184,6 +185,10 @@ class Budget:
 
     deadline: float  # On `read_clock`'s clock [s]
     last: float = math.inf  # when the time of the whole process is over: no call begins after it
+    began: float = 0.0
+    growth: Callable[[], float] = lambda: 1.0
+    """How many times longer it lasts than was known when it began: an environment shows while it is played how slow it
+    is."""
     bytes_left: int = 48 * 2**20
     failures: int = 0
     was_cut: bool = False  # whether time ran out before all steps or resets were done
@@ -191,17 +196,22 @@ class Budget:
     @property
     def seconds_left(self) -> float:
         """How much time is left [s]."""
-        return max(0.0, self.deadline - read_clock())
+        return max(0.0, self.ends(self.deadline) - read_clock())
+
+    def ends(self, planned: float) -> float:
+        """Return when something ends that was planned to end at a time."""
+        growth = self.growth()
+        return planned if growth == 1.0 else self.began + (planned - self.began) * growth
 
     def is_over(self) -> bool:
         """Say whether time ran out, and note it: the caller then stops the experiment."""
-        is_over = read_clock() > self.deadline
+        is_over = read_clock() > self.ends(self.deadline)
         self.was_cut |= is_over
         return is_over
 
     def require_time(self, least_s: float = 0.0) -> None:
         """Raise `NotJudged` if the time of the whole process is over in `least_s`."""
-        if read_clock() + least_s > self.last:
+        if read_clock() + least_s > self.ends(self.last):
             self.was_cut = True
             raise NotJudged("time ran out")
 
@@ -275,6 +285,8 @@ class Context:
         self.progress = progress or CallProgress()
         self.budget = Budget(read_clock())  # What the experiment that is running may use
         self.least_s = 0.0  # what the last build took: an experiment takes at least so long
+        self.most_growth = 1.0  # how many times longer a slow environment may be checked
+        self.seconds = math.inf  # what all experiments of the process may take together
         self.unseeded_calls: set[tuple[str, int]] = set()  # file and line of default_rng() in reset or step
         self.generators: dict[str, str] | None = None  # State of each after the first watched reset; None before
 
@@ -293,6 +305,17 @@ class Context:
             return Instance(env, self)
         except BaseException as error:
             raise EnvironmentRaised("build", error) from error
+
+    @property
+    def needed_s(self) -> float:
+        """Estimate how long all experiments of a process take [s]; 0 before it is known how slow the steps are."""
+        step_s, reset_s = self.progress.mean_s("step"), self.progress.mean_s("reset", fewest=2)
+        return RESERVE * (MOST_STEPS * (step_s or 0.0) + MOST_RESETS * (reset_s or 0.0))
+
+    @property
+    def growth(self) -> float:
+        """How many times longer than `seconds` the experiments may take, because the environment is slow."""
+        return min(max(self.needed_s / self.seconds, 1.0), self.most_growth)
 
     @functools.cached_property
     def instance(self) -> Instance:

@@ -43,6 +43,8 @@ class CallProgress:
             os.ftruncate(descriptor, ctypes.sizeof(_Memory))
             self._now = _Memory.from_buffer(mmap.mmap(descriptor, ctypes.sizeof(_Memory)))
         self._called: set[str] = set()
+        self._entered, self._began = "", 0.0
+        self._times: dict[str, list[float]] = {}  # number and time [s] of the calls of a kind, without the first
 
     def phase(self, name: str) -> None:
         """Note which experiment, or part of one, begins."""
@@ -58,11 +60,22 @@ class CallProgress:
         now.step, now.is_first, now.call = step, call not in self._called, call.encode()
         now.counter += 1
         self._called.add(call)
+        self._entered, self._began = "" if now.is_first else call, read_clock()
 
     def leave(self) -> None:
         """Note that the call came back."""
+        if self._entered:
+            times = self._times.setdefault(self._entered, [0, 0.0])
+            times[0] += 1
+            times[1] += read_clock() - self._began
+            self._entered = ""
         self._now.call = b""
         self._now.counter += 1
+
+    def mean_s(self, call: str, fewest: int = 5) -> float | None:
+        """Return the mean time of the calls of a kind so far [s]; None before there were a few."""
+        number, seconds = self._times.get(call, (0, 0.0))
+        return seconds / number if number >= fewest else None
 
     def read(self) -> Position:
         """Return where the child is."""

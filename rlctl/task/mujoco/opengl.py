@@ -25,7 +25,7 @@ def draw_without_display(*, only_where_possible: bool = False) -> None:
     renderer = getattr(mujoco, "Renderer", None)
     if mujoco is None or renderer is None:
         return
-    chosen: Any = sys.modules[renderer.__module__].gl_context  # type: ignore[attr-defined]
+    chosen: Any = sys.modules[renderer.__module__].gl_context
     if "glfw" in chosen.GLContext.__module__:
         importlib.reload(chosen)
         for module in (mujoco, sys.modules.get("mujoco.gl_context")):  # which have the name too
