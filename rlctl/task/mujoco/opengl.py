@@ -26,7 +26,8 @@ def draw_without_display(*, only_where_possible: bool = False) -> None:
     if mujoco is None or renderer is None:
         return
     chosen: Any = sys.modules[renderer.__module__].gl_context
-    if "glfw" in chosen.GLContext.__module__:
+    context = getattr(chosen, "GLContext", None)  # MUJOCO_GL=disable leaves it out
+    if context is not None and "glfw" in context.__module__:
         importlib.reload(chosen)
         for module in (mujoco, sys.modules.get("mujoco.gl_context")):  # which have the name too
             if hasattr(module, "GLContext"):
