@@ -5,9 +5,9 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.environments.success import find_success
+from rlctl.play.messages import Attach, Build, LoadPolicy, Play, WorkerJob
+from rlctl.play.worker import Worker
 from rlctl.processes.child_process import anonymous_file
-from rlctl.rollout.messages import Attach, Build, LoadPolicy, Play, WorkerJob
-from rlctl.rollout.worker import Worker
 
 
 @pytest.mark.parametrize(
