@@ -22,7 +22,7 @@ from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Sho
 from rlctl.checking.rules import NotJudged, RuleFinding, experiment
 
 MOST_STEPS, MOST_EPISODES = 4_500, 60  # in all: they find the goal of the bundled `reach` from most seeds
-ENOUGH_EPISODES, STEPS_AFTER = 11, 1_000  # Of a slow environment; of the episodes after the search
+ENOUGH_EPISODES, STEPS_AFTER = 11, 2_000  # Of a slow environment; of the episodes after the search
 LONGEST = 150  # episodes are stopped after so many steps; a reward that leads to a goal shows before
 SEGMENTS = 3  # Of a sequence, each one action that is held: few numbers to search among
 GENERATION, ELITE = 10, 3  # Sequences; the best of them
