@@ -58,7 +58,7 @@ def test_the_time_of_a_slow_environment_grows_while_it_is_played(slow):
 
 
 def test_fewer_episodes_are_enough_for_a_slow_environment(slow):
-    records = play(slow, ["episodes"], 0.45, 1.0)  # for some of 16 episodes of 0.05 s
+    records = play(slow, ["episodes", "search"], 1.1, 1.0)  # half a second for 16 episodes of 0.05 s
     episodes = len(records.role("episodes"))
     assert 5 <= episodes < 16
     assert records.shortened == {"episodes": f"{episodes} of 16 episodes"}
