@@ -139,16 +139,20 @@ class Interrupted(RlctlError):
         self.exit_code = 128 + signal_number
 
 
+def read_message(error: BaseException) -> str:
+    """Return the message of any exception; one whose `__str__` raises has one that says so."""
+    try:
+        return str(error)
+    except Exception as another:
+        return f"(message unavailable: {type(another).__name__})"
+
+
 def describe_exception(error: BaseException, where: str = "") -> str:
     """Describe any exception in one line of limited length: `RuntimeError: the gripper fell off`.
 
     `where` comes after it, and last what to install for a module that is missing.
     """
-    name = type(error).__name__
-    try:
-        text = " ".join(str(error).split())
-    except Exception as another:
-        text = f"(message unavailable: {type(another).__name__})"
+    name, text = type(error).__name__, " ".join(read_message(error).split())
     if len(text) > _LONGEST:
         text = f"{text[:_LONGEST]}..."
     # Python decodes file names that are not UTF-8 to surrogates, which cannot be written as UTF-8.

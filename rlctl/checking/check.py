@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 import time
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -25,6 +26,7 @@ OF_SPACES = ("RL103", "RL106", "RL108", "RL109")  # rules about what a space dec
 OF_OLD_GYM = ("RL106", "RL109", "RL207")  # which today's libraries cannot read or call: not faults of their own
 OF_AN_EXAMPLE = ("RL3", "RL120", "RL406", "RL407", "RL409", "RL810", "RL811", "RL814", "RL815", "RL816", "RL820")
 """Rules whose finding shows one element of all that are wrong: without a seed, another one in another run."""
+BUDGET_STEP_S = 10
 LOADING = ("RL0", "RL216")  # judged even if no instance could be built
 
 
@@ -58,6 +60,17 @@ class CheckReport:
         """Rules that were not judged because the time of an experiment ended."""
         cut = {name for name, end in self.records.finished.items() if end.is_cut}
         return [rule for rule in self.verdict.not_judged if rule in RULES and families.find_needs([rule]) & cut]
+
+    @property
+    def advice(self) -> str:
+        """What more time would do: how many rules are not judged for lack of it; empty if all are."""
+        late = len(self.out_of_time)
+        if not late:
+            return ""
+        ends = self.records.finished.values()
+        needed_s = max([2 * self.budget_s, *(end.needed_s for end in ends)])
+        seconds = math.ceil(needed_s / BUDGET_STEP_S) * BUDGET_STEP_S
+        return f"{output.format_count(late, 'rule')} not judged for lack of time: --budget {seconds} should judge them"
 
     @property
     def exit_code(self) -> int:
@@ -153,20 +166,23 @@ def check(
     rules: Sequence[str] = tuple(RULES),
     strict: bool = False,
     only: Collection[str] | None = None,
-    budget_s: float = families.PROCESS_S,
+    budget_s: float | None = None,
     show_progress: bool = True,
 ) -> CheckReport:
     """Check an environment with some rules, by id; with `only`, from some of their experiments.
 
     Raises `UsageError` for a task or a parameter that does not exist. The report has every fault of the environment
-    itself, also crashes, and calls that take more than `env_timeout_s` seconds.
+    itself, also crashes, and calls that take more than `env_timeout_s` seconds. `budget_s` is the computing time of
+    each process [s]; without it this is `PROCESS_S`, and up to `MOST_GROWTH` times as much where the steps are slow.
     """
+    most_growth = families.MOST_GROWTH if budget_s is None else 1.0
+    budget_s = budget_s or families.PROCESS_S
     started = time.monotonic()
     records = Records(spec.task, normalizes=lambda what: _normalizes(spec.task, what))
 
     needed = {"build"} | {name for name in families.find_needs(rules) if only is None or name in only}
     wanted = {process: [n for n in names if n in needed] for process, names in families.PROCESSES.items()}
-    supervisor = Supervisor(spec, budget_s, env_timeout_s, records.add)
+    supervisor = Supervisor(spec, budget_s, env_timeout_s, records.add, most_growth)
     with _status(spec.task, show_progress) as say:
         supervisor.run({process: names for process, names in wanted.items() if names}, say)
     records.printed_lines, records.printed_first = supervisor.children[0].printed, supervisor.children[0].first_line

@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection, wait
 from gymnasium import spaces
 
 from rlctl.checking import families
-from rlctl.checking.instance import Budget, Context, EnvironmentRaised, describe_failure
+from rlctl.checking.instance import Budget, Context, EnvironmentRaised, describe_failure, raised_by_environment
 from rlctl.checking.progress import CallProgress, Position, read_clock, read_clock_of
 from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finished, Mistake, Skipped
 from rlctl.checking.rules import Experiment, NotApplicable, NotJudged, RuleFinding
@@ -27,19 +27,34 @@ from rlctl.processes.messages import send
 
 
 def main(
-    connection: Connection, process: str, spec: EnvSpec, experiments: list[str], seconds: float, memory: int
+    connection: Connection,
+    process: str,
+    spec: EnvSpec,
+    experiments: list[str],
+    seconds: float,
+    most_growth: float,
+    memory: int,
 ) -> None:
     """Run some experiments of one process and send what they yield. `memory`: the descriptor of the progress."""
-    for message in run(process, spec, experiments, seconds, CallProgress(memory)):
+    for message in run(process, spec, experiments, seconds, CallProgress(memory), most_growth):
         send(connection, message)
     send(connection, End())
 
 
 def run(
-    process: str, spec: EnvSpec, experiments: Sequence[str], seconds: float, progress: CallProgress | None = None
+    process: str,
+    spec: EnvSpec,
+    experiments: Sequence[str],
+    seconds: float,
+    progress: CallProgress | None = None,
+    most_growth: float = 1.0,
 ) -> Iterator[ChildMessage]:
-    """Yield the messages of some experiments of one process, which may take so many seconds together."""
+    """Yield the messages of some experiments of one process, which may take so many seconds together.
+
+    A slow environment may take up to `most_growth` times as long.
+    """
     context = Context(spec, progress)
+    context.seconds, context.most_growth = seconds, most_growth
     try:
         for message in _run_all(context, [families.EXPERIMENTS[name] for name in experiments], seconds):
             yield dataclasses.replace(message, process=process) if isinstance(message, CallFailure) else message
@@ -48,27 +63,36 @@ def run(
 
 
 def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> Iterator[ChildMessage]:
-    end = read_clock() + seconds
+    began = read_clock()
     shares = sum(experiment.share for experiment in chosen)
     for experiment in chosen:
-        started = read_clock()
+        started, growth = read_clock(), context.growth
+        end = began + seconds * growth
         if experiment.name == "build":
             yield from _run(experiment, context)
             if not context.is_built:
                 return
-            end += read_clock() - started  # importing and building comes on top
+            began += read_clock() - started  # importing and building comes on top
         elif context.is_built and not isinstance(context.instance.env.action_space, spaces.Space):
             yield Skipped(experiment.name, "its action space is not a space of Gymnasium")
         elif started > end:
-            yield Skipped(experiment.name, f"earlier experiments used all of the {seconds:g} s of computing time")
-            yield Finished(experiment.name, 0.0, is_complete=False, is_cut=True)
+            spent = f"earlier experiments used all of the {seconds * growth:.3g} s of computing time"
+            yield Skipped(experiment.name, spent)
+            yield Finished(experiment.name, 0.0, is_complete=False, is_cut=True, needed_s=context.needed_s)
         else:
-            context.budget = Budget(started + (end - started) * experiment.share / shares, last=end)
+            own_end = started + (end - started) * experiment.share / shares
+            further = functools.partial(_grow_further, context, growth)
+            context.budget = Budget(own_end, last=end, began=started, growth=further)
             yield from _run(experiment, context)
         shares -= experiment.share
     if context.is_built:
         context.progress.phase("close")
         yield from context.instance.close()
+
+
+def _grow_further(context: Context, known: float) -> float:
+    """Return how much the time of an experiment has grown beyond what was known at its beginning."""
+    return context.growth / known
 
 
 def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
@@ -90,9 +114,14 @@ def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
         yield describe_failure(error, context.progress)
     except UsageError:
         raise
-    except Exception:  # what the environment raises was caught at the call, so this is a bug of rlctl
-        is_complete, crash = False, traceback.format_exc()
-    yield Finished(experiment.name, time.monotonic() - started, is_complete, context.budget.was_cut, crash)
+    except Exception as error:  # what calls of the environment raise was caught at the call
+        is_complete = False
+        if raised_by_environment(error):
+            yield describe_failure(EnvironmentRaised("reading an attribute", error), context.progress)
+        else:
+            crash = traceback.format_exc()
+    seconds, is_cut = time.monotonic() - started, context.budget.was_cut
+    yield Finished(experiment.name, seconds, is_complete, is_cut, crash, needed_s=context.needed_s)
 
 
 BUILD_TIMEOUT_S = 60.0  # How long importing and building may take, unless a step may take longer
@@ -103,7 +132,9 @@ IDLE_TIMEOUT_S = 300.0  # outside of the environment: loading libraries [s]
 class Child:
     """A process of the check, watched."""
 
-    def __init__(self, name: str, spec: EnvSpec, experiments: Sequence[str], seconds: float) -> None:
+    def __init__(
+        self, name: str, spec: EnvSpec, experiments: Sequence[str], seconds: float, most_growth: float
+    ) -> None:
         self.name = name
         self.experiments = list(experiments)  # Those that it has not finished; the first is running
         self.has_finished_one = False
@@ -116,7 +147,7 @@ class Child:
         arguments = {"process": name, "spec": spec, "experiments": self.experiments}
         self.process = ChildProcess(
             "rlctl.checking.children:main",
-            {**arguments, "seconds": seconds, "memory": self._memory},
+            {**arguments, "seconds": seconds, "most_growth": most_growth, "memory": self._memory},
             stdout=self._readers[0].descriptor,
             stderr=self._readers[1].descriptor,
             pass_fds=[self._memory],
@@ -164,8 +195,14 @@ class Supervisor:
     """The child processes of one check."""
 
     def __init__(
-        self, spec: EnvSpec, budget_s: float, env_timeout_s: float, receive: Callable[[ChildMessage], None]
+        self,
+        spec: EnvSpec,
+        budget_s: float,
+        env_timeout_s: float,
+        receive: Callable[[ChildMessage], None],
+        most_growth: float = 1.0,
     ) -> None:
+        self._most_growth = most_growth
         self._spec, self._budget_s, self._env_timeout_s, self._receive = spec, budget_s, env_timeout_s, receive
         self._waiting: dict[str, Sequence[str]] = {}
         self._active: dict[Connection, Child] = {}
@@ -198,7 +235,7 @@ class Supervisor:
     def _start(self) -> None:
         while self._waiting and len(self._active) < (2 if self._has_built else 1):
             name = next(iter(self._waiting))
-            child = Child(name, self._spec, self._waiting.pop(name), self._budget_s)
+            child = Child(name, self._spec, self._waiting.pop(name), self._budget_s, self._most_growth)
             self.children.append(child)
             self._active[child.process.connection] = child
 

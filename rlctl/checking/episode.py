@@ -53,7 +53,7 @@ class EpisodePlayer:
     sequence: Iterable[Any] | None = None
 
     def __post_init__(self) -> None:
-        self._deadline = min(self.instance.context.budget.deadline, read_clock() + self.longest_s)
+        self._began = read_clock()
         self.steps = 0
         self.ended = ""
         """`terminated`, `truncated`, `both`, or what cut it: `steps`, `time`, `raised` (a wrong return value)."""
@@ -90,9 +90,14 @@ class EpisodePlayer:
             self.ended = "both" if terminated and truncated else "terminated" if terminated else "truncated"
         elif self.steps >= self.max_steps:
             self.ended = "steps"
-        elif read_clock() > self._deadline:
+        elif self._is_late():
             self.ended, self.instance.context.budget.was_cut = "time", True
         return moment
+
+    def _is_late(self) -> bool:
+        budget, now = self.instance.context.budget, read_clock()
+        growth = budget.growth()
+        return now > budget.ends(budget.deadline) or now > self._began + self.longest_s * growth
 
     def _read(self, action: Any, returned: Any) -> Moment:
         if isinstance(returned, tuple) and len(returned) == 5:

@@ -168,6 +168,10 @@ def _facts(report: CheckReport) -> Iterator[str]:
     for reason in dict.fromkeys(verdict.not_judged.values()):
         names = [name for name, why in verdict.not_judged.items() if why == reason]
         yield f"not judged: {_list_rules(names)}: {reason}"
+    if shortened := report.records.shortened:
+        yield f"slow environment: judged on {', '.join(shortened.values())}"
+    if advice := report.advice:
+        yield advice
 
 
 def _randomizes(task: str) -> bool:

@@ -20,10 +20,13 @@ from rlctl.checking.records import CallFailure
 from rlctl.checking.rules import NotJudged
 from rlctl.checking.values import find_leaves, is_task
 from rlctl.environments import registry
-from rlctl.environments.places import find_line, format_place
+from rlctl.environments.graphics import opengl_fix
+from rlctl.environments.mujoco_version import mujoco_fix
+from rlctl.environments.places import find_line, format_place, is_own_file
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import RlctlError, TaskError
+from rlctl.errors import RlctlError, TaskError, read_message
 from rlctl.missing_packages import advise
+from rlctl.version import PACKAGE_FOLDER
 
 _HERE = Path(__file__).parent
 NO_DISPLAY = re.compile(
@@ -54,7 +57,22 @@ def describe_failure(error: EnvironmentRaised, progress: CallProgress) -> CallFa
     at, cause = progress.read(), error.cause
     place = (error.call, at.phase, at.episode, at.seed, at.step)
     trace, file = "".join(traceback.format_exception(cause)), find_missing_file(cause)
-    return CallFailure("raised", *place, describe(cause), trace, file, find_line(cause))
+    text = describe(cause)
+    fix = opengl_fix(text) or mujoco_fix(cause)
+    return CallFailure("raised", *place, text, trace, file, find_line(cause), fix=fix)
+
+
+def raised_by_environment(error: BaseException) -> bool:
+    """Return whether an exception comes from code of the environment, such as a property or `__getattr__`.
+
+    Libraries between that code and the place of the exception do not matter.
+    """
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if is_own_file(frame.filename):
+            return True
+        if PACKAGE_FOLDER in Path(frame.filename).parents:
+            return False
+    return False
 
 
 def describe(error: BaseException) -> str:
@@ -63,7 +81,7 @@ def describe(error: BaseException) -> str:
         return f"{type(error).__name__}: {error}"
     where = find_line(error)
     place = f" ({format_place(*where)})" if where else ""
-    text = " ".join(str(error).split()) or "no message"
+    text = " ".join(read_message(error).split()) or "no message"
     return f"{type(error).__name__}: {text}{place}{advise(error)}"
 
 
@@ -76,13 +94,14 @@ def display_error(failure: CallFailure) -> str:
 def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
     """Describe the file behind an exception, or behind what caused it; None if it is about something else."""
     for cause in get_causes(error):
+        message = read_message(cause)
         name, folders = None, [str(Path.cwd())]
         if isinstance(cause, FileNotFoundError):
-            path = re.search(r"[^\s'\"]*[/\\][^\s'\":]*", str(cause))
-            name = str(cause.filename or (path[0] if path else cause))
-        elif match := _NO_FILE.search(str(cause)):
+            path = re.search(r"[^\s'\"]*[/\\][^\s'\":]*", message)
+            name = str(cause.filename or (path[0] if path else message))
+        elif match := _NO_FILE.search(message):
             name = match[1] or match[2]
-        elif type(cause).__module__ == "pybullet" and "load" in str(cause).lower():
+        elif type(cause).__module__ == "pybullet" and "load" in message.lower():
             name, data = _find_model(cause.__traceback__), sys.modules.get("pybullet_data")
             folders += [data.getDataPath()] if data else []
         if name is not None:
@@ -90,6 +109,19 @@ def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
             found = next((folder for folder in searched[1:] if Path(folder, name).is_file()), "")
             return {"file": name, "searched": searched, "found": found}
     return None
+
+
+def find_first_error(error: BaseException | None) -> BaseException | None:
+    """Return the first exception of the chain that a traceback of this one shows; None if it is the only one."""
+    first = error
+    while first is not None:
+        behind = first.__cause__
+        if behind is None and not first.__suppress_context__:
+            behind = first.__context__
+        if behind is None:
+            break
+        first = behind
+    return None if first is error else first
 
 
 def get_causes(error: BaseException | None) -> list[BaseException]:
@@ -143,6 +175,7 @@ def _evaluate(node: ast.AST, frame: FrameType) -> str | None:
 
 Timer = Callable[..., Any]  # calls its first argument with the others
 
+MOST_STEPS, MOST_RESETS, RESERVE = 14_000, 200, 1.3  # Of all experiments of a process, about; for what is not a step
 MOST_FAILURES = 3  # An experiment stops after so many episodes that raised
 
 
@@ -152,6 +185,10 @@ class Budget:
 
     deadline: float  # On `read_clock`'s clock [s]
     last: float = math.inf  # when the time of the whole process is over: no call begins after it
+    began: float = 0.0
+    growth: Callable[[], float] = lambda: 1.0
+    """How many times longer it lasts than was known when it began: an environment shows while it is played how slow it
+    is."""
     bytes_left: int = 48 * 2**20
     failures: int = 0
     was_cut: bool = False  # whether time ran out before all steps or resets were done
@@ -159,17 +196,22 @@ class Budget:
     @property
     def seconds_left(self) -> float:
         """How much time is left [s]."""
-        return max(0.0, self.deadline - read_clock())
+        return max(0.0, self.ends(self.deadline) - read_clock())
+
+    def ends(self, planned: float) -> float:
+        """Return when something ends that was planned to end at a time."""
+        growth = self.growth()
+        return planned if growth == 1.0 else self.began + (planned - self.began) * growth
 
     def is_over(self) -> bool:
         """Say whether time ran out, and note it: the caller then stops the experiment."""
-        is_over = read_clock() > self.deadline
+        is_over = read_clock() > self.ends(self.deadline)
         self.was_cut |= is_over
         return is_over
 
     def require_time(self, least_s: float = 0.0) -> None:
         """Raise `NotJudged` if the time of the whole process is over in `least_s`."""
-        if read_clock() + least_s > self.last:
+        if read_clock() + least_s > self.ends(self.last):
             self.was_cut = True
             raise NotJudged("time ran out")
 
@@ -243,6 +285,8 @@ class Context:
         self.progress = progress or CallProgress()
         self.budget = Budget(read_clock())  # What the experiment that is running may use
         self.least_s = 0.0  # what the last build took: an experiment takes at least so long
+        self.most_growth = 1.0  # how many times longer a slow environment may be checked
+        self.seconds = math.inf  # what all experiments of the process may take together
         self.unseeded_calls: set[tuple[str, int]] = set()  # file and line of default_rng() in reset or step
         self.generators: dict[str, str] | None = None  # State of each after the first watched reset; None before
 
@@ -261,6 +305,17 @@ class Context:
             return Instance(env, self)
         except BaseException as error:
             raise EnvironmentRaised("build", error) from error
+
+    @property
+    def needed_s(self) -> float:
+        """Estimate how long all experiments of a process take [s]; 0 before it is known how slow the steps are."""
+        step_s, reset_s = self.progress.mean_s("step"), self.progress.mean_s("reset", fewest=2)
+        return RESERVE * (MOST_STEPS * (step_s or 0.0) + MOST_RESETS * (reset_s or 0.0))
+
+    @property
+    def growth(self) -> float:
+        """How many times longer than `seconds` the experiments may take, because the environment is slow."""
+        return min(max(self.needed_s / self.seconds, 1.0), self.most_growth)
 
     @functools.cached_property
     def instance(self) -> Instance:

@@ -43,6 +43,9 @@ class CallProgress:
             os.ftruncate(descriptor, ctypes.sizeof(_Memory))
             self._now = _Memory.from_buffer(mmap.mmap(descriptor, ctypes.sizeof(_Memory)))
         self._called: set[str] = set()
+        self._entered, self._began = "", 0.0
+        self._step_began: float | None = None  # of the step before, in the same episode
+        self._times: dict[str, list[float]] = {}  # number and time [s] of the calls of a kind, without the first
 
     def phase(self, name: str) -> None:
         """Note which experiment, or part of one, begins."""
@@ -58,11 +61,34 @@ class CallProgress:
         now.step, now.is_first, now.call = step, call not in self._called, call.encode()
         now.counter += 1
         self._called.add(call)
+        self._entered, self._began = "" if now.is_first else call, read_clock()
+        if call == "step":
+            if self._step_began is not None:
+                self._count("step", self._began - self._step_began)
+            self._step_began = self._began
+        elif call != "sample":
+            self._step_began = None
 
     def leave(self) -> None:
         """Note that the call came back."""
+        if self._entered not in ("", "step"):
+            self._count(self._entered, read_clock() - self._began)
+        self._entered = ""
         self._now.call = b""
         self._now.counter += 1
+
+    def _count(self, call: str, seconds: float) -> None:
+        times = self._times.setdefault(call, [0, 0.0])
+        times[0] += 1
+        times[1] += seconds
+
+    def mean_s(self, call: str, fewest: int = 5) -> float | None:
+        """Return the mean time of the calls of a kind so far [s]; None before there were a few.
+
+        That of `step` is from one step to the next: with what the check itself does between them.
+        """
+        number, seconds = self._times.get(call, (0, 0.0))
+        return seconds / number if number >= fewest else None
 
     def read(self) -> Position:
         """Return where the child is."""

@@ -9,6 +9,7 @@ from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.instance import EnvironmentRaised, describe_failure
 from rlctl.checking.records import MOST_INFOS, CallFailure, CheckedEpisode, Form, Series
 from rlctl.checking.values import Leaf, find_numbers, flatten_action, name_type, pick
+from rlctl.environments.success import OTHER_SUCCESS, SUCCESS, find_success
 
 
 class Recording:
@@ -77,7 +78,7 @@ class Recording:
     def _add_info(self, info: Any) -> None:
         self._count_form("info", name_type(info))
         if isinstance(info, dict):
-            for name, value in find_numbers(info):
+            for name, value in find_numbers(_name_success(info)):
                 if name in self._infos or len(self._infos) < MOST_INFOS:
                     steps, values = self._infos.setdefault(name, ([], []))
                     steps.append(self._step)
@@ -146,6 +147,15 @@ class Recording:
             forms=[Form(what, kind, step, count, *more) for (what, kind, *more), (step, count) in forms],
             taken=np.stack(self._taken) if self._taken else np.zeros((0, 0)),
         )
+
+
+def _name_success(info: dict[Any, Any]) -> dict[Any, Any]:
+    """Return an `info` in which success has the name that the rules know, where it has the other one."""
+    success = find_success(info)
+    if success is None or info.get(SUCCESS) is not None:
+        return info
+    others = {name: value for name, value in info.items() if name != OTHER_SUCCESS}
+    return {**others, SUCCESS: success}
 
 
 def _to_series(steps: list[int], values: list[Any]) -> Series:

@@ -15,7 +15,6 @@ from rlctl.errors import UsageError
 
 FIRST_SEED, SECOND_SEED = 1000, 1001
 MOST_INFOS = 100  # So many numbers of info are recorded per episode, by name
-SUCCESS = "is_success"  # The name of success in info
 ENDS = ("terminated", "truncated", "both")
 
 
@@ -134,6 +133,7 @@ class CallFailure:
     file: Mapping[str, Any] | None = None  # one that was not found, and the searched folders
     where: tuple[str, int] | None = None  # last line of the environment's own code
     process: str = ""  # Which child process: `probe` or `instances`
+    fix: str = ""  # what to do about it, where that is known
 
     @property
     def message(self) -> str:
@@ -160,6 +160,14 @@ class Fact:
 
 
 @dataclasses.dataclass(frozen=True)
+class Shortened:
+    """An experiment was judged on less than usual, because the environment is slow."""
+
+    experiment: str
+    extent: str  # `12 of 16 episodes`
+
+
+@dataclasses.dataclass(frozen=True)
 class Skipped:
     """An experiment, a role of one, or a rule that cannot be judged, and why."""
 
@@ -177,6 +185,7 @@ class Finished:
     is_complete: bool
     is_cut: bool = False  # time ran out: what would have happened later is unknown
     crash: str = ""  # The traceback of a bug of the experiment
+    needed_s: float = 0.0  # how long all experiments of its process would take, as far as it is known then
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,7 +200,9 @@ class End:
     """The process has finished."""
 
 
-ChildMessage = Built | CheckedEpisode | CallFailure | RuleFinding | Fact | Skipped | Finished | Mistake | End
+ChildMessage = (
+    Built | CheckedEpisode | CallFailure | RuleFinding | Fact | Shortened | Skipped | Finished | Mistake | End
+)
 OTHERS_MATTER = ("interleaved", "interleaved second", "after close")  # judged by RL401 and RL402
 
 
@@ -208,6 +219,7 @@ class Records:
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)  # experiment, role or rule -> reason
     not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)  # rule -> reason
     finished: dict[str, Finished] = dataclasses.field(default_factory=dict)  # by experiment
+    shortened: dict[str, str] = dataclasses.field(default_factory=dict)  # experiment -> `12 of 16 episodes`
     normalizes: Callable[[str], bool] = lambda _: False  # says whether the recipe normalises `reward` or `observation`
     printed_lines: int = 0  # Lines that the environment of the first process wrote to stdout
     printed_first: str = ""
@@ -227,6 +239,8 @@ class Records:
                 self.facts[message.experiment] = message.value
             case Skipped():
                 (self.skipped if message.applies else self.not_applicable)[message.name] = message.reason
+            case Shortened():
+                self.shortened[message.experiment] = message.extent
             case Finished():
                 self.finished[message.experiment] = message
             case Mistake():

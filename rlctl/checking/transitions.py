@@ -6,9 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.records import SUCCESS, CheckedEpisode, Records
+from rlctl.checking.records import CheckedEpisode, Records
 from rlctl.checking.rules import NotJudged
 from rlctl.checking.values import Leaf
+from rlctl.environments.success import SUCCESS
 
 ROLES = ("episodes", "seeds", "starts", "search")  # each plays other states; the other roles repeat an episode
 MOST_ELEMENTS = 64

@@ -72,8 +72,13 @@ def check_env(
     ] = None,
     env_timeout: EnvTimeout = 10.0,
     budget: Annotated[
-        float, Option("Computing time in seconds of each process of the check; slow environments need more.", min=1)
-    ] = 18.0,
+        float | None,
+        Option(
+            "Computing time in seconds of each process of the check.",
+            min=1,
+            default_text="18, and up to 90 for slow environments",
+        ),
+    ] = None,
     list_rules: Annotated[bool, Option("List all rules and exit.", ("--list",))] = False,
     explain: Annotated[
         str | None, Option("Explain a rule, or a finding of a training, such as Q10.", metavar="RULE")

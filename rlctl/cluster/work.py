@@ -83,12 +83,16 @@ def make_work(request: TrainRequest, token: str, settings: ClusterSettings) -> W
     seed = int(run.recipe().seed if run is not None else request.settings["seed"])
     task = locate_task(run.status()["task"], run) if run is not None else str(request.task)
     root = request.root.absolute()
-    # A node may be in a copy of the current folder, which has no runs.
+    # A node may be in a copy of the current folder, which has no runs and nothing from outside.
     resume, policy = _make_absolute(request.resume), _make_absolute(request.initial_policy)
+    demos = request.demos
+    if demos is not None and os.path.exists(demos):  # else the name of a dataset
+        demos = os.path.abspath(demos)
+    on_node = dataclasses.replace(request, root=root, resume=resume, initial_policy=policy, demos=demos)
     return Work(
         seed=seed,
         task=task,
-        request=dataclasses.replace(request, root=root, resume=resume, initial_policy=policy).to_json(),
+        request=on_node.to_json(),
         root=str(root),
         cwd=os.getcwd(),
         command=sys.argv,

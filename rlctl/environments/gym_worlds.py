@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import join, split, split_space
+from rlctl.environments.success import SUCCESS, find_success
 from rlctl.environments.teacher_view import TeacherView
 from rlctl.output import format_count
 from rlctl.task.calls import ONE_FLAG
@@ -64,10 +65,9 @@ class GymWorlds:
         raw = self._no_terms
         if self.weights:
             raw = np.array([list(info["metrics"].values())])
-        success = None
-        if info.get("is_success") is not None:
-            success = np.array([_to_bool(info["is_success"], "info['is_success']")])
-        return Step(self._writer.read(observation), np.array([reward]), *flags, raw, success)
+        success = _read_success(info)
+        successes = None if success is None else np.array([success])
+        return Step(self._writer.read(observation), np.array([reward]), *flags, raw, successes)
 
     def _count(self, reward: float, info: Mapping[str, Any]) -> None:
         self._reward += reward
@@ -82,7 +82,7 @@ class GymWorlds:
         """Return what the episode has added up to so far."""
         if self.task_worlds is not None:
             return self.task_worlds.totals(0)
-        success, metrics = self._info.get("is_success"), self._info.get("metrics")
+        metrics = self._info.get("metrics")
         # In a plain environment "metrics" and "distance" may be anything.
         distance = (metrics if isinstance(metrics, dict) else self._info).get("distance")
         if not isinstance(distance, int | float | np.number) or not math.isfinite(distance):
@@ -92,7 +92,7 @@ class GymWorlds:
             terms={str(name): _to_float(value, f"reward term {name}") for name, value in self._sums.items()},
             metrics={},
             distance=None if distance is None else float(distance),
-            success=None if success is None else _to_bool(success, "info['is_success']"),
+            success=_read_success(self._info),
             drawn={},
         )
 
@@ -157,6 +157,11 @@ def _to_float(value: Any, name: str) -> float:
         return float(value.item() if isinstance(value, np.ndarray) else value)
     except (TypeError, ValueError):
         raise ValueError(f"{name} is {reprlib.repr(value)}, not a number") from None
+
+
+def _read_success(info: Mapping[str, Any]) -> bool | None:
+    success = find_success(info)
+    return None if success is None else _to_bool(success, f"info['{SUCCESS}']")
 
 
 def _to_bool(value: Any, name: str) -> bool:

@@ -22,8 +22,6 @@ POLICY = "a policy file"
 EPISODE = "a recorded episode"
 RUN, GROUP, TUNING = "run.json", "group.json", "tune.json"
 
-_MODULE_ID = re.compile(r"^([\w.]+):(?:[\w.-]+/)?[\w.-]+-v\d+$")
-
 
 def load(task: str, named_by: str) -> Callable[..., Any]:
     """Import a task that a file of kind `named_by` names; raises `ArtifactError` if it is not an environment."""
@@ -51,7 +49,6 @@ def _make_error(task: str, named_by: str, why: str) -> ArtifactError:
 
 def _look_before_import(task: str, named_by: str) -> None:
     """Raise `ArtifactError` if the source shows that it cannot be an environment; an import would already run it."""
-    by_id = _MODULE_ID.match(task)
     place, _, name = task.rpartition(":")
     file = registry.find_source_file(f"{place}:_")  # of a Gymnasium id, the module that registers it
     if file is None or not file.is_file():
@@ -61,11 +58,12 @@ def _look_before_import(task: str, named_by: str) -> None:
     if file.suffix != ".py" or _is_of_python(file):
         raise _make_error(task, named_by, "it is part of Python or rlctl")
     source = file.read_text(encoding="utf-8", errors="replace")
-    if by_id is not None:
-        if "gymnasium" not in source:
+    if "gymnasium" not in source:
+        if registry.is_gymnasium_id(task):
             raise _make_error(task, named_by, "its module does not mention Gymnasium")
-    elif not _defines(source, name.partition(".")[0]):
-        raise _make_error(task, named_by, f"{file.name} does not define it")
+        # With Gymnasium, a name that is not defined may be an id without a version: see `_may_be_called`.
+        if not _defines(source, name.partition(".")[0]):
+            raise _make_error(task, named_by, f"{file.name} does not define it")
 
 
 def _is_of_python(file: Path) -> bool:

@@ -18,12 +18,14 @@ from typing import Any
 from rlctl import errors, missing_packages
 from rlctl.environments import installed, own_ids, suggestions
 from rlctl.environments.graphics import opengl_fix
+from rlctl.environments.mujoco_version import mujoco_fix
 from rlctl.environments.places import describe_exception_place
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError, did_you_mean
 from rlctl.storage import files
 
 _MOST_NAMED = 4  # classes of a file
-_GYMNASIUM_ID = re.compile(r"^(?:[\w.]+:)?(?:[\w.-]+/)?[\w.-]+-v\d+$")
+_GYMNASIUM_ID = re.compile(r"^(?!.*\.py:)(?:(?:[\w.]+:)?(?:[\w.-]+/)?[\w.-]+-v\d+|[\w.]+:[\w.-]+/[\w.-]+)$")
+"""An id with a version, or one of a module with a namespace, as `metaworld:Meta-World/MT1`: no class has that form."""
 
 
 def load(task: str) -> Callable[..., Any]:
@@ -44,6 +46,8 @@ def load(task: str) -> Callable[..., Any]:
     if ":" in task.rstrip(":"):
         append_to_path(os.getcwd())
         return _load_target(task, task)
+    if _is_registered(task):
+        return _load_gymnasium(task)  # an id without a version, of a plugin that Gymnasium has loaded
     for file in (Path(os.path.expanduser(task.rstrip(":"))), Path(f"{task}.py"), Path(f"{task.lower()}.py")):
         if file.suffix == ".py" and file.is_file():
             classes = suggestions.list_classes(file)
@@ -54,6 +58,8 @@ def load(task: str) -> Callable[..., Any]:
         raise UsageError(f"{task} is a folder, not a task: {forms}")
     if model := suggestions.explain_model_file(task):
         raise UsageError(model)
+    if "/" in task and (module := own_ids.find_registering_module(task)):
+        raise _name_module(task, module)
     names = [entry.name for entry in installed.list_installed()]
     listed, close = ", ".join(dict.fromkeys(names)) or "none", suggestions.suggest(task)
     close, forms = (
@@ -63,6 +69,12 @@ def load(task: str) -> Callable[..., Any]:
     raise UsageError(f"no task {task!r}{close} Installed: {listed}. Other forms: {forms}")
 
 
+def _is_registered(task: str) -> bool:
+    import gymnasium
+
+    return task in gymnasium.registry
+
+
 def is_task(constructor: Any) -> bool:
     """Return whether a constructor is a `Task` or a `BatchTask` of `rlctl.task`."""
     module = sys.modules.get("rlctl.task.task")
@@ -70,7 +82,7 @@ def is_task(constructor: Any) -> bool:
 
 
 def is_gymnasium_id(task: str) -> bool:
-    """Return whether a task is named by a Gymnasium id of the usual form, `Env-v0` or `package:Env-v0`."""
+    """Return whether a task is named by a Gymnasium id: `Env-v0`, `package:Env-v0` or `package:Namespace/Env`."""
     return installed.find(task) is None and _GYMNASIUM_ID.match(task) is not None
 
 
@@ -193,9 +205,7 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
                 known = f"{name} is registered with the old gym package"
                 raise OldGymError(f"{known}; Gymnasium cannot find it there") from None
             if module := own_ids.find_registering_module(task):
-                raise UsageError(
-                    f"{module} registers {task}, which Gymnasium cannot know: write {module}:{task}"
-                ) from None
+                raise _name_module(task, module) from None
             forms = "" if ":" in task else f" If a package registers it, write PACKAGE:{task}."
             close = did_you_mean(name, gymnasium.registry)
             raise UsageError(f"Gymnasium has no environment {task!r}.{close}{forms}") from None
@@ -210,6 +220,10 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
     return constructor
 
 
+def _name_module(task: str, module: str) -> UsageError:
+    return UsageError(f"{module} registers {task}, which Gymnasium cannot know: write {module}:{task}")
+
+
 def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
     """Call a plugin's code; any exception from it, `SystemExit` included, becomes a `TaskError`."""
     try:
@@ -219,7 +233,7 @@ def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
     except BaseException as error:
         where = describe_exception_place(error)
         reason, details = errors.describe_exception(error, where), errors.format_plugin_traceback(error) or None
-        hint = opengl_fix(reason)
+        hint = opengl_fix(reason) or mujoco_fix(error)
         message = f"task {task!r}: {doing}{reason}" + (f"\n{hint}" if hint else "")
         raise TaskError(message, details=details) from error
 

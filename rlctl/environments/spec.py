@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
-import os
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NoReturn
 
@@ -75,8 +74,6 @@ class EnvSpec:
         With a `teacher` it also observes what a policy of that spec sees; see `rlctl.environments.teacher_view`.
         Without `visuals` a task that draws nothing needs less memory: see `TaskEnv`.
         """
-        if render_mode == "rgb_array" and not os.environ.get("DISPLAY"):
-            os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it at import; its default needs a display
         constructor = self.constructor()
         print_mujoco_warnings()
         if is_task(constructor):
@@ -215,6 +212,8 @@ class EnvSpec:
     def _make_plain_env(self, constructor: Any, render_mode: Any) -> gymnasium.Env[Any, Any]:
         import gymnasium
 
+        from rlctl.task.mujoco.opengl import draw_without_display
+
         parameters = dict(self.parameters)
         if not may_make_environments(constructor):
             why = "; it was not called, because its source file mentions neither gymnasium nor rlctl"
@@ -227,9 +226,12 @@ class EnvSpec:
                 check_keywords(self.task, constructor, parameters)
             except RecipeError:
                 raise RecipeError(f"{self.task} takes no render_mode") from None
+        draw_without_display(only_where_possible=True)  # a constructor may draw, in any render mode
         with refuse_windows(self.task):
             env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
-        if hasattr(env, "num_envs") and not isinstance(env, gymnasium.Env):
+        asking = "__getattr__ for an attribute that it lacks: "  # which must raise AttributeError
+        is_vectorised = call_plugin(self.task, lambda: hasattr(env, "num_envs"), doing=asking)
+        if is_vectorised and not isinstance(env, gymnasium.Env):
             hint = "give a single environment; rlctl itself runs n_envs of them in parallel"
             raise TaskError(f"{self.task}: {type(env).__name__} is a vectorised environment\n{hint}")
         if not (hasattr(env, "reset") and hasattr(env, "step") and hasattr(env, "action_space")):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rlctl.environments import dict_spaces, registry
 from rlctl.environments.info import EnvInfo, describe, find_mujoco
 from rlctl.environments.spec import EnvSpec
+from rlctl.environments.success import find_success
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.play.messages import format_hint
 from rlctl.replaying.bullet_scene import TaskReader, WorldsReader
@@ -180,8 +181,9 @@ def _read_step(action: Any, observation: Any, reward: float, info: dict[str, Any
         raise ValueError(f"reward is {reward}")
     names = list(about.reward_weights)
     raw, weighted = ([float(info[key][name]) for name in names] for key in ("metrics", "reward_terms"))
-    success = None if info.get("is_success") is None else bool(info["is_success"])
-    return _Step(np.array(action), observation, reward, raw, weighted, success, _find_events(info, about))
+    success = find_success(info)
+    flag = None if success is None else bool(success)
+    return _Step(np.array(action), observation, reward, raw, weighted, flag, _find_events(info, about))
 
 
 def _find_events(info: dict[str, Any], about: EnvInfo) -> dict[str, dict[str, float]]:

@@ -14,6 +14,53 @@ class Raising(Clean):
         raise RuntimeError("no licence")
 
 
+class UnreadableError(Exception):
+    def __str__(self):
+        raise RuntimeError("no text")
+
+
+class RaisingUnreadably(Clean):
+    def __init__(self):
+        raise UnreadableError
+
+
+class RaisingUnreadablyInStep(Clean):
+    def step(self, action):
+        raise UnreadableError
+
+
+class AnyAttribute(Clean):
+    """Python expects AttributeError for a name that does not exist."""
+
+    def __getattr__(self, name):
+        return {}[name]
+
+
+class RaisingProperty(Clean):
+    @property
+    def sim(self):
+        raise RuntimeError("not connected")
+
+
+class RaisingOfAnother(Clean):
+    def __init__(self):
+        try:
+            import no_such_module_at_all  # noqa: F401
+        except ImportError:
+            raise RuntimeError("install the extra")  # noqa: B904
+
+
+class NeedsArgumentsInside(Clean):
+    """The constructor's own call lacks an argument: nothing that a user can give."""
+
+    def __init__(self):
+        super().__init__()
+        self.place()
+
+    def place(self, link):
+        pass
+
+
 class NeedsArguments(Clean):
     def __init__(self, gain, *, offset):
         super().__init__()

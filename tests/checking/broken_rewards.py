@@ -186,7 +186,21 @@ class SuccessUntold(Clean):
 
 class SuccessMisnamed(Clean):
     def info(self):
-        return {"success": bool(np.linalg.norm(self.position) < 0.1)}
+        return {"goal_reached": bool(np.linalg.norm(self.position) < 0.1)}
+
+
+class SuccessOtherwiseNamed(Clean):
+    """The name and the numbers of Adroit and Meta-World count too."""
+
+    def info(self):
+        return {"success": float(np.linalg.norm(self.position) < 0.1)}
+
+
+class SuccessIsAShare(Clean):
+    """A `success` that is no flag means something else."""
+
+    def info(self):
+        return {"success": 0.37}
 
 
 class SuccessArray(Clean):

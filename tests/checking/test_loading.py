@@ -1,5 +1,6 @@
 """RL0: from a name to an environment, and what the environment says about itself."""
 
+import re
 import sys
 import types
 from pathlib import Path
@@ -16,6 +17,11 @@ ERROR = "error"
 CASES = [
     case("broken_import.py:Anything", ("RL001", ERROR)),
     case("broken_loading.py:Raising", ("RL002", ERROR)),
+    case("broken_loading.py:RaisingUnreadably", ("RL002", ERROR)),
+    case("broken_loading.py:AnyAttribute", ("RL002", ERROR)),
+    case("broken_loading.py:RaisingProperty", ("RL002", ERROR)),
+    case("broken_loading.py:RaisingOfAnother", ("RL002", ERROR)),
+    case("broken_loading.py:NeedsArgumentsInside", ("RL002", ERROR)),
     case("broken_envs.py:NoEnvironment", ("RL003", ERROR)),
     case("broken_envs.py:Cleen", ("RL005", ERROR)),
     case("broken_loading.py:NeedsArguments", ("RL006", ERROR)),
@@ -35,6 +41,34 @@ def test_arguments_are_named_and_how_to_give_them():
     (finding,) = findings("broken_loading.py:NeedsArguments", "RL006")
     assert "missing 1 required positional argument: 'gain'" in finding.message
     assert "(--set task.gain=...)" in finding.fix
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("RaisingUnreadably", r"UnreadableError: \(message unavailable: RuntimeError\)"),
+        ("AnyAttribute", "__getattr__ for an attribute that it lacks: KeyError: 'num_envs'"),
+        ("RaisingProperty", r"reading an attribute raises RuntimeError: not connected \(.*broken_loading.py:"),
+        ("RaisingOfAnother", "RuntimeError: install the extra .*; the first error was ModuleNotFoundError: No module"),
+        ("NeedsArgumentsInside", "missing 1 required positional argument: 'link'"),
+    ],
+)
+def test_what_a_constructor_raises_is_named(name, message):
+    (finding,) = findings(f"broken_loading.py:{name}", "RL002", "RL006")
+    assert re.search(message, finding.message)
+
+
+def test_an_exception_without_a_readable_message_is_a_finding_of_its_call():
+    (finding,) = findings("broken_loading.py:RaisingUnreadablyInStep", "RL207")
+    assert finding.message.startswith("step 1 raised UnreadableError: (message unavailable: RuntimeError)")
+
+
+def test_an_import_names_the_first_error_of_a_chain(tmp_path):
+    file = tmp_path / "chained_import.py"
+    file.write_text("try:\n    import no_such_module\nexcept ImportError as e:\n    raise RuntimeError('extra') from e")
+    (finding,) = findings(f"{file}:Env", "RL001")
+    assert "RuntimeError: extra" in finding.message
+    assert "the first error was ModuleNotFoundError: No module named 'no_such_module'" in finding.message
 
 
 def test_a_missing_class_gets_the_closest_name():

@@ -90,6 +90,30 @@ def test_a_first_call_that_hangs_ends_the_process_once(in_root):
     assert [failure.process for failure in report.records.failures] == ["probe", "instances"]
 
 
+NAN = """
+import gymnasium, numpy
+class Env(gymnasium.Env):
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (2,))
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return numpy.zeros(2, numpy.float32), {}
+    def step(self, action):
+        while not abs(action).sum() < 10:
+            pass
+        return action, 0.0, False, False, {}
+"""
+
+
+def test_what_hangs_for_nan_is_not_called_a_hang(tmp_path):
+    (tmp_path / "nan_hangs.py").write_text(NAN)
+    rules = choose_rules(["RL209", "RL704"])
+    report = check(EnvSpec(f"{tmp_path}/nan_hangs.py:Env"), rules=rules, only=["nan action"], env_timeout_s=0.2)
+    (finding,) = report.verdict.findings
+    assert (finding.rule, finding.severity) == ("RL704", "info")
+    assert finding.message == "after an action of NaN, step 1 did not return within 0.6 s"
+    assert report.exit_code == 0
+
+
 def test_printing_is_worth_knowing_and_does_not_reach_the_result(in_root):
     run = rlctl(f"{BROKEN}:Prints", "--select", "RL211", "--json", "-")
     content = json.loads(run.stdout)

@@ -57,3 +57,14 @@ def test_what_a_node_refuses(work, changes, message):
 def test_paths_of_a_work_are_absolute(work, tmp_path):
     assert work.root == str(tmp_path / "runs")
     assert work.request["root"] == work.root
+
+
+def test_demonstrations_outside_of_the_copied_folder_are_found(request_of_line, tmp_path, monkeypatch):
+    here, demos = tmp_path / "here", tmp_path / "demos"
+    here.mkdir()
+    demos.mkdir()
+    monkeypatch.chdir(here)
+    settings = {"seed": 3}
+    for name, expected in (("../demos", str(demos)), ("D4RL/door/human-v2", "D4RL/door/human-v2")):
+        request = dataclasses.replace(request_of_line, task="toy.py:Toy", demos=name, root=tmp_path, settings=settings)
+        assert make_work(request, "token", ClusterSettings()).request["demos"] == expected

@@ -89,6 +89,46 @@ def test_what_does_not_exist_is_a_usage_error():
             EnvSpec(task, named_by=named_task.POLICY).make()
 
 
+REGISTERS = """
+import gymnasium
+
+def _make(**keywords):
+    from tests.training.faulty_envs import Faulty
+    return Faulty(**keywords)
+
+for name in ("Made/Leg", "LegAlone"):
+    gymnasium.register(name, lambda **keywords: _make(**keywords))
+"""
+
+
+@pytest.mark.filterwarnings("ignore:.*Overriding environment")
+@pytest.mark.parametrize(
+    "task", ["made_ids:Made/Leg", "made_ids:LegAlone", "made_ids.py:Made/Leg", "made_ids.py:LegAlone"]
+)
+def test_an_id_without_a_version_may_be_named(task, tmp_path, monkeypatch):
+    (tmp_path / "made_ids.py").write_text(REGISTERS)
+    monkeypatch.chdir(tmp_path)
+    EnvSpec(task, {"fault": ""}, named_by=named_task.POLICY).make().close()
+    EnvSpec(task, {"fault": ""}).make().close()
+
+
+def test_an_id_of_a_module_without_gymnasium_is_not_imported(tmp_path, monkeypatch):
+    mark = tmp_path / "ran"
+    (tmp_path / "other_ids.py").write_text(f"open({str(mark)!r}, 'w')")
+    monkeypatch.chdir(tmp_path)
+    for name in ("Made/Leg", "Leg", "Leg-v0"):
+        with pytest.raises(ArtifactError, match="not run"):
+            EnvSpec(f"other_ids:{name}", named_by=named_task.POLICY).make()
+    assert not mark.exists()
+
+
+def test_what_registers_an_id_without_a_version_is_named(tmp_path, monkeypatch):
+    (tmp_path / "some_ids.py").write_text('import gymnasium\ngymnasium.register("Made/Arm", "some_ids:Arm")')
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError, match=r"^some_ids registers Made/Arm, .*: write some_ids:Made/Arm$"):
+        EnvSpec("Made/Arm").make()
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     root = tmp_path_factory.mktemp("runs")

@@ -146,3 +146,11 @@ def test_what_a_baseline_does_not_take():
         UsageError, match=r"plays a task, and best\.onnx is a file: leave out --policy, or name its task"
     ):
         run_evaluation(EvalRequest("best.onnx", baseline="zero"))
+
+
+def test_random_leaves_the_generator_of_the_environment_alone():
+    space = spaces.Box(-1.0, 1.0, (2,))
+    space.seed(3)
+    before = space.np_random.bit_generator.state
+    make_player("random", space).act(None, seed=1, step=2)
+    assert space.np_random.bit_generator.state == before

@@ -1,7 +1,9 @@
 """Tasks in batches: an episode has the same bits alone and in any world, whatever the other worlds do."""
 
 import contextlib
+import sys
 from contextlib import closing
+from importlib import metadata
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from rlctl.errors import ShapeError, TaskError, UsageError, WorldFailed
 from rlctl.task import BatchTask
 from rlctl.task.batch import WorldRngs
 from rlctl.task.env import TaskEnv
+from rlctl.task.mujoco.world import MujocoWorld
 from rlctl.task.worlds import TaskWorlds
 from tests.task.batches import Stool
 
@@ -288,6 +291,16 @@ def test_a_missing_method():
     with pytest.raises(TaskError) as caught:
         TaskEnv(WithoutAct(), sim="mujoco")
     assert str(caught.value) == "WithoutAct does not define act(); a task needs build, act, observe, rewards"
+
+
+def test_a_mujoco_without_batches_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco.batch", None)  # as before version 4
+    version = metadata.version("mujoco")
+    with pytest.raises(
+        UsageError, match=rf"^a batch of worlds needs MuJoCo 4 or later, and {version} is installed: pip"
+    ):
+        MujocoWorld(substeps=1, count=2)
+    MujocoWorld(substeps=1, count=1)
 
 
 def test_batches_need_mujoco_and_no_wrappers():

@@ -1,6 +1,7 @@
 """Worlds of tasks in MuJoCo: the same models, starts and motors as in PyBullet, and bit-exact resets."""
 
 import ctypes.util
+import os
 import subprocess
 import sys
 from contextlib import closing
@@ -12,6 +13,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
 from rlctl.task import worlds as worlds_module
 from rlctl.task.env import TaskEnv
+from rlctl.task.mujoco.opengl import draw_without_display
 from rlctl.task.mujoco.sim import MujocoSim, read_solref
 from rlctl.task.pybullet.sim import PybulletSim
 from rlctl_manipulation.peg_insert import SCARA
@@ -208,6 +210,37 @@ def test_a_task_draws_without_a_display(monkeypatch):
     code += "env.reset(seed=0); print(env.unwrapped.sim.render().shape)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=250)
     assert done.stdout == "(240, 320, 3)\n", done.stderr
+
+
+DRAWS = """
+import gymnasium, mujoco
+class Camera(gymnasium.Env):
+    action_space = observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    def __init__(self):
+        model = mujoco.MjModel.from_xml_string("<mujoco/>")
+        print(mujoco.Renderer(model, 8, 8).render().shape)
+    def reset(self, seed=None, options=None): ...
+    def step(self, action): ...
+"""
+
+
+@needs_egl
+def test_a_constructor_draws_without_a_display(monkeypatch, tmp_path):
+    for name in ("DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / "camera.py").write_text(DRAWS)
+    code = f"from rlctl.environments.spec import EnvSpec; EnvSpec('{tmp_path}/camera.py:Camera').make()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=250)
+    assert done.stdout == "(8, 8, 3)\n", done.stderr
+
+
+@pytest.mark.parametrize("platform", ["darwin", "win32"])
+def test_only_linux_is_told_to_draw_by_egl(platform, monkeypatch):
+    monkeypatch.setattr(sys, "platform", platform)
+    for name in ("DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    draw_without_display()
+    assert "MUJOCO_GL" not in os.environ
 
 
 def test_an_engine_is_chosen_by_what_is_installed(monkeypatch):

@@ -33,6 +33,7 @@ from collections.abc import Collection
 from rlctl.checking.rules import RULES, Check, Experiment
 
 PROCESS_S = 18.0  # for the experiments of one process [s], besides importing and building
+MOST_GROWTH = 5.0  # times longer, for an environment whose steps are slow
 
 _MODULES = [importlib.import_module(f"{__name__}.{module.name}") for module in pkgutil.iter_modules(__path__)]
 _MEMBERS = [value for module in _MODULES for value in vars(module).values()]

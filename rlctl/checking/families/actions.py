@@ -81,6 +81,15 @@ def give_nan(context: Context) -> Iterator[ChildMessage]:
                 yield RuleFinding("RL704", message, evidence, Severity.WARNING if lasts else None)
 
 
+@check("RL704", "nan action")
+def _find_end_after_nan(records: Records) -> Iterator[RuleFinding]:
+    for failure in records.failures:
+        if failure.phase == "nan action" and failure.kind in ("died", "hung"):
+            evidence = {**failure.place, "value": "NaN", "expected": "an exception"}
+            yield RuleFinding("RL704", f"after an action of NaN, {failure.message}", evidence)
+            return
+
+
 @check("RL705")
 def _find_changed_actions(records: Records) -> Iterator[RuleFinding]:
     for episode, form in records.forms("action")[:1]:

@@ -10,9 +10,10 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.mujoco_worlds import FIELDS, read_kept_fields
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import FIRST_SEED, SECOND_SEED, SUCCESS, CheckedEpisode, ChildMessage, Fact, Records, Series
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, CheckedEpisode, ChildMessage, Fact, Records, Series
 from rlctl.checking.rules import Check, NotJudged, RuleFinding, Severity, check, experiment, list_names
 from rlctl.checking.values import find_unequal, read_attributes
+from rlctl.environments.success import SUCCESS
 
 COMPARED_STEPS = 200  # How far comparisons go
 DIRTY_STEPS = 37  # longest unfinished episode before a repetition

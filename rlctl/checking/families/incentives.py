@@ -9,8 +9,9 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.families import rewards
 from rlctl.checking.instance import Context
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import FIRST_SEED, SUCCESS, CheckedEpisode, ChildMessage, Records, Skipped
+from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Records, Skipped
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
+from rlctl.environments.success import SUCCESS
 
 LIKE_A_GOAL, LIKE_ANY = 0.9, 0.5  # of all rewards up to the last one: like a goal, like any; less: a failure
 NEARLY = 0.05  # How much better than doing nothing something has to be, to be better

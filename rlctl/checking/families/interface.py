@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 
 from rlctl.checking.instance import Context, EnvironmentRaised, display_error, find_missing_file, get_causes
-from rlctl.checking.records import FIRST_SEED, SUCCESS, CallFailure, CheckedEpisode, ChildMessage, Form, Records
+from rlctl.checking.records import FIRST_SEED, CallFailure, CheckedEpisode, ChildMessage, Form, Records
 from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
 from rlctl.environments.graphics import opengl_fix
+from rlctl.environments.success import SUCCESS
 from rlctl.errors import RecipeError, UsageError
 
 NUMBERS = ("float", "int", "numpy.float64")  # Reward types that both libraries accept
 MANY_LINES, FEWEST_STEPS = 0.5, 20  # lines per step; with fewer steps most lines come from the start
-OF_OTHER_RULES = ("interleaved", "after close", "rendering")  # failures there are RL401's, RL402's and RL215's
+OF_OTHER_RULES = ("interleaved", "after close", "rendering", "nan action")
+"""Failures there are those of RL401, RL402, RL215 and RL704."""
 PICTURE = "a uint8 array of shape (height, width, 3)"  # What `render` returns in the mode rgb_array
 NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECASE)  # raised without graphics
 
@@ -98,8 +100,7 @@ def select_failures(records: Records, kind: str) -> Iterator[CallFailure]:
 def _find_exceptions(records: Records) -> Iterator[RuleFinding]:
     raised = (failure for failure in select_failures(records, "raised") if failure.file is None)  # the others: RL007
     for failure in itertools.islice(raised, 3):
-        fix = opengl_fix(failure.error)
-        yield RuleFinding("RL207", failure.message, failure.place, fix=fix, where=failure.where)
+        yield RuleFinding("RL207", failure.message, failure.place, fix=failure.fix, where=failure.where)
 
 
 @check("RL208")

@@ -5,6 +5,7 @@ import dataclasses
 import difflib
 import inspect
 import re
+import traceback
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -20,9 +21,12 @@ from rlctl.checking.instance import (
     Context,
     EnvironmentRaised,
     Instance,
+    describe,
     display_error,
+    find_first_error,
     find_missing_file,
     get_causes,
+    raised_by_environment,
 )
 from rlctl.checking.records import FIRST_SEED, Built, ChildMessage, Records, Skipped
 from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, check, experiment
@@ -32,10 +36,20 @@ from rlctl.environments import registry
 from rlctl.environments.dict_spaces import format_space
 from rlctl.environments.graphics import opengl_fix
 from rlctl.environments.info import describe_mujoco_model
+from rlctl.environments.mujoco_version import mujoco_fix
 from rlctl.environments.places import find_line, is_own_file
 from rlctl.environments.registrations import describe_registrations
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import NoDisplayError, NoSuchClassError, OldGymError, RecipeError, RlctlError, TaskError, UsageError
+from rlctl.errors import (
+    NoDisplayError,
+    NoSuchClassError,
+    OldGymError,
+    RecipeError,
+    RlctlError,
+    TaskError,
+    UsageError,
+    read_message,
+)
 
 WAIVERS = "rlctl_ignore"  # The class attribute that waives rules: rule id -> reason
 
@@ -52,7 +66,15 @@ def build(context: Context) -> Iterator[ChildMessage]:
             raise error from None  # a name that does not exist, or a bug
         yield _explain(context, error)
         return
-    yield _describe_built(instance)
+    try:
+        built = _describe_built(instance)
+    except Exception as error:
+        if not raised_by_environment(error):
+            raise
+        trace = {"traceback": "".join(traceback.format_exception(error))}
+        yield RuleFinding("RL002", f"reading an attribute raises {describe(error)}", trace, where=find_line(error))
+        return
+    yield built
     yield from _base_class(instance)
     if is_task(instance.env):
         yield from _find_misspelled(type(find_author(instance.env)))
@@ -77,19 +99,37 @@ def _explain(context: Context, error: RlctlError) -> RuleFinding:
     if (file := find_missing_file(cause)) is not None:
         return _not_found("the constructor", file, error.details)
     where = find_line(cause) if cause is not None else None
+    fix = to_install or _fix_libraries(cause)
+    if first := find_first_error(cause):
+        message = f"{message}; the first error was {describe(first)}"
     if context.progress.read().call == "load":
-        return RuleFinding("RL001", message, details, fix=to_install, where=where)
-    missing = re.search(r"missing \d+ required .*?arguments?: (.*)", str(cause))
-    if isinstance(cause, TypeError) and missing:
-        settings = " ".join(f"--set task.{name}=..." for name in re.findall(r"'(\w+)'", missing[1]))
-        fix = f"Give them ({settings}), or give them default values."
+        return RuleFinding("RL001", message, details, fix=fix, where=where)
+    missing = _find_missing_arguments(cause)
+    if missing:
+        settings = " ".join(f"--set task.{name}=..." for name in missing)
+        give = f"Give them ({settings}), or give them default values."
         registered = describe_registrations(context.spec.task, "check-env")
-        return RuleFinding("RL006", message, details, fix=f"{fix} The class is {registered}" if registered else fix)
+        return RuleFinding("RL006", message, details, fix=f"{give} The class is {registered}" if registered else give)
     is_without_trace = isinstance(error, TaskError) and error.details is None  # a constructor's error has one
     if is_without_trace and not registry.is_task(registry.load(context.spec.task)):
-        fix = str(error).partition("\n")[2]
-        return RuleFinding("RL003", message, fix=f"{fix[:1].upper()}{fix[1:]}")
-    return RuleFinding("RL002", message, details, fix=to_install or opengl_fix(str(cause)), where=where)
+        what_to_do = str(error).partition("\n")[2]
+        return RuleFinding("RL003", message, fix=f"{what_to_do[:1].upper()}{what_to_do[1:]}")
+    return RuleFinding("RL002", message, details, fix=fix, where=where)
+
+
+def _fix_libraries(cause: BaseException | None) -> str:
+    """Return what to do about a library that an error comes from; empty where it is the environment's own."""
+    if cause is None:
+        return ""
+    return opengl_fix(read_message(cause)) or mujoco_fix(cause)
+
+
+def _find_missing_arguments(cause: BaseException | None) -> list[str]:
+    """Return the arguments that the call of the constructor lacked; none if the error is of code that it runs."""
+    if not isinstance(cause, TypeError) or find_line(cause) is not None:
+        return []
+    missing = re.search(r"missing \d+ required .*?arguments?: (.*)", read_message(cause))
+    return re.findall(r"'(\w+)'", missing[1]) if missing else []
 
 
 def _base_class(instance: Instance) -> Iterator[RuleFinding]:

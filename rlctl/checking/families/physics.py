@@ -14,7 +14,7 @@ from rlctl.checking.families.derived import find_wrong_reads
 from rlctl.checking.families.robots import find_misuses
 from rlctl.checking.instance import Context, EnvironmentRaised, describe_failure
 from rlctl.checking.mujoco_calls import MujocoCalls, join_calls
-from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Shortened, Skipped
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, experiment, list_names
 from rlctl.checking.values import is_task
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
@@ -24,6 +24,7 @@ from rlctl.environments.bullet_calls import FULL_TURN, record_calls
 ENGINES = {"pybullet", "mujoco"}
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60)) + (("random", 2),) * 16
 """Actions and logged steps. The last ones are for what resets draw."""
+ENOUGH_EPISODES, PART_FOR_THE_REST = 5, 0.3  # of a slow environment; of the experiment's time
 LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved yet
 LASTING_SOFT = 10  # the same for contacts of MuJoCo, which are soft by design, if they begin after a reset
 PART_OF_RANGE, LEAST_ANGLE, LEAST_LENGTH = 0.1, 0.05, 0.01
@@ -50,8 +51,12 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
             instance.reset(FIRST_SEED)
         yield from _model_faults(instance.env)
         logger = WorldLogger(instance, older, calls, mujoco_calls)
+        whole_s = context.budget.seconds_left
         for number, (kind, steps) in enumerate(EPISODES):
             if number and (not logger.worlds or context.budget.is_over()):
+                break
+            if number >= ENOUGH_EPISODES and context.budget.seconds_left < PART_FOR_THE_REST * whole_s:
+                yield Shortened("worlds", f"{number} of {len(EPISODES)} logged episodes")
                 break
             try:
                 logger.play(number, kind, steps)

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Context, EnvironmentRaised
-from rlctl.checking.records import FIRST_SEED, SUCCESS, CheckedEpisode, ChildMessage, Records
+from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Records
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
+from rlctl.environments.success import SUCCESS
 
 WITH_SEARCH = ("comparisons", "episodes", "starts", "search")  # they play the first process's instance
 DISCOUNT = 0.99  # per step: what is hundreds of steps away hardly counts

@@ -18,10 +18,11 @@ from rlctl.checking.families import rewards
 from rlctl.checking.families.reset import play_after_ends
 from rlctl.checking.instance import Context
 from rlctl.checking.recording import Recording
-from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Skipped
+from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Shortened, Skipped
 from rlctl.checking.rules import NotJudged, RuleFinding, experiment
 
 MOST_STEPS, MOST_EPISODES = 4_500, 60  # in all: they find the goal of the bundled `reach` from most seeds
+ENOUGH_EPISODES, STEPS_AFTER = 11, 2_000  # Of a slow environment; of the episodes after the search
 LONGEST = 150  # episodes are stopped after so many steps; a reward that leads to a goal shows before
 SEGMENTS = 3  # Of a sequence, each one action that is held: few numbers to search among
 GENERATION, ELITE = 10, 3  # Sequences; the best of them
@@ -63,6 +64,8 @@ def search(context: Context) -> Iterator[ChildMessage]:
     yield from play_after_ends(context, first)
     if why := context.budget.why_spent():
         yield Skipped("search", f"{len(searcher.attempts)} episodes were searched: {why}")
+    elif searcher.is_shortened:
+        yield Shortened("search", f"{len(searcher.attempts)} searched episodes")
 
 
 class _Search:
@@ -70,6 +73,7 @@ class _Search:
         self.instance = context.instance
         self.budget = context.budget
         self.attempts: list[_Attempt] = []
+        self.is_shortened = False  # because the environment is slow
         self._rng = np.random.default_rng(FIRST_SEED)
         self._space = self.instance.env.action_space
         self._length = LONGEST
@@ -150,7 +154,14 @@ class _Search:
     def _goes_on(self, part: float = 1.0) -> bool:
         steps = sum(attempt.played.steps for attempt in self.attempts)
         is_left = steps < part * MOST_STEPS and len(self.attempts) < part * MOST_EPISODES
+        if is_left and len(self.attempts) >= ENOUGH_EPISODES and self.budget.seconds_left < self._time_after():
+            self.is_shortened = True
+            return False
         return is_left and not self.budget.why_spent()
+
+    def _time_after(self) -> float:
+        """Return how long the episodes after the search take [s], about: their rule needs whole ones."""
+        return STEPS_AFTER * (self.instance.progress.mean_s("step") or 0.0)
 
 
 def _finishes(episode: CheckedEpisode, success_is_reported: bool) -> bool:

@@ -13,6 +13,7 @@ from rlctl.deploy.controller_layout import ControllerLayout, JointTarget
 from rlctl.deploy.filter.limits import Limits
 from rlctl.deploy.filter.safety_filter import SafetyFilter
 from rlctl.environments.registry import call_plugin
+from rlctl.environments.success import find_success
 from rlctl.errors import TaskError
 from rlctl.exporting.controller.players import CController, Controller, Inputs
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, compare_episodes
@@ -92,7 +93,7 @@ class TaskPlayer:
             step = call_plugin(self._task, lambda action=action: self._env.step(action))  # type: ignore[misc]
             observation, reward, terminated, truncated, info = step
             total, ended = total + float(reward), bool(terminated or truncated)
-        success = info.get("is_success")
+        success = find_success(info)
         result = EpisodeResult(0, seed, total, len(actions), None if success is None else bool(success), {}, None)
         return Recorded(measured, actions, Episode(result))
 

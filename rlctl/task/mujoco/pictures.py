@@ -1,8 +1,5 @@
 """Pictures of a world in MuJoCo, drawn by OpenGL without a display."""
 
-import importlib
-import os
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import UsageError, describe_exception
+from rlctl.task.mujoco.opengl import draw_without_display
 from rlctl.task.mujoco.world import import_mujoco
 
 _NEAREST = 0.05  # of the distance from the eye to the target
@@ -109,21 +107,10 @@ def _find_renderer(model: Any, size: tuple[int, int]) -> Any:
         _kept[2].close()
         _kept.clear()
     mujoco = import_mujoco()
-    _choose_opengl(mujoco)
+    draw_without_display()
     renderer = mujoco.Renderer(model, size[1], size[0])
     _kept[:] = model, size, renderer
     return renderer
-
-
-def _choose_opengl(mujoco: Any) -> None:
-    """Let MuJoCo draw by EGL where there is no display, unless MUJOCO_GL is set.
-
-    It has chosen at its import, and without a display that choice, GLFW, ends the process.
-    """
-    chosen = sys.modules[mujoco.Renderer.__module__].gl_context
-    if sys.platform == "linux" and not os.environ.get("DISPLAY") and "glfw" in chosen.GLContext.__module__:
-        os.environ.setdefault("MUJOCO_GL", "egl")
-        importlib.reload(chosen)
 
 
 def _add_sun(scene: Any, target: Any) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
+import importlib.util
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -32,6 +34,10 @@ _OF_STEPS = ("sensordata", "actuator_force", "qfrc_actuator")
 """Those that only a step computes; after any other call a world of a batch has those of another world."""
 
 
+OLDEST_FOR_TASKS, OLDEST_FOR_BATCHES = "3.17", "4"
+"""Versions of MuJoCo. Plain Gymnasium environments run with older ones too, see pyproject.toml."""
+
+
 def import_mujoco() -> Any:
     """Import MuJoCo; raises `UsageError` where it is missing."""
     try:
@@ -44,6 +50,11 @@ def import_mujoco() -> Any:
     return mujoco
 
 
+def _too_old(what: str, needed: str) -> UsageError:
+    installed = importlib.metadata.version("mujoco")
+    return UsageError(f"{what} needs MuJoCo {needed} or later, and {installed} is installed: pip install -U mujoco")
+
+
 class MujocoWorld:
     """One world of a model, or `count` worlds that `mujoco.batch` steps with one call of C.
 
@@ -54,6 +65,10 @@ class MujocoWorld:
 
     def __init__(self, substeps: int, count: int | None = None) -> None:
         self.mujoco = import_mujoco()
+        if not hasattr(self.mujoco.mjtIntegrator, "mjINT_DISCRETE"):  # see `scene.py`
+            raise _too_old("a task in MuJoCo", OLDEST_FOR_TASKS)
+        if count is not None and count > 1 and importlib.util.find_spec("mujoco.batch") is None:
+            raise _too_old("a batch of worlds", OLDEST_FOR_BATCHES)
         self.substeps, self.count = substeps, count
         self.mj_model: Any
         self.mj_data: Any
