@@ -258,9 +258,9 @@ def test_events_set_in_a_standing_world_act_as_in_a_new_one():
 
 
 @pytest.mark.pybullet
-def test_the_same_episodes_in_mujoco(rlctl):
+def test_contacts_from_soft_to_stiff(rlctl):
     pytest.importorskip("mujoco")
-    done = rlctl("eval", "reach", "--pretrained", "--sim", "mujoco", "--episodes", "2", "--json", "-")
+    done = rlctl("eval", "reach", "--pretrained", "--vary", "sim", "--episodes", "2", "--json", "-")
     assert done.returncode == 0, done.stderr
     (engine,) = json.loads(done.stdout)["maps"]
     assert engine["axes"][0]["values"] == [0.02, 0.01, 0.005]
@@ -269,11 +269,11 @@ def test_the_same_episodes_in_mujoco(rlctl):
 
 def test_the_worst_contacts_are_gated(rlctl):
     pytest.importorskip("mujoco")
-    options = ("--episodes", "2", "--sim", "mujoco:0.02", "--min-success", "0.9")
+    options = ("--episodes", "2", "--vary", "sim=0.01:0.02:2", "--min-success", "0.9")
     done = rlctl("eval", "biped-3d", "--pretrained", *options)
     assert done.returncode == 1
-    assert "gate missed in the worst cell, mujoco solref 0.02" in done.stderr
-    assert "--sim mujoco:0.02 --set randomize=false" in done.stdout
+    assert "gate missed in the worst cell, mujoco solref 0.01" in done.stderr
+    assert "--sim mujoco:0.01 --set randomize=false" in done.stdout
 
 
 @pytest.mark.pybullet
