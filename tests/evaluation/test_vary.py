@@ -1,11 +1,13 @@
 """`rlctl eval --vary`: maps over events and parameters, with the same episodes in every cell."""
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rlctl.engine import Engine
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.episode_statistics import mean_interval
@@ -127,6 +129,32 @@ def test_the_command_for_one_cell_is_the_whole_of_it(measured):
         "--set 'task.goal=[1, 2]' --set task.limit=0.1234567891 --set reward_weights.distance=0.5 "
         "--set 'events.mass.factor=[0.9, 1.1]' --set 'events.push={}' --set randomize=false"
     )
+
+
+@pytest.mark.pybullet
+@pytest.mark.parametrize("vary", [["push=0:3:2", "mass=1:3:2"], ["sim=0.01:0.02:2"]], ids=["events", "sim"])
+def test_the_command_for_one_cell_plays_it_and_leaves_the_measurement(vary, rlctl, tmp_path):
+    run = write_run(tmp_path / "run", f"{ENVS}:Block")
+    result = measure_robustness(EvalRequest(str(run.path), episodes=3), vary)
+    (found,) = result.maps
+    stored = run.robustness_file.read_bytes()
+    command = format_command(result, found, found.cells[-1])
+    played = rlctl(*shlex.split(command)[1:], "--json", "-")
+    assert played.returncode == 0, played.stderr
+    assert json.loads(played.stdout)["return"]["mean"] == found.cells[-1].mean_return
+    assert run.robustness_file.read_bytes() == stored
+
+
+@pytest.mark.pybullet
+def test_the_command_names_what_the_measurement_changed(measured):
+    (found,) = measured.maps
+    changed = measured.model_copy(
+        update={"sim": Engine("mujoco", 0.01), "randomize": True, "other_task": "reach", "events": {}}
+    )
+    command = format_command(changed, found, found.cells[0])
+    assert "--task reach --sim mujoco:0.01" in command
+    assert "--set randomize=true" in command
+    assert measured.sim == Engine()  # the policy's own
 
 
 @pytest.mark.pybullet
