@@ -10,16 +10,14 @@ from typing import TYPE_CHECKING, Any
 from rlctl.version import __version__
 
 if TYPE_CHECKING:
-    from rlctl.api import check_env, evaluate, load_policy, train
-    from rlctl.environments.spec import make
+    from rlctl.api import check_env, evaluate, load_policy, make, train
     from rlctl.training.callbacks import Callback
 
 __all__ = ["Callback", "__version__", "check_env", "evaluate", "load_policy", "make", "train"]
 
 _DEFINED_IN = {
-    **dict.fromkeys(("check_env", "evaluate", "load_policy", "train"), "rlctl.api"),
+    **dict.fromkeys(("check_env", "evaluate", "load_policy", "make", "train"), "rlctl.api"),
     "Callback": "rlctl.training.callbacks",
-    "make": "rlctl.environments.spec",
 }
 
 

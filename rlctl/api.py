@@ -1,17 +1,57 @@
-"""The Python API: `rlctl.check_env`, `train`, `evaluate` and `load_policy`."""
+"""The Python API: `rlctl.make`, `check_env`, `train`, `evaluate` and `load_policy`."""
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
+    import gymnasium
+
     from rlctl.checking.rules import RuleFinding
+    from rlctl.environments.spec import EnvSpec
     from rlctl.evaluation.evaluate import Evaluation
     from rlctl.policy.policy import Policy
     from rlctl.training.request import TrainResult
+
+
+def make(
+    task: str,
+    *,
+    render_mode: Literal["human", "rgb_array"] | None = None,
+    randomize: bool = False,
+    events: Mapping[str, Mapping[str, Any]] | None = None,
+    sim: str | None = None,
+    **parameters: Any,
+) -> gymnasium.Env[Any, Any]:
+    """Return the Gymnasium environment of a task; keywords are the task's parameters.
+
+    `randomize` enables all events of the task; `events` enables the named ones and sets their parameters:
+    `events={"mass": {"factor": (0.9, 1.1)}}`. `sim` is the physics engine, like `--sim`: `pybullet`, `mujoco`, or
+    `mujoco:0.01` with the time constant of contacts [s]; default: that of the task's recipe.
+    """
+    from rlctl.environments.registry import is_task, make_slug
+
+    spec = dataclasses.replace(_make_spec(task, parameters, sim), randomize=randomize, events=events or {})
+    env = spec.make(render_mode)
+    if is_task(spec.constructor()):
+        from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
+
+        own = {"task": task, "render_mode": render_mode, "randomize": randomize, "events": events, "sim": sim}
+        name, kwargs = f"rlctl/{make_slug(task)}-v0", own | parameters
+        env.unwrapped.spec = GymnasiumSpec(name, "rlctl.api:make", kwargs=kwargs, disable_env_checker=True)
+    return env
+
+
+def _make_spec(task: str, parameters: Mapping[str, Any], sim: str | None) -> EnvSpec:
+    from rlctl.engine import read_engine
+    from rlctl.recipe.sources import make_spec
+
+    spec = make_spec(task, parameters)
+    return spec if sim is None else dataclasses.replace(spec, sim=read_engine(sim))
 
 
 def check_env(
@@ -22,24 +62,25 @@ def check_env(
     ignore: Sequence[str] = (),
     env_timeout_s: float = 10.0,
     baseline: str | os.PathLike[str] | None = None,
+    sim: str | None = None,
     **parameters: Any,
 ) -> list[RuleFinding]:
     """Check an environment as `rlctl check-env` does, in child processes, and return the findings, worst first.
 
-    Keywords are parameters of the task. `select` and `ignore` are prefixes of rule ids: `ignore=["RL5"]`. A finding
-    has `rule`, `severity` ("error", "warning", "info"), `message`, `fix` and `evidence`; `str(finding)` is one line.
-    Those of `baseline`, a report of `rlctl check-env --json` on the task under the same name, are left out.
+    Keywords are parameters of the task. `sim` is the physics engine, as for `make`. `select` and `ignore` are
+    prefixes of rule ids: `ignore=["RL5"]`. A finding has `rule`, `severity` ("error", "warning", "info"), `message`,
+    `fix` and `evidence`; `str(finding)` is one line. Those of `baseline`, a report of `rlctl check-env --json` on the
+    task under the same name, are left out.
     Raises `UsageError` for an unknown task or parameter, `ArtifactError` for a file that is no report, and `TaskError`
     if no instance can be built and no finding says why.
     """
     from rlctl.checking.check import check
     from rlctl.checking.rules import choose_rules
     from rlctl.checking.tool_formats import read_baseline
-    from rlctl.environments.spec import EnvSpec
     from rlctl.errors import RlctlError, TaskError
 
     rules, known = choose_rules(select, ignore), set() if baseline is None else read_baseline(Path(baseline))
-    report = check(EnvSpec(task, parameters), rules=rules, env_timeout_s=env_timeout_s, show_progress=False)
+    report = check(_make_spec(task, parameters, sim), rules=rules, env_timeout_s=env_timeout_s, show_progress=False)
     report.subtract(known)
     if report.verdict.crashed:
         names, details = ", ".join(report.verdict.crashed), "\n".join(report.verdict.crashed.values())

@@ -11,7 +11,7 @@ for _entry in installed.list_installed():
     if _entry.problem is None:
         gymnasium.register(
             id=f"rlctl/{_entry.name}-v0",
-            entry_point="rlctl.environments.spec:make",
+            entry_point="rlctl.api:make",
             kwargs={"task": _entry.name},
             disable_env_checker=True,
         )

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from rlctl.engine import Engine, read_option
+
 
 @dataclasses.dataclass(frozen=True)
 class Option:
@@ -45,8 +47,12 @@ Settings = Annotated[
     list[str], Option("Set a key, e.g. task.tolerance=0.02, randomize=true.", ("--set",), metavar="KEY=VALUE")
 ]
 Sim = Annotated[
-    str | None,
-    Option("Physics engine of a task; default: PyBullet if it is installed.", metavar="pybullet|mujoco[:SOLREF]"),
+    Engine | None,
+    Option(
+        "Physics engine of a task; default: that of the policy or recipe, else PyBullet if it is installed.",
+        metavar="pybullet|mujoco[:SOLREF]",
+        parse=read_option,
+    ),
 ]
 EpisodeSeed = Annotated[int, Option("Seed of the list of episodes.", min=0)]
 Json = Annotated[str | None, Option("Also write the result as JSON; - writes only JSON, to stdout.", metavar="FILE")]

@@ -41,7 +41,9 @@ LAYERS = [
     {"printed_lines"},
     {"output"},
     {"storage"},
-    {"errors", "options", "version"},
+    {"options"},
+    {"engine"},
+    {"errors", "version"},
     {"missing_packages"},
 ]
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}

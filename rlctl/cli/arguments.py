@@ -17,6 +17,7 @@ from rlctl.options import Argument, Option
 from rlctl.printed_lines import collect
 
 if TYPE_CHECKING:
+    from rlctl.engine import Engine
     from rlctl.environments.spec import EnvChanges
 
 _RUNS = Path("runs")
@@ -153,13 +154,13 @@ def choose_checkpoint(checkpoint: str, pretrained: bool) -> str:
     return PRETRAINED
 
 
-def parse_changes(settings: list[str], sim: str | None = None) -> EnvChanges:
-    """Read the `--set` options and the engine of a command that changes an environment."""
+def parse_changes(settings: list[str], sim: Engine | None = None) -> EnvChanges:
+    """Read the `--set` options and the engine of a command that changes an environment; `--sim` overrides `--set`."""
     from rlctl.environments.spec import UNCHANGED
 
-    settings = settings if sim is None else [*settings, f"sim={sim}"]
-    if not settings:
-        return UNCHANGED
-    from rlctl.recipe.sources import parse_changes  # takes a quarter of a second
+    changes = UNCHANGED
+    if settings:
+        from rlctl.recipe.sources import parse_changes  # takes a quarter of a second
 
-    return parse_changes(settings)
+        changes = parse_changes(settings)
+    return changes if sim is None else dataclasses.replace(changes, sim=sim)

@@ -31,6 +31,8 @@ def serve(
     from rlctl.deploy.server.serve import make_server, run_server
     from rlctl.run.lookup import find_policy
 
+    if sim is not None and not self_test:
+        raise UsageError("--sim: only the self-test simulates; add --self-test")
     policy = find_policy(run, choose_checkpoint(checkpoint, pretrained))
     output.print_notes(policy.notes)
     if request.limits is None:
@@ -136,9 +138,9 @@ def identify(
     from rlctl import output
     from rlctl.deploy.identify.excite import show_excitation, write_excitation
     from rlctl.deploy.identify.identify import identify, show
-    from rlctl.environments.spec import EnvSpec
+    from rlctl.recipe.sources import make_spec
 
-    spec = parse_changes(settings, sim).apply(EnvSpec(task))
+    spec = parse_changes(settings, sim).apply(make_spec(task))
     if excite is not None and log is None:
         show_excitation(write_excitation(spec, excite, seconds=seconds, seed=seed), json)
         return

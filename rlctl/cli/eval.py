@@ -13,7 +13,7 @@ from typer.core import TyperCommand
 from rlctl.cli.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates, MinReturn, MinSuccess, MinSuccessLower
-from rlctl.options import Cluster, Json, Junit, On, Option, PictureFile, Pretrained, Settings, Yes
+from rlctl.options import Cluster, Json, Junit, On, Option, PictureFile, Pretrained, Settings, Sim, Yes
 from rlctl.replaying.request import ReplayRequest
 
 
@@ -21,8 +21,8 @@ from rlctl.replaying.request import ReplayRequest
     {
         "Options": ["episodes", "seed", "checkpoint", "pretrained", "baseline", "task", "settings", "stage"],
         "Gates": ["min_success", "min_success_lower", "min_return", "decide_early"],
-        "Robustness": ["vary", "push", "sim", "yes"],
-        "How": ["deterministic", "limits", "env_timeout_s"],
+        "Robustness": ["vary", "push", "yes"],
+        "How": ["sim", "deterministic", "limits", "env_timeout_s"],
         "Where": ["n_envs", "on", "cluster"],
         "Output": ["record", "picture", "json", "junit"],
     }
@@ -37,18 +37,13 @@ def evaluate(
     vary: Annotated[
         list[str],
         Option(
-            "Vary an event or parameter of the task, e.g. mass=0.6:1.4:9; give it twice for a 2-D map.",
-            metavar="NAME=LOW:HIGH:COUNT|all",
+            "Vary an event or parameter of the task, e.g. mass=0.6:1.4:9, or with sim MuJoCo's contacts; give it "
+            "twice for a 2-D map.",
+            metavar="NAME=LOW:HIGH:COUNT|sim|all",
         ),
     ] = [],
     push: Annotated[bool, Option("Find the smallest push at which the policy fails.", ("--push",))] = False,
-    sim: Annotated[
-        str | None,
-        Option(
-            "Play in another engine: MuJoCo with soft, medium and stiff contacts, or PyBullet.",
-            metavar="mujoco[:SOLREF]|pybullet",
-        ),
-    ] = None,
+    sim: Sim = None,
     yes: Yes = False,
     on: On = None,
     cluster: Cluster = None,
@@ -61,6 +56,7 @@ def evaluate(
     from rlctl.evaluation.evaluate import run_evaluation
     from rlctl.evaluation.group_scores import evaluate_group
     from rlctl.evaluation.report import show, show_group, show_robustness
+    from rlctl.output import print_notes
     from rlctl.run.directory import is_group
     from rlctl.run.group import read_group
     from rlctl.storage.junit import write as write_junit
@@ -68,21 +64,19 @@ def evaluate(
     began = time.monotonic()
     gates = Gates(min_success, min_success_lower, min_return)
     chosen = dataclasses.replace(options, checkpoint=choose_checkpoint(options.checkpoint, pretrained))
-    # PyBullet has no range of contacts, and what a robustness map cannot be combined with is played in one engine.
-    is_single = options.baseline is not None or options.limits is not None or options.record is not None
-    only = sim if sim == "pybullet" or is_single or options.decide_early else None
-    sim = None if only is not None else sim
-    request = EvalRequest(**vars(chosen), changes=parse_changes(settings, only))
-    if on is not None and not vary and sim is None:
-        raise UsageError("--on needs a robustness map: give --vary or --sim too")
+    request = EvalRequest(**vars(chosen), changes=parse_changes(settings, sim))
+    if on is not None and not vary:
+        raise UsageError("--on needs a robustness map: give --vary too")
     if picture is not None:
-        if not vary and sim is None:
-            raise UsageError("--picture draws maps: give --vary or --sim too")
+        if not vary:
+            raise UsageError("--picture draws maps: give --vary too")
         from rlctl.runs.report import plots
         from rlctl.storage import files
 
         plots.choose_form(picture)  # raises before any episode is played
-    if vary or push or sim is not None:
+    if sim is not None and sim.name == "mujoco" and not vary:
+        print_notes([f"--sim {sim} plays in one engine; to vary the stiffness of its contacts: --vary sim"])
+    if vary or push:
         unsupported: dict[str, object] = {
             "--policy": request.baseline,
             "--limits": request.limits,
@@ -90,12 +84,12 @@ def evaluate(
             "--decide-early": request.decide_early or None,
         }
         if option := next((name for name, value in unsupported.items() if value is not None), None):
-            raise UsageError(f"{option} cannot be combined with --vary, --push or --sim")
+            raise UsageError(f"{option} cannot be combined with --vary or --push")
         from rlctl.cluster.executors import choose_cell_player
         from rlctl.evaluation.vary import check_gates, measure_robustness
 
         play = choose_cell_player(on, cluster)
-        robustness = measure_robustness(request, vary, push=push, sim=sim, yes=yes, gates=gates, play_cells=play)
+        robustness = measure_robustness(request, vary, push=push, yes=yes, gates=gates, play_cells=play)
         show_robustness(robustness, json)
         if picture is not None:
             files.write_result(picture, plots.draw_maps(robustness, plots.choose_form(picture)))

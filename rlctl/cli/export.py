@@ -54,6 +54,8 @@ def export(
     checkpoint = choose_checkpoint(checkpoint, pretrained)
     if policy is not None and (output is not None or onnx or c or controller):
         raise UsageError("--policy FILE writes only that file: leave out --output, --onnx, --c and --controller")
+    if policy is not None and sim is not None:
+        raise UsageError("--policy FILE contains the score in the engine of the training: leave out --sim")
     both = onnx == c if controller else onnx and c
     formats: tuple[Format, ...] = ("onnx", "c") if both else ("c",) if c else ("onnx",)
     request = ExportRequest(

@@ -7,12 +7,12 @@ import typer
 
 from rlctl.cli.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.evaluation.request import MinReturn, MinSuccess, MinSuccessLower
-from rlctl.options import Checkpoint, EpisodeSeed, Json, Junit, Option, Pretrained, RunName, Settings
+from rlctl.options import Checkpoint, EpisodeSeed, Json, Junit, Option, Pretrained, RunName, Settings, Sim
 
 
 @command_in_panels(
     {
-        "Options": ["task", "checkpoint", "pretrained", "episodes", "seed", "settings"],
+        "Options": ["task", "checkpoint", "pretrained", "episodes", "seed", "settings", "sim"],
         "Check": ["strict", "budget"],
         "Gates": ["min_success", "min_success_lower", "min_return", "decide_early"],
         "Comparison": ["against", "margin", "allow_no_success"],
@@ -27,6 +27,7 @@ def gate(
     episodes: Annotated[int, Option("Episodes, each with its own seed.", min=2, max=1_000_000)] = 100,
     seed: EpisodeSeed = 0,
     settings: Settings = [],
+    sim: Sim = None,
     strict: Annotated[bool, Option("Warnings of the check fail too.", ("--strict",))] = False,
     budget: Annotated[float, Option("Computing time of the check in seconds.", min=1)] = 18.0,
     min_success: MinSuccess = None,
@@ -62,7 +63,7 @@ def gate(
         episodes=episodes,
         seed=seed,
         decide_early=decide_early,
-        changes=parse_changes(settings),
+        changes=parse_changes(settings, sim),
     )
     request = GateRequest(
         evaluation=evaluation,

@@ -90,8 +90,8 @@ def check_env(
     from rlctl.checking.check import check
     from rlctl.checking.rules import choose_rules
     from rlctl.checking.tool_formats import read_baseline
-    from rlctl.environments.spec import EnvSpec
     from rlctl.environments.suggestions import find_only_class
+    from rlctl.recipe.sources import make_spec
 
     if explain is not None and explain.upper().startswith("Q"):
         from rlctl.runs.diagnosis import findings
@@ -110,7 +110,7 @@ def check_env(
     if only := find_only_class(task):
         streams.print_notes([f"{task} has one environment class: {only}"])
         task = only
-    spec = parse_changes(settings, sim).apply(EnvSpec(task))
+    spec = parse_changes(settings, sim).apply(make_spec(task))
     rules = choose_rules(select, ignore)
     report = check(spec, rules=rules, strict=strict, env_timeout_s=env_timeout, budget_s=budget)
     report.subtract(known)

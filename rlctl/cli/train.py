@@ -31,7 +31,8 @@ class RecipeFlags:
         """Return all keys and values, nested as in a recipe."""
         from rlctl.recipe.sources import merge_flags
 
-        return merge_flags(**vars(self))
+        # The settings of a training are plain data: a group and a cluster store them as JSON.
+        return merge_flags(**vars(self) | {"sim": None if self.sim is None else str(self.sim)})
 
 
 def suggest_setting(option: str) -> str | None:

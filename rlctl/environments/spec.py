@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NoReturn
 from annotated_types import Ge, Le
 from pydantic import AfterValidator, PlainSerializer
 
+from rlctl.engine import PYBULLET, Engine
 from rlctl.environments import named_task
 from rlctl.environments.graphics import refuse_windows
-from rlctl.environments.registry import call_plugin, is_task, load, make_slug, may_make_environments
+from rlctl.environments.registry import call_plugin, is_task, load, may_make_environments
 from rlctl.errors import RecipeError, TaskError, check_name, short_repr
 from rlctl.library_output import print_mujoco_warnings
 from rlctl.storage import validation
@@ -50,11 +51,8 @@ class EnvSpec:
     stage: Annotated[int, Ge(0)] = 0  # stage of the curriculum, from 1; 0 without a curriculum
     level: Annotated[float, Ge(0), Le(1)] = 1.0
     """How far ranges written `{from: ..., to: ...}` have widened, from 0 (`from`) to 1 (`to`)."""
-    sim: str = ""
-    """The physics engine of a task: `pybullet`, `mujoco`, or `mujoco:0.01` with the time constant of contacts [s].
-
-    Empty: see `resolve`.
-    """
+    sim: Engine = Engine()  # noqa: RUF009 (it cannot change)
+    """The physics engine of a task; no choice: see `resolve`."""
     named_by: str = dataclasses.field(default="", compare=False)
     """The kind of file that names the task; empty if a user named it. A file may name environments only."""
 
@@ -81,7 +79,7 @@ class EnvSpec:
         else:
             for key in ("reward_weights", "randomize", "events", "level", "sim", "observation_history"):
                 # Files of plain environments that were written before engines could be chosen name PyBullet.
-                if getattr(self, key) not in (getattr(EnvSpec(self.task), key), "pybullet"):
+                if getattr(self, key) not in (getattr(EnvSpec(self.task), key), PYBULLET):
                     raise RecipeError(f"{key}: {self.task} is a plain Gymnasium environment; only tasks have them")
             env = self._make_plain_env(constructor, render_mode)
         try:
@@ -99,11 +97,17 @@ class EnvSpec:
         """Whether its engine is PyBullet, which is not installed."""
         from rlctl.task.pybullet.library import is_installed
 
-        return self.sim == "pybullet" and not is_installed()
+        return self.sim == PYBULLET and not is_installed()
 
     def replace_missing_engine(self) -> EnvSpec:
         """Return the spec with the default engine if PyBullet is not installed, as where a policy comes from."""
-        return dataclasses.replace(self, sim="") if self.lacks_pybullet else self
+        return dataclasses.replace(self, sim=Engine()) if self.lacks_pybullet else self
+
+    def with_engine(self, sim: Engine | None) -> EnvSpec:
+        """Return the spec in the engine of `--sim`; without that option in its own, if it is installed."""
+        if sim is None:
+            return self.replace_missing_engine()
+        return dataclasses.replace(self, sim=sim)
 
     def wrap(self, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
         """Return an environment with the wrappers that change its observations; raises `RecipeError`."""
@@ -142,7 +146,7 @@ class EnvSpec:
         """The name of the physics engine, for people; empty for a plain environment. The task is imported."""
         if not is_task(self.constructor()):
             return ""
-        return "PyBullet" if self.resolve().sim == "pybullet" else "MuJoCo"
+        return self.resolve().sim.title
 
     @property
     def observing(self) -> Observing:
@@ -253,7 +257,8 @@ class EnvChanges:
     randomize: bool | None = None
     """True: all events act. False: only those in `events`, and those the task enables itself. None: unchanged."""
     events: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-    sim: str = ""  # physics engine; empty: unchanged
+    sim: Engine = Engine()  # noqa: RUF009 (it cannot change)
+    """Physics engine; no choice: unchanged."""
 
     def apply(self, spec: EnvSpec) -> EnvSpec:
         """Return `spec` with the changes applied."""
@@ -283,35 +288,12 @@ def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def make(
-    task: str,
-    *,
-    render_mode: Literal["human", "rgb_array"] | None = None,
-    randomize: bool = False,
-    events: Mapping[str, Mapping[str, Any]] | None = None,
-    **parameters: Any,
-) -> gymnasium.Env[Any, Any]:
-    """Return the Gymnasium environment of a task; keywords are the task's parameters.
-
-    `randomize` enables all events of the task; `events` enables the named ones and sets their parameters:
-    `events={"mass": {"factor": (0.9, 1.1)}}`.
-    """
-    env = EnvSpec(task, parameters, randomize=randomize, events=events or {}).make(render_mode)
-    if is_task(load(task)):
-        from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
-
-        kwargs = {"task": task, "render_mode": render_mode, "randomize": randomize, "events": events, **parameters}
-        name, entry_point = f"rlctl/{make_slug(task)}-v0", "rlctl.environments.spec:make"
-        env.unwrapped.spec = GymnasiumSpec(name, entry_point, kwargs=kwargs, disable_env_checker=True)
-    return env
-
-
 def _name_by(kind: str) -> Callable[[EnvSpec], EnvSpec]:
     return lambda spec: dataclasses.replace(spec, named_by=kind)
 
 
 def _dump(spec: EnvSpec) -> dict[str, Any]:
-    content = dataclasses.asdict(spec)
+    content = dataclasses.asdict(spec) | {"sim": str(spec.sim)}
     del content["named_by"]
     return content
 

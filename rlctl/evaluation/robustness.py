@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import pydantic
 
+from rlctl.engine import Engine
 from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvChanges, EnvSpec, read_parameters
 from rlctl.errors import UsageError, check_name, did_you_mean, short_repr
@@ -133,6 +134,9 @@ class Robustness(_Content):
     parameters: dict[str, Any]
     reward_weights: dict[str, float] = {}
     events: dict[str, dict[str, Any]] = {}  # events that are active in every cell; see `EnvSpec.events`
+    randomize: bool = False  # whether all events of the task are active in every cell
+    sim: Engine = Engine()  # in which the cells were played; no choice: the policy's own
+    other_task: str | None = None  # on which the policy was played; None: on that of its training
     policy_file: str
     algo: str
     training_steps: int
@@ -170,7 +174,11 @@ def read(path: Path) -> Robustness:
 
 
 def read_axes(texts: Sequence[str], spec: EnvSpec) -> list[list[Axis]]:
-    """Return the axes of each map of `--vary`: a single map, or with `all` one per event of the task."""
+    """Return the axes of each map of `--vary`: a single map, or with `all` one per event of the task.
+
+    The axis `sim` has time constants of MuJoCo's contacts [s]: `sim=LOWEST:HIGHEST:VALUES`, or only `sim` for a soft, a
+    medium and a stiff one.
+    """
     task = spec.constructor()
     if list(texts) == [ALL]:
         return [[axis] for axis in _vary_all(task, spec)]
@@ -187,7 +195,7 @@ def apply_axes(axes: Sequence[Axis], values: Sequence[float], spec: EnvSpec) -> 
     for axis, value in zip(axes, values, strict=True):
         kind, _, rest = axis.setting.partition(".")
         if axis.setting == SIM:
-            spec = dataclasses.replace(spec, sim=f"mujoco:{value:g}")
+            spec = dataclasses.replace(spec, sim=Engine("mujoco", value))
         elif kind == "events":
             event, _, parameter = rest.partition(".")
             spec = EnvChanges(events={event: {parameter: value}}).apply(spec)
@@ -199,7 +207,9 @@ def apply_axes(axes: Sequence[Axis], values: Sequence[float], spec: EnvSpec) -> 
 
 def _read_axis(text: str, task: Any, spec: EnvSpec) -> Axis:
     name, equals, values = text.partition("=")
-    parts = values.split(":")
+    name, parts = name.strip(), values.split(":")
+    if name == SIM and not equals:
+        return _vary_contacts(SOLREFS, task, spec)
     try:
         if not equals or len(parts) != 3:
             raise ValueError
@@ -208,12 +218,21 @@ def _read_axis(text: str, task: Any, spec: EnvSpec) -> Axis:
             raise ValueError
     except ValueError:
         raise UsageError(f"--vary {short_repr(text)!r}: {_FORM}; for a single value use --set") from None
-    name = name.strip()
+    if name == SIM:
+        if low <= 0 or high >= 1:
+            raise UsageError(f"--vary {text}: the time constant of MuJoCo's contacts is between 0 and 1 s")
+        return _vary_contacts(_spread((low, high, count), whole=False), task, spec)
     events: Mapping[str, Event] = task.events if is_task(task) else {}
     event, _, parameter = name.removeprefix("events.").partition(".")
     if event in events:
         return _vary_event(name, event, parameter, events[event], (low, high, count), spec)
     return _vary_parameter(name, task, (low, high, count), spec)
+
+
+def _vary_contacts(solrefs: list[float], task: Any, spec: EnvSpec) -> Axis:
+    if not is_task(task):
+        raise UsageError(f"--vary sim: {spec.task} is a plain Gymnasium environment; only tasks run in another engine")
+    return Axis(name="mujoco solref", setting=SIM, values=solrefs, nominal=None)
 
 
 def _vary_event(

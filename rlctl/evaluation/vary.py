@@ -11,8 +11,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from rlctl import output
+from rlctl.engine import MUJOCO, Engine
 from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
@@ -42,26 +44,22 @@ def measure_robustness(
     vary: Sequence[str] = (),
     *,
     push: bool = False,
-    sim: str | None = None,
     yes: bool = False,
     gates: Gates = NO_GATES,
     play_cells: PlayCells | None = None,
 ) -> Robustness:
     """Measure a policy in every cell of the maps of `vary`, and with pushes, and store the result in its run.
 
-    `vary` is `NAME=LOWEST:HIGHEST:VALUES`, one or two, or `all`. `sim` is `mujoco`, or `mujoco:SOLREF` with a time
-    constant of contacts [s]: the same episodes in another physics engine. `yes` starts a long measurement without
-    asking; so does `play_cells`, which plays the cells elsewhere. Domain randomization is off, unless the request's own
-    changes turn it on.
+    `vary` is `NAME=LOWEST:HIGHEST:VALUES`, one or two, or `all`; see `robustness.read_axes`. `yes` starts a long
+    measurement without asking; so does `play_cells`, which plays the cells elsewhere. Domain randomization is off,
+    unless the request's own changes turn it on.
     """
     if request.changes.randomize is None:
         request = dataclasses.replace(request, changes=dataclasses.replace(request.changes, randomize=False))
     source, policy, spec = find_player(request)
     maps = robustness.read_axes(vary, spec) if vary else []
-    if sim is not None:
-        dataclasses.replace(spec, sim=sim).make().close()  # raises for what MuJoCo cannot build
-        values = [float(sim.partition(":")[2])] if ":" in sim else robustness.SOLREFS
-        maps.append([Axis(name="mujoco solref", setting=robustness.SIM, values=values, nominal=None)])
+    if any(axis.setting == robustness.SIM for axes in maps for axis in axes):
+        dataclasses.replace(spec, sim=MUJOCO).make().close()  # raises for what MuJoCo cannot build
     cells = sum(math.prod(len(axis.values) for axis in axes) for axes in maps)
     gates.check_reachable(request.episodes)
     with CellPlayer(spec, policy, request) as player:
@@ -79,6 +77,9 @@ def measure_robustness(
         parameters=dict(spec.parameters),
         reward_weights=dict(spec.reward_weights),
         events={name: dict(event) for name, event in spec.events.items()},
+        randomize=spec.randomize,
+        sim=_find_other_engine(spec, policy),
+        other_task=request.task,
         policy_file=str(source.file),
         algo=policy.info.algo,
         training_steps=policy.info.training_steps,
@@ -94,6 +95,12 @@ def measure_robustness(
     if source.run is not None and request.task in (None, policy.info.spec.task):
         _store(source.run.robustness_file, result)
     return result
+
+
+def _find_other_engine(spec: EnvSpec, policy: LoadedPolicy) -> Engine:
+    """Return the engine of a measurement; no choice where it is the policy's own."""
+    own = policy.info.spec.replace_missing_engine()
+    return Engine() if spec.sim == own.sim else spec.sim
 
 
 class CellPlayer(contextlib.AbstractContextManager["CellPlayer"]):
@@ -144,8 +151,15 @@ class CellPlayer(contextlib.AbstractContextManager["CellPlayer"]):
 
 
 def order_cells(specs: Sequence[EnvSpec]) -> list[int]:
-    """Return the indices of settings, those with equal task parameters next to each other: others need a new world."""
-    return sorted(range(len(specs)), key=lambda index: sorted(specs[index].parameters.items(), key=repr))
+    """Return the indices of settings, those with equal task parameters and engines next to each other.
+
+    Others need a new world.
+    """
+
+    def world(index: int) -> tuple[list[Any], str]:
+        return sorted(specs[index].parameters.items(), key=repr), str(specs[index].sim)
+
+    return sorted(range(len(specs)), key=world)
 
 
 def _play_maps(
@@ -212,13 +226,18 @@ def format_command(result: Robustness, varied: RobustnessMap, cell: Cell) -> str
     for name, event in result.events.items():
         values = {f"events.{name}.{key}": json.dumps(value) for key, value in event.items()}
         settings |= values or {f"events.{name}": "{}"}
-    settings["randomize"] = "false"
-    engine = []
+    settings["randomize"] = json.dumps(result.randomize)
+    engine = result.sim
     for axis, value in zip(varied.axes, cell.values, strict=True):
         if axis.setting == robustness.SIM:
-            engine = ["--sim", f"mujoco:{value:g}"]
+            engine = Engine("mujoco", value)
             continue
         settings[axis.setting] = str(int(value) if value.is_integer() else value)
     words = ["rlctl", "eval", result.policy_file, "--episodes", str(result.episodes), "--seed", str(result.seed)]
-    words += [*engine, *([] if result.deterministic else ["--stochastic"])]
+    if result.other_task is not None:
+        words += ["--task", result.other_task]
+    if engine:
+        words += ["--sim", str(engine)]
+    if not result.deterministic:
+        words.append("--stochastic")
     return shlex.join([*words, *(word for key, value in settings.items() for word in ("--set", f"{key}={value}"))])

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl import output
+from rlctl.engine import Engine
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.exporting.request import ExportRequest
@@ -164,7 +165,7 @@ def find_source(request: ExportRequest, name: str) -> tuple[FoundPolicy, Path]:
     return source, target
 
 
-def _export(source: FoundPolicy, targets: list[Path], sim: str | None) -> list[ExportReport]:
+def _export(source: FoundPolicy, targets: list[Path], sim: Engine | None) -> list[ExportReport]:
     policy = check_playable(PolicyFile.read(source.file))
     info = policy.info
     has_own = any(isinstance(info.policy_kwargs.get(key), dict) for key in KEYS)
@@ -173,7 +174,7 @@ def _export(source: FoundPolicy, targets: list[Path], sim: str | None) -> list[E
         import_named(source.run.recipe().policy_kwargs)
     # The environments are built while torch is imported.
     n_envs = 1
-    spec = source.locate(dataclasses.replace(info.spec, sim=sim) if sim else info.spec.replace_missing_engine())
+    spec = source.locate(info.spec.with_engine(sim))
     with contextlib.suppress(UsageError, TaskError):  # `_check_environment` says what does not build
         n_envs = count_envs(spec, EPISODES)
     with Workers(spec, n_envs) as workers:

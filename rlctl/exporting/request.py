@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
+from rlctl.engine import Engine
 from rlctl.errors import UsageError
 
 Format = Literal["onnx", "c"]
@@ -25,7 +26,7 @@ class ExportRequest:
 
     controller: bool = False  # write the controller: from what a robot measures to joint targets within limits
     limits: Path | None = None  # of the controller
-    sim: str | None = None  # engine of the episodes that are compared; default: that of the training
+    sim: Engine | None = None  # engine of the episodes that are compared; default: that of the training
     mapping: Path | None = None  # between a program's values and the controller's
 
     def __post_init__(self) -> None:

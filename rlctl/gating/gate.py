@@ -223,7 +223,8 @@ class _Findings:
         assert target is not None
         form: Format = "c" if target.suffix == ".c" else "onnx"
         options = self._request.evaluation
-        reports = export_policy(ExportRequest(options.run, (form,), options.checkpoint, target))
+        request = ExportRequest(options.run, (form,), options.checkpoint, target, sim=options.changes.sim or None)
+        reports = export_policy(request)
         self.exported = reports
         self._show(reports)
         for report in reports:

@@ -17,6 +17,7 @@ from rlctl.errors import ArtifactError, UsageError
 from rlctl.importing.sb3_model import SavedModel, read_model, read_normalization
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.load import load_policy
+from rlctl.recipe.sources import make_spec
 from rlctl.storage import files
 from rlctl.version import collect_versions
 
@@ -46,7 +47,7 @@ def import_model(
         raise UsageError(f"{target} exists already; give another name: --output FILE")
     model = read_model(file, algo)
     statistics = read_normalization(normalization) if normalization else None
-    spec = changes.apply(EnvSpec(task))
+    spec = changes.apply(make_spec(task))
     env_info = _describe_env(spec)
     if _has_time_feature(model, env_info):
         spec = dataclasses.replace(spec, time_feature=True)

@@ -58,7 +58,9 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
     def derive_spec(self, task: str | None = None, changes: EnvChanges = UNCHANGED) -> EnvSpec:
         """Return the spec of the environment it was trained in, or of another task, with `changes`."""
         if task is not None and task != self.spec.task:
-            return changes.apply(EnvSpec(task).observe_as(self.spec))
+            from rlctl.recipe.sources import make_spec  # few commands play another task
+
+            return changes.apply(make_spec(task).observe_as(self.spec))
         own = self.spec.replace_missing_engine()
         return changes.apply(dataclasses.replace(own, named_by=POLICY if task is None else ""))
 

@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal, Self, get_args
 import pydantic
 from pydantic import Field
 
+from rlctl.engine import Engine
 from rlctl.environments.spec import EnvSpec, merge
-from rlctl.errors import RecipeError, UsageError, short_repr
+from rlctl.errors import RecipeError, short_repr
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS, decide_by
 from rlctl.recipe.hyperparameters import ON_POLICY as ON_POLICY
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
@@ -100,7 +101,7 @@ class Recipe(Section):
     """Whether all of the task's events (random changes) act."""
     events: dict[str, dict[str, Any]] = {}
     """Events (random changes) that act, by name, with the parameters that differ from the task's defaults."""
-    sim: str | None = Field(None, json_schema_extra=decide_by("pybullet if it is installed, else mujoco"))
+    sim: Engine | None = Field(None, json_schema_extra=decide_by("pybullet if it is installed, else mujoco"))
     """Physics engine of a task: pybullet, mujoco, or mujoco:0.01 with the time constant of contacts [s]."""
     algo: Algorithm = "ppo"
     """The algorithm."""
@@ -158,18 +159,6 @@ class Recipe(Section):
             return values
         return model.model_validate(values).model_dump(mode="json", exclude_unset=True)
 
-    @pydantic.field_validator("sim")
-    @classmethod
-    def _check_engine(cls, value: str | None) -> str | None:
-        from rlctl.task.mujoco.sim import read_solref  # few recipes name an engine
-
-        try:
-            if value is not None:
-                read_solref(value)
-        except UsageError as error:
-            raise ValueError(str(error)) from None
-        return value
-
     @pydantic.model_validator(mode="after")
     def _fit_together(self) -> Self:
         dropped = self.algo_kwargs.get("top_quantiles_to_drop_per_net", 0)
@@ -215,7 +204,7 @@ class Recipe(Section):
             self.time_feature,
             tuple(self.observe),
             self.observation_history,
-            sim=self.sim or "",
+            sim=self.sim or Engine(),
             named_by=named_by,
         )
         return [

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rlctl.engine import Engine
 from rlctl.environments import registry
-from rlctl.environments.spec import EnvChanges, merge
+from rlctl.environments.spec import EnvChanges, EnvSpec, merge
 from rlctl.errors import ArtifactError, RecipeError, check_name, did_you_mean, short_repr
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.recipe.recipe import WITH_PRIVILEGED, NormalizeSettings, Recipe, Source, validate
@@ -113,6 +114,18 @@ def resolve_with_stages(task: str, config: Path | None = None, settings: Mapping
     return resolve(task, config, settings or {}, constructor.stages if registry.is_task(constructor) else ())
 
 
+def make_spec(task: str, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
+    """Return the environment of a task that the user named: of its recipe only the engine counts.
+
+    Raises `RecipeError` if the recipe names no engine that exists.
+    """
+    file = registry.find_recipe_file(task)
+    packaged = read(file) if file else {}
+    named = {"sim": packaged["sim"]} if "sim" in packaged else {}
+    recipe = validate(named, Source(str(file), named, file))
+    return EnvSpec(task, parameters or {}, sim=recipe.sim or Engine())
+
+
 def fill_defaults(recipe: Recipe) -> Recipe:
     """Fill in defaults that depend on other keys: rollout length, normalisation, evaluation interval."""
     kwargs, on_policy = dict(recipe.algo_kwargs), recipe.algo in ON_POLICY
@@ -206,7 +219,7 @@ def check_changes(values: Mapping[str, Any], source: str) -> EnvChanges:
             raise RecipeError(f"{source} {key}: only {can}.{did_you_mean(key, _OF_THE_ENVIRONMENT, parameter)}")
     recipe = validate(values, source)
     randomize = recipe.randomize if "randomize" in values else None
-    return EnvChanges(recipe.task, recipe.reward_weights, randomize, recipe.events, recipe.sim or "")
+    return EnvChanges(recipe.task, recipe.reward_weights, randomize, recipe.events, recipe.sim or Engine())
 
 
 def merge_flags(settings: list[str], **flags: Any) -> dict[str, Any]:

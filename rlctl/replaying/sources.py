@@ -150,7 +150,7 @@ class PolicySource(_NewEpisodes):
         spec = policy.locate(info.derive_spec(request.task, _read_changes(request)))
         self.name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
         self.described = f"{self._file} ({info.algo}, step {info.training_steps:,})"
-        super().__init__(request, _choose_sim(spec, request), load_player(self._file, deterministic=True))
+        super().__init__(request, spec, load_player(self._file, deterministic=True))
 
     def begin(self, env: Env, seed: int) -> Choose:
         """Return the function that chooses the actions of an episode."""
@@ -176,7 +176,7 @@ class TaskSource(_NewEpisodes):
         self._other_clients = find_clients()
         self._actor: Actor | None = None
         self._world: WorldWatch | None = None
-        super().__init__(request, _choose_sim(spec, request), self._baseline)
+        super().__init__(request, spec, self._baseline)
 
     def begin(self, env: Env, seed: int) -> Choose:
         """Return the function that chooses the actions of an episode."""
@@ -235,14 +235,7 @@ def load_located(path: Path) -> RecordedEpisode:
 
 def _read_changes(request: ReplayRequest) -> EnvChanges:
     changes = parse_changes(request.settings) if request.settings else EnvChanges()
-    if request.sim is None:
-        return changes
-    # As `rlctl eval --sim`: without the recipe's events, which may be PyBullet's only.
-    return dataclasses.replace(changes, randomize=bool(changes.randomize))
-
-
-def _choose_sim(spec: EnvSpec, request: ReplayRequest) -> EnvSpec:
-    return spec if request.sim is None else dataclasses.replace(spec, sim=request.sim)
+    return changes if request.sim is None else dataclasses.replace(changes, sim=request.sim)
 
 
 def summarize(rollout: Rollout, recording: Path | None = None, episode: Path | None = None) -> ReplayedEpisode:

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from rlctl.engine import Engine
 from rlctl.errors import RecipeError, TaskError
 from rlctl.task.batch import BatchTask
 from rlctl.task.commands import CommandTerm
@@ -25,8 +26,8 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
     """Steps a `Task` or one world of a `BatchTask`: act, physics, terminated, rewards, interval events, observe.
 
     `info` holds `reward_terms` (weighted; they add up to the reward), `metrics` (every raw term), `is_success`
-    where the task defines it, and, in steps with events, `events` (the drawn values). `sim` is the engine:
-    `pybullet`, `mujoco`, `mujoco:SOLREF`; by default that of `choose_engine`. Without `visuals` MuJoCo loads visual
+    where the task defines it, and, in steps with events, `events` (the drawn values). `sim` is the engine,
+    by default that of `choose_engine`. Without `visuals` MuJoCo loads visual
     shapes only when the task takes its first picture. `observing` is what the policy sees.
     """
 
@@ -37,7 +38,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         render_mode: Literal["human", "rgb_array"] | None = None,
         reward_weights: Mapping[str, float] | None = None,
         events: EventSettings | None = None,
-        sim: str = "",
+        sim: Engine = Engine(),  # noqa: B008 (it cannot change)
         visuals: bool = True,
         observing: Observing = Observing(),  # noqa: B008 (it cannot change)
     ) -> None:

@@ -10,6 +10,7 @@ from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
+from rlctl.engine import MUJOCO, PYBULLET, Engine
 from rlctl.errors import RecipeError, TaskError, UsageError, WorldFailed, check_name, in_world
 from rlctl.task.batch import BatchTask
 from rlctl.task.calls import Array, Flags, ManyWorldCalls, OneWorldCalls, TaskCalls, Worlds
@@ -19,7 +20,7 @@ from rlctl.task.events.event import Drawn
 from rlctl.task.events.signals import Signals
 from rlctl.task.joints import check_joints
 from rlctl.task.mirror import ACTION, check_declaration
-from rlctl.task.mujoco.sim import MujocoSim, read_solref
+from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.task.observation import (
     Observation,
     Observing,
@@ -76,7 +77,7 @@ class TaskWorlds:
         render_mode: RenderMode = None,
         reward_weights: Mapping[str, float] | None = None,
         events: EventSettings | None = None,
-        sim: str = "",
+        sim: Engine = Engine(),  # noqa: B008 (it cannot change)
         visuals: bool = True,
         observing: Observing = Observing(),  # noqa: B008 (it cannot change)
     ) -> None:
@@ -490,19 +491,20 @@ def take_row(rows: Any, row: int = 0) -> Any:
     return rows[row]
 
 
-def choose_engine(task: type) -> str:
-    """Return `pybullet` if it is installed, for a `BatchTask` and otherwise `mujoco`."""
-    return "mujoco" if issubclass(task, BatchTask) or not is_installed() else "pybullet"
+def choose_engine(task: type) -> Engine:
+    """Return PyBullet if it is installed, for a `BatchTask` and otherwise MuJoCo."""
+    needs_mujoco = issubclass(task, BatchTask) or not is_installed()
+    return MUJOCO if needs_mujoco else PYBULLET
 
 
 def _make_sim(
-    task: Task | BatchTask, worlds: int, sim: str, render_mode: RenderMode, *, visuals: bool
+    task: Task | BatchTask, worlds: int, sim: Engine, render_mode: RenderMode, *, visuals: bool
 ) -> PybulletSim | MujocoSim:
-    solref, iterations = read_solref(sim or choose_engine(type(task))), task.solver_iterations
+    engine, iterations = sim or choose_engine(type(task)), task.solver_iterations
     dt, substeps, is_batch = task.control_dt, task.substeps, isinstance(task, BatchTask)
-    if solref is None and is_batch:
+    if engine.name != "mujoco" and is_batch:
         raise UsageError(f"{type(task).__name__} simulates its worlds in MuJoCo: sim: mujoco, or --sim mujoco")
-    if solref is None:
+    if engine.name != "mujoco":
         gui = render_mode == "human"
         return PybulletSim(control_dt=dt, substeps=substeps, solver_iterations=iterations, gui=gui)
     if render_mode == "human" and not is_batch:
@@ -510,7 +512,7 @@ def _make_sim(
     return MujocoSim(
         control_dt=dt,
         substeps=substeps,
-        solref=solref,
+        solref=engine.contact_time,
         iterations=iterations,
         worlds=worlds if is_batch else None,
         visuals=visuals,

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from rlctl.engine import MUJOCO, PYBULLET
 from rlctl.environments.spec import EnvSpec
 from tests.benchmarks.row import Row, side_by_side
 
@@ -25,7 +26,7 @@ TRAINED = 614_400  # steps, 100 rollouts
 
 def one_world(repeat: int) -> Row:
     """Count steps/s of `reach` on one core: MuJoCo next to PyBullet."""
-    mujoco, bullet = (EnvSpec("reach", sim=sim).make() for sim in ("mujoco", "pybullet"))
+    mujoco, bullet = (EnvSpec("reach", sim=sim).make() for sim in (MUJOCO, PYBULLET))
     pair = side_by_side(lambda: _count_steps(mujoco), lambda: _count_steps(bullet), 3 * repeat)
     mujoco.close()
     bullet.close()

@@ -11,6 +11,7 @@ from rlctl.checking.rules import NotJudged
 from rlctl.checking.transitions import Transitions
 from rlctl.checking.values import read_attributes
 from rlctl.checking.workspaces import find_chains, find_reach, measure_reach
+from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
 from tests.checking.judging import case, check_case, findings, mark_slow, shared_records_of
 
@@ -64,7 +65,7 @@ def test_what_the_joints_do_not_move_is_not_the_hand():
 
 
 def test_the_reach_of_a_task_in_mujoco_is_measured_by_its_joints():
-    with contextlib.closing(EnvSpec("reach", sim="mujoco").make()) as env:
+    with contextlib.closing(EnvSpec("reach", sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         *_, chain = find_chains(env)  # other tests may have left PyBullet's
         reach = measure_reach(chain, chain.names.index("arm/lbr_iiwa_link_7"), 3)
@@ -81,7 +82,7 @@ def test_the_joints_of_an_arm_do_not_move_what_it_pushes(tmp_path):
         "    def build(self, sim):\n        super().build(sim)\n"
         "        sim.load('cube', 'cube_4cm.urdf', position=(0.5, 0, 0.02))\n"
     )
-    with contextlib.closing(EnvSpec(f"{pushing}:Push", sim="mujoco").make()) as env:
+    with contextlib.closing(EnvSpec(f"{pushing}:Push", sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         *_, chain = find_chains(env)
     assert {name.partition("/")[0] for name in chain.names} == {"arm"}

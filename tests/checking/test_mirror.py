@@ -2,6 +2,7 @@
 
 import pytest
 
+from rlctl.engine import MUJOCO
 from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
 from rlctl_locomotion.walk import Walk
@@ -58,7 +59,7 @@ def test_tasks_without_a_symmetry():
 def test_declarations_that_do_not_fit(changes, message, monkeypatch):
     monkeypatch.setattr(Walk, "mirror", {**Walk.mirror, **changes})
     with pytest.raises(TaskError, match=message):
-        TaskEnv(Walk(), sim="mujoco")
+        TaskEnv(Walk(), sim=MUJOCO)
 
 
 def test_an_observation_without_an_entry(monkeypatch):
@@ -66,4 +67,4 @@ def test_an_observation_without_an_entry(monkeypatch):
     with pytest.raises(
         TaskError, match="mirror: 'gyroscope' is missing; each observation and the action need an entry"
     ):
-        TaskEnv(Walk(), sim="mujoco")
+        TaskEnv(Walk(), sim=MUJOCO)

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from rlctl.engine import Engine
 from rlctl.policy.file import PolicyFile
 
 pytestmark = pytest.mark.pybullet  # which of two engines is taken
@@ -38,7 +39,7 @@ def test_a_policy_contains_the_engine_of_its_training(rlctl, tmp_path):
     assert "train reach (ppo, MuJoCo)" in done.stderr
     run = tmp_path / json.loads(done.stdout)["run"]
     assert "sim: mujoco:0.01" in (run / "recipe.yaml").read_text()
-    assert PolicyFile.read(run / "policies" / "last.safetensors").info.spec.sim == "mujoco:0.01"
+    assert PolicyFile.read(run / "policies" / "last.safetensors").info.spec.sim == Engine("mujoco", 0.01)
     played = rlctl("eval", run, "--checkpoint", "last", "--episodes", "2")
     assert "2 episodes, seed 0, MuJoCo" in played.stdout, played.stderr
     other = rlctl("eval", run, "--checkpoint", "last", "--episodes", "2", "--sim", "pybullet")
@@ -51,11 +52,30 @@ def test_a_batch_has_no_worlds_in_pybullet(rlctl):
     assert done.stderr == "error: Walk simulates its worlds in MuJoCo: sim: mujoco, or --sim mujoco\n"
 
 
-@pytest.mark.parametrize("verb", [("check-env", "reach"), ("train", "reach")])
+VERBS = [
+    "check-env",
+    "train",
+    "eval",
+    "replay",
+    "play",
+    "export",
+    "robot",
+    "serve",
+    "identify",
+    "diagnose",
+    "distill",
+    "tune",
+]
+
+
+@pytest.mark.parametrize("verb", ["check-env", pytest.param("eval", marks=pytest.mark.slow)])
 def test_an_engine_that_does_not_exist(rlctl, verb):
-    done = rlctl(*verb, "--sim", "bullet")
+    done = rlctl(verb, "reach", "--sim", "mujocoo")
     assert done.returncode == 2
-    assert "sim 'bullet': give pybullet, mujoco, or mujoco:SOLREF with 0 < SOLREF < 1 s" in done.stderr
+    assert done.stderr == (
+        "error: --sim 'mujocoo': no such engine. Did you mean 'mujoco'? "
+        "Give pybullet, mujoco, or mujoco:SOLREF with 0 < SOLREF < 1 s\n"
+    )
 
 
 @pytest.mark.slow
@@ -63,3 +83,11 @@ def test_a_look_in_mujoco(rlctl):
     done = rlctl("replay", "reach", "--policy", "zero", "--sim", "mujoco", "--json", "-")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["episodes"][0]["length"] == 120
+
+
+def test_the_engine_leaves_the_events_as_they_are(rlctl):
+    """`--sim` is the engine and nothing else: not whether the world is randomised."""
+    done = rlctl("eval", "walk", "--policy", "zero", "--episodes", "1", "--sim", "mujoco", "--set", "randomize=true")
+    assert done.returncode == 0, done.stderr
+    assert "1 episode, seed 0, MuJoCo, randomised" in done.stdout
+    assert done.stderr.startswith("--sim mujoco plays in one engine; to vary the stiffness of its contacts: --vary sim")

@@ -48,7 +48,7 @@ def test_settings_come_from_a_file(tmp_path, monkeypatch):
 def test_on_without_cells_or_seeds_is_an_error(rlctl):
     for push in ([], ["--push"]):
         done = rlctl("eval", "reach", "--on", "ray", *push)
-        assert (done.returncode, done.stderr) == (2, "error: --on needs a robustness map: give --vary or --sim too\n")
+        assert (done.returncode, done.stderr) == (2, "error: --on needs a robustness map: give --vary too\n")
     assert "--jobs, --on and --detach need several seeds" in rlctl("train", "reach", "--on", "ray").stderr
 
 

@@ -1,11 +1,13 @@
 """`rlctl eval --vary`: maps over events and parameters, with the same episodes in every cell."""
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rlctl.engine import Engine
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.episode_statistics import mean_interval
@@ -127,6 +129,32 @@ def test_the_command_for_one_cell_is_the_whole_of_it(measured):
         "--set 'task.goal=[1, 2]' --set task.limit=0.1234567891 --set reward_weights.distance=0.5 "
         "--set 'events.mass.factor=[0.9, 1.1]' --set 'events.push={}' --set randomize=false"
     )
+
+
+@pytest.mark.pybullet
+@pytest.mark.parametrize("vary", [["push=0:3:2", "mass=1:3:2"], ["sim=0.01:0.02:2"]], ids=["events", "sim"])
+def test_the_command_for_one_cell_plays_it_and_leaves_the_measurement(vary, rlctl, tmp_path):
+    run = write_run(tmp_path / "run", f"{ENVS}:Block")
+    result = measure_robustness(EvalRequest(str(run.path), episodes=3), vary)
+    (found,) = result.maps
+    stored = run.robustness_file.read_bytes()
+    command = format_command(result, found, found.cells[-1])
+    played = rlctl(*shlex.split(command)[1:], "--json", "-")
+    assert played.returncode == 0, played.stderr
+    assert json.loads(played.stdout)["return"]["mean"] == found.cells[-1].mean_return
+    assert run.robustness_file.read_bytes() == stored
+
+
+@pytest.mark.pybullet
+def test_the_command_names_what_the_measurement_changed(measured):
+    (found,) = measured.maps
+    changed = measured.model_copy(
+        update={"sim": Engine("mujoco", 0.01), "randomize": True, "other_task": "reach", "events": {}}
+    )
+    command = format_command(changed, found, found.cells[0])
+    assert "--task reach --sim mujoco:0.01" in command
+    assert "--set randomize=true" in command
+    assert measured.sim == Engine()  # the policy's own
 
 
 @pytest.mark.pybullet
@@ -258,9 +286,9 @@ def test_events_set_in_a_standing_world_act_as_in_a_new_one():
 
 
 @pytest.mark.pybullet
-def test_the_same_episodes_in_mujoco(rlctl):
+def test_contacts_from_soft_to_stiff(rlctl):
     pytest.importorskip("mujoco")
-    done = rlctl("eval", "reach", "--pretrained", "--sim", "mujoco", "--episodes", "2", "--json", "-")
+    done = rlctl("eval", "reach", "--pretrained", "--vary", "sim", "--episodes", "2", "--json", "-")
     assert done.returncode == 0, done.stderr
     (engine,) = json.loads(done.stdout)["maps"]
     assert engine["axes"][0]["values"] == [0.02, 0.01, 0.005]
@@ -269,11 +297,11 @@ def test_the_same_episodes_in_mujoco(rlctl):
 
 def test_the_worst_contacts_are_gated(rlctl):
     pytest.importorskip("mujoco")
-    options = ("--episodes", "2", "--sim", "mujoco:0.02", "--min-success", "0.9")
+    options = ("--episodes", "2", "--vary", "sim=0.01:0.02:2", "--min-success", "0.9")
     done = rlctl("eval", "biped-3d", "--pretrained", *options)
     assert done.returncode == 1
-    assert "gate missed in the worst cell, mujoco solref 0.02" in done.stderr
-    assert "--sim mujoco:0.02 --set randomize=false" in done.stdout
+    assert "gate missed in the worst cell, mujoco solref 0.01" in done.stderr
+    assert "--sim mujoco:0.01 --set randomize=false" in done.stdout
 
 
 @pytest.mark.pybullet

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO
 from rlctl.recipe import sources
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
@@ -203,7 +204,7 @@ def test_an_episode_in_mujoco_stays_finite(robot):
             return False
 
     pytest.importorskip("mujoco")
-    env, rng = TaskEnv(Endless(), sim="mujoco"), np.random.default_rng(0)
+    env, rng = TaskEnv(Endless(), sim=MUJOCO), np.random.default_rng(0)
     observation, bullet = env.reset(seed=0)[0], TaskEnv(robot())
     # The same joints and start. The height is of the torso's centre of mass, which the engines place differently.
     np.testing.assert_allclose(observation[1:], bullet.reset(seed=0)[0][1:], atol=1e-4)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
 
 pytest.importorskip("mujoco")
@@ -10,7 +11,7 @@ pytest.importorskip("mujoco")
 
 def test_it_is_reach():
     """Same start and goal for a seed; batches integrate otherwise, so that joints differ by some milliradians later."""
-    one, batch = EnvSpec("reach", sim="mujoco").make(), EnvSpec("reach-batch").make()
+    one, batch = EnvSpec("reach", sim=MUJOCO).make(), EnvSpec("reach-batch").make()
     np.testing.assert_allclose(batch.reset(seed=5)[0], one.reset(seed=5)[0], atol=1e-6)
     rng = np.random.default_rng(0)
     for _ in range(40):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO
 from rlctl.errors import TaskError, UsageError
 from rlctl.playing.controls import Controls
 from rlctl.playing.page_server import PageServer
@@ -50,7 +51,7 @@ def test_a_walker_follows_commands_pushes_and_the_clock():
 
 
 def test_a_goal_is_moved_and_recorded(tmp_path):
-    with play("reach", sim="mujoco", output=tmp_path) as (page, results):
+    with play("reach", sim=MUJOCO, output=tmp_path) as (page, results):
         page.wait_for(lambda frame: True)
         page.send(record=True)
         page.wait_for(lambda frame: frame["recording"])
@@ -76,7 +77,7 @@ def test_a_goal_is_moved_and_recorded(tmp_path):
 
 def test_what_was_recorded_before_an_error_is_written(tmp_path):
     run = write_run(tmp_path / "run", f"{Path(__file__).with_name('envs.py')}:Breaks")
-    source = PolicySource(ReplayRequest(str(run.path), sim="mujoco", output=tmp_path / "films"))
+    source = PolicySource(ReplayRequest(str(run.path), sim=MUJOCO, output=tmp_path / "films"))
     controls = Controls(record=True)
     server = PageServer(0, controls)
     server.start()

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO, PYBULLET
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.playing.controls import Wishes
@@ -19,7 +20,7 @@ from rlctl.task.meshes import read_mesh
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
-@pytest.mark.parametrize("sim", [pytest.param("pybullet", marks=pytest.mark.pybullet), "mujoco"])
+@pytest.mark.parametrize("sim", [pytest.param(PYBULLET, marks=pytest.mark.pybullet), MUJOCO], ids=str)
 def test_pushes_and_friction(sim):
     with closing(EnvSpec("quadruped", sim=sim).make()) as env:
         world, task = RobotWorld(env), env.unwrapped.task
@@ -47,7 +48,7 @@ def test_a_plain_environment_only_has_a_clock():
 
 
 def test_a_command_without_a_range_names_itself():
-    with closing(EnvSpec("reach", sim="mujoco").make()) as env:
+    with closing(EnvSpec("reach", sim=MUJOCO).make()) as env:
         env.unwrapped.task.commands = lambda: {"height": CommandTerm(0.1, 1.0, 1.0, "m")}
         with pytest.raises(
             TaskError, match=r"^commands\(\): height is \(0.1, 1.0, 1.0, 'm', False\); give a value, an"
@@ -110,7 +111,7 @@ def test_rough_ground_is_in_the_world_frame():
 
 @pytest.mark.parametrize("direction", [(1e308, 1e308), (5e-324, 5e-324), (-3.0, -3.0)])
 def test_a_push_has_a_direction_only(direction):
-    with closing(EnvSpec("reach", sim="mujoco").make()) as env:
+    with closing(EnvSpec("reach", sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         world = RobotWorld(env)
         mass = max(body.total_mass() for body in env.unwrapped.sim.bodies.values() if body.joint_names)

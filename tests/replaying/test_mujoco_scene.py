@@ -5,6 +5,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO, PYBULLET
 from rlctl.environments.spec import EnvSpec
 from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.mjcf import ShapeKind
@@ -131,7 +132,7 @@ def test_a_trunk_that_moves_is_followed():
 
 
 def test_a_task_of_rlctl_in_mujoco():
-    spec = EnvSpec("quadruped", sim="mujoco")
+    spec = EnvSpec("quadruped", sim=MUJOCO)
     with closing(make_drawable(spec)) as env:
         zero = np.zeros(env.action_space.shape)
         rollout = play_episode(env, spec, 3, lambda o, step: zero if step < 10 else None, policy="zero", draw=print)
@@ -146,7 +147,7 @@ def test_a_task_of_rlctl_in_mujoco():
 @pytest.mark.parametrize("task", ["reach", "quadruped"])
 def test_a_task_shows_its_visual_shapes_as_in_pybullet(task):
     shapes = []
-    for sim in ("pybullet", "mujoco"):
+    for sim in (PYBULLET, MUJOCO):
         spec = EnvSpec(task, sim=sim)
         with closing(make_drawable(spec)) as env:
             rollout = play_episode(env, spec, 3, lambda observation, step: None, policy="nothing", draw=print)
@@ -159,7 +160,7 @@ def test_a_task_shows_its_visual_shapes_as_in_pybullet(task):
 
 
 def test_bounds_of_a_task_leave_out_the_ground():
-    with closing(EnvSpec("reach", sim="mujoco").make()) as env:
+    with closing(EnvSpec("reach", sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         sim = env.unwrapped.sim
         low, high = find_mujoco_bounds(sim, list(sim.bodies.values()), [np.array([0.0, 2.0, 0.0])])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rlctl.checking.bullet_worlds import find_clients
+from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
 from rlctl.replaying.recorder import play_episode
 from rlctl.replaying.world import BodySummary, Contact, JointSummary, Motion, Pose, Touch, WorldSummary, WorldWatch
@@ -208,7 +209,7 @@ def test_mujoco():
 
 def test_a_task_in_mujoco():
     pytest.importorskip("mujoco")
-    spec = EnvSpec("quadruped", sim="mujoco")
+    spec = EnvSpec("quadruped", sim=MUJOCO)
     with closing(spec.make()) as env:
         env.reset(seed=0)
         ground, robot = make_world_reader(env).read_bodies()

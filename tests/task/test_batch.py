@@ -8,6 +8,7 @@ from importlib import metadata
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO, PYBULLET
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ShapeError, TaskError, UsageError, WorldFailed
 from rlctl.task import BatchTask
@@ -162,7 +163,7 @@ class Meddler(Stool):
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_others_keep_their_model_and_a_failed_step_leaves_them_alone_too(fails):
-    with closing(TaskWorlds(Meddler(), 4, sim="mujoco")) as batch:
+    with closing(TaskWorlds(Meddler(), 4, sim=MUJOCO)) as batch:
         batch.reset(np.arange(4), range(4))
         batch.step(np.full((4, 2), 0.4, np.float32))
         others = np.array([0, 2])
@@ -289,7 +290,7 @@ class WithoutAct(BatchTask):
 
 def test_a_missing_method():
     with pytest.raises(TaskError) as caught:
-        TaskEnv(WithoutAct(), sim="mujoco")
+        TaskEnv(WithoutAct(), sim=MUJOCO)
     assert str(caught.value) == "WithoutAct does not define act(); a task needs build, act, observe, rewards"
 
 
@@ -305,7 +306,7 @@ def test_a_mujoco_without_batches_is_named(monkeypatch):
 
 def test_batches_need_mujoco_and_no_wrappers():
     with pytest.raises(UsageError, match="simulates its worlds in MuJoCo"):
-        EnvSpec(STOOL, sim="pybullet").make()
+        EnvSpec(STOOL, sim=PYBULLET).make()
     spec = EnvSpec(STOOL, frame_stack=2)
     with closing(spec.make()), pytest.raises(UsageError, match="no frame_stack and no time_feature"):
         spec.make_worlds(2)

@@ -9,12 +9,13 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO, PYBULLET
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import TaskError, UsageError
+from rlctl.errors import TaskError
 from rlctl.task import worlds as worlds_module
 from rlctl.task.env import TaskEnv
 from rlctl.task.mujoco.opengl import draw_without_display
-from rlctl.task.mujoco.sim import MujocoSim, read_solref
+from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.task.pybullet.sim import PybulletSim
 from rlctl_manipulation.peg_insert import SCARA
 from tests.task.tasks import Cart, Slider
@@ -39,14 +40,14 @@ def play(env, steps: int = 40):
 @pytest.mark.pybullet
 @pytest.mark.parametrize("task", TASKS)
 def test_an_episode_starts_as_in_pybullet_and_repeats_bit_for_bit(task):
-    with closing(EnvSpec(task, sim="pybullet").make()) as env:
+    with closing(EnvSpec(task, sim=PYBULLET).make()) as env:
         bullet = play(env, steps=0)[0]
         joints = env.unwrapped.task.describe_joints()
-    with closing(EnvSpec(task, sim="mujoco").make()) as env:
+    with closing(EnvSpec(task, sim=MUJOCO).make()) as env:
         first = play(env)
         again = play(env)
         described = env.unwrapped.task.describe_joints()
-    with closing(EnvSpec(task, sim="mujoco").make()) as env:
+    with closing(EnvSpec(task, sim=MUJOCO).make()) as env:
         fresh = play(env)
     np.testing.assert_allclose(first[0], bullet, atol=1e-5)
     assert described.names == joints.names
@@ -97,7 +98,7 @@ def test_a_velocity_motor_and_brakes(weightless_arm):
 
 @pytest.mark.pybullet
 def test_frictions_are_multiplied_and_restored():
-    with closing(TaskEnv(Cart(), sim="mujoco")) as env:
+    with closing(TaskEnv(Cart(), sim=MUJOCO)) as env:
         cube, plane = env.task.cube, env.task.plane
         env.reset(seed=0)
         nominal = env.sim.model.pair_friction.copy()
@@ -109,7 +110,7 @@ def test_frictions_are_multiplied_and_restored():
 
 
 def test_feet_have_the_spinning_friction_of_their_file():
-    with closing(EnvSpec("biped-3d", sim="mujoco").make()) as env:
+    with closing(EnvSpec("biped-3d", sim=MUJOCO).make()) as env:
         # 0.04 m of the two feet, times the ground's friction of 1; the other links have none.
         spins = np.sort(env.unwrapped.sim.model.pair_friction[:, 2])
     assert spins[-2:] == pytest.approx(0.04)
@@ -133,7 +134,7 @@ def test_a_force_sensor_measures_what_hangs_from_it(world):
 
 
 def test_gears_and_a_linkage_hold():
-    with closing(EnvSpec("gear-arm", sim="mujoco").make()) as env:
+    with closing(EnvSpec("gear-arm", sim=MUJOCO).make()) as env:
         play(env)
         task = env.unwrapped.task
         positions = dict(zip(task.arm.joint_names, task.arm.joint_positions, strict=True))
@@ -146,7 +147,7 @@ def test_gears_and_a_linkage_hold():
 def test_events_act_in_mujoco_too():
     masses = []
     for events in ({}, {"mass": {"factor": (1.5, 1.5)}}):
-        with closing(EnvSpec("reach", events=events, sim="mujoco").make()) as env:
+        with closing(EnvSpec("reach", events=events, sim=MUJOCO).make()) as env:
             env.reset(seed=0)
             masses.append(float(env.unwrapped.sim.model.body_mass.sum()))
     assert masses[1] > 1.2 * masses[0]
@@ -159,17 +160,7 @@ def test_events_act_in_mujoco_too():
 )
 def test_what_mujoco_has_not_is_named(task, parameters, missing):
     with pytest.raises(TaskError, match=missing):
-        EnvSpec(task, parameters, sim="mujoco").make()
-
-
-def test_engines():
-    assert [read_solref(sim) for sim in ("pybullet", "mujoco", "mujoco:0.005")] == [None, 0.02, 0.005]
-
-
-@pytest.mark.parametrize("sim", ["mujoco:stiff", "mujoco:0", "mujoco:nan", "bullet", ""])
-def test_what_is_no_engine(sim):
-    with pytest.raises(UsageError, match="give pybullet, mujoco, or mujoco:SOLREF"):
-        read_solref(sim)
+        EnvSpec(task, parameters, sim=MUJOCO).make()
 
 
 needs_egl = pytest.mark.skipif(ctypes.util.find_library("EGL") is None, reason="needs libEGL")
@@ -177,7 +168,7 @@ needs_egl = pytest.mark.skipif(ctypes.util.find_library("EGL") is None, reason="
 
 @needs_egl
 def test_markers_are_drawn_where_they_are_moved():
-    with closing(EnvSpec("reach", sim="mujoco").make("rgb_array")) as env:
+    with closing(EnvSpec("reach", sim=MUJOCO).make("rgb_array")) as env:
         env.reset(seed=0)
         pictures = []
         for y in (-0.3, 0.3, 0.3):
@@ -206,7 +197,7 @@ def test_a_task_draws_without_a_display(monkeypatch):
     # In a process of its own: MuJoCo chooses at its import how to draw, and GLFW would end the process.
     for name in ("DISPLAY", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)
-    code = "from rlctl.environments.spec import EnvSpec; env = EnvSpec('reach', sim='mujoco').make(); "
+    code = "import rlctl; env = rlctl.make('reach', sim='mujoco'); "
     code += "env.reset(seed=0); print(env.unwrapped.sim.render().shape)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=250)
     assert done.stdout == "(240, 320, 3)\n", done.stderr
@@ -253,7 +244,7 @@ def test_an_engine_is_chosen_by_what_is_installed(monkeypatch):
 
 
 def test_a_slippery_ground_is_solved_further_until_the_reset():
-    with closing(EnvSpec("walk", sim="mujoco").make()) as env:
+    with closing(EnvSpec("walk", sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         task, world = env.unwrapped.task, env.unwrapped.sim.world
         iterations = world.mj_model.opt.iterations

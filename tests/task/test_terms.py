@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError, TaskError
@@ -151,8 +152,8 @@ class StoolWithHistory(Stool):
 def test_many_worlds_have_the_histories_of_one(start):
     kind = type("Remembering", (StoolWithHistory,), {"history_start": start, "__doc__": "A stool."})
     events = EventSettings(True, {})
-    single = TaskEnv(kind(), events=events, sim="mujoco")
-    batch = TaskWorlds(kind(), 3, events=events, sim="mujoco")
+    single = TaskEnv(kind(), events=events, sim=MUJOCO)
+    batch = TaskWorlds(kind(), 3, events=events, sim=MUJOCO)
     actions = np.random.default_rng(0).uniform(-1, 1, (6, 2)).astype(np.float32)
     rows = [batch.reset(np.arange(3), [5, 6, 7])[1]]
     for step, action in enumerate(actions):

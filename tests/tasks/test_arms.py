@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
 from rlctl.tasks import new
 
@@ -119,7 +120,7 @@ def test_what_only_mujoco_reads_is_simulated_in_mujoco(tmp_path, monkeypatch):
     plugin = new.create("mujoco-arm", model="arm.xml")
     assert "sim: mujoco" in (plugin.folder / "mujoco_arm" / "task.yaml").read_text().splitlines()
     assert "PyBullet does not read this file as MuJoCo does" in plugin.summary
-    with contextlib.closing(EnvSpec(plugin.target, sim="mujoco").make()) as env:
+    with contextlib.closing(EnvSpec(plugin.target, sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         assert env.unwrapped.task.arm.joint_names == ["lift"]
 

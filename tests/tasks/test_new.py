@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO
 from rlctl.environments import registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
@@ -189,7 +190,7 @@ def test_a_plugin_of_a_users_own_model(model, tmp_path):
     assert "MAX_SPEED = [0.5, 1.0, 1.0, 1.0]" in code
     assert "MAX_FORCE = [20.0, 10.0, 10.0, 10.0]" in code
     assert "START = np.array([0.2, 0.2, 0.2, 0.2])" in code  # 0 is below the limits: a tenth of the range inside
-    with contextlib.closing(EnvSpec("two-arms/two_arms/task.py:TwoArms", sim="mujoco").make()) as env:
+    with contextlib.closing(EnvSpec("two-arms/two_arms/task.py:TwoArms", sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         task = env.unwrapped.task
         before = task.target
@@ -220,7 +221,7 @@ def test_an_mjcf_model_becomes_one_file(tmp_path, monkeypatch):
         arm = sim.load("arm", plugin.folder / "lifter" / "arm.xml", fixed=True)
         assert (arm.joint_names, arm.joint_max_force.tolist(), arm.joint_low.tolist()) == (["lift"], [5.0], [-1.0])
         assert sim.model.nmesh == 1
-    with contextlib.closing(EnvSpec("lifter/lifter/task.py:Lifter", sim="mujoco").make()) as env:
+    with contextlib.closing(EnvSpec("lifter/lifter/task.py:Lifter", sim=MUJOCO).make()) as env:
         assert list(env.unwrapped.sim.bodies) == ["arm"]  # the file has a floor
 
 

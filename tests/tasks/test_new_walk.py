@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.task.mujoco.sim import MujocoSim
@@ -55,7 +56,7 @@ def read_task(plugin: new.NewPlugin) -> SimpleNamespace:
 
 def check_that_it_stands(plugin: new.NewPlugin, feet: list[str], height: float) -> None:
     """Play 50 steps with zero actions: it must stay up, on its feet only, within 10 % of the stance's height."""
-    with contextlib.closing(EnvSpec(plugin.target, sim="mujoco").make()) as env:
+    with contextlib.closing(EnvSpec(plugin.target, sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         task = env.unwrapped.task
         for _ in range(50):
@@ -99,7 +100,7 @@ def test_two_legs_step_in_time_with_a_clock(tmp_path, monkeypatch):
     assert task.feet == ["front_left_shank", "front_right_shank"]
     assert task.aside == ["front_left_hip", "front_right_hip"]
     assert task.other_side == (-4, 5, 6, -1, 2, 3)
-    with contextlib.closing(EnvSpec(plugin.target, {"start_noise": 0.0}, sim="mujoco").make()) as env:
+    with contextlib.closing(EnvSpec(plugin.target, {"start_noise": 0.0}, sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         batch = env.unwrapped.task
         first, terminated, steps = int(batch.phase[0, 1] < 0), False, 0
@@ -133,7 +134,7 @@ def test_two_legs_that_only_turn_about_y(tmp_path, monkeypatch):
     file.write_text(hips)
     plugin = new.create("flat-bird", model="dog.xml", walk=True)
     assert not hasattr(read_task(plugin), "aside")
-    with contextlib.closing(EnvSpec(plugin.target, sim="mujoco").make()) as env:
+    with contextlib.closing(EnvSpec(plugin.target, sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         _, reward, _, _, _ = env.step(np.zeros(4, np.float32))
     assert np.isfinite(reward)

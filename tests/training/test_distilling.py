@@ -7,6 +7,7 @@ import numpy as np
 import onnx
 import pytest
 
+from rlctl.engine import MUJOCO
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError
@@ -95,7 +96,7 @@ def test_the_oldest_steps_are_replaced(monkeypatch):
 
 
 def test_a_student_sees_what_its_teacher_saw_unless_it_is_told_otherwise():
-    teacher = EnvSpec("reach", {"tolerance": 0.1}, observe=("hand",), observation_history={"hand": 3}, sim="mujoco")
+    teacher = EnvSpec("reach", {"tolerance": 0.1}, observe=("hand",), observation_history={"hand": 3}, sim=MUJOCO)
     same = make_settings(DistillRequest(), teacher)
     assert same["observe"] == ["hand"]
     assert same["observation_history"] == {"hand": 3}

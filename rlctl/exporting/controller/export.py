@@ -15,6 +15,7 @@ from rlctl import output
 from rlctl.deploy.controller_layout import ControllerLayout, JointTarget
 from rlctl.deploy.filter.doubts import list_doubts
 from rlctl.deploy.filter.limits import Limits, read_limits
+from rlctl.engine import Engine
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
@@ -103,10 +104,9 @@ def _describe_controller(policy: PolicyFile) -> ControllerLayout:
     return ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
 
 
-def _choose_spec(spec: EnvSpec, sim: str | None) -> EnvSpec:
+def _choose_spec(spec: EnvSpec, sim: Engine | None) -> EnvSpec:
     """Return the environment of the verification: without events, because noise acts on computed terms."""
-    spec = spec.replace_missing_engine() if sim is None else dataclasses.replace(spec, sim=sim)
-    return dataclasses.replace(spec, randomize=False, events={})
+    return dataclasses.replace(spec.with_engine(sim), randomize=False, events={})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

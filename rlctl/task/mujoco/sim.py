@@ -8,7 +8,6 @@ frictions of its links, as in PyBullet, and at least 0.001.
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +15,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import UsageError
 from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.mujoco.body import MujocoBody
 from rlctl.task.mujoco.drawn_world import DrawnWorld
@@ -29,23 +27,6 @@ from rlctl.task.sim import Sim
 
 _LEAST_FRICTION = 1e-3
 """Of a contact: MuJoCo divides by it, and with less a falling robot's numbers become infinite."""
-
-
-def read_solref(sim: str) -> float | None:
-    """Return the time constant of contacts [s] in `mujoco:0.01`, 0.02 for `mujoco`, None for `pybullet`.
-
-    Raises `UsageError` for anything else.
-    """
-    engine, _, value = sim.partition(":")
-    if sim == "pybullet":
-        return None
-    try:
-        solref = float(value or 0.02)
-    except ValueError:
-        solref = math.nan
-    if engine != "mujoco" or not 0 < solref < 1:
-        raise UsageError(f"sim {sim!r}: give pybullet, mujoco, or mujoco:SOLREF with 0 < SOLREF < 1 s")
-    return solref
 
 
 class MujocoSim(Sim):

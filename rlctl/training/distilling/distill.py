@@ -92,7 +92,7 @@ def make_settings(request: DistillRequest, teacher: EnvSpec) -> dict[str, Any]:
         "stages": [],
     }
     if teacher.sim:
-        environment["sim"] = teacher.sim
+        environment["sim"] = str(teacher.sim)
     if request.observe is None:
         same = teacher.frame_stack, teacher.time_feature, list(teacher.observe), dict(teacher.observation_history)
         names = "frame_stack", "time_feature", "observe", "observation_history"

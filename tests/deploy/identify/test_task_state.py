@@ -12,12 +12,13 @@ from rlctl.deploy.identify.identify import IdentifiedValue, _estimate_values, id
 from rlctl.deploy.identify.log import Log, read_log, write_log
 from rlctl.deploy.identify.search import Fit, _compute_cost, _find_fit, search
 from rlctl.deploy.identify.targets import read_targets
+from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo
 from rlctl.task.events import EventSettings
 from rlctl.tasks import new
 
-SPEC = EnvSpec("my-arm/my_arm/task.py:MyArm", sim="mujoco")
+SPEC = EnvSpec("my-arm/my_arm/task.py:MyArm", sim=MUJOCO)
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ import pytest
 
 from rlctl.deploy.robot.commands import CommandQueue
 from rlctl.deploy.robot.faults import Faults, parse_faults, set_stuck_joints
+from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 
@@ -39,7 +40,7 @@ def test_an_older_command_does_not_replace_a_newer_one():
 
 
 def test_a_stuck_joint():
-    env = EnvSpec("reach", sim="mujoco").make()
+    env = EnvSpec("reach", sim=MUJOCO).make()
 
     def measure_motion():
         observation, _ = env.reset(seed=3)
