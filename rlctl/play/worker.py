@@ -158,8 +158,8 @@ class Worker:
                 self._actors.append(RowsOfPlayers(None, make, count, states))
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
-        from rlctl.deploy.filter.limited_player import LimitedPlayer  # few evaluations need it
-        from rlctl.deploy.filter.limits import Limits
+        from rlctl.limits.limited_player import LimitedPlayer  # few evaluations need it
+        from rlctl.limits.limits import Limits
 
         make, limits = self._make_player, Limits.model_validate(message.limits)
         self._set_players(lambda: LimitedPlayer(make(), self._info, limits))
@@ -212,7 +212,7 @@ def make_player_of(name: str, worlds: Any) -> Player:
     """Return the player of a policy server (`ws://...`), or of any other name as `make_player` does."""
     if not name.startswith(SERVER):
         return make_player(name, worlds.action_space)
-    from rlctl.deploy.server.client import RemotePlayer  # only here: it imports aiohttp
+    from rlctl.play.remote import RemotePlayer  # only here: it imports aiohttp
 
     return RemotePlayer(name, worlds.observation_space, worlds.action_space)
 

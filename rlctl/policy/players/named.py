@@ -26,7 +26,7 @@ from rlctl.policy.players.player import Player, make_generator
 
 BASELINES = ("zero", "random")
 SERVER = ("ws://", "wss://")
-"""Prefixes of the address of a policy server; its player is `rlctl.deploy.server.client.RemotePlayer`."""
+"""Prefixes of the address of a policy server; its player is `rlctl.play.remote.RemotePlayer`."""
 
 
 def make_player(name: str, space: spaces.Space[Any]) -> Player:
