@@ -58,7 +58,7 @@ def test_the_help_lists_what_can_be_called_and_imports_nothing(rlctl, site):
     assert result.returncode == 0, result.stderr
     text = result.stdout
     assert "imported" not in text
-    assert text.index("Commands ") < text.index("Commands of a-robot")
+    assert text.index("─ Robot ") < text.index("─ Commands of a-robot ")
     assert "greet" in text.partition("Commands of a-robot")[2]
     assert "Greet a robot." in text
     assert "Commands of a robot." in text  # of the module, for an app
