@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 import typer
 from typer.cli import get_docs_for_click
 
-from rlctl.cli import build_app
+from rlctl.cli import build_app, list_names
 
 ROOT = Path(__file__).parent.parent
 TARGET = ROOT / "build" / "pages"
@@ -32,7 +32,7 @@ API = {  # modules, names with the classes that they return, or with `.*` all th
     "rlctl.task.rewards": ["rlctl.task.rewards"],
     "rlctl.task.terms": ["rlctl.task.terms"],
     "rlctl.task.events": ["rlctl.task.events.*"],
-    "rlctl.deploy": [f"rlctl.deploy.filter.{name}" for name in ("limits", "safety_filter", "bounds.SafetyEvent")],
+    "rlctl.deploy": [f"rlctl.limits.{name}" for name in ("limits", "safety_filter", "bounds.SafetyEvent")],
     "rlctl.errors": ["rlctl.errors"],
 }
 
@@ -64,7 +64,7 @@ def _list_objects(written: str) -> list[str]:
 
 def render_commands() -> str:
     """Return the page of all commands with their options."""
-    group = typer.main.get_command(build_app())
+    group = typer.main.get_command(build_app(list_names()))
     return get_docs_for_click(obj=group, ctx=typer.Context(group), name="rlctl", title="Commands")
 
 

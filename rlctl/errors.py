@@ -15,6 +15,7 @@ from rlctl.missing_packages import advise
 _LONGEST = 400  # [characters] of another library's message
 _MOST_FRAMES = 40  # of a plugin's traceback: an endless recursion has a thousand
 _OURS = Path(__file__).parent
+_OUR_COMMANDS = "rlctl_robot"  # a package of commands that comes with rlctl
 _IMPORTLIB = Path(importlib.__file__).parent
 
 
@@ -179,6 +180,8 @@ def find_plugin_line(error: BaseException) -> str:
 
 def _is_plugin_file(file: str) -> bool:
     if file.startswith("<frozen importlib"):
+        return False
+    if _OUR_COMMANDS in Path(file).parts:
         return False
     return not any(Path(file).is_relative_to(folder) for folder in (_OURS, _IMPORTLIB))
 

@@ -1,6 +1,6 @@
 """Command-line options of the fields of a request, declared once, next to the field.
 
-A request is a dataclass with the arguments of a command. The command line fills it (`rlctl.cli.arguments.command`),
+A request is a dataclass with the arguments of a command. The command line fills it (`rlctl.arguments.command`),
 Python passes it, a group stores it and a child process receives it.
 """
 
@@ -31,6 +31,9 @@ class Option:
 class Argument(Option):
     """A positional argument."""
 
+
+KEY_VARIABLE = "RLCTL_API_KEY"
+"""The environment variable with the key of a policy server: the server demands it, clients send it."""
 
 TASK_FORMS = (
     "Installed name, package.module:Class or path/to/file.py:Class (or a function), Gymnasium id, or package:Id."

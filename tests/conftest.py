@@ -99,13 +99,13 @@ def write_module(tmp_path):
 def install(tmp_path):
     """Install a distribution without pip: a folder for `sys.path` with the metadata that pip would write."""
 
-    def installed(name: str, tasks: dict[str, str], files: dict[str, str] | None = None, version="1.2") -> Path:
+    def installed(name: str, tasks, files: dict[str, str] | None = None, version="1.2", group="rlctl.tasks") -> Path:
         folder = tmp_path / "site"
         metadata = folder / f"{name.replace('-', '_')}-{version}.dist-info"
         metadata.mkdir(parents=True)
         (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
         points = "".join(f"{task} = {target}\n" for task, target in tasks.items())
-        (metadata / "entry_points.txt").write_text(f"[rlctl.tasks]\n{points}")
+        (metadata / "entry_points.txt").write_text(f"[{group}]\n{points}")
         for file, source in (files or {}).items():
             (folder / file).parent.mkdir(parents=True, exist_ok=True)
             (folder / file).write_text(textwrap.dedent(source))

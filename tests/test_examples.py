@@ -10,6 +10,7 @@ import subprocess
 import sys
 import venv
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -136,6 +137,16 @@ def _environment_without_rlctl(folder: Path) -> Path:
     return folder / "bin"
 
 
+def test_my_task_has_a_command_of_its_own(tmp_path: Path, install: Any) -> None:
+    site = install("my-task", {"first-rewards": "my_task.first_rewards:first_rewards"}, group="rlctl.commands")
+    shutil.copytree(EXAMPLES / "my_task/my_task", site / "my_task")
+    printed = rlctl("first-rewards", "my_task.touch:Touch", "--episodes", "2", "--json", "-", cwd=tmp_path, path=site)
+    result = json.loads(printed)
+    assert result["task"] == "my_task.touch:Touch"
+    assert len(result["rewards"]) == 2
+    assert max(result["rewards"]) < 0.0  # the tip is not at the point
+
+
 @pytest.mark.slow
 def test_my_task_as_a_wheel(tmp_path: Path) -> None:
     project = EXAMPLES / "my_task"
@@ -146,6 +157,7 @@ def test_my_task_as_a_wheel(tmp_path: Path) -> None:
 
     listed = json.loads(rlctl("tasks", "--json", "-", cwd=tmp_path, path=site))
     assert "my-task" in json.dumps(listed)
+    assert rlctl("first-rewards", "my-task", "--episodes", "1", cwd=tmp_path, path=site).startswith("seed 0: -")
 
     empty = tmp_path / "empty"
     empty.mkdir()

@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from rlctl.entry_points import find_module_file
 from rlctl.environments import installed
 from rlctl.tasks.listing import describe_entry
 
@@ -163,5 +164,5 @@ def test_a_module_is_found_below_a_folder_without_init(tmp_path, monkeypatch):
         (tmp_path / package / "__init__.py").touch()
     (folder / "reach.py").touch()
     monkeypatch.syspath_prepend(tmp_path)
-    assert installed.find_module_file("robots_below.envs.arms.reach") == folder / "reach.py"
-    assert installed.find_module_file("robots_below.envs.legs.walk") is None
+    assert find_module_file("robots_below.envs.arms.reach") == folder / "reach.py"
+    assert find_module_file("robots_below.envs.legs.walk") is None

@@ -14,6 +14,7 @@ ROOT = Path(__file__).parent.parent
 LAYERS = [
     {"__main__"},
     {"cli"},
+    {"arguments"},
     {"__init__"},  # loads `rlctl.train` and the others on their first use
     {"pytest_plugin"},
     {"api", "gym"},
@@ -22,20 +23,18 @@ LAYERS = [
     {"training"},
     {"gating"},
     {"runs"},
-    {"playing"},
-    {"exporting", "replaying", "tasks", "importing", "deploy.robot"},
+    {"exporting", "replaying", "tasks", "importing"},
     {"checking", "evaluation"},
-    {"deploy.identify", "deploy.diagnose"},
     {"play"},
-    {"deploy.server"},
-    {"deploy"},
-    {"deploy.filter"},
+    {"deploy"},  # names of `limits` for Python programs
+    {"limits"},
     {"processes"},
     {"run"},
     {"policy"},
     {"recipe"},
     {"hub"},
     {"environments"},
+    {"entry_points"},
     {"task"},
     {"library_output"},
     {"printed_lines"},
@@ -73,7 +72,7 @@ def files(folder: str) -> list[Path]:
 
 
 def room_of(module: str) -> str:
-    """`rlctl.run.episode` -> `run`; `rlctl.deploy.filter.limits` -> `deploy.filter`; `rlctl.train` -> `__init__`."""
+    """`rlctl.run.episode` -> `run`; `rlctl.limits.limits` -> `deploy.filter`; `rlctl.train` -> `__init__`."""
     parts = module.split(".")[1:]
     names = (".".join(parts[:2]), parts[0] if parts else "")
     return next((name for name in names if any(name in layer for layer in LAYERS)), "__init__")
@@ -139,14 +138,35 @@ def test_who_imports_torch():
     assert found == []
 
 
-def test_plugins_know_the_task_layer_only():
-    wrong = [
+OPEN_TO_COMMANDS = {
+    *("arguments", "environments", "errors", "evaluation", "exporting.controller.layout"),
+    *("exporting.controller.observation", "limits", "options", "output", "play", "policy", "processes", "replaying"),
+    *("run", "storage", "task", "version"),
+}
+"""The rooms and modules that a plugin with commands may import; one with tasks imports `rlctl.task` alone."""
+
+
+def find_imports_of_rlctl(plugin: str, allowed: set[str]) -> list[str]:
+    beginnings = tuple(f"rlctl.{name}." for name in allowed)
+    return [
         f"{file.relative_to(ROOT)} imports {module}"
-        for file in files("plugins")
+        for file in files(plugin)
         for module in imports(file)
-        if module.split(".")[0] == "rlctl" and not module.startswith("rlctl.task")
+        if module.split(".")[0] == "rlctl" and not f"{module}.".startswith(beginnings)
     ]
-    assert wrong == []
+
+
+def test_plugins_with_tasks_know_the_task_layer_only():
+    plugins = {folder.name for folder in (ROOT / "plugins").iterdir() if any(folder.glob("*.py"))}
+    assert plugins == {"rlctl_locomotion", "rlctl_manipulation", "rlctl_robot"}
+    for plugin in plugins - {"rlctl_robot"}:
+        assert find_imports_of_rlctl(f"plugins/{plugin}", {"task"}) == []
+
+
+def test_plugins_with_commands_know_the_rooms_that_are_open_to_them():
+    assert find_imports_of_rlctl("plugins/rlctl_robot", OPEN_TO_COMMANDS) == []
+    page = (ROOT / "docs/own-commands.md").read_text()
+    assert {name for name in OPEN_TO_COMMANDS if f"`rlctl.{name}`" not in page} == set()
 
 
 def loaded_after(*lines: str) -> dict[str, set[str]]:

@@ -47,7 +47,7 @@ def test_every_import_is_a_declared_dependency():
         distributions = providers.get("google.protobuf" if name.startswith("google.protobuf") else top, [])
         if name.startswith("google.protobuf"):
             distributions = ["protobuf"]
-        of_rlctl = top in ("rlctl", "rlctl_manipulation", "rlctl_locomotion")
+        of_rlctl = top in ("rlctl", "rlctl_manipulation", "rlctl_locomotion", "rlctl_robot")
         if of_rlctl or top in sys.stdlib_module_names or top in OF_USERS:
             continue
         if not declared & {normalize(distribution) for distribution in distributions}:

@@ -45,7 +45,9 @@ def test_another_tag_is_refused(tmp_path):
 def test_the_wheels_share_the_files_and_the_dependencies(wheels):
     core, whole = (zipfile.ZipFile(path) for path in wheels)
     assert {name for name in whole.namelist() if ".dist-info/" not in name} == set()
-    assert {"rlctl/cli/__init__.py", "rlctl_manipulation/reach.py"} <= set(core.namelist())
+    assert {"rlctl/cli/__init__.py", "rlctl_manipulation/reach.py", "rlctl_robot/serve/page.html"} <= set(
+        core.namelist()
+    )
     small, rest = (
         {line for line in read_metadata(archive) if line.startswith("Requires-Dist") and "extra ==" not in line}
         for archive in (core, whole)
@@ -56,8 +58,8 @@ def test_the_wheels_share_the_files_and_the_dependencies(wheels):
     assert not any(heavy in line for line in small for heavy in ("torch", "stable", "rerun", "tensorboard", "scipy"))
 
 
-def read_metadata(archive: zipfile.ZipFile) -> list[str]:
-    (name,) = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
+def read_metadata(archive: zipfile.ZipFile, file: str = "METADATA") -> list[str]:
+    (name,) = [name for name in archive.namelist() if name.endswith(f".dist-info/{file}")]
     return archive.read(name).decode().splitlines()
 
 

@@ -8,11 +8,12 @@ import itertools
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from rlctl.cli import demo, deploy, diagnose, eval, export, gate, runs, tasks, train
+from rlctl.cli import demo, eval, export, gate, plugin_commands, runs, tasks, train
 from rlctl.errors import AnswerIsNo, RlctlError, UsageError
 from rlctl.processes import error_boundary
 from rlctl.version import __version__
@@ -48,15 +49,10 @@ GROUPS: dict[str, Commands] = {
     },
     "Show": {
         "replay": eval.replay,
-        "play": deploy.play,
         "demo": demo.demo,
     },
     "Robot": {
         "export": export.export,
-        "serve": deploy.serve,
-        "robot": deploy.robot,
-        "identify": deploy.identify,
-        "diagnose": diagnose.diagnose,
     },
     "Tools": {
         "tasks": tasks.app,
@@ -70,13 +66,46 @@ GROUPS: dict[str, Commands] = {
 COMMANDS: Commands = {name: command for group in GROUPS.values() for name, command in group.items()}
 _PANELS = {name: panel for panel, group in GROUPS.items() for name in group}
 
+plugin_commands.reserve(COMMANDS)
+
 _CLASSES = {"check-env": tasks.CheckCommand, "replay": eval.ReplayCommand}  # that read arguments in their own way
 
 
-def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
-    """Return the Typer app with the named commands."""
+class UnloadedCommand(TyperCommand):
+    """Stands for a command of a plugin that is not imported yet."""
+
+
+class RootCommand(TyperGroup):
+    """Imports the command of a plugin when it is called or its options are completed: before, it has a summary only."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the name and the command of the first argument, and the other arguments."""
+        name, command, left = super().resolve_command(ctx, args)
+        if not isinstance(command, UnloadedCommand):
+            return name, command, left
+        try:
+            group = typer.main.get_command(build_app([str(command.name)]))
+        except RlctlError:
+            if ctx.resilient_parsing:  # the shell completes
+                return name, command, left
+            raise
+        assert isinstance(group, TyperGroup)
+        return name, group.commands[str(command.name)], left
+
+
+def list_names() -> list[str]:
+    """Return the names of all commands, last those of plugins."""
+    return [*COMMANDS, *(entry.name for entry in plugin_commands.list_commands() if entry.problem is None)]
+
+
+def build_app(names: Iterable[str] | None = None) -> typer.Typer:
+    """Return the Typer app with the named commands, or with all; it imports those of plugins that are named.
+
+    Raises `TaskError` for one that cannot be imported.
+    """
     app = typer.Typer(
         name="rlctl",
+        cls=RootCommand,
         help="Robot learning in simulation, end to end: check an environment, train, evaluate, export, replay.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
@@ -89,13 +118,28 @@ def build_app(names: Iterable[str] = COMMANDS) -> typer.Typer:
         },
     )
     app.callback()(_root)
-    for name in names:
-        command = COMMANDS[name]
+    for name in COMMANDS if names is None else names:
+        command = COMMANDS[name] if name in COMMANDS else _load_of_plugin(name)
         if isinstance(command, typer.Typer):
-            app.add_typer(command, name=name, rich_help_panel=_PANELS[name])
+            app.add_typer(command, name=name, rich_help_panel=_PANELS.get(name))
         else:
-            app.command(name, cls=_CLASSES.get(name), rich_help_panel=_PANELS[name])(command)
+            app.command(name, cls=_CLASSES.get(name), rich_help_panel=_PANELS.get(name))(command)
+    if names is None:
+        for entry in plugin_commands.list_commands():
+            if entry.problem is None:
+                panel = "Robot" if entry.is_ours else f"Commands of {entry.distribution}"
+                app.command(entry.name, cls=UnloadedCommand, help=entry.summary, rich_help_panel=panel)(_do_nothing)
     return app
+
+
+def _load_of_plugin(name: str) -> Callable[..., None] | typer.Typer:
+    entry = plugin_commands.find(name)
+    assert entry is not None
+    return plugin_commands.load(entry)
+
+
+def _do_nothing() -> None:
+    pass
 
 
 def main() -> None:
@@ -113,8 +157,10 @@ def run(arguments: list[str]) -> int:
 
 def _call(arguments: list[str]) -> int:
     # Typer inspects the options of every command, which takes longer than most commands need to start.
-    app = build_app(arguments[:1] if arguments and arguments[0] in COMMANDS else COMMANDS)
+    name = arguments[0] if arguments else ""
+    is_one = name in COMMANDS or (name[:1].isalpha() and plugin_commands.find(name) is not None)
     try:
+        app = build_app([name] if is_one else None)
         code = app(arguments, standalone_mode=False)
     except typer.Abort:  # the user cancelled a question
         raise KeyboardInterrupt from None
@@ -131,6 +177,8 @@ def _call(arguments: list[str]) -> int:
             and (setting := train.suggest_setting(option))
         ):
             raise UsageError(f"no option {option}; set the recipe's key instead: {setting}VALUE") from None
+        if is_one and name not in COMMANDS:
+            plugin_commands.explain_failure(name, error)
         raise
     if code == error_boundary.INTERRUPTED:
         raise KeyboardInterrupt  # Typer has caught it

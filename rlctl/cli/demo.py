@@ -6,7 +6,7 @@ import sys
 import typer
 
 from rlctl import output
-from rlctl.cli.arguments import command
+from rlctl.arguments import command
 
 _COMMANDS = (
     ("train", "reach"),

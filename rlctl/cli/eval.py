@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from typer.core import TyperCommand
 
-from rlctl.cli.arguments import choose_checkpoint, command_in_panels, parse_changes
+from rlctl.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates, MinReturn, MinSuccess, MinSuccessLower
 from rlctl.options import Cluster, Json, Junit, On, Option, PictureFile, Pretrained, Settings, Sim, Yes

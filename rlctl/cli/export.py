@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from rlctl.cli.arguments import choose_checkpoint, command
+from rlctl.arguments import choose_checkpoint, command
 from rlctl.errors import UsageError
 from rlctl.exporting.request import DatasetFormat, ExportRequest, Format
 from rlctl.options import Argument, Checkpoint, Json, Option, Pretrained, RunName, Sim

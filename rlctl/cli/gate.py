@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rlctl.cli.arguments import choose_checkpoint, command_in_panels, parse_changes
+from rlctl.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.evaluation.request import MinReturn, MinSuccess, MinSuccessLower
 from rlctl.options import Checkpoint, EpisodeSeed, Json, Junit, Option, Pretrained, RunName, Settings, Sim
 

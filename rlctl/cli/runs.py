@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer.core import TyperGroup
 
-from rlctl.cli.arguments import command, parse_changes
+from rlctl.arguments import command, parse_changes
 from rlctl.errors import UsageError
 from rlctl.options import (
     TASK_FORMS,

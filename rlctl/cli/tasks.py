@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from rlctl.cli.arguments import command, command_in_panels, parse_changes
+from rlctl.arguments import command, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.options import Argument, Config, EnvTimeout, Json, Option, OptionalTask, Settings, Sim, TaskName
 
@@ -130,7 +130,7 @@ app = typer.Typer()
 @command
 def tasks(
     context: typer.Context,
-    check: Annotated[bool, Option("Import each task in a child process.", ("--check",))] = False,
+    check: Annotated[bool, Option("Import each task and command of plugins in a child process.", ("--check",))] = False,
     json: Json = None,
 ) -> None:
     """List the installed tasks; show one, or create your own."""
@@ -138,9 +138,10 @@ def tasks(
         if check or json is not None:
             raise UsageError(f"put the options after `rlctl tasks {context.invoked_subcommand}`")
         return
+    from rlctl.cli import plugin_commands
     from rlctl.tasks.listing import list_tasks, show
 
-    show(list_tasks(check=check), json)
+    show(list_tasks(check=check), plugin_commands.describe_all(check=check), json)
 
 
 @app.command("show")

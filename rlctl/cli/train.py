@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Annotated, Any
 
-from rlctl.cli.arguments import choose_checkpoint, command_in_panels
+from rlctl.arguments import choose_checkpoint, command_in_panels
 from rlctl.errors import UsageError
 from rlctl.options import Cluster, Jobs, Json, On, Option, Pretrained, Settings, Sim
 from rlctl.run.train_request import TrainRequest

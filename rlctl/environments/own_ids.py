@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
-from rlctl.environments import installed
+from rlctl.entry_points import find_module_file
 
 _MOST_FILES = 400  # of the current folder, and of each installed package
 _DEEPEST = 4  # folders below the current one
@@ -22,7 +22,7 @@ def find_registering_module(name: str) -> str:
 def find_class_file(name: str) -> Path | None:
     """Return the file of the class of `module:Id-v0`; None where the module does not register the id with literals."""
     module, _, identifier = name.rpartition(":")
-    file = installed.find_module_file(module, in_current_folder=True) if module else None
+    file = find_module_file(module, in_current_folder=True) if module else None
     nodes: list[ast.AST] = []
     with contextlib.suppress(OSError, SyntaxError, ValueError):
         nodes = list(ast.walk(ast.parse(file.read_bytes()))) if file else []
@@ -32,7 +32,7 @@ def find_class_file(name: str) -> Path | None:
         given |= {keyword.arg: keyword.value for keyword in call.keywords if keyword.arg is not None}
         match given.get("id"), given.get("entry_point"):
             case ast.Constant(value=registered), ast.Constant(value=str(place)) if registered == identifier:
-                return installed.find_module_file(place.partition(":")[0], in_current_folder=True)
+                return find_module_file(place.partition(":")[0], in_current_folder=True)
             case ast.Constant(value=registered), ast.Name(id=own) if registered == identifier and own in own_classes:
                 return file
     return None
@@ -57,10 +57,10 @@ def _name_module(file: Path) -> str:
     parts = file.parent.parts if file.name == "__init__.py" else file.with_suffix("").parts
     for start in range(len(parts)):
         name = ".".join(parts[start:])
-        if (found := installed.find_module_file(name)) is not None and found.resolve() == file.resolve():
+        if (found := find_module_file(name)) is not None and found.resolve() == file.resolve():
             return name
     name = ".".join(parts)
-    return name if parts and installed.find_module_file(name, in_current_folder=True) is not None else ""
+    return name if parts and find_module_file(name, in_current_folder=True) is not None else ""
 
 
 def _has(file: Path, quoted: re.Pattern[bytes]) -> bool:
@@ -76,6 +76,6 @@ def _list_packages() -> Iterator[tuple[str, Path]]:
         if not any(re.match(r"gym(nasium)?\b", requirement) for requirement in distribution.requires or ()):
             continue
         for package in (distribution.read_text("top_level.txt") or distribution.metadata["Name"] or "").split():
-            file = installed.find_module_file(package.replace("-", "_"))
+            file = find_module_file(package.replace("-", "_"))
             if file is not None and file.name == "__init__.py":
                 yield package.replace("-", "_"), file.parent

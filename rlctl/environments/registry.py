@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import errors, missing_packages
+from rlctl.entry_points import find_module_file
 from rlctl.environments import installed, own_ids, suggestions
 from rlctl.environments.graphics import opengl_fix
 from rlctl.environments.mujoco_version import mujoco_fix
@@ -39,7 +40,7 @@ def load(task: str) -> Callable[..., Any]:
         return _load_target(task, entry.target)
     if _GYMNASIUM_ID.match(task):
         package = task.rpartition(":")[0]
-        if package and installed.find_module_file(package, in_current_folder=True) is not None:
+        if package and find_module_file(package, in_current_folder=True) is not None:
             append_to_path(os.getcwd())
             import_module(task, package)  # separately, so that an exception is reported as one of the import
         return _load_gymnasium(task)
@@ -102,7 +103,7 @@ def find_source_file(task: str) -> Path | None:
     if _GYMNASIUM_ID.match(task) or ":" not in task:
         return None
     place = task.rpartition(":")[0]
-    return Path(place) if place.endswith(".py") else installed.find_module_file(place, in_current_folder=True)
+    return Path(place) if place.endswith(".py") else find_module_file(place, in_current_folder=True)
 
 
 def find_origin(task: str) -> dict[str, str]:
@@ -191,7 +192,7 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
     spec = gymnasium.registry.get(task.rpartition(":")[2])
     if spec is not None and isinstance(spec.entry_point, str):
         module = spec.entry_point.partition(":")[0]
-        if installed.find_module_file(module) is not None:
+        if find_module_file(module) is not None:
             import_module(task, module)  # as in `load`: report exceptions of the import separately
 
     def constructor(**parameters: Any) -> Any:
@@ -240,8 +241,8 @@ def call_plugin(task: str, call: Callable[[], Any], doing: str = "") -> Any:
 
 def import_module(task: str, name: str) -> Any:
     """Import a module that is installed or in the current folder; raises `TaskError` for any exception in it."""
-    is_installed = name in sys.modules or installed.find_module_file(name) is not None
-    if not is_installed and installed.find_module_file(name, in_current_folder=True) is None:
+    is_installed = name in sys.modules or find_module_file(name) is not None
+    if not is_installed and find_module_file(name, in_current_folder=True) is None:
         hint = missing_packages.advise_on(name) or suggestions.suggest(task) or installed.explain_hidden_package(name)
         raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}{hint}")
     return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
@@ -289,10 +290,10 @@ def _import_from_package(task: str, file: Path) -> Any:
     for folder in (root, file.parent):
         append_to_path(str(folder))
     package, name = names[0], ".".join(names)
-    own, found = root / package / "__init__.py", installed.find_module_file(package)
+    own, found = root / package / "__init__.py", find_module_file(package)
     if found is None or found.resolve() != own:
         fix = f"rename the folder {package!r}, or delete its __init__.py"
-        if found is not None and installed.find_module_file(name) is not None:  # a copy of the package, probably
+        if found is not None and find_module_file(name) is not None:  # a copy of the package, probably
             fix = f"name the installed module, {name}:{task.rpartition(':')[2]}; or {fix}"
         elsewhere = found or "its own modules"
         problem = f"{file.name} belongs to the package {own.parent}, but Python imports {package!r} from {elsewhere}"

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from rlctl.environments import installed
+from rlctl.entry_points import find_module_file
 
 _MOST_NAMED = 4
 
@@ -33,7 +33,7 @@ def suggest_name(task: str, installed_names: Sequence[str]) -> str:
 def _list_in_module(task: str) -> list[str]:
     """Return the classes of a module that is named without a class."""
     is_module = re.fullmatch(r"\w+(\.\w+)+", task) is not None
-    file = installed.find_module_file(task, in_current_folder=True) if is_module else None
+    file = find_module_file(task, in_current_folder=True) if is_module else None
     return [f"{task}:{name}" for name in list_classes(file)] if file is not None and file.suffix == ".py" else []
 
 
@@ -62,7 +62,7 @@ def _list_forms(task: str) -> Iterator[str]:
     for form in (place, f"{place}.py"):
         if form.endswith(".py") and Path(form).is_file():
             yield f"{form}:{name}"
-    if "/" not in place and installed.find_module_file(place, in_current_folder=True) is not None:
+    if "/" not in place and find_module_file(place, in_current_folder=True) is not None:
         yield f"{place}:{name}"
     file = Path(place)
     if file.parent.is_dir():

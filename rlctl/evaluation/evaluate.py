@@ -151,8 +151,8 @@ def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalReques
 
 def _read_limits(file: Path, info: EnvInfo) -> dict[str, Any]:
     """Return limits as plain data; raises `RecipeError` if they do not fit the environment's actions."""
-    from rlctl.deploy.filter.fitting import fit_limits
-    from rlctl.deploy.filter.limits import read_limits
+    from rlctl.limits.fitting import fit_limits
+    from rlctl.limits.limits import read_limits
 
     limits = read_limits(file)
     fit_limits(limits, info)

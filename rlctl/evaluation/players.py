@@ -100,7 +100,7 @@ def load_baseline(name: str) -> Baseline:
     """Return the baseline of `--policy`; raises `UsageError` if it does not exist."""
     if name.startswith(SERVER):
         try:
-            from rlctl.deploy.server.client import PolicyClient
+            from rlctl.play.remote import PolicyClient
         except ModuleNotFoundError as error:
             raise UsageError(explain_missing_package(f"--policy {name}", error.name, "serve")) from None
         PolicyClient(name).close()  # raises if no policy server answers, before environments are built

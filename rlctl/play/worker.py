@@ -151,8 +151,8 @@ class Worker:
             self._actor = NumpyActor(policy, self._job.count)
 
     def _limit_actions(self, message: messages.LimitActions) -> None:
-        from rlctl.deploy.filter.limited import Limited  # few evaluations need it
-        from rlctl.deploy.filter.limits import Limits
+        from rlctl.limits.limited import Limited  # few evaluations need it
+        from rlctl.limits.limits import Limits
 
         limits = Limits.model_validate(message.limits)
         self._actor = Limited(self._loaded_actor, self._info, limits, self._job.count)
@@ -217,7 +217,7 @@ def make_actor_of(name: str, worlds: Any, count: int = 1) -> Actor:
     """Return the actor of a policy server (`ws://...`), or of any other name as `make_actor` does."""
     if not name.startswith(SERVER):
         return make_actor(name, worlds.action_space, count)
-    from rlctl.deploy.server.client import RemoteActor  # only here: it imports aiohttp
+    from rlctl.play.remote import RemoteActor  # only here: it imports aiohttp
 
     return RemoteActor(name, worlds.observation_space, worlds.action_space)
 

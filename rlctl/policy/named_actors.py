@@ -27,7 +27,7 @@ from rlctl.policy.noise import make_generator
 
 BASELINES = ("zero", "random")
 SERVER = ("ws://", "wss://")
-"""Prefixes of the address of a policy server; its actor is `rlctl.deploy.server.client.RemoteActor`."""
+"""Prefixes of the address of a policy server; its actor is `rlctl.play.remote.RemoteActor`."""
 
 
 def make_actor(name: str, space: spaces.Space[Any], count: int = 1) -> Actor:

@@ -1,4 +1,4 @@
-"""Messages between rlctl's own processes, pickled: rlctl's dataclasses and models, arrays, built-in types.
+"""Messages between rlctl's own processes, pickled: dataclasses and models of rlctl, arrays, built-in types.
 
 Files and data from a network are never read this way. A child process runs third-party code, which may write to any
 descriptor, so the reader creates plain data only: it imports no other module and calls no other function.
@@ -33,6 +33,18 @@ _ARRAYS = {
 """Names that pickled arrays refer to."""
 
 
+_packages = {"rlctl"}
+"""The packages whose dataclasses, enumerations and models are plain data."""
+
+
+def trust_package(name: str) -> None:
+    """Let messages contain dataclasses, enumerations and models of another package: of a command with processes.
+
+    Call it where the classes are defined, because both processes must know it.
+    """
+    _packages.add(name)
+
+
 class UnreadableMessageError(OSError):
     """The received bytes are not a message."""
 
@@ -56,7 +68,7 @@ class _MessageWriter(pickle.Pickler):
 class _MessageReader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         """Return a class of plain data; raises `UnpicklingError` for everything else, without importing it."""
-        if module in ("rlctl", "builtins") or module.startswith("rlctl.") or (module, name) in _ARRAYS:
+        if module == "builtins" or module.partition(".")[0] in _packages or (module, name) in _ARRAYS:
             value = super().find_class(module, name)
             if (module, name) in _ARRAYS or _is_plain(value):
                 return value
@@ -66,8 +78,10 @@ class _MessageReader(pickle.Unpickler):
 def _is_plain(kind: Any) -> bool:
     if kind in _BUILT_IN or kind in (np.ndarray, np.dtype):
         return True
-    is_ours = isinstance(kind, type) and kind.__module__.startswith("rlctl.")
-    return is_ours and (dataclasses.is_dataclass(kind) or issubclass(kind, enum.Enum) or hasattr(kind, "model_fields"))
+    is_trusted = isinstance(kind, type) and kind.__module__.partition(".")[0] in _packages
+    return is_trusted and (
+        dataclasses.is_dataclass(kind) or issubclass(kind, enum.Enum) or hasattr(kind, "model_fields")
+    )
 
 
 def encode(message: Any) -> bytes:

@@ -1,10 +1,7 @@
 """`rlctl tasks`: the installed tasks, with summary, score of the shipped policy, and problems."""
 
-import ast
 import dataclasses
-import functools
 import json
-from pathlib import Path
 from typing import Any
 
 from rlctl import output
@@ -28,6 +25,18 @@ class ListedTask:
     problem: str | None
 
 
+@dataclasses.dataclass(frozen=True)
+class ListedCommand:
+    """A command of a plugin."""
+
+    name: str
+    target: str
+    distribution: str
+    version: str
+    summary: str  # first line of its docstring
+    problem: str | None
+
+
 def list_tasks(*, check: bool = False) -> list[ListedTask]:
     """List the installed tasks; `check` imports each in a child process."""
     return [describe_entry(entry, check=check) for entry in installed.list_installed()]
@@ -40,7 +49,7 @@ def describe_entry(entry: installed.TaskEntry, *, check: bool) -> ListedTask:
     score: dict[str, Any] = {}
     try:
         if problem is None:
-            summary, algo, score = read_summary(entry), _read_algorithm(entry), _read_score(entry)
+            summary, algo, score = entry.summary, _read_algorithm(entry), _read_score(entry)
     except RlctlError as error:
         problem = str(error)
     except (OSError, UnicodeDecodeError) as error:
@@ -50,22 +59,6 @@ def describe_entry(entry: installed.TaskEntry, *, check: bool) -> ListedTask:
     success, mean_return = score.get("success"), score.get("mean_return")
     declared = entry.name, entry.target, entry.distribution, entry.version
     return ListedTask(*declared, summary, algo, success, mean_return, problem)
-
-
-def read_summary(entry: installed.TaskEntry) -> str:
-    """Read the first line of a task's docstring from its source; importing the task would take seconds."""
-    file = entry.module_file
-    return _read_class_summaries(file).get(entry.target.partition(":")[2], "") if file else ""
-
-
-@functools.cache
-def _read_class_summaries(file: Path) -> dict[str, str]:
-    try:
-        tree = ast.parse(file.read_bytes())
-    except (OSError, SyntaxError, ValueError, RecursionError):
-        return {}
-    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
-    return {node.name: (ast.get_docstring(node) or "").partition("\n")[0] for node in classes}
 
 
 def _read_algorithm(entry: installed.TaskEntry) -> str | None:
@@ -93,13 +86,20 @@ def _read_score(entry: installed.TaskEntry) -> dict[str, Any]:
         return {}  # loading the policy reports the error
 
 
-def show(listed: list[ListedTask], json: str | None) -> None:
-    """Print the table, or only JSON for `-`."""
-    if output.present({"tasks": listed}, json):
+def show(listed: list[ListedTask], commands: list[ListedCommand], json: str | None) -> None:
+    """Print the table of tasks and a line per command of a plugin that cannot be called, or only JSON for `-`."""
+    if output.present({"tasks": listed, "commands": commands}, json):
         return
-    if not listed:
+    if listed:
+        _print_table(listed)
+    else:
         output.out().print("no tasks are installed")
-        return
+    for command in commands:
+        if command.problem:
+            output.out().print(f"command {command.name} of {command.distribution} {command.version}: {command.problem}")
+
+
+def _print_table(listed: list[ListedTask]) -> None:
     from rich.text import Text
 
     columns = ["task", "success", "return", "algorithm", "origin", "what it does"]

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.deploy.diagnose.correction import Correction
-from rlctl.deploy.diagnose.diagnose import Doctor, MappingFinding
-from rlctl.deploy.diagnose.signals import LoggedSignals
+from rlctl_robot.diagnose.correction import Correction
+from rlctl_robot.diagnose.diagnose import Doctor, MappingFinding
+from rlctl_robot.diagnose.signals import LoggedSignals
 from tests.benchmarks.broken_logs import BrokenLog, Draws, Robot, Wrong
 from tests.benchmarks.row import Row
 

@@ -16,7 +16,7 @@ import numpy as np
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from rlctl.deploy.server.session import load_served_policy
+from rlctl_robot.serve.session import load_served_policy
 
 
 def encode(value: Any) -> Any:

@@ -15,10 +15,10 @@ from collections.abc import Iterator
 import aiohttp
 import numpy as np
 
-from rlctl.deploy.filter.limits import Limits
-from rlctl.deploy.filter.safety_filter import SafetyFilter
-from rlctl.deploy.server import messages
 from rlctl.environments.info import EnvInfo
+from rlctl.limits.limits import Limits
+from rlctl.limits.safety_filter import SafetyFilter
+from rlctl.play import remote_messages as messages
 from rlctl.policy.shipped import find_shipped_policy
 from tests.benchmarks.row import Row
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.deploy.diagnose.diagnose import Doctor
-from rlctl.deploy.diagnose.signals import LoggedSignals
+from rlctl_robot.diagnose.diagnose import Doctor
+from rlctl_robot.diagnose.signals import LoggedSignals
 from tests.benchmarks.broken_logs import Robot, Wrong
 from tests.benchmarks.diagnosing import is_named
 from tests.benchmarks.row import Row

@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rlctl.entry_points import OURS
 from rlctl.environments import installed, registry
 from rlctl.evaluation.group_scores import evaluate_group
 from rlctl.evaluation.request import EvalRequest
@@ -36,7 +37,7 @@ HEAD = """\
 
 def list_tasks() -> list[str]:
     """Return the bundled tasks."""
-    return [each.name for each in installed.list_installed() if each.distribution == installed.OURS]
+    return [each.name for each in installed.list_installed() if each.distribution in OURS]
 
 
 def find_group(task: str, seeds: Sequence[int], root: Path) -> Group | None:

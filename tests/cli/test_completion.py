@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from rlctl.cli.arguments import complete_algorithm, complete_run, complete_task
+from rlctl.arguments import complete_algorithm, complete_run, complete_task
 
 
 def test_tasks_and_files(tmp_path, monkeypatch):

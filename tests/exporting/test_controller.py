@@ -7,11 +7,11 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.deploy import Limits
-from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.graph import build_graph
+from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.exporting.controller.players import OnnxController
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.numpy_actor import NumpyActor

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.errors import RecipeError, RlctlError, UsageError
 from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.graph import build_graph
+from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.exporting.controller.players import CController, MappedController, OnnxController, compile_controller
 from rlctl.exporting.controller.program_mapping import read_mapping
 from rlctl.exporting.controller.source import ControllerSource

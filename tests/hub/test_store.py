@@ -14,7 +14,7 @@ from rlctl.policy.file import PolicyFile
 from rlctl.run.lookup import find_policy, find_run, locate_task
 from rlctl.runs.push import push_run
 from rlctl.storage import files
-from tests.deploy.server.serving import write_policy
+from tests.robot.serve.serving import write_policy
 
 ADDRESS = "memory://lab/reach"
 STATUS = {"task": "reach", "status": "finished", "source_sha256": None}

@@ -152,5 +152,5 @@ def test_random_leaves_the_generator_of_the_environment_alone():
     space = spaces.Box(-1.0, 1.0, (2,))
     space.seed(3)
     before = space.np_random.bit_generator.state
-    make_player("random", space).act(None, seed=1, step=2)
+    make_actor("random", space).act(np.zeros((1, 1)), Rows.one(seed=1, step=2))
     assert space.np_random.bit_generator.state == before

@@ -1,6 +1,7 @@
 """Messages arrive as they were sent, and only plain data is read from what a child process writes."""
 
 import collections
+import dataclasses
 import enum
 import fractions
 import math
@@ -16,6 +17,7 @@ from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.play import messages
 from rlctl.policy.file import PolicyInfo
+from rlctl.processes import messages as process_messages
 from rlctl.processes.messages import UnreadableMessageError, decode, encode
 from rlctl.processes.pool import WorkerException
 
@@ -121,3 +123,20 @@ def test_nothing_but_plain_data_is_read(content, capsys):
     with pytest.raises(UnreadableMessageError, match="not a message of rlctl"):
         decode(content)
     assert capsys.readouterr().out == ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Question:
+    value: float
+
+
+def test_dataclasses_of_a_package_are_sent_if_it_is_trusted(monkeypatch):
+    monkeypatch.setattr(process_messages, "_packages", {"rlctl"})
+    with pytest.raises(TypeError, match=r"Question cannot be sent: it is not plain data"):
+        encode(Question(2.0))
+    process_messages.trust_package("tests")
+    content = encode(Question(2.0))
+    assert decode(content) == Question(2.0)
+    monkeypatch.setattr(process_messages, "_packages", {"rlctl"})
+    with pytest.raises(UnreadableMessageError, match=r"Question is not plain data"):
+        decode(content)

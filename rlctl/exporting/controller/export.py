@@ -12,9 +12,6 @@ from typing import Any
 import numpy as np
 
 from rlctl import output
-from rlctl.deploy.controller_layout import ControllerLayout, JointTarget
-from rlctl.deploy.filter.doubts import list_doubts
-from rlctl.deploy.filter.limits import Limits, read_limits
 from rlctl.engine import Engine
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
@@ -23,6 +20,7 @@ from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
 from rlctl.exporting.controller.example import ROWS, write_example
 from rlctl.exporting.controller.graph import build_graph
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
 from rlctl.exporting.controller.players import (
     CController,
     Controller,
@@ -42,6 +40,8 @@ from rlctl.exporting.export import (
 )
 from rlctl.exporting.request import ExportRequest
 from rlctl.exporting.verify import Latency, change_last_bits, measure_sb3
+from rlctl.limits.doubts import list_doubts
+from rlctl.limits.limits import Limits, read_limits
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.onnx_policy import encode

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import onnx
 
-from rlctl.deploy.controller_layout import ControllerLayout, JointTarget, Observed, Quantity, Stack
 from rlctl.exporting.actor import emit_actor, make_metadata
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Quantity, Stack
 from rlctl.exporting.controller.program_mapping import NO_MAPPING, ElementMap, ProgramMapping
 from rlctl.exporting.controller.symbols import GraphSymbol
 from rlctl.exporting.layers import BATCH, Graph, concatenate

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.deploy.controller_layout import ControllerLayout
 from rlctl.errors import AnswerIsNo, short_repr
 from rlctl.exporting.c_source import FLAGS, CSource
 from rlctl.exporting.controller.graph import LAST_ACTION, TARGET, name_input
+from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.exporting.controller.program_mapping import ProgramMapping
 from rlctl.policy.c_policy import action_type
 from rlctl.policy.load import LIBRARY_SUFFIX

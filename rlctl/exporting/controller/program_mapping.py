@@ -10,8 +10,8 @@ import numpy as np
 import pydantic
 from numpy.typing import NDArray
 
-from rlctl.deploy.controller_layout import ControllerLayout, Quantity
 from rlctl.errors import RecipeError, UsageError, check_name
+from rlctl.exporting.controller.layout import ControllerLayout, Quantity
 from rlctl.storage import yaml_text
 from rlctl.storage.validation import Number, Section, Whole
 

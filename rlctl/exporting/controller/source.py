@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.deploy.controller_layout import ControllerLayout, JointTarget, Observed, Quantity
-from rlctl.deploy.filter.fitting import fit_limits
-from rlctl.deploy.filter.limits import NO_LIMITS, Limits
 from rlctl.exporting import c_source
 from rlctl.exporting.c_layers import CWriter, write_number
 from rlctl.exporting.c_source import CSource, Layout
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Quantity
 from rlctl.exporting.controller.limits_source import LimitsSource
 from rlctl.exporting.controller.program_mapping import NO_MAPPING, ElementMap, ProgramMapping
 from rlctl.exporting.controller.symbols import CSymbol
+from rlctl.limits.fitting import fit_limits
+from rlctl.limits.limits import NO_LIMITS, Limits
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.network import Network
 from rlctl.version import __version__

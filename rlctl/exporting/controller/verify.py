@@ -9,14 +9,14 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.deploy.controller_layout import ControllerLayout, JointTarget
-from rlctl.deploy.filter.limits import Limits
-from rlctl.deploy.filter.safety_filter import SafetyFilter
 from rlctl.environments.registry import call_plugin
 from rlctl.environments.success import find_success
 from rlctl.errors import TaskError
+from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
 from rlctl.exporting.controller.players import CController, Controller, Inputs
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, compare_episodes
+from rlctl.limits.limits import Limits
+from rlctl.limits.safety_filter import SafetyFilter
 from rlctl.play.collect import MOST_STEPS, Episode
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.seeds import Stream, episode_seeds

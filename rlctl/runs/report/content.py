@@ -21,7 +21,6 @@ from rlctl.runs.diagnosis.findings import Finding
 from rlctl.runs.listing import find_runs_of
 from rlctl.runs.show import RunDescription
 from rlctl.runs.summary import Rows, list_points
-from rlctl.tasks.listing import read_summary
 
 _SETTINGS_NAMED = 3  # in the name of a recipe
 _GOOD_SUCCESS = 0.5
@@ -142,7 +141,7 @@ def list_facts(report: RunReport) -> list[tuple[str, str]]:
     summaries = [run.summary for run in report.runs]
     task = summaries[0].task
     entry = installed.find(task)
-    summary = read_summary(entry) if entry else ""
+    summary = entry.summary if entry else ""
     hosts = dict.fromkeys(f"{run.status.get('host', '')}, {run.status.get('device', '')}" for run in report.runs)
     started = sorted(summary.started[:16].replace("T", " ") for summary in summaries if summary.started)
     steps = sorted({summary.steps or 0 for summary in summaries})

@@ -1,0 +1,48 @@
+"""`rlctl diagnose`."""
+
+from pathlib import Path
+from typing import Annotated
+
+from rlctl.arguments import choose_checkpoint, command
+from rlctl.options import Argument, Json, Sim
+from rlctl_robot.diagnose.request import DiagnoseRequest
+
+
+@command
+def diagnose(
+    log: Annotated[
+        Path,
+        Argument(
+            "Observations and actions, a row per action: .csv or .npz with columns NAME_0, .., action_0, .., or what "
+            "`rlctl serve --rerun` wrote.",
+            metavar="LOG",
+        ),
+    ],
+    request: DiagnoseRequest,
+    sim: Sim = None,
+    json: Json = None,
+) -> None:
+    """Find what is wrong between a robot and a policy: order, sign, unit, offset, delay, frozen sensors."""
+    from rlctl import output
+    from rlctl.arguments import parse_changes
+    from rlctl_robot.diagnose.diagnose import diagnose_log
+    from rlctl_robot.diagnose.report import show
+    from rlctl_robot.diagnose.source import find_source
+
+    source = find_source(
+        request.policy, choose_checkpoint(request.checkpoint, request.pretrained), parse_changes([], sim)
+    )
+    output.print_notes(source.notes)
+    result = diagnose_log(
+        log,
+        source.policy,
+        source.spec,
+        columns=request.columns,
+        limits=request.limits,
+        seed=request.seed,
+        others=source.others,
+        report=lambda line: output.err().print(f"diagnose: {line}"),
+    )
+    output.print_notes(result.notes)
+    show(result, json)
+    result.check()

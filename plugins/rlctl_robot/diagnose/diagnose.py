@@ -1,0 +1,296 @@
+"""Finds what is wrong in the mapping between a robot and a policy, from a log of observations and actions."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import AnswerIsNo, ArtifactError
+from rlctl.limits.limits import Limits, read_limits
+from rlctl.policy.file import PolicyFile
+from rlctl_robot.diagnose.actor import RIGHT, Actor
+from rlctl_robot.diagnose.candidates import list_candidates, make_normalised
+from rlctl_robot.diagnose.correction import Correction, correct
+from rlctl_robot.diagnose.evidence import Likelihood, Scorer
+from rlctl_robot.diagnose.frozen import Frozen, find_frozen
+from rlctl_robot.diagnose.limited import find_limited_rows
+from rlctl_robot.diagnose.log import RobotLog, read_robot_log
+from rlctl_robot.diagnose.mapping import CorrectedMapping, build_mapping
+from rlctl_robot.diagnose.policy_match import SAME, Matcher, PolicyMatch, describe_in_log
+from rlctl_robot.diagnose.reference import record_mistakes, record_reference
+from rlctl_robot.diagnose.rows import ChosenRows, choose_rows
+from rlctl_robot.diagnose.search import Found, Search
+from rlctl_robot.diagnose.signals import ACTIONS, Array, LoggedSignals
+
+MOST = 5  # findings that are listed
+_STEPS_PER_ELEMENT, _FEWEST_STEPS, _MOST_STEPS = 400, 16_000, 20_000  # of rollouts in simulation
+_GUESSES, _GUESS_STEPS = 4, 300  # mistakes with which the robot is simulated again, and for how many steps each
+_ROWS = 500  # of a log, for the answers in numbers
+_CERTAIN = 1e4  # evidence of what needs no statistics [nats]
+
+
+@dataclasses.dataclass(frozen=True)
+class MappingFinding:
+    """One mistake in the mapping."""
+
+    question: Literal[1, 2, 3]
+    term: str
+    kind: str
+    text: str
+    evidence: float  # [nats]
+    explains: float  # part of the difference, in [0, 1]
+    also: tuple[str, ...] = ()  # what this log cannot tell from it
+    correction: Correction | None = None
+
+    def describe(self) -> str:
+        """Return the finding as a sentence."""
+        return f"{self.text}: explains {self.explains:.0%} of the difference"
+
+
+@dataclasses.dataclass(frozen=True)
+class Answers:
+    """The three questions as numbers."""
+
+    policy_difference: float  # mean |logged - computed action| in standard deviations, each at most 1
+    policy_difference_corrected: float
+    term_errors: dict[str, tuple[float, float]]
+    """Per observation: how many times larger than in simulation errors are, as logged and corrected."""
+    step_error: tuple[float, float]  # the same of the prediction of the next row from this row and the action
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """What a log shows about the mapping between a robot and a policy."""
+
+    log: Path
+    policy: str
+    task: str
+    rows: int
+    seconds: float
+    notes: tuple[str, ...]
+    answers: Answers
+    findings: tuple[MappingFinding, ...]
+    mapping: CorrectedMapping
+
+    def check(self) -> None:
+        """Raise `AnswerIsNo` if a mistake was found."""
+        if self.findings:
+            count = len(self.findings)
+            raise AnswerIsNo(f"{self.log}: {count} mistake{'s' if count > 1 else ''} in the mapping; see above")
+
+
+class Doctor:
+    """Diagnoses logs of one policy; the rollouts in simulation are made once.
+
+    Raises `UsageError` for a policy whose observations or actions are not vectors of numbers.
+    """
+
+    def __init__(
+        self,
+        policy: PolicyFile,
+        spec: EnvSpec,
+        seed: int = 0,
+        others: Sequence[PolicyFile] = (),
+        steps: int | None = None,
+    ) -> None:
+        """`steps` of rollouts in simulation in total; by default as many as the observation needs."""
+        self.policy, self.spec, self._others, self._seed = policy, spec, others, seed
+        self.actor = Actor(policy)
+        width = int(np.prod(policy.info.env.spaces()[0].shape or ()))
+        steps = steps or int(np.clip(_STEPS_PER_ELEMENT * width, _FEWEST_STEPS, _MOST_STEPS))
+        self.likelihood = Likelihood(record_reference(spec, self.actor, steps, seed))
+        statistics = self.likelihood.reference.statistics
+        self.candidates = list_candidates(policy.info.env, statistics, self.actor.normalize)
+        self.likelihood.learn_chances(self.candidates)
+
+    def diagnose(
+        self, signals: LoggedSignals, limits: Limits | None = None
+    ) -> tuple[list[MappingFinding], Answers, CorrectedMapping]:
+        """Return the mistakes, the one with the most evidence first, the answers in numbers and the mapping.
+
+        Actions that `limits` have changed are not compared with those of the policy.
+        """
+        if not len(signals.inner_rows(self.likelihood.margin)):
+            longest, needed = max(signals.lengths), 2 * self.likelihood.margin + 1
+            raise ArtifactError(f"the longest part without gaps has {longest} rows; diagnose needs {needed}")
+        reference = self.likelihood.reference
+        frozen = find_frozen(signals, (reference.sound, reference.varied))
+        limited = (
+            None if limits is None else find_limited_rows(limits, self.policy.info.env, signals, self.likelihood.margin)
+        )
+        match = self._match(signals, frozen, limited)
+        findings = [*self._describe_frozen(frozen, signals), *self._describe_match(match, signals, bool(frozen))]
+        corrected = correct(signals, match.corrections)
+        stuck = [(one.term, element) for one in frozen for element in one.elements]
+        used = len(match.corrections) + bool(match.variant.text) + len(frozen)
+        found = self._search(corrected, stuck, max(0, 2 - used))
+        for one in found:
+            findings.append(
+                MappingFinding(
+                    3 if one.correction.term == ACTIONS else 2,
+                    one.correction.term,
+                    one.correction.kind,
+                    one.correction.describe(),
+                    one.evidence,
+                    one.explains,
+                    tuple(other.describe() for other in one.also),
+                    one.correction,
+                )
+            )
+        findings.sort(key=lambda finding: -finding.evidence)
+        of_robot = [one.correction for one in found]
+        answers = self._answer(signals, corrected, of_robot, match, stuck)
+        return findings[:MOST], answers, build_mapping(match.corrections, of_robot, dict(signals.sizes))
+
+    def _search(self, signals: LoggedSignals, stuck: Sequence[tuple[str, int]], most: int) -> list[Found]:
+        """Return what the simulation says is wrong.
+
+        Where something is, the search is repeated with relations that are also those of robots with such mistakes: they
+        get where the other rollouts were not.
+        """
+        search = Search(self.likelihood, signals, self.candidates, stuck)
+        found = search.find(most)
+        if not found:
+            return []
+        first = [one.correction for one in found]
+        mistakes = [first, *search.list_guesses(_GUESSES)]
+        if len(first) < most:
+            mistakes += search.list_guesses(_GUESSES, first)
+        recordings = record_mistakes(self.spec, self.actor, mistakes, _GUESS_STEPS * len(mistakes), self._seed)
+        return Search(self.likelihood.learn_more(recordings), signals, self.candidates, stuck).find(most) or found
+
+    def _match(self, signals: LoggedSignals, frozen: Sequence[Frozen], limited: Array | None) -> PolicyMatch:
+        std = self.likelihood.reference.statistics[ACTIONS].std
+        if self.actor.in_rows:
+            match = Matcher(self.actor, signals, std, self.candidates, None, limited).match(pairs=not frozen)
+            if frozen and not match.is_explained:  # the policy may have received what the log does not hold
+                unknown = self._list_unknown(frozen, signals)
+                if len(unknown) < len(std):
+                    match = Matcher(self.actor, signals, std, self.candidates, unknown, limited).match(pairs=False)
+            return self._decide_normalisation(match, signals)
+        difference = np.minimum(np.abs(signals.actions - self.actor.act_all(signals)) / std, 1.0)
+        difference = difference if limited is None else difference[~limited]
+        return PolicyMatch(float(difference.mean()), float(difference.mean()))
+
+    def _list_unknown(self, frozen: Sequence[Frozen], signals: LoggedSignals) -> dict[int, float]:
+        """Return the columns of frozen elements, with their usual values."""
+        statistics = self.likelihood.reference.statistics
+        return {
+            signals.slices[one.term].start + element: float(statistics[one.term].mean[element])
+            for one in frozen
+            for element in one.elements
+        }
+
+    def _decide_normalisation(self, match: PolicyMatch, signals: LoggedSignals) -> PolicyMatch:
+        """Tell logged values that are normalised already from a network that got none: the actions are the same."""
+        if self.actor.normalize is None or not match.is_explained:
+            return match
+        normalised = make_normalised(self.actor.normalize)
+        is_variant = match.variant.normalizes == 0
+        if not is_variant and normalised not in match.corrections:
+            return match
+        scorer = Scorer(self.likelihood, signals, self._choose_rows(signals))
+        others = [one for one in match.corrections if one != normalised]
+        scorer.rebase(others)
+        if scorer.gain(normalised) > 0:
+            return dataclasses.replace(match, corrections=(normalised, *others), variant=RIGHT, also=())
+        variant = next(one for one in self.actor.variants() if one.normalizes == 0)
+        return dataclasses.replace(match, corrections=tuple(others), variant=variant, also=())
+
+    def _choose_rows(self, signals: LoggedSignals) -> ChosenRows:
+        rows = signals.inner_rows(self.likelihood.margin)
+        return choose_rows(signals, rows, self.likelihood.reference.statistics, _ROWS)
+
+    def _describe_frozen(self, frozen: Sequence[Frozen], signals: LoggedSignals) -> list[MappingFinding]:
+        return [
+            MappingFinding(2, one.term, "frozen", one.describe(signals.sizes[one.term]), _CERTAIN + one.rows, 1.0)
+            for one in frozen
+        ]
+
+    def _describe_match(self, match: PolicyMatch, signals: LoggedSignals, is_frozen: bool) -> list[MappingFinding]:
+        if match.is_same:
+            return []
+        explains = max(0.0, 1 - match.corrected / match.difference)
+        evidence = len(signals.actions) * float(np.log(match.difference / max(match.corrected, 1e-6)))
+        if not match.is_explained:
+            if is_frozen:  # the policy may have received what the log does not show
+                return []
+            text = self._find_other_policy(signals) or (
+                "actions: the policy does not produce the logged actions from the logged observations, and no "
+                "correction explains it: they may be of another policy file, sampled, or limited (--limits FILE)"
+            )
+            return [MappingFinding(1, "policy", "policy", text, _CERTAIN, 1.0 if "of the policy" in text else 0.0)]
+        found = []
+        if match.variant.text:
+            text = f"policy: {match.variant.text}"
+            found.append(MappingFinding(1, "policy", "variant", text, evidence, explains))
+        also = tuple(" and ".join(one.describe() for one in some) for some in match.also)
+        for one in match.corrections:
+            text = describe_in_log(one)
+            found.append(MappingFinding(1, one.term, one.kind, text, evidence, explains, also, one))
+        return found
+
+    def _find_other_policy(self, signals: LoggedSignals) -> str:
+        std = self.likelihood.reference.statistics[ACTIONS].std
+        for other in self._others:
+            difference = np.abs(signals.actions - Actor(other).act_all(signals)) / std
+            if float(np.minimum(difference, 1.0).mean()) < SAME:
+                return f"actions: they are those of the policy {other.path}"
+        return ""
+
+    def _answer(
+        self,
+        signals: LoggedSignals,
+        corrected: LoggedSignals,
+        of_robot: Sequence[Correction],
+        match: PolicyMatch,
+        stuck: Sequence[tuple[str, int]],
+    ) -> Answers:
+        rows = self._choose_rows(signals)
+        before, after = Scorer(self.likelihood, signals, rows, stuck), Scorer(self.likelihood, corrected, rows, stuck)
+        after.rebase(of_robot)
+        terms = {name: (before.times_usual(name), after.times_usual(name)) for name in signals.sizes}
+        step = before.times_usual(None), after.times_usual(None)
+        return Answers(match.difference, match.corrected, terms, step)
+
+
+def diagnose_log(
+    path: Path,
+    policy: PolicyFile,
+    spec: EnvSpec,
+    *,
+    columns: Path | None = None,
+    limits: Path | None = None,
+    seed: int = 0,
+    others: Sequence[PolicyFile] = (),
+    report: Callable[[str], None] = lambda _: None,
+) -> Diagnosis:
+    """Read a log and compare it with a policy and its task in simulation.
+
+    Raises `ArtifactError` for a log that cannot be read or does not fit the policy, `UsageError` for a policy that
+    cannot be diagnosed.
+    """
+    from threadpoolctl import threadpool_limits
+
+    bounds = None if limits is None else read_limits(limits)
+    log: RobotLog = read_robot_log(path, policy.info.env, columns)
+    report(f"{len(log.signals.actions):,} rows; rollouts in simulation")
+    with threadpool_limits(1, "blas"):  # with other programs on the same cores, threads wait for each other
+        doctor = Doctor(policy, spec, seed, others)
+        report("comparing the log with the policy and the simulation")
+        findings, answers, mapping = doctor.diagnose(log.signals, bounds)
+    rows = len(log.signals.actions)
+    return Diagnosis(
+        log=path,
+        policy=str(policy.path),
+        task=spec.task,
+        rows=rows,
+        seconds=rows * (policy.info.env.control_dt or 0.0),
+        notes=log.notes,
+        answers=answers,
+        findings=tuple(findings),
+        mapping=mapping,
+    )

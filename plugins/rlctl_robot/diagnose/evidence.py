@@ -1,0 +1,208 @@
+"""How much more plausible corrections make a log for the robot in simulation, in nats."""
+
+import dataclasses
+from collections.abc import Collection, Iterable, Sequence
+
+import numpy as np
+
+from rlctl_robot.diagnose.correction import EVERYTHING, Correction
+from rlctl_robot.diagnose.reference import Recordings
+from rlctl_robot.diagnose.relations import STRIDE, Windows, compute_losses, fit_relations
+from rlctl_robot.diagnose.rows import ChosenRows, choose_rows
+from rlctl_robot.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
+
+_MOST_SAMPLES = 30.0
+"""Independent rows that a relation counts for at most: a real robot differs a little, however long the log is."""
+
+_CHANCE_LOGS, _CHANCE_ROWS = 6, 1500  # logs of a sound robot in simulation, and for how many rows each counts
+_CHANCE_SAMPLE = 400  # rows of such a log that are scored
+_CHANCE_FACTOR = 1.5
+_SMALL_OFFSET = 0.3  # in standard deviations: the effect of an offset is measured with it
+
+
+class Likelihood:
+    """The relations of a task, and what they count for."""
+
+    def __init__(self, reference: Recordings) -> None:
+        self.reference = reference
+        self.windows = Windows(reference)
+        self.relations, self.echoes = fit_relations(reference, self.windows)
+        matrix = self.relations.matrix[:, : self.windows.total]
+        self.affected = {
+            name: np.flatnonzero(np.abs(matrix[:, columns]).max(axis=1) > 0)  # its features are of these relations too
+            for name, columns in self.windows.columns.items()
+        }
+        self.margin = MAX_DELAY + reference.allowed_delay + STRIDE
+        """Rows that are left out at both ends of a segment."""
+        self._chances: dict[tuple[str, str] | Correction, float] = {}
+
+    def learn_chances(self, candidates: Sequence[Correction]) -> None:
+        """Learn which evidence wrong corrections have in simulation, where nothing is wrong.
+
+        It is not zero where a linear relation does not hold, such as for a finger that has reached its end stop.
+        """
+        held_out = self.reference.held_out
+        starts, groups = held_out.starts, min(_CHANCE_LOGS, len(held_out.lengths))
+        for group in np.array_split(np.arange(len(starts)), groups):
+            first, last = int(group[0]), int(group[-1])
+            rows = np.arange(starts[first], starts[last] + held_out.lengths[last])
+            part = dataclasses.replace(
+                held_out,
+                observations=held_out.observations[rows],
+                actions=held_out.actions[rows],
+                lengths=held_out.lengths[first : last + 1],
+            )
+            if not len(inner := part.inner_rows(self.margin)):
+                continue
+            chosen = choose_rows(part, inner, self.reference.statistics, _CHANCE_SAMPLE)
+            scorer = Scorer(self, part, dataclasses.replace(chosen, stands_for=_CHANCE_ROWS))
+            for one in candidates:
+                gain = scorer.gain(one)
+                for key in (one, _group(one)):
+                    self._chances[key] = max(self._chances.get(key, 0.0), gain)
+
+    def learn_more(self, recordings: LoggedSignals) -> "Likelihood":
+        """Return the likelihood with relations that are also those of further recordings in simulation."""
+        varied = self.reference.varied.join(recordings)
+        more = Likelihood(dataclasses.replace(self.reference, varied=varied))
+        more._chances = self._chances
+        return more
+
+    def chance(self, one: Correction) -> float:
+        """Return the evidence to take off a correction: more than it had in simulation without any mistake [nats]."""
+        return _CHANCE_FACTOR * self._chances.get(one, self._chances.get(_group(one), 0.0))
+
+
+def _group(one: Correction) -> tuple[str, str]:
+    """Return which corrections one with a fitted number is like."""
+    return one.term, "scale" if one.kind == "unit" else one.kind
+
+
+class Scorer:
+    """Scores corrections on some rows of a log; lower is more plausible, a difference is evidence in nats."""
+
+    def __init__(
+        self,
+        likelihood: Likelihood,
+        signals: LoggedSignals,
+        chosen: ChosenRows,
+        frozen: Collection[tuple[str, int]] = (),
+    ) -> None:
+        self._likelihood, self._signals, self._rows = likelihood, signals, chosen.rows
+        relations, windows = likelihood.relations, likelihood.windows
+        weights = np.minimum(relations.samples * chosen.stands_for, _MOST_SAMPLES)
+        self._keep = np.ones(windows.total)  # 0 for columns of frozen elements: their usual value is used
+        for name, element in frozen:
+            weights[relations.element == windows.slices[name].start + element] = 0.0
+            self._keep[windows.columns[name][element :: windows.sizes[name]]] = 0.0
+        self._weights = weights
+        self.rebase([])
+
+    def rebase(self, corrections: Sequence[Correction]) -> float:
+        """Begin from these corrections; return their score."""
+        cost = 0.0
+        self.base: list[Correction] = []
+        self._begin()
+        for one in corrections:
+            cost += self._cost(one)
+            self.base = [*self.base, one]
+            self._begin()
+        self.score = float(self._losses @ self._weights) + cost
+        return self.score
+
+    def _begin(self) -> None:
+        windows, relations = self._likelihood.windows, self._likelihood.relations
+        self._window = windows.make(self._signals, self._rows, self.base) * self._keep
+        extended = windows.extend(self._window)
+        self._features = extended[:, windows.total :]
+        self._before = self._window @ windows.projection + windows.bias
+        self._errors = extended @ relations.matrix.T + relations.constant
+        self._losses = compute_losses(self._errors).mean(axis=0)
+
+    def _cost(self, one: Correction) -> float:
+        """Return what a correction that makes values smaller gains where they are noise; it is no evidence."""
+        windows, relations = self._likelihood.windows, self._likelihood.relations
+        if one.term == ACTIONS or not one.factor:
+            return 0.0
+        shrinks = np.ones(windows.width)
+        columns = slice(None) if one.term == EVERYTHING else windows.slices[one.term]
+        shrinks[columns] = np.minimum(np.abs(one.factor), 1.0)
+        factors = shrinks[relations.element]
+        some = np.flatnonzero(factors < 1.0)
+        if not len(some):
+            return 0.0
+        gains = self._losses[some] - compute_losses(self._errors[:, some] * factors[some]).mean(axis=0)
+        return float(gains @ self._weights[some])
+
+    def gain(self, one: Correction) -> float:
+        """Return the evidence for one more correction [nats]."""
+        return float((self._losses - self._try(one)) @ self._weights) - self._cost(one)
+
+    def _try(self, one: Correction) -> Array:
+        """Return the mean losses with one more correction, shape (relations,)."""
+        windows, relations = self._likelihood.windows, self._likelihood.relations
+        corrections = [*self.base, one]
+        if one.term == EVERYTHING and EVERYTHING not in windows.sizes:
+            window = windows.make(self._signals, self._rows, corrections) * self._keep
+            everything: Array = compute_losses(windows.extend(window) @ relations.matrix.T + relations.constant).mean(
+                axis=0
+            )
+            return everything
+        block = windows.block(one.term, self._signals, self._rows, corrections) * self._keep[windows.columns[one.term]]
+        losses = self._losses.copy()
+        affected = self._likelihood.affected[one.term]
+        losses[affected] = compute_losses(self._errors_with(one.term, block)).mean(axis=0)
+        return losses
+
+    def _errors_with(self, name: str, block: Array) -> Array:
+        """Return the errors of the affected relations with another part of the windows, shape (rows, affected)."""
+        windows, matrix = self._likelihood.windows, self._likelihood.relations.matrix
+        columns, affected, features = windows.columns[name], self._likelihood.affected[name], windows.features_of[name]
+        change = block - self._window[:, columns]
+        projected = self._before[:, features] + change @ windows.projection[np.ix_(columns, features)]
+        moved = np.tanh(projected) - self._features[:, features]
+        errors: Array = self._errors[:, affected] + change @ matrix[np.ix_(affected, columns)].T
+        errors += moved @ matrix[np.ix_(affected, windows.total + features)].T
+        return errors
+
+    def share(self, one: Correction) -> float:
+        """Return which part of the errors that it changes a correction explains, in [0, 1]."""
+        typical = self._likelihood.relations.typical
+        before, after = self._losses, self._try(one)
+        better = self._weights * (before > after + 0.05)
+        removable = float(np.maximum(before - np.minimum(typical, before), before - after) @ better)
+        return float((before - after) @ better) / max(removable, 1e-9)
+
+    def rank(self, candidates: Iterable[Correction]) -> list[tuple[float, Correction]]:
+        """Return candidates with their evidence, the best first."""
+        return sorted(((self.gain(one), one) for one in candidates), key=lambda pair: -pair[0])
+
+    def times_usual(self, name: str | None) -> float:
+        """Return how many times larger than in simulation errors of an observation are; None: of the next row's."""
+        relations, windows = self._likelihood.relations, self._likelihood.windows
+        used = np.array([kind == "ahead" for kind in relations.kind])
+        if name is not None:
+            part = windows.slices[name]
+            used = (relations.element >= part.start) & (relations.element < part.stop)
+        used &= self._weights > 0
+        if not used.any():
+            return 1.0
+        return float(np.exp((self._losses - relations.typical)[used].mean()))
+
+    def fit_offset(self, name: str) -> Array:
+        """Return the offset of each element alone that suits the log best, by reweighted least squares."""
+        windows = self._likelihood.windows
+        columns, size = windows.columns[name], windows.sizes[name]
+        affected = self._likelihood.affected[name]
+        errors, offset = self._errors[:, affected], np.zeros(size)
+        for index in range(size):
+            moved = self._window[:, columns]
+            moved[:, index::size] += _SMALL_OFFSET
+            effect = (self._errors_with(name, moved) - errors) / _SMALL_OFFSET
+            for _ in range(6):
+                now = errors + effect * offset[index]
+                weights = self._weights[affected] / (1.0 + np.square(now))
+                slope = float((weights * np.square(effect)).mean(axis=0).sum())
+                offset[index] -= float((weights * now * effect).mean(axis=0).sum()) / max(slope, 1e-9)
+        found: Array = offset * windows.statistics[name].std
+        return found

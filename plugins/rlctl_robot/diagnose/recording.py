@@ -1,0 +1,86 @@
+"""Reads what `rlctl serve --rerun FILE` recorded: a row per answer to a client."""
+
+import collections
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlctl.errors import ArtifactError, short_repr
+from rlctl.storage import untrusted
+from rlctl_robot.diagnose.signals import Array
+from rlctl_robot.diagnose.table import LogTable
+
+_ENTITY = re.compile(r"/client_(\d+)/(action|episode|observation/.+)")
+_NUMBERS, _TIME = "Scalars:scalars", "time"
+_LARGEST = 512 * 2**20  # [bytes], of a file, which is read as a whole
+
+_Rows = dict[int, Array]  # numbers by time [ns]
+
+
+def read_recording(path: Path) -> LogTable:
+    """Return the columns `time`, `episode`, `action_0`, .. and NAME_0, .. of each observation, client by client.
+
+    Raises `ArtifactError` for a file that is no such recording.
+    """
+    with untrusted.open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+    if size > _LARGEST:
+        raise ArtifactError(f"{path}: {size:,} bytes, the limit is {_LARGEST:,}; record a shorter time")
+    clients = _read_clients(path)
+    parts = [part for number in sorted(clients) if (part := _join(path, clients[number])) is not None]
+    if not parts:
+        raise ArtifactError(
+            f"{path}: no actions with observations in it; diagnose reads what `rlctl serve --rerun` writes"
+        )
+    if any(part.keys() != parts[0].keys() for part in parts):
+        raise ArtifactError(f"{path}: its clients had policies with other observations; record one policy per file")
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    lengths = tuple(len(part["time"]) for part in parts)
+    for name, values in columns.items():
+        if (bad := np.flatnonzero(~np.isfinite(values))).size:
+            raise ArtifactError(f"{path}, row {bad[0]}, column {name}: {values[bad[0]]} is not a finite number")
+    return LogTable(path, columns, np.arange(sum(lengths)), lengths, "row", has_row_per_action=True)
+
+
+def _read_clients(path: Path) -> dict[int, dict[str, _Rows]]:
+    """Return the numbers of each entity of each client."""
+    from rerun.chunk import RrdReader  # takes a second
+
+    clients: dict[int, dict[str, _Rows]] = collections.defaultdict(lambda: collections.defaultdict(dict))
+    try:
+        for chunk in RrdReader(path).stream().filter(content="/**", has_timeline=_TIME, components=_NUMBERS):
+            if match := _ENTITY.fullmatch(str(chunk.entity_path)):
+                clients[int(match[1])][match[2]] |= _read_chunk(chunk.to_record_batch())
+    except (RuntimeError, ValueError) as error:  # what Rerun raises for a damaged file
+        raise ArtifactError(f"{path}: damaged, or no Rerun recording: {short_repr(str(error), 200)}") from None
+    return clients
+
+
+def _read_chunk(batch: Any) -> _Rows:
+    times = batch.column(_TIME).to_numpy(zero_copy_only=False).astype("datetime64[ns]").astype(np.int64)
+    values = batch.column(_NUMBERS)
+    ends = values.offsets.to_numpy()
+    flat = values.flatten().to_numpy(zero_copy_only=False)
+    flat, ends = flat[: ends[-1] - ends[0]], ends - ends[0]
+    return {int(at): flat[begin:end] for at, begin, end in zip(times, ends[:-1], ends[1:], strict=True)}
+
+
+def _join(path: Path, entities: dict[str, _Rows]) -> dict[str, Array] | None:
+    """Return the columns of the rows that have an action and all observations; None if there are none."""
+    names = [name for name in entities if name.startswith("observation/")]
+    if not names or "action" not in entities or "episode" not in entities:
+        return None
+    times = sorted(set.intersection(*(set(entities[name]) for name in [*names, "action", "episode"])))
+    if not times:
+        return None
+    columns = {"time": (np.array(times) - times[0]) / 1e9}
+    for name in ["episode", "action", *names]:
+        rows = [entities[name][at] for at in times]
+        if len({len(row) for row in rows}) > 1:
+            raise ArtifactError(f"{path}: {name} changes its size")
+        label, values = name.removeprefix("observation/"), np.array(rows, np.float64)
+        columns |= {label if name == "episode" else f"{label}_{index}": column for index, column in enumerate(values.T)}
+    return columns

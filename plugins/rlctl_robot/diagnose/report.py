@@ -1,0 +1,58 @@
+"""Prints a diagnosis."""
+
+import dataclasses
+
+from rlctl import output
+from rlctl.storage import yaml_text
+from rlctl_robot.diagnose.diagnose import Diagnosis
+from rlctl_robot.diagnose.policy_match import SAME
+
+_ODD = 1.6  # times the usual error, from which an observation is listed
+_FEW = 4  # odd observations that are named
+
+
+def show(result: Diagnosis, json: str | None) -> None:
+    """Print the answers and the findings, or write them as JSON to a file or, for `-`, to stdout."""
+    mapping = result.mapping.model_dump(exclude_defaults=True)
+    if output.present({**dataclasses.asdict(result), "mapping": mapping}, json):
+        return
+    out = output.out()
+    out.print(f"{result.log}: {result.rows:,} rows, {result.seconds:.1f} s, policy {result.policy}", soft_wrap=True)
+    for line in describe_answers(result):
+        out.print(line, soft_wrap=True)
+    if not result.findings:
+        out.print("no mistake in the mapping found")
+        return
+    out.print("\nfindings, the one with the most evidence first:")
+    for number, finding in enumerate(result.findings, start=1):
+        out.print(f"{number}. {finding.describe()}", soft_wrap=True)
+        for other in finding.also:
+            out.print(f"   this log cannot tell it from: {other}", soft_wrap=True)
+    if mapping:
+        out.print("\nthe corrected mapping, corrected = sign * scale * value[order] + offset:")
+        out.print(yaml_text.dump(mapping), end="", soft_wrap=True)
+
+
+def describe_answers(result: Diagnosis) -> list[str]:
+    """Return a line for each of the three questions."""
+    answers = result.answers
+    is_corrected = answers.policy_difference_corrected < answers.policy_difference
+    same = "yes" if answers.policy_difference < SAME and not is_corrected else "no"
+    first = f"1. does the policy produce the logged actions? {same}: they differ by {answers.policy_difference:.2g}"
+    if same == "no":
+        first += f" standard deviations on average, {answers.policy_difference_corrected:.2g} when corrected"
+    else:
+        first += " standard deviations on average"
+    odd = sorted(answers.term_errors.items(), key=lambda item: -item[1][0])
+    found = {finding.term for finding in result.findings if finding.question == 2}
+    odd = [(name, errors) for name, errors in odd if errors[0] > _ODD or name in found]
+    second = "2. are the observations those of the simulation? "
+    if odd:
+        named = ", ".join(f"{name} {before:.3g} -> {after:.3g}" for name, (before, after) in odd[:_FEW])
+        second += f"errors in units of the usual ones, as logged and corrected: {named}"
+    else:
+        second += "yes"
+    before, after = answers.step_error
+    third = f"3. does the simulation predict the next row? errors are {before:.3g} times the usual ones"
+    third += f", {after:.3g} times when corrected" if result.findings else ""
+    return [first, second, third]

@@ -1,0 +1,95 @@
+"""Corrections and the mapping that they make together, computed by hand."""
+
+import numpy as np
+import pytest
+
+from rlctl_robot.diagnose.candidates import list_permutations, make_scale, make_sign
+from rlctl_robot.diagnose.correction import Correction, correct
+from rlctl_robot.diagnose.mapping import build_mapping, compose, invert
+from rlctl_robot.diagnose.signals import LoggedSignals, shift
+
+SWAP = Correction("q", "order", "", order=(1, 0, 2))
+AFFINE = Correction("q", "scale", "", factor=(2.0, -1.0, 1.0), offset=(0.5, 0.0, 0.0))
+
+
+def make_signals(observations, actions, lengths=None):
+    return LoggedSignals(np.array(observations, float), np.array(actions, float), lengths or (len(actions),), {"q": 3})
+
+
+def test_a_correction_orders_then_scales_then_shifts_and_undo_is_its_inverse():
+    # [10, 20, 30] -> [20, 10, 30] by SWAP; -> [2 * 10 + 0.5, -20, 30] by AFFINE.
+    values = np.array([10.0, 20.0, 30.0])
+    assert SWAP.change(values).tolist() == [20, 10, 30]
+    assert AFFINE.change(values).tolist() == [20.5, -20, 30]
+    assert AFFINE.undo(AFFINE.change(values)).tolist() == values.tolist()
+    turned = Correction("q", "order", "", order=(1, 2, 0))
+    assert turned.undo(turned.change(values)).tolist() == values.tolist()
+
+
+def test_delays_stay_inside_a_segment():
+    values = np.arange(6.0)
+    assert shift(values, 1, (3, 3)).tolist() == [1, 2, 2, 4, 5, 5]
+    assert shift(values, -2, (3, 3)).tolist() == [0, 0, 0, 3, 3, 3]
+
+
+def test_actions_late_in_the_log_move_up_and_late_on_the_robot_move_down():
+    signals = make_signals(np.zeros((4, 3)), [[1], [2], [3], [4]])
+    late = Correction("actions", "delay", "", delay=1)
+    assert correct(signals, [late]).actions.ravel().tolist() == [2, 3, 4, 4]
+    assert correct(signals, [late], on_robot=True).actions.ravel().tolist() == [1, 1, 2, 3]
+
+
+def test_a_frame_is_turned_with_the_logged_attitude():
+    # Yaw of 90 degrees: forward in the world (1, 0, 0) is right of a body that looks along y: (0, -1, 0).
+    signals = LoggedSignals(
+        np.array([[1.0, 0, 0, 0, 0, np.pi / 2]]), np.zeros((1, 1)), (1,), {"velocity": 3, "attitude": 3}
+    )
+    one = Correction("velocity", "frame", "", frame="to body", attitude="attitude")
+    assert correct(signals, [one]).observations[0, :3] == pytest.approx([0, -1, 0])
+
+
+def test_several_corrections_compose_to_one_mapping():
+    mapping = compose([SWAP, AFFINE])
+    value = np.array([10.0, 20.0, 30.0])
+    composed = np.array(mapping.sign) * np.array(mapping.scale) * value[mapping.order] + np.array(mapping.offset)
+    assert composed.tolist() == AFFINE.change(SWAP.change(value)).tolist() == [40.5, -10, 30]
+
+
+def test_what_is_sent_to_a_robot_is_the_inverse_of_what_it_does():
+    robot = Correction("actions", "scale", "", order=(2, 0, 1), factor=(1.0, -2.0, 4.0))
+    mapping = invert([robot])
+    wanted = np.array([1.0, 2.0, 3.0])
+    sent = np.array(mapping.sign) * np.array(mapping.scale) * wanted[mapping.order]
+    assert robot.change(sent) == pytest.approx(wanted)
+
+
+def test_the_mapping_of_a_swap_has_only_its_order():
+    mapping = build_mapping([], [SWAP], {"q": 3}).model_dump(exclude_defaults=True)
+    assert mapping == {"observations": {"q": {"order": [1, 0, 2]}}}
+
+
+def test_mistakes_of_the_log_alone_do_not_change_what_a_program_must_do():
+    everything = Correction("observation", "normalised", "", factor=(2.0, 2.0, 2.0, 3.0), offset=(0.0, 0.0, 0.0, 1.0))
+    mapping = build_mapping([everything], [SWAP], {"q": 3, "v": 1}).model_dump(exclude_defaults=True)
+    assert mapping == {
+        "observations": {"q": {"order": [1, 0, 2]}},
+        "log": {"observations": {"q": {"scale": [2.0, 2.0, 2.0]}, "v": {"scale": [3.0], "offset": [1.0]}}},
+    }
+
+
+def test_orders_of_legs_joints_and_names_are_tried():
+    names = [f"{leg}_{joint}" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
+    orders = list_permutations(12, names)
+    assert "the joints are in alphabetical order" in orders.values()
+    # Logged FL, FR, RL, RR; the policy has FR, FL, RR, RL.
+    assert orders[(3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8)] == "groups of 3 elements are in the order 1, 0, 3, 2"
+    # Logged all hips, then all thighs, then all calves: element 1, FR's thigh, is the fifth of the log.
+    by_kind = next(order for order, text in orders.items() if "grouped by kind, 4 of each" in text)
+    assert by_kind[:3] == (0, 4, 8)
+
+
+def test_texts_name_elements():
+    assert make_sign("q", 3, [1]).describe() == "q: element 1 has the wrong sign"
+    assert make_scale("q", 3, range(3), 0.5).describe() == "q: all elements are 2 times too large"
+    text = make_scale("actions", 3, [2], 0.5).describe()
+    assert text == "actions: element 2 acts 0.5 times as strongly as in simulation"
