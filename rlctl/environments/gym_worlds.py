@@ -36,18 +36,21 @@ class GymWorlds:
         self.step_of = np.zeros(1, np.int64)
         self._is_discrete = isinstance(env.action_space, spaces.Discrete)
         self._writer = ObservationCheck(env.observation_space)
-        self._reward, self._sums, self._info = 0.0, dict[str, float](), dict[str, Any]()
+        self._reward, self._sums = 0.0, dict[str, float]()
+        self.info: Mapping[str, Any] = {}
+        """What the last reset or step returned beside the rest."""
         self._no_terms = np.zeros((1, 0))
         self._teacher = _find_teacher_view(env)
 
     def reset(self, worlds: NDArray[np.int64], seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
         """Begin the episode of a seed, of a task at this level; return its first observation, shape (1, ...)."""
         self.step_of[0] = 0
-        self._reward, self._sums, self._info = 0.0, {}, {}
+        self._reward, self._sums, self.info = 0.0, {}, {}
         if self.task_worlds is not None:
             self.task_worlds.level = self.level if levels is None else float(levels[0])
         observation, info = _check_tuple(self.env.reset(seed=int(seeds[0])), _RESET, "reset")
         _check_info(info)
+        self.info = info
         return self._writer.read(observation)
 
     def step(self, action: Any, worlds: NDArray[np.int64] | None = None) -> Step:
@@ -60,7 +63,7 @@ class GymWorlds:
             raise ValueError(f"reward is {reward}")
         _check_info(info)
         flags = ONE_FLAG[_to_bool(terminated, "terminated")], ONE_FLAG[_to_bool(truncated, "truncated")]
-        self._info = info
+        self.info = info
         self._count(reward, info)
         raw = self._no_terms
         if self.weights:
@@ -82,9 +85,9 @@ class GymWorlds:
         """Return what the episode has added up to so far."""
         if self.task_worlds is not None:
             return self.task_worlds.totals(0)
-        metrics = self._info.get("metrics")
+        metrics = self.info.get("metrics")
         # In a plain environment "metrics" and "distance" may be anything.
-        distance = (metrics if isinstance(metrics, dict) else self._info).get("distance")
+        distance = (metrics if isinstance(metrics, dict) else self.info).get("distance")
         if not isinstance(distance, int | float | np.number) or not math.isfinite(distance):
             distance = None
         return EpisodeTotals(
@@ -92,7 +95,7 @@ class GymWorlds:
             terms={str(name): _to_float(value, f"reward term {name}") for name, value in self._sums.items()},
             metrics={},
             distance=None if distance is None else float(distance),
-            success=_read_success(self._info),
+            success=_read_success(self.info),
             drawn={},
         )
 
@@ -184,15 +187,21 @@ class ObservationCheck:
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         self._fields: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {}
-        for key, part in split_space(space).items():
+        parts = _flatten_space(space)
+        for key, part in parts.items():
             if part.shape is None or part.dtype is None:
                 raise TypeError(f"{type(part).__name__} inside a Dict space is not supported")
             self._fields[key] = part.shape, np.dtype(part.dtype)
-        self._categories = {key: _category_bounds(part) for key, part in split_space(space).items()}
+        self._categories = {key: _category_bounds(part) for key, part in parts.items()}
 
     def read(self, observation: Any) -> Any:
-        """Return an observation with a leading axis; raises `ValueError` for one that does not fit."""
+        """Return a copy of an observation with a leading axis; raises `ValueError` for one that does not fit.
+
+        A Dict inside a Dict becomes keys such as `achieved_goal/kettle`.
+        """
         parts = split(observation)
+        if isinstance(observation, dict) and any(isinstance(part, dict) for part in observation.values()):
+            parts = _flatten(observation)
         if parts.keys() != self._fields.keys():
             raise ValueError(f"observation has the keys {sorted(parts)}, the space has {sorted(self._fields)}")
         rows = {}
@@ -216,6 +225,26 @@ class ObservationCheck:
         limits = self._categories[key]
         if limits is not None and not ((limits[0] <= value) & (value <= limits[1])).all():
             raise ValueError(f"{_named(key)} is {value}, the space has {limits[0]} to {limits[1]}")
+
+
+def _flatten_space(space: spaces.Space[Any]) -> dict[str, spaces.Space[Any]]:
+    parts: dict[str, spaces.Space[Any]] = {}
+    for key, part in split_space(space).items():
+        if isinstance(part, spaces.Dict):
+            parts |= {f"{key}/{name}": inner for name, inner in _flatten_space(part).items()}
+        else:
+            parts[key] = part
+    return parts
+
+
+def _flatten(observation: Mapping[str, Any]) -> dict[str, Any]:
+    parts: dict[str, Any] = {}
+    for key, part in observation.items():
+        if isinstance(part, dict):
+            parts |= {f"{key}/{name}": inner for name, inner in _flatten(part).items()}
+        else:
+            parts[key] = part
+    return parts
 
 
 def _named(key: str) -> str:

@@ -46,6 +46,10 @@ class Played:
     ended: Index  # the worlds whose episode has ended
 
 
+class NoMoreActions(Exception):
+    """An actor has no action for the next step: the loop ends."""
+
+
 class Playing:
     """The episodes that run in `worlds`; whoever iterates over `play` observes them."""
 
@@ -78,13 +82,17 @@ class Playing:
     def play(self, actor: Actor, index: Index, observations: Any) -> Iterator[Played]:
         """Continue the episodes of worlds, in ascending order, whose `observations` are given; yield each step.
 
-        An episode that ends leaves, unless another has begun there. Exceptions are those of worlds and actor.
+        An episode that ends leaves, unless another has begun there. `NoMoreActions` from the actor ends the loop; other
+        exceptions are those of worlds and actor.
         """
         self._index, self._observations = index, observations
         try:
             while len(self._index):
                 rows = self.select(self._index)
-                _, action = actor.act(self._observations, rows)
+                try:
+                    _, action = actor.act(self._observations, rows)
+                except NoMoreActions:
+                    return
                 result = self.worlds.step(action, rows.index)
                 self._observations = result.observation
                 ended = self._none

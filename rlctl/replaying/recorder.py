@@ -3,10 +3,8 @@
 import contextlib
 import dataclasses
 import functools
-import math
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -15,17 +13,21 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.environments import dict_spaces, registry
+from rlctl.environments.dict_spaces import map_parts, take_row
+from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.environments.info import EnvInfo, describe, find_mujoco
 from rlctl.environments.spec import EnvSpec
-from rlctl.environments.success import find_success
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.play.messages import format_hint
+from rlctl.play.playing import NoMoreActions, Played, Playing
+from rlctl.policy.actor import Actor, Rows
 from rlctl.replaying.bullet_scene import TaskReader, WorldsReader
 from rlctl.replaying.drawable import DrawableEnv
 from rlctl.replaying.mujoco_scene import MujocoReader
 from rlctl.replaying.scene import Camera, Env, Scene, Warn
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode
 from rlctl.task.env import TaskEnv
+from rlctl.task.worlds import Step
 from rlctl.version import collect_versions
 
 Choose = Callable[[Any, int], Any]
@@ -135,16 +137,15 @@ def play_episode(
     With `draw` the rollout has a scene, and `draw` receives the reasons for missing parts. Raises `TaskError`, with
     seed and step, for any exception of the environment; `salvage` receives the steps before any exception.
     """
-    about, space = describe(env), env.observation_space
+    about = describe(env)
     reader = make_reader(env, draw) if draw is not None else None
     read = (lambda step: None) if reader is None else reader.read
-    cast = int if isinstance(env.action_space, spaces.Discrete) else partial(np.array, dtype=env.action_space.dtype)
+    worlds = _LocatedWorlds(env, spec.task, seed, read)
+    playing = Playing(worlds)
     steps: list[_Step] = []
-    terminated = truncated = False
-    with _locate_errors(spec.task, seed, 0):
-        observation, info = env.reset(seed=seed)
-        first, drawn = copy_observation(observation, space), _find_events(info, about)
-        read(0)
+    first_row = np.zeros(1, np.int64)
+    observations = playing.begin(first_row, [seed])
+    first, drawn = take_row(observations, 0), _find_events(worlds.info, about)
 
     def collect(end: str) -> Rollout:
         successes = [step.success for step in steps if step.success is not None]
@@ -159,34 +160,77 @@ def play_episode(
             scene=Scene() if reader is None else reader.scene(),
         )
 
+    end = ""
     try:
         watch(0)
-        while not (terminated or truncated) and (action := choose(observation, len(steps))) is not None:
-            with _locate_errors(spec.task, seed, len(steps) + 1):
-                observation, reward, terminated, truncated, info = env.step(cast(action))
-                step = _read_step(action, copy_observation(observation, space), float(reward), info, about)
-                read(len(steps) + 1)
-                steps.append(step)
+        for played in playing.play(_Chooser(choose, env.action_space), first_row, observations):
+            steps.append(_read_step(played, worlds.info, about))
+            if played.result.terminated[0]:
+                end = "terminated"
+            elif played.result.truncated[0]:
+                end = "truncated: time limit"
             watch(len(steps))
     except Exception as error:
         rollout = collect("")
         failure = LogEntry(len(steps), str(error).partition("\n")[0], "WARN")
         salvage(dataclasses.replace(rollout, log=[*rollout.log, failure]))
         raise
-    return collect("terminated" if terminated else "truncated: time limit" if truncated else "")
+    return collect(end)
 
 
-def _read_step(action: Any, observation: Any, reward: float, info: dict[str, Any], about: EnvInfo) -> _Step:
-    if not math.isfinite(reward):
-        raise ValueError(f"reward is {reward}")
+class _LocatedWorlds(GymWorlds):
+    """An environment whose exceptions name the task, the episode and the step; `read` is called after each step."""
+
+    def __init__(self, env: Env, task: str, seed: int, read: Watch) -> None:
+        super().__init__(env)
+        self._task, self._seed, self._read = task, seed, read
+
+    def reset(self, *arguments: Any) -> Any:
+        """Begin the episode."""
+        with _locate_errors(self._task, self._seed, 0):
+            observations = super().reset(*arguments)
+            self._read(0)
+        return observations
+
+    def step(self, action: Any, worlds: Any = None) -> Step:
+        """Take a step."""
+        with _locate_errors(self._task, self._seed, int(self.step_of[0]) + 1):
+            result = super().step(action, worlds)
+            self._read(int(self.step_of[0]))
+        return result
+
+
+class _Chooser(Actor):
+    """Acts as `choose` says, until it returns None."""
+
+    def __init__(self, choose: Choose, space: spaces.Space[Any]) -> None:
+        self._choose, self._space = choose, space
+
+    def act(self, observations: Any, rows: Rows) -> tuple[Any, Any]:
+        """Return the chosen action; raises `NoMoreActions` if there is none."""
+        action = self._choose(take_row(observations, 0), int(rows.step[0]))
+        if action is None:
+            raise NoMoreActions
+        chosen = np.array(action, self._space.dtype)[None]
+        return chosen, chosen
+
+
+def _read_step(played: Played, info: Mapping[str, Any], about: EnvInfo) -> _Step:
     names = list(about.reward_weights)
     raw, weighted = ([float(info[key][name]) for name in names] for key in ("metrics", "reward_terms"))
-    success = find_success(info)
-    flag = None if success is None else bool(success)
-    return _Step(np.array(action), observation, reward, raw, weighted, flag, _find_events(info, about))
+    result = played.result
+    return _Step(
+        action=np.array(played.action[0]),
+        observation=map_parts(np.copy, take_row(result.observation, 0)),
+        reward=float(result.reward[0]),
+        raw=raw,
+        weighted=weighted,
+        success=None if result.success is None else bool(result.success[0]),
+        events=_find_events(info, about),
+    )
 
 
-def _find_events(info: dict[str, Any], about: EnvInfo) -> dict[str, dict[str, float]]:
+def _find_events(info: Mapping[str, Any], about: EnvInfo) -> dict[str, dict[str, float]]:
     return info.get("events", {}) if about.events else {}  # may be anything in a plain environment
 
 
@@ -274,20 +318,3 @@ def _locate_errors(task: str, seed: int, step: int) -> Iterator[None]:
         where = f"in the episode with seed {seed}, step {step}; {format_hint(task)}"
         details = None if ours else format_plugin_traceback(error) or None
         raise TaskError(f"task {task!r}: {what}\n{where}", details=details) from error
-
-
-def copy_observation(observation: Any, space: spaces.Space[Any]) -> Any:
-    """Copy an observation in the dtype of its space, as recorded episodes have it; some environments reuse theirs.
-
-    A Dict inside a Dict becomes keys such as `achieved_goal/kettle`.
-    """
-    if isinstance(space, spaces.Dict):
-        copied: dict[str, Any] = {}
-        for key, part in space.spaces.items():
-            parts = dict_spaces.split(copy_observation(observation[key], part))
-            copied |= {f"{key}/{name}" if name else key: value for name, value in parts.items()}
-        return copied
-    value = np.array(observation, dtype=space.dtype)
-    if value.shape != space.shape:
-        raise ValueError(f"observation has shape {value.shape}, the space has {space.shape}")
-    return value

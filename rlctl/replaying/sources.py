@@ -22,7 +22,6 @@ from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.recorder import (
     Choose,
     Rollout,
-    copy_observation,
     find_dt,
     play_episode,
     recorded_actions,
@@ -189,8 +188,7 @@ class TaskSource(_NewEpisodes):
             if step == longest:
                 print_warning(f"seed {seed}: cut after {_LONGEST:,} steps, because no time limit is known")
                 return None
-            rows = as_rows(copy_observation(observation, env.observation_space))
-            return actor.act(rows, Rows.one(seed, step))[1][0]
+            return actor.act(as_rows(observation), Rows.one(seed, step))[1][0]
 
         return choose
 

@@ -27,7 +27,7 @@ class Variant:
 RIGHT = Variant("")
 
 
-class Actor:
+class LoggedPolicy:
     """A policy file that acts on rows of observations, deterministically."""
 
     def __init__(self, policy: PolicyFile) -> None:

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from rlctl_robot.diagnose.actor import RIGHT, Actor, Variant
+from rlctl_robot.diagnose.actor import RIGHT, LoggedPolicy, Variant
 from rlctl_robot.diagnose.candidates import make_offset, make_scale
 from rlctl_robot.diagnose.correction import Correction, correct
 from rlctl_robot.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
@@ -65,7 +65,7 @@ class Matcher:
 
     def __init__(
         self,
-        actor: Actor,
+        actor: LoggedPolicy,
         signals: LoggedSignals,
         std: Array,
         candidates: Sequence[Correction],

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
+from rlctl.play.playing import Playing
+from rlctl.policy.actor import Actor, Rows
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings, delay
 from rlctl.task.events.event import Widening
-from rlctl_robot.diagnose.actor import Actor
+from rlctl_robot.diagnose.actor import LoggedPolicy
 from rlctl_robot.diagnose.candidates import TermStatistics, list_candidates
 from rlctl_robot.diagnose.correction import EVERYTHING, Correction
 from rlctl_robot.diagnose.signals import ACTIONS, Array, LoggedSignals
@@ -38,7 +41,7 @@ class Recordings:
     allowed_delay: int  # [control steps]: how late actions can be by the task's own events
 
 
-def record_reference(spec: EnvSpec, actor: Actor, steps: int, seed: int = 0) -> Recordings:
+def record_reference(spec: EnvSpec, actor: LoggedPolicy, steps: int, seed: int = 0) -> Recordings:
     """Play the policy in its task for so many control steps in total.
 
     Raises `UsageError` for a task whose observations or actions are not flat vectors of numbers.
@@ -60,7 +63,7 @@ def record_reference(spec: EnvSpec, actor: Actor, steps: int, seed: int = 0) -> 
 
 
 def record_mistakes(
-    spec: EnvSpec, actor: Actor, mistakes: Sequence[Sequence[Correction]], steps: int, seed: int = 0
+    spec: EnvSpec, actor: LoggedPolicy, mistakes: Sequence[Sequence[Correction]], steps: int, seed: int = 0
 ) -> LoggedSignals:
     """Play the policy in its task with each of the combinations of mistakes, for so many control steps in total."""
     with contextlib.closing(spec.make()) as env:
@@ -83,7 +86,7 @@ def measure_statistics(signals: LoggedSignals) -> dict[str, TermStatistics]:
 
 
 class _ReferencePlayer:
-    def __init__(self, env: Any, actor: Actor, rng: np.random.Generator) -> None:
+    def __init__(self, env: Any, actor: LoggedPolicy, rng: np.random.Generator) -> None:
         self._env, self._actor, self._rng = env, actor, rng
         sizes = actor.info.env.observation_sizes
         self._sizes = dict(sizes) or {EVERYTHING: math.prod(env.observation_space.shape)}
@@ -125,33 +128,60 @@ class _ReferencePlayer:
         return [possible[int(index)] for index in self._rng.integers(0, len(possible), count)]
 
     def _play_episode(self, mistakes: Sequence[Correction], noise: float) -> tuple[Array, Array]:
-        env, rng, actor = self._env, self._rng, self._actor
-        slices = LoggedSignals(np.zeros((0, 0)), np.zeros((0, 0)), (), self._sizes).slices
-        actor.reset()
-        observation, _ = env.reset(seed=int(rng.integers(2**31)))
-        observations: list[Array] = []
-        sent: list[Array] = []
-        actions: list[Array] = []
-        late = sum(one.delay for one in mistakes if one.term == ACTIONS)
-        disturbance = np.zeros(len(actor.low))
-        for step in range(int(rng.integers(_SHORT, _LONG))):
-            observations.append(np.array(observation, np.float64))
-            seen = observations[-1].copy()
-            for one in mistakes:
-                if one.term in slices:
-                    part = slices[one.term]
-                    seen[part] = one.undo(observations[max(0, step - one.delay)][part] if one.delay else seen[part])
-            action = actor.act_step(seen)
-            for one in mistakes:
-                if one.term == ACTIONS:
-                    action = one.change(action)
-            if noise:
-                disturbance = 0.8 * disturbance + 0.6 * noise * self._range * rng.standard_normal(len(action))
-                action = action + disturbance
-            sent.append(np.clip(action, actor.low, actor.high))
-            executed = sent[max(0, step - late)]
-            actions.append(executed)
-            observation, _, terminated, truncated, _ = env.step(executed.astype(np.float32))
-            if terminated or truncated:
+        first = np.zeros(1, np.int64)
+        mistaken = _MistakenActor(self._actor, mistakes, noise * self._range, self._sizes, self._rng)
+        self._actor.reset()
+        playing = Playing(GymWorlds(self._env))
+        observations = playing.begin(first, [int(self._rng.integers(2**31))])
+        length = int(self._rng.integers(_SHORT, _LONG))
+        for number, _ in enumerate(playing.play(mistaken, first, observations), start=1):
+            if number == length:
                 break
-        return np.array(observations), np.array(actions)
+        return np.array(mistaken.observations), np.array(mistaken.actions)
+
+
+class _MistakenActor(Actor):
+    """The policy as a faulty program uses it, with disturbances; `noise` is their size per element of the action."""
+
+    def __init__(
+        self,
+        actor: LoggedPolicy,
+        mistakes: Sequence[Correction],
+        noise: Array,
+        sizes: Mapping[str, int],
+        rng: np.random.Generator,
+    ) -> None:
+        self._actor, self._mistakes, self._noise, self._rng = actor, mistakes, noise, rng
+        self._slices = LoggedSignals(np.zeros((0, 0)), np.zeros((0, 0)), (), dict(sizes)).slices
+        self._late = sum(one.delay for one in mistakes if one.term == ACTIONS)
+        self._disturbance = np.zeros(len(actor.low))
+        self._sent: list[Array] = []
+        self.observations: list[Array] = []  # what the sensors measured
+        self.actions: list[Array] = []  # what the robot executed
+
+    def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
+        """Return the executed action of the only row."""
+        step, actor = int(rows.step[0]), self._actor
+        self.observations.append(np.array(observations[0], np.float64))
+        seen = self.observations[-1].copy()
+        for one in self._mistakes:
+            if one.term not in self._slices:
+                continue
+            part = self._slices[one.term]
+            measured = seen[part]
+            if one.delay:
+                measured = self.observations[max(0, step - one.delay)][part]
+            seen[part] = one.undo(measured)
+        action = actor.act_step(seen)
+        for one in self._mistakes:
+            if one.term == ACTIONS:
+                action = one.change(action)
+        if self._noise.any():
+            drawn = self._rng.standard_normal(len(action))
+            self._disturbance = 0.8 * self._disturbance + 0.6 * self._noise * drawn
+            action = action + self._disturbance
+        self._sent.append(np.clip(action, actor.low, actor.high))
+        executed = self._sent[max(0, step - self._late)]
+        self.actions.append(executed)
+        rows_executed = executed.astype(np.float32)[None]
+        return rows_executed, rows_executed

@@ -9,8 +9,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.environments.dict_spaces import take_row
+from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.environments.registry import call_plugin
-from rlctl.environments.success import find_success
 from rlctl.errors import TaskError
 from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
 from rlctl.exporting.controller.players import CController, Controller, Inputs
@@ -19,7 +20,9 @@ from rlctl.limits.limits import Limits
 from rlctl.limits.safety_filter import SafetyFilter
 from rlctl.play.collect import MOST_STEPS, Episode
 from rlctl.play.messages import EpisodeResult
+from rlctl.play.playing import Playing
 from rlctl.play.seeds import Stream, episode_seeds
+from rlctl.policy.actor import Actor, Rows
 from rlctl.policy.policy import Policy
 
 _MIN_OBSERVATIONS = 2000
@@ -79,23 +82,36 @@ class TaskPlayer:
 
     def play(self, seed: int, act: Callable[[Any, Inputs], NDArray[Any]]) -> Recorded:
         """Play an episode; raises `TaskError` if the environment fails or the episode does not end."""
-        observation, info = call_plugin(self._task, lambda: self._env.reset(seed=seed))
-        measured: list[Inputs] = []
-        actions: list[NDArray[Any]] = []
-        total, ended = 0.0, False
-        while not ended:
-            if len(actions) == MOST_STEPS:
+        worlds, first = GymWorlds(self._env), np.zeros(1, np.int64)
+        playing, recorder = Playing(worlds), _MeasuringActor(self._layout, self._env, act)
+        observations = call_plugin(self._task, lambda: playing.begin(first, [seed]))
+        steps = playing.play(recorder, first, observations)
+        while call_plugin(self._task, lambda: next(steps, None)) is not None:
+            if worlds.step_of[0] == MOST_STEPS:
                 raise TaskError(f"{self._task}: the episode of seed {seed} has not ended after {MOST_STEPS:,} steps")
-            inputs = self._layout.measure(observation, getattr(self._env.unwrapped, "measured", {}))
-            action = np.array(act(observation, inputs))
-            measured.append(inputs)
-            actions.append(action)
-            step = call_plugin(self._task, lambda action=action: self._env.step(action))  # type: ignore[misc]
-            observation, reward, terminated, truncated, info = step
-            total, ended = total + float(reward), bool(terminated or truncated)
-        success = find_success(info)
-        result = EpisodeResult(0, seed, total, len(actions), None if success is None else bool(success), {}, None)
-        return Recorded(measured, actions, Episode(result))
+        totals = worlds.totals()
+        result = EpisodeResult(0, seed, totals.reward, int(worlds.step_of[0]), totals.success, {}, None)
+        return Recorded(recorder.measured, recorder.actions, Episode(result))
+
+
+class _MeasuringActor(Actor):
+    """Acts on what is observed and on what the robot measures, and keeps both."""
+
+    def __init__(
+        self, layout: ControllerLayout, env: gymnasium.Env[Any, Any], act: Callable[[Any, Inputs], NDArray[Any]]
+    ) -> None:
+        self._layout, self._inner, self._act = layout, env.unwrapped, act
+        self.measured: list[Inputs] = []
+        self.actions: list[NDArray[Any]] = []
+
+    def act(self, observations: Any, rows: Rows) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the action of the only row."""
+        observation = take_row(observations, 0)
+        inputs = self._layout.measure(observation, getattr(self._inner, "measured", {}))
+        action = np.array(self._act(observation, inputs))
+        self.measured.append(inputs)
+        self.actions.append(action)
+        return action[None], action[None]
 
 
 @dataclasses.dataclass(frozen=True)
