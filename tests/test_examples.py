@@ -80,7 +80,7 @@ def test_ci_workflow_uses_options_that_exist() -> None:
     workflow = yaml.safe_load((EXAMPLES / "ci" / "rlctl.yml").read_text())
     commands = [step["run"].split() for step in workflow["jobs"]["learn"]["steps"] if "rlctl " in step.get("run", "")]
     verbs = [command for command in commands if command[0] == "rlctl"]
-    assert {verb[1] for verb in verbs} == {"check-env", "train", "eval", "export", "replay", "runs"}
+    assert {verb[1] for verb in verbs} == {"train", "eval", "gate", "replay", "runs"}
     for verb in verbs:
         page = run("-m", "rlctl", *verb[1 : 3 if verb[1] == "runs" else 2], "--help", cwd=EXAMPLES)
         assert [word for word in verb if word.startswith("--") and word not in page] == []

@@ -120,10 +120,10 @@ def test_the_check_of_all_tasks(rlctl, importable):
 def test_a_broken_plugin_harms_only_itself(rlctl, importable, tmp_path):
     (importable / "some_robots" / "raises.yaml").unlink()
     code = (
-        "from rlctl.environments import registry, spec as env_spec\n"
+        "import rlctl; from rlctl.environments import registry\n"
         "from rlctl.errors import RlctlError\n"
         "for name in ('raises', 'leaves', 'absent', 'good', 'reach'):\n"
-        "    try: print(name, type(env_spec.make(name).unwrapped).__name__)\n"
+        "    try: print(name, type(rlctl.make(name).unwrapped).__name__)\n"
         "    except RlctlError as error: print(name, type(error).__name__, str(error).splitlines()[0])\n"
     )
     result = subprocess.run(

@@ -141,7 +141,7 @@ def test_who_imports_torch():
 OPEN_TO_COMMANDS = {
     *("arguments", "environments", "errors", "evaluation", "exporting.controller.layout"),
     *("exporting.controller.observation", "limits", "options", "output", "play", "policy", "processes", "replaying"),
-    *("run", "storage", "task", "version"),
+    *("recipe.sources", "run", "storage", "task", "version"),
 }
 """The rooms and modules that a plugin with commands may import; one with tasks imports `rlctl.task` alone."""
 

@@ -15,7 +15,7 @@ from rlctl.environments.teacher_view import TeacherView
 from rlctl.output import format_count
 from rlctl.task.calls import ONE_FLAG
 from rlctl.task.env import TaskEnv
-from rlctl.task.worlds import EpisodeTotals, Step
+from rlctl.task.worlds import EpisodeTotals, WorldsStep
 
 _STEP = ("observation", "reward", "terminated", "truncated", "info")
 _RESET = ("observation", "info")
@@ -53,7 +53,7 @@ class GymWorlds:
         self.info = info
         return self._writer.read(observation)
 
-    def step(self, action: Any, worlds: NDArray[np.int64] | None = None) -> Step:
+    def step(self, action: Any, worlds: NDArray[np.int64] | None = None) -> WorldsStep:
         """Take a step with an action of shape (1, ...)."""
         self.step_of[0] += 1
         chosen = int(action[0]) if self._is_discrete else np.array(action[0])
@@ -70,7 +70,7 @@ class GymWorlds:
             raw = np.array([list(info["metrics"].values())])
         success = _read_success(info)
         successes = None if success is None else np.array([success])
-        return Step(self._writer.read(observation), np.array([reward]), *flags, raw, successes)
+        return WorldsStep(self._writer.read(observation), np.array([reward]), *flags, raw, successes)
 
     def _count(self, reward: float, info: Mapping[str, Any]) -> None:
         self._reward += reward

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import map_parts, split
 from rlctl.policy.actor import Actor, Array, Rows, act_one_by_one
-from rlctl.task.worlds import EpisodeTotals, Step
+from rlctl.task.worlds import EpisodeTotals, WorldsStep
 
 Index = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -29,7 +29,7 @@ class Worlds(Protocol):
     def reset(self, worlds: Index, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
         """Begin the episodes of `seeds` in some worlds; return their first observations, shape (k, ...)."""
 
-    def step(self, action: Any, worlds: Index | None = None) -> Step:
+    def step(self, action: Any, worlds: Index | None = None) -> WorldsStep:
         """Advance some worlds by a step; `action` has a row for each, shape (k, ...)."""
 
     def totals(self, world: int) -> EpisodeTotals:
@@ -42,7 +42,7 @@ class Played:
 
     index: Index  # of the worlds, shape (k,)
     action: Any
-    result: Step
+    result: WorldsStep
     ended: Index  # the worlds whose episode has ended
 
 

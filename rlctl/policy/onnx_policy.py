@@ -191,6 +191,8 @@ class OnnxActor(FileActor):
         actions, *after = _run_session(self.session, self._outputs, feed)
         for part, value in enumerate(after):
             states[:, part] = value.swapaxes(0, 1)
+        if len(actions) != len(states):
+            raise ValueError(f"it returns {len(actions)} actions for {len(states)} observations")
         return np.asarray(actions)
 
 

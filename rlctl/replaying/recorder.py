@@ -27,7 +27,7 @@ from rlctl.replaying.mujoco_scene import MujocoReader
 from rlctl.replaying.scene import Camera, Env, Scene, Warn
 from rlctl.run.episode import EpisodeInfo, RecordedEpisode
 from rlctl.task.env import TaskEnv
-from rlctl.task.worlds import Step
+from rlctl.task.worlds import WorldsStep
 from rlctl.version import collect_versions
 
 Choose = Callable[[Any, int], Any]
@@ -47,7 +47,7 @@ class LogEntry:
 
 @dataclasses.dataclass(frozen=True)
 class Rollout:
-    """An episode of T steps that was just played. Step 0 is the reset; step k is the world after action k."""
+    """An episode of T steps that was just played. WorldsStep 0 is the reset; step k is the world after action k."""
 
     env: EnvInfo
     episode: RecordedEpisode
@@ -192,7 +192,7 @@ class _LocatedWorlds(GymWorlds):
             self._read(0)
         return observations
 
-    def step(self, action: Any, worlds: Any = None) -> Step:
+    def step(self, action: Any, worlds: Any = None) -> WorldsStep:
         """Take a step."""
         with _locate_errors(self._task, self._seed, int(self.step_of[0]) + 1):
             result = super().step(action, worlds)

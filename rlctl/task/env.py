@@ -17,7 +17,7 @@ from rlctl.task.events.event import Drawn
 from rlctl.task.observation import Observation, Observing, View
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task
-from rlctl.task.worlds import Step, TaskWorlds, take_row
+from rlctl.task.worlds import TaskWorlds, WorldsStep, take_row
 
 _ROW = np.zeros(1, np.int64)
 
@@ -171,7 +171,7 @@ class TaskEnv(gymnasium.Env[Observation, Any]):
         flags = bool(result.terminated[0]), bool(result.truncated[0])
         return take_row(result.observation), float(result.reward[0]), *flags, info
 
-    def _describe(self, result: Step) -> dict[str, Any]:
+    def _describe(self, result: WorldsStep) -> dict[str, Any]:
         raw = dict(zip(self.reward_weights, result.terms[0].tolist(), strict=True))
         terms = {name: weight * raw[name] for name, weight in self.reward_weights.items()}
         info: dict[str, Any] = {"reward_terms": terms, "metrics": raw}

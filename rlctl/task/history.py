@@ -12,7 +12,7 @@ Start = Literal["first", "zeros"]
 """What fills a history when an episode begins: the first observation, or zeros before it."""
 
 
-class History:
+class TermHistory:
     """The histories of n worlds; `frames` has the number of values by name."""
 
     def __init__(self, worlds: int, frames: Mapping[str, int], start: Start) -> None:

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean
-from rlctl.task.history import History
+from rlctl.task.history import TermHistory
 from rlctl.task.layout import Layout
 from rlctl.task.task import TaskDefinition
 from rlctl.task.terms import Term
@@ -92,7 +92,7 @@ class View:
                     f"{self._name}: observation_history of {name!r}, of shape {shape}: only vectors have one"
                 )
         self._names = names if observing.names else None
-        self._history = History(worlds, self.frames, task.history_start) if self.frames else None
+        self._history = TermHistory(worlds, self.frames, task.history_start) if self.frames else None
         self._single_shapes = {name: np.shape(value) for name, value in first.items()}
         self._shapes = {name: self._find_shape(name, value) for name, value in first.items()}
         self.layout = Layout({name: math.prod(shape) for name, shape in self._shapes.items()})

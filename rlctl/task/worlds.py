@@ -40,7 +40,7 @@ from rlctl.task.task import Task, check_definition, check_parameters
 RenderMode = Literal["human", "rgb_array"] | None
 
 
-class Step(NamedTuple):
+class WorldsStep(NamedTuple):
     """What a control step of k worlds gave."""
 
     observation: Observation  # (k, size), or a dict of (k, ...)
@@ -283,7 +283,7 @@ class TaskWorlds:
             self._fail(worlds[row], f"privileged {self.critic.find_fault(chosen[row])!r} is not finite at step {{}}")
         return chosen
 
-    def step(self, action: Any, worlds: Worlds | None = None) -> Step:
+    def step(self, action: Any, worlds: Worlds | None = None) -> WorldsStep:
         """Advance all worlds, or some, by a control step; `action` has a row for each of them, shape (k, ...)."""
         if worlds is None or self._is_all(worlds):
             np.add(self.step_of, self._ones, out=self.step_of)
@@ -296,7 +296,7 @@ class TaskWorlds:
     def _is_all(self, worlds: Worlds) -> bool:
         return self.count == 1 or (len(worlds) == self.count and bool((worlds == self._all).all()))
 
-    def _step(self, chosen: Any, worlds: Worlds) -> Step:
+    def _step(self, chosen: Any, worlds: Worlds) -> WorldsStep:
         is_all = worlds is self._all
         self.calls.act(self._spread(self._signals.act(chosen, worlds), worlds))
         if is_all:
@@ -330,7 +330,7 @@ class TaskWorlds:
             self._last_terms = terms
         else:
             self._last_terms[worlds] = terms
-        return Step(observation, reward, terminated, truncated, terms, success)
+        return WorldsStep(observation, reward, terminated, truncated, terms, success)
 
     def _find_truncated(self, terminated: Flags, worlds: Worlds) -> Flags:
         self._steps_left -= 1

@@ -19,7 +19,7 @@ from rlctl.policy.onnx_policy import OnnxActor, encode
 from rlctl.policy.policy import Policy
 from rlctl.policy.torch_policy import TorchActor
 from rlctl.task import Joints, terms
-from rlctl.task.history import History
+from rlctl.task.history import TermHistory
 from rlctl.task.rotations import normalize
 from tests.exporting.controllers import build_controller, make_arm, make_policy
 
@@ -65,7 +65,7 @@ def draw_inputs(rng):
 def play(policy, controllers, env):
     """Compare controllers with terms, history and policy in Python, in two episodes; return the largest difference."""
     rng, worst = np.random.default_rng(3), 0.0
-    history = History(1, env.observation_history, env.history_start)
+    history = TermHistory(1, env.observation_history, env.history_start)
     for _ in range(2):
         history.begin(slice(None))
         policy.reset()

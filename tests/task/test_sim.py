@@ -44,7 +44,7 @@ def test_a_model_file_that_is_none(sim, tmp_path):
         sim.load("robot", file)
 
 
-MESH = '<visual><geometry><mesh filename="meshes/hand.stl"/></geometry></visual>'
+MESH = '<collision><geometry><mesh filename="meshes/hand.stl"/></geometry></collision>'
 
 
 def test_what_pybullet_prints_of_a_model_is_in_the_error(sim, tmp_path):

@@ -9,7 +9,7 @@ from safetensors.numpy import load_file
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
 from rlctl.recipe.recipe import merge
-from rlctl.task.history import History
+from rlctl.task.history import TermHistory
 from rlctl.task.layout import Layout
 from rlctl.training import algorithms
 from rlctl.training.checkpoint import ReplaySegments
@@ -48,7 +48,7 @@ def make_buffer(kind, *, once, start="first"):
 def list_steps(count, start="first"):
     """Return steps of all environments: episodes end after random times, some at a time limit or cut short."""
     rng = np.random.default_rng(0)
-    history, everyone = History(ENVS, FRAMES, start), np.arange(ENVS)
+    history, everyone = TermHistory(ENVS, FRAMES, start), np.arange(ENVS)
 
     def stack(rows, envs):
         parts = history.add(Layout(SIZES).split(rows), envs)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.exporting.controller.layout import ControllerLayout
-from rlctl.task.history import History
+from rlctl.task.history import TermHistory
 
 
 class ControllerObservation:
@@ -15,7 +15,7 @@ class ControllerObservation:
 
     def __init__(self, layout: ControllerLayout) -> None:
         self._layout = layout
-        self._history = History(1, layout.env.observation_history, layout.env.history_start)
+        self._history = TermHistory(1, layout.env.observation_history, layout.env.history_start)
 
     def begin(self) -> None:
         """Begin an episode: the histories are empty."""

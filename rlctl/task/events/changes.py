@@ -10,7 +10,7 @@ import numpy as np
 
 from rlctl.errors import TaskError
 from rlctl.task.events.event import Drawn, Fraction, NotNegative, Parts, Positive, Range, Signal, Steps, acts_at
-from rlctl.task.events.world_signals import WORLD_SIGNALS, Delay, Noise, in_one_world
+from rlctl.task.events.world_signals import WORLD_SIGNALS, WorldDelay, WorldNoise, in_one_world
 from rlctl.task.sim import Sim
 
 Rng = np.random.Generator
@@ -167,17 +167,17 @@ def noise(rng: Rng, first: Parts, *, std: NotNegative) -> tuple[Drawn, Signal]:
 
     Its standard deviation, in the unit of the observation or the action, is drawn once per episode.
     """
-    return in_one_world(Noise, rng, first, std=std)
+    return in_one_world(WorldNoise, rng, first, std=std)
 
 
 @acts_at("observation", "action", steps=0.0)
 def delay(rng: Rng, first: Parts, *, steps: Steps) -> tuple[Drawn, Signal]:
-    """Delay all values by some control steps; the number is drawn once per episode, both ends included.
+    """WorldDelay all values by some control steps; the number is drawn once per episode, both ends included.
 
     In these first steps the observation is the first of the episode, and the action is 0 or the nearest to 0.
     """
-    return in_one_world(Delay, rng, first, steps=steps)
+    return in_one_world(WorldDelay, rng, first, steps=steps)
 
 
-WORLD_SIGNALS[noise] = Noise
-WORLD_SIGNALS[delay] = Delay
+WORLD_SIGNALS[noise] = WorldNoise
+WORLD_SIGNALS[delay] = WorldDelay

@@ -1,4 +1,4 @@
-"""Noise and delay of n worlds; each world has the numbers of its own generator, whatever the other worlds are."""
+"""WorldNoise and delay of n worlds; each world has the numbers of its own generator, whatever the other worlds are."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
@@ -29,7 +29,7 @@ class WorldSignal(Protocol):
         """Return the values of some worlds with noise or delay, shape (k, size)."""
 
 
-class Noise:
+class WorldNoise:
     """Normal noise on every value at every step."""
 
     def __init__(self, worlds: int, size: int, largest: Mapping[str, float]) -> None:
@@ -59,7 +59,7 @@ class Noise:
         return noisy
 
 
-class Delay:
+class WorldDelay:
     """Values of some control steps before; the last ones of each world are in a ring."""
 
     def __init__(self, worlds: int, size: int, largest: Mapping[str, float]) -> None:
