@@ -12,10 +12,11 @@ from gymnasium import spaces
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
+from rlctl.policy.actor import Rows
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings, delay
 from rlctl.task.events.event import Widening
-from rlctl_robot.diagnose.actor import Actor
+from rlctl_robot.diagnose.actor import LoggedActor
 from rlctl_robot.diagnose.candidates import TermStatistics, list_candidates
 from rlctl_robot.diagnose.correction import EVERYTHING, Correction
 from rlctl_robot.diagnose.signals import ACTIONS, Array, LoggedSignals
@@ -38,7 +39,7 @@ class Recordings:
     allowed_delay: int  # [control steps]: how late actions can be by the task's own events
 
 
-def record_reference(spec: EnvSpec, actor: Actor, steps: int, seed: int = 0) -> Recordings:
+def record_reference(spec: EnvSpec, actor: LoggedActor, steps: int, seed: int = 0) -> Recordings:
     """Play the policy in its task for so many control steps in total.
 
     Raises `UsageError` for a task whose observations or actions are not flat vectors of numbers.
@@ -60,7 +61,7 @@ def record_reference(spec: EnvSpec, actor: Actor, steps: int, seed: int = 0) -> 
 
 
 def record_mistakes(
-    spec: EnvSpec, actor: Actor, mistakes: Sequence[Sequence[Correction]], steps: int, seed: int = 0
+    spec: EnvSpec, actor: LoggedActor, mistakes: Sequence[Sequence[Correction]], steps: int, seed: int = 0
 ) -> LoggedSignals:
     """Play the policy in its task with each of the combinations of mistakes, for so many control steps in total."""
     with contextlib.closing(spec.make()) as env:
@@ -83,7 +84,7 @@ def measure_statistics(signals: LoggedSignals) -> dict[str, TermStatistics]:
 
 
 class _ReferencePlayer:
-    def __init__(self, env: Any, actor: Actor, rng: np.random.Generator) -> None:
+    def __init__(self, env: Any, actor: LoggedActor, rng: np.random.Generator) -> None:
         self._env, self._actor, self._rng = env, actor, rng
         sizes = actor.info.env.observation_sizes
         self._sizes = dict(sizes) or {EVERYTHING: math.prod(env.observation_space.shape)}
@@ -127,7 +128,8 @@ class _ReferencePlayer:
     def _play_episode(self, mistakes: Sequence[Correction], noise: float) -> tuple[Array, Array]:
         env, rng, actor = self._env, self._rng, self._actor
         slices = LoggedSignals(np.zeros((0, 0)), np.zeros((0, 0)), (), self._sizes).slices
-        actor.reset()
+        row = Rows.one()
+        actor.begin(row)
         observation, _ = env.reset(seed=int(rng.integers(2**31)))
         observations: list[Array] = []
         sent: list[Array] = []
@@ -141,7 +143,7 @@ class _ReferencePlayer:
                 if one.term in slices:
                     part = slices[one.term]
                     seen[part] = one.undo(observations[max(0, step - one.delay)][part] if one.delay else seen[part])
-            action = actor.act_step(seen)
+            action = actor.act(seen[None], row)[1][0]
             for one in mistakes:
                 if one.term == ACTIONS:
                     action = one.change(action)
