@@ -36,7 +36,7 @@ def test_it_records_and_reports_without_a_run(replay, tmp_path):
     assert done.returncode == 0, done.stderr
     heading, names, *lines = done.stdout.splitlines()
     assert heading == f"{TUMBLE}: zero, randomised by mass, grip"
-    assert names.split() == "body kg base joints height m lowest highest end tilt deg".split()
+    assert names.split() == ["body", "kg", "base", "joints", "height", "m", "lowest", "highest", "end", "tilt", "deg"]
     assert lines[0] == "ground      0  fixed"
     assert lines[1].startswith("cube      0.1  free              0.400   0.0")
     assert lines[2].startswith("car     5.892  free        6     0.100 ")
