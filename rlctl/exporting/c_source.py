@@ -51,7 +51,7 @@ class Element:
     unit: str = ""  # empty if unknown
 
 
-class Layout:
+class SourceLayout:
     """The elements of the C function's observation and action; `name` is the prefix of all names in the header."""
 
     def __init__(self, name: str, info: PolicyInfo) -> None:
@@ -151,7 +151,7 @@ def write_c(policy: PolicyFile, file_name: str) -> CSource:
     """
     check_can_be_written(policy)
     name, network = make_identifier(file_name), Network(policy)
-    layout = Layout(name, policy.info)
+    layout = SourceLayout(name, policy.info)
     has_images = any(isinstance(layer, ScaleImage) for part in network.parts.values() for layer in part)
     if has_images or (layout.frames > 1 and [len(part.shape or ()) for part in layout.parts.values()] != [1]):
         raise UsageError("export --c: networks for images cannot be written as C; use export --onnx")

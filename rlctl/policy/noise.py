@@ -9,7 +9,7 @@ NOISE_BLOCK = 64
 _STEP_NOISE, _MATRIX = 0, 1  # random streams: noise of steps, gSDE's matrices
 
 
-class Noise:
+class ActionNoise:
     """Random numbers of the steps of the episodes in `count` rows; they do not depend on which were drawn before."""
 
     def __init__(self, count: int, size: int) -> None:
@@ -65,7 +65,7 @@ class _Blocks:
 
 
 def draw_noise(seed: int, block: int, size: int) -> dict[str, Array]:
-    """Return the random numbers of a block of steps of an episode, by the names of `Noise`'s methods."""
+    """Return the random numbers of a block of steps of an episode, by the names of `ActionNoise`'s methods."""
     generator = make_generator(seed, _STEP_NOISE, block)
     normal = generator.standard_normal((NOISE_BLOCK, 2, size), np.float32)
     uniform = generator.random((NOISE_BLOCK, size + 1))

@@ -8,7 +8,7 @@ import numpy as np
 
 from rlctl.exporting import c_source
 from rlctl.exporting.c_layers import CWriter, write_number
-from rlctl.exporting.c_source import CSource, Layout
+from rlctl.exporting.c_source import CSource, SourceLayout
 from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Quantity
 from rlctl.exporting.controller.limits_source import LimitsSource
 from rlctl.exporting.controller.program_mapping import NO_MAPPING, ElementMap, ProgramMapping
@@ -72,7 +72,7 @@ class ControllerSource:
 
     def _describe(self, policy: PolicyFile) -> dict[str, Any]:
         layout, network, writer = self.layout, Network(policy), CWriter()
-        described = Layout(self.name, policy.info)
+        described = SourceLayout(self.name, policy.info)
         sizes = {key: part.shape[0] for key, part in layout.parts.items()}  # type: ignore[index]  # vectors
         value, size = writer.write(network, sizes, "state->observation")
         writer.write_action(network, value, size, layout.action_space, described.action_type)
@@ -171,7 +171,7 @@ class ControllerSource:
             default=is_position,
         )
 
-    def _list_arrays(self, described: Layout) -> list[tuple[str, str, str, list[str]]]:
+    def _list_arrays(self, described: SourceLayout) -> list[tuple[str, str, str, list[str]]]:
         """Return the header's constant arrays: type, name, the macro of the length, and the values as C."""
         quote, target, env = c_source.quote, self.target, self.layout.env
         quantities = self.layout.quantities
@@ -210,7 +210,7 @@ class ControllerSource:
 class _WithActions:
     """The layout as the templates read it: of the controller and, for the action, of the policy."""
 
-    def __init__(self, layout: ControllerLayout, described: Layout) -> None:
+    def __init__(self, layout: ControllerLayout, described: SourceLayout) -> None:
         self._layout, self.describe_action = layout, described.describe_action
 
     def __getattr__(self, name: str) -> Any:
