@@ -110,7 +110,7 @@ def train(
     `if __name__ == "__main__":`, because worker processes may import the script. Raises the exceptions of
     `rlctl.errors`.
     """
-    from rlctl.run.train_request import TrainRequest
+    from rlctl.runs.train_request import TrainRequest
     from rlctl.training.request import run_training
 
     request = TrainRequest(
@@ -177,7 +177,7 @@ def load_policy(path: str | os.PathLike[str], /) -> Policy:
     from rlctl.hub import store
     from rlctl.policy import load
     from rlctl.policy.shipped import find_shipped_policy
-    from rlctl.run.directory import RunDirectory
+    from rlctl.runs.directory import RunDirectory
 
     name, file = os.fspath(path), Path(path)
     if store.is_address(name):

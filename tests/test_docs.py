@@ -161,7 +161,7 @@ def test_limits_are_limits_of_reach():
     from rlctl.exporting.controller.source import ControllerSource
     from rlctl.policy.file import PolicyFile
     from rlctl.policy.shipped import PRETRAINED
-    from rlctl.run.lookup import find_policy
+    from rlctl.runs.lookup import find_policy
 
     policy = PolicyFile.read(find_policy("reach", PRETRAINED).file)
     (block,) = [each for each in find_blocks("yaml") if is_limits(each) and "shoulder" not in each.text]
@@ -322,7 +322,7 @@ def test_the_page_on_tasks_has_all_that_a_task_has():
 
 
 def test_the_page_on_runs_has_every_file(tmp_path):
-    from rlctl.run.directory import RunDirectory
+    from rlctl.runs.directory import RunDirectory
 
     run, table = RunDirectory(tmp_path), (ROOT / "docs/run.md").read_text().partition("\n## ")[0]
     for name in ("recipe_file", "status_file", "metrics_file", "evals_file", "best_policy", "last_policy", "onnx_file"):

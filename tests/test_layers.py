@@ -22,14 +22,15 @@ LAYERS = [
     {"tuning"},
     {"training"},
     {"gating"},
-    {"runs"},
+    {"runs.report"},
+    {"runs.compare"},
     {"exporting", "replaying", "tasks", "importing"},
     {"checking", "evaluation"},
+    {"runs"},
     {"play"},
     {"deploy"},  # names of `limits` for Python programs
     {"limits"},
     {"processes"},
-    {"run"},
     {"policy"},
     {"recipe"},
     {"hub"},
@@ -53,11 +54,8 @@ MAY_IMPORT_TORCH = {  # besides training/
 
 @functools.cache
 def imports(file: Path) -> set[str]:
-    """Every module a file imports, anywhere in it but under TYPE_CHECKING."""
+    """Every module a file imports, anywhere in it: also in functions, and for types alone."""
     tree = ast.parse(file.read_text())
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            node.body = []
     found = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -72,7 +70,7 @@ def files(folder: str) -> list[Path]:
 
 
 def room_of(module: str) -> str:
-    """`rlctl.run.episode` -> `run`; `rlctl.limits.limits` -> `deploy.filter`; `rlctl.train` -> `__init__`."""
+    """`rlctl.play.episode` -> `run`; `rlctl.limits.limits` -> `deploy.filter`; `rlctl.train` -> `__init__`."""
     parts = module.split(".")[1:]
     names = (".".join(parts[:2]), parts[0] if parts else "")
     return next((name for name in names if any(name in layer for layer in LAYERS)), "__init__")
@@ -83,7 +81,8 @@ def level(room: str) -> int:
 
 
 def module_of(file: Path) -> str:
-    return ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    root = ROOT / "plugins" if file.is_relative_to(ROOT / "plugins") else ROOT
+    return ".".join(file.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
 
 
 def test_every_room_has_a_layer():
@@ -109,7 +108,7 @@ def list_imported_modules(module: str, modules: dict[str, Path]) -> set[str]:
 
 
 def test_no_two_modules_import_each_other():
-    modules = {module_of(file): file for file in files("rlctl")}
+    modules = {module_of(file): file for folder in ("rlctl", "plugins") for file in files(folder)}
     left = {module: list_imported_modules(module, modules) for module in modules}
     while leaves := [module for module, others in left.items() if not others & set(left)]:
         for module in leaves:
@@ -141,7 +140,7 @@ def test_who_imports_torch():
 OPEN_TO_COMMANDS = {
     *("arguments", "environments", "errors", "evaluation", "exporting.controller.layout"),
     *("exporting.controller.observation", "limits", "options", "output", "play", "policy", "processes", "replaying"),
-    *("recipe.sources", "run", "storage", "task", "version"),
+    *("recipe", "runs", "storage", "task", "version"),
 }
 """The rooms and modules that a plugin with commands may import; one with tasks imports `rlctl.task` alone."""
 

@@ -14,8 +14,8 @@ from rlctl.exporting.request import ExportRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.shipped import MeasuredScore, Provenance, find_shipped_policy, list_shipped
 from rlctl.recipe.sources import resolve_with_stages
-from rlctl.run.directory import RunDirectory
-from rlctl.run.lookup import find_policy
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.lookup import find_policy
 
 OURS = [name for name in list_shipped() if installed.find(name).distribution == "rlctl"]
 

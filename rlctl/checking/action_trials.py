@@ -12,7 +12,8 @@ from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_act
 from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rules import NotJudged, OutOfTime
-from rlctl.checking.values import Leaf, flatten, flatten_action, name_element, pick
+from rlctl.checking.values import flatten, flatten_action
+from rlctl.environments.leaves import Leaf, name_element, pick
 
 Frame = NDArray[np.float64]
 """What one call of reset or step returned: the observation's numbers, flat, the reward, and the two flags."""

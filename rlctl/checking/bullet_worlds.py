@@ -5,11 +5,7 @@ It does not call `getCollisionShapeData`, which crashes on some models.
 
 import contextlib
 import dataclasses
-import functools
-import inspect
 import math
-import sys
-from typing import Any
 
 import numpy as np
 
@@ -32,33 +28,10 @@ from rlctl.checking.worlds import (
     WorldBody,
 )
 from rlctl.environments.bullet_calls import BulletCalls
-
-MOST_CLIENTS = 1024  # So many physics clients a process may have, in the wheels of PyBullet 3.2
+from rlctl.environments.bullet_clients import ClientCalls, bullet
 
 GRAVITY, WEIGHT_STEPS = -9.81, 20  # [m/s^2]
 UNMOVED = 1e-6  # smaller differences are no effect of gravity [m, rad, m/s, rad/s]; stiff motors leave little
-
-
-def bullet() -> Any:
-    """Return PyBullet, which the environment has loaded."""
-    return sys.modules["pybullet"]
-
-
-class ClientCalls:
-    """PyBullet's functions, bound to one client; its constants too."""
-
-    def __init__(self, client: int) -> None:
-        self._client = client
-
-    def __getattr__(self, name: str) -> Any:
-        value = getattr(bullet(), name)
-        return functools.partial(value, physicsClientId=self._client) if inspect.isbuiltin(value) else value
-
-
-def find_clients(most: int = MOST_CLIENTS) -> list[int]:
-    """Return the ids below `most` of the clients that are connected, whoever did it; empty without PyBullet."""
-    ids = range(min(most, MOST_CLIENTS) if "pybullet" in sys.modules else 0)
-    return [client for client in ids if ClientCalls(client).getConnectionInfo()["isConnected"]]
 
 
 def read_world(client: int) -> World:

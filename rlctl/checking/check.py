@@ -13,9 +13,9 @@ from rlctl.checking import families
 from rlctl.checking.children import Supervisor
 from rlctl.checking.records import Records
 from rlctl.checking.rules import RULES, NotApplicable, NotJudged, RuleFinding, Severity
-from rlctl.checking.values import name_leaf
 from rlctl.checking.working_copy import find_outdated, find_root, prefer_working_copy
 from rlctl.environments import registry
+from rlctl.environments.leaves import name_leaf
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, did_you_mean
 from rlctl.recipe import sources

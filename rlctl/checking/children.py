@@ -15,10 +15,11 @@ from multiprocessing.connection import Connection, wait
 from gymnasium import spaces
 
 from rlctl.checking import families
+from rlctl.checking.experiments import Experiment
 from rlctl.checking.instance import Budget, Context, EnvironmentRaised, describe_failure, raised_by_environment
 from rlctl.checking.progress import CallProgress, Position, read_clock, read_clock_of
 from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finished, Mistake, Skipped
-from rlctl.checking.rules import Experiment, NotApplicable, NotJudged, RuleFinding
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.printed_lines import LineReader, clean

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from rlctl.checking.instance import Instance
 from rlctl.checking.progress import read_clock
-from rlctl.checking.values import Leaf, Path, find_leaves, flatten_action, name_type, read_flag
+from rlctl.checking.values import flatten_action, name_type, read_flag
+from rlctl.environments.leaves import Leaf, Path, find_leaves
 
 HOLD_STEPS, RARE = 10, 0.1  # How long an extreme action is held; how often a rare action is not zero
 

@@ -18,9 +18,10 @@ from typing import Any, Literal
 from rlctl.checking.progress import CallProgress, read_clock
 from rlctl.checking.records import CallFailure
 from rlctl.checking.rules import NotJudged
-from rlctl.checking.values import find_leaves, is_task
+from rlctl.checking.values import is_task
 from rlctl.environments import registry
 from rlctl.environments.graphics import opengl_fix
+from rlctl.environments.leaves import find_leaves
 from rlctl.environments.mujoco_version import mujoco_fix
 from rlctl.environments.places import find_line, format_place, is_own_file
 from rlctl.environments.spec import EnvSpec

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.instance import EnvironmentRaised, describe_failure
 from rlctl.checking.records import MOST_INFOS, CallFailure, CheckedEpisode, Form, Series
-from rlctl.checking.values import Leaf, find_numbers, flatten_action, name_type, pick
+from rlctl.checking.values import find_numbers, flatten_action, name_type
+from rlctl.environments.leaves import Leaf, pick
 from rlctl.environments.success import OTHER_SUCCESS, SUCCESS, find_success
 
 

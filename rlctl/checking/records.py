@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.rules import NotJudged, RuleFinding
-from rlctl.checking.values import Leaf, name_element
+from rlctl.environments.leaves import Leaf, name_element
 from rlctl.errors import UsageError
 
 FIRST_SEED, SECOND_SEED = 1000, 1001

@@ -1,25 +1,17 @@
-"""Rules, what they find, and the two kinds of code that judge them. The texts of the rules are in `rules.yaml`."""
+"""Rules, and what they find. Their texts are in `rules.yaml`; the code that judges them is in `families`."""
 
 from __future__ import annotations
 
 import dataclasses
 import enum
-import functools
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
 from rlctl.errors import UsageError, did_you_mean
-
-if TYPE_CHECKING:
-    from rlctl.checking.instance import Context
-    from rlctl.checking.records import ChildMessage, Records
-
-    RunExperiment = Callable[[Context], Iterator[ChildMessage]]
-    RunCheck = Callable[[Records], Iterable["RuleFinding"]]
 
 
 class Severity(enum.StrEnum):
@@ -138,37 +130,3 @@ def _codes(texts: Sequence[str], option: str) -> list[str]:
             closest = did_you_mean(code.replace("O", "0"), RULES) or did_you_mean(code, FAMILIES)
             raise UsageError(f"{option} {code}: no such rule.{closest} rlctl check-env --list shows all.")
     return codes
-
-
-RECORDING = ("comparisons", "episodes", "instances")
-"""The experiments that record episodes for all rules: with random and other actions, alone and beside another."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Experiment:
-    """One thing to do with an environment in a child process."""
-
-    name: str
-    rules: tuple[str, ...]  # those it decides if it completes; may be empty
-    share: float  # of the time of its process, relative to the others
-    run: RunExperiment  # yields findings at once, so that a crash loses none
-
-
-@dataclasses.dataclass(frozen=True)
-class Check:
-    """How the parent process judges a rule from what was recorded."""
-
-    rule: str
-    needs: tuple[str, ...]  # The experiments that record what it reads
-    of_absence: bool  # it judges what never happened, so its experiments must be complete
-    run: RunCheck
-
-
-def experiment(name: str, *rules: str, share: float = 1.0) -> Callable[[RunExperiment], Experiment]:
-    """Make an experiment of a function. It decides `rules`; see the package `families` for how."""
-    return functools.partial(Experiment, name, rules, share)
-
-
-def check(rule: str, *needs: str, of_absence: bool = False) -> Callable[[RunCheck], Check]:
-    """Make the check of a rule of a function; by default it reads the recorded episodes."""
-    return functools.partial(Check, rule, needs or RECORDING, of_absence)

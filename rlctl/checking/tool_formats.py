@@ -15,7 +15,7 @@ from rlctl.checking.check import CheckReport
 from rlctl.checking.families.speed import Speed
 from rlctl.checking.records import Built, Records
 from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity
-from rlctl.checking.values import Leaf, name_leaf
+from rlctl.environments.leaves import Leaf, name_leaf
 from rlctl.errors import ArtifactError
 from rlctl.storage import files
 from rlctl.version import __version__

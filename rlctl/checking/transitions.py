@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.records import CheckedEpisode, Records
 from rlctl.checking.rules import NotJudged
-from rlctl.checking.values import Leaf
+from rlctl.environments.leaves import Leaf
 from rlctl.environments.success import SUCCESS
 
 ROLES = ("episodes", "seeds", "starts", "search")  # each plays other states; the other roles repeat an episode

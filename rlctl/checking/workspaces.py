@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.bullet_worlds import ClientCalls, find_clients, read_world
+from rlctl.checking.bullet_worlds import read_world
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rules import NotJudged
 from rlctl.checking.worlds import WorldBody
+from rlctl.environments.bullet_clients import ClientCalls, find_clients
 from rlctl.task.env import TaskEnv
 from rlctl.task.mujoco.sim import MujocoSim
 

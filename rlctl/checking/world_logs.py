@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from rlctl.checking.bullet_worlds import BulletStateReader, find_clients, read_world
+from rlctl.checking.bullet_worlds import BulletStateReader, read_world
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
@@ -31,6 +31,7 @@ from rlctl.checking.worlds import (
     WorldBody,
 )
 from rlctl.environments.bullet_calls import BulletCalls
+from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.info import find_mujoco
 
 DEEPEST_FINE = 0.02  # [m]; Bullet pushes links apart over several steps, heavy robots leave up to 2 cm

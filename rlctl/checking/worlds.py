@@ -9,9 +9,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.task.joints import WIDEST_RANGE
+
 MOST_BODIES, MOST_JOINTS = 20, 60  # So many of a world, and of a body, are read; robots and free bodies first
 MOST_LINKS = 30  # So many links of a robot are read for their orientation
-WIDEST_RANGE = 1e3  # wider limits are none: some models write 1e16
 LONGEST_S, MOST_STEPS = 0.1, 100  # simulated without the environment: overlapping bodies are thrown out by then
 
 Array = NDArray[np.float64]

@@ -57,8 +57,8 @@ def evaluate(
     from rlctl.evaluation.group_scores import evaluate_group
     from rlctl.evaluation.report import show, show_group, show_robustness
     from rlctl.output import print_notes
-    from rlctl.run.directory import is_group
-    from rlctl.run.group import read_group
+    from rlctl.runs.directory import is_group
+    from rlctl.runs.group import read_group
     from rlctl.storage.junit import write as write_junit
 
     began = time.monotonic()
@@ -108,7 +108,7 @@ def evaluate(
     show(result, json, gates)
     if junit is not None:
         write_junit(junit, [suites.make_suite(result, gates, time.monotonic() - began)])
-    return gates.check(result)
+    return result.check(gates)
 
 
 _BY_OUTCOME = ("--worst", "--best", "--failures")

@@ -60,8 +60,8 @@ def list_runs(
 @command
 def show_run(run: RunName = None, json: Json = None) -> None:
     """Show a run: its recipe, curve, evaluations, warnings and files."""
-    from rlctl.run.lookup import find_run
-    from rlctl.runs.show import RunDescription, show
+    from rlctl.runs.lookup import find_run
+    from rlctl.runs.report.show import RunDescription, show
 
     show(RunDescription(find_run(run)), json)
 
@@ -131,8 +131,8 @@ def compare_runs(
 ) -> None:
     """Test whether a policy, or a recipe trained with several seeds, is better than another."""
     from rlctl.evaluation.request import EvalRequest
-    from rlctl.runs.comparison import compare
-    from rlctl.runs.comparison_report import make_suite, show
+    from rlctl.runs.compare.comparison import compare
+    from rlctl.runs.compare.report import make_suite, show
     from rlctl.storage.junit import write as write_junit
 
     began = time.monotonic()
@@ -159,7 +159,7 @@ def compare_runs(
 def _compare_maps(
     runs: list[str], request: "EvalRequest", vary: list[str], picture: Path | None, *, yes: bool, json: str | None
 ) -> None:
-    from rlctl.runs.comparison_map import compare_maps, show
+    from rlctl.runs.compare.maps import compare_maps, show
 
     if picture is None:
         show(compare_maps(runs, request, vary, yes=yes), json)

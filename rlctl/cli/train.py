@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from rlctl.arguments import choose_checkpoint, command_in_panels
 from rlctl.errors import UsageError
 from rlctl.options import Cluster, Jobs, Json, On, Option, Pretrained, Settings, Sim
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training.distilling.distill_request import DistillRequest
 from rlctl.tuning.tune_request import TuneRequest
 
@@ -87,7 +87,7 @@ def train(
     json: Json = None,
 ) -> None:
     """Train a policy, evaluate during the training, and save the best and the last policy."""
-    from rlctl.run.group import find_group
+    from rlctl.runs.group import find_group
 
     group_folder = find_group(request.resume, request.root) if request.resume is not None else None
     resume = request.resume if group_folder is None else str(group_folder)

@@ -26,8 +26,8 @@ from rlctl.cluster.work import PREEMPTED, TAKEN, ClusterSettings, Work, execute,
 from rlctl.environments import registry
 from rlctl.errors import TaskError, UsageError, explain_missing_package
 from rlctl.play.workers import available_cores
-from rlctl.run.group import Job, read_job, write_job
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.group import Job, read_job, write_job
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training.trainings import NextSignal, Trainings
 
 _BEAT_S = 0.5

@@ -23,8 +23,8 @@ from rlctl import output
 from rlctl.cluster.work import PREEMPTED, TAKEN, ClusterSettings, Work, execute, make_work, mark_shared_folder
 from rlctl.errors import TaskError, UsageError
 from rlctl.processes.child_process import Standstill
-from rlctl.run.group import JOBS, Job, job_file, list_jobs, read_job, write_job
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.group import JOBS, Job, job_file, list_jobs, read_job, write_job
+from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.signals import HandledSignals
 from rlctl.training.trainings import Detached, NextSignal, Result, Trainings

@@ -17,10 +17,10 @@ from pydantic import Field
 
 from rlctl.environments.registry import identify_task
 from rlctl.errors import ArtifactError, RlctlError
-from rlctl.run.directory import RunDirectory
-from rlctl.run.group import JOBS, find_run_of_seed, list_jobs
-from rlctl.run.lookup import locate_task
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.group import JOBS, find_run_of_seed, list_jobs
+from rlctl.runs.lookup import locate_task
+from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files, yaml_text
 from rlctl.training.trainings import NextSignal, train_in_child
 from rlctl.version import collect_versions

@@ -14,7 +14,17 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any, NamedTuple
 
-LIBRARIES = ("gymnasium", "numpy", "torch", "pybullet", "pybullet_utils", "rlctl", "builtins", "stable_baselines3")
+LIBRARIES = (
+    "gymnasium",
+    "numpy",
+    "torch",
+    "pybullet",
+    "pybullet_utils",
+    "rlctl",
+    "rlctl_robot",
+    "builtins",
+    "stable_baselines3",
+)
 """Packages that are not part of an environment; rlctl's own tasks are in packages of their own."""
 NO_CLIENT = re.compile(
     r"connect|error|getAPIVersion|isNumpyEnabled|submitProfileTiming|rotateVector|calculateVelocityQuaternion"

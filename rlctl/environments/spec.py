@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import gymnasium
 
     from rlctl.environments.gym_worlds import GymWorlds
+    from rlctl.task.events import EventSettings
     from rlctl.task.observation import Observing
     from rlctl.task.worlds import TaskWorlds
 
@@ -86,7 +87,7 @@ class EnvSpec:
             if teacher is not None:
                 from rlctl.environments.teacher_view import TeacherView
 
-                env = TeacherView(env, teacher)
+                env = TeacherView(env, teacher.observing, teacher.event_settings, teacher.wrap)
             return self.wrap(env)
         except RecipeError:
             env.close()
@@ -149,6 +150,13 @@ class EnvSpec:
         return self.resolve().sim.title
 
     @property
+    def event_settings(self) -> EventSettings:
+        """Which events act in episodes of a task, and with what values."""
+        from rlctl.task.events import EventSettings
+
+        return EventSettings(self.randomize, self.events)
+
+    @property
     def observing(self) -> Observing:
         """What the policy observes of a task."""
         from rlctl.task.observation import Observing
@@ -180,9 +188,7 @@ class EnvSpec:
         worlds: TaskWorlds = self._build_task(TaskWorlds, count=count, visuals=False)
         worlds.level = self.level
         if teacher is not None:
-            from rlctl.task.events import EventSettings
-
-            worlds.show_teacher(teacher.observing, EventSettings(teacher.randomize, teacher.events))
+            worlds.show_teacher(teacher.observing, teacher.event_settings)
         return worlds
 
     @property
@@ -192,7 +198,6 @@ class EnvSpec:
 
     def _build_task(self, build: Callable[..., Any], **options: Any) -> Any:
         """Return what `build` makes of an instance of the task and the settings of this spec."""
-        from rlctl.task.events import EventSettings
         from rlctl.task.task import check_parameters
 
         constructor: Any = self.constructor()
@@ -200,7 +205,7 @@ class EnvSpec:
         parameters = check_fields(constructor, self.parameters)
         settings = {
             "reward_weights": self.reward_weights,
-            "events": EventSettings(self.randomize, self.events),
+            "events": self.event_settings,
             "sim": self.resolve().sim,
             "observing": self.observing,
         }

@@ -9,12 +9,11 @@ import gymnasium
 
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
+from rlctl.task.observation import Observing
 from rlctl.task.worlds import take_row
 
 if TYPE_CHECKING:
     from gymnasium import spaces
-
-    from rlctl.environments.spec import EnvSpec
 
 
 class TeacherView(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -23,18 +22,21 @@ class TeacherView(gymnasium.Wrapper[Any, Any, Any, Any]):
     It is the innermost wrapper; those around it change the observations of the student only.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], teacher: EnvSpec) -> None:
+    def __init__(
+        self, env: gymnasium.Env[Any, Any], observing: Observing, events: EventSettings, wrap: Callable[[Any], Any]
+    ) -> None:
+        """`wrap` puts the teacher's wrappers around an environment."""
         super().__init__(env)
         inner = env.unwrapped
         if isinstance(inner, TaskEnv):
-            sight = inner.worlds.show_teacher(teacher.observing, EventSettings(teacher.randomize, teacher.events))
+            sight = inner.worlds.show_teacher(observing, events)
             self.sizes = sight.view.sizes
             """Elements per name of what the teacher sees, without its wrappers; empty for a plain environment."""
             self._source = _Source(env, sight.view.space, lambda: take_row(sight.seen))
         else:
             self.sizes = {}
             self._source = _Source(env, env.observation_space, lambda: self._observation)
-        self._wrapped = teacher.wrap(self._source)
+        self._wrapped = wrap(self._source)
         self.teacher_space = self._wrapped.observation_space
         self._observation: Any = None
         self.seen: Any = None

@@ -9,7 +9,7 @@ from typing import Any
 from rlctl import output
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import UsageError
+from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation import episode_statistics
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.failures import FailurePattern, find_patterns
@@ -17,13 +17,13 @@ from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, find_p
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.evaluation.sequential import EarlyGate, find_interval
 from rlctl.play.collect import Episode, play_episodes
+from rlctl.play.episode import save_episode
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers, count_envs
 from rlctl.policy.actor import Exploration
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.shipped import MeasuredScore
-from rlctl.run.episode import save_episode
 
 _PLAYED_TOGETHER = 10  # episodes, before it is asked whether the gate is decided
 
@@ -53,6 +53,11 @@ class Evaluation:
     failure_patterns: list[FailurePattern] = dataclasses.field(default_factory=list)  # what failures have in common
     planned: int = 0  # episodes that were to be played
     early: EarlyGate | None = None  # what may have ended it before
+
+    def check(self, gates: Gates) -> None:
+        """Raise `AnswerIsNo`, naming every gate that was missed."""
+        if missed := gates.list_missed(self.success_rate, self.success_interval, self.returns.mean):
+            raise AnswerIsNo("gate missed: " + "; ".join(missed))
 
     @property
     def end(self) -> str:

@@ -13,7 +13,7 @@ from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.evaluate import measure_score
 from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.policy.shipped import MeasuredScore
-from rlctl.run.group import Group
+from rlctl.runs.group import Group
 
 
 @dataclasses.dataclass(frozen=True)

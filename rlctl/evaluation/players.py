@@ -14,7 +14,7 @@ from rlctl.policy.actor import Actor
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.load import check_playable, load_policy
 from rlctl.policy.named_actors import BASELINES, SERVER, load_function
-from rlctl.run import lookup
+from rlctl.runs import lookup
 
 
 @dataclasses.dataclass(frozen=True)

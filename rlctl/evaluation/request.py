@@ -7,13 +7,12 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from rlctl.errors import AnswerIsNo, UsageError
+from rlctl.errors import UsageError
 from rlctl.evaluation.sequential import EarlyGate, find_interval, find_least_episodes
 from rlctl.options import Checkpoint, EnvTimeout, EpisodeSeed, Option, RunName
 
 if TYPE_CHECKING:
     from rlctl.environments.spec import EnvChanges, EnvSpec
-    from rlctl.evaluation.evaluate import Evaluation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,11 +104,6 @@ class Gates:
                 "--min-return or --limits"
             )
         return EarlyGate(rates[0], on_lower_end=self.min_success is None)
-
-    def check(self, result: Evaluation) -> None:
-        """Raise `AnswerIsNo`, naming every gate that was missed."""
-        if missed := self.list_missed(result.success_rate, result.success_interval, result.returns.mean):
-            raise AnswerIsNo("gate missed: " + "; ".join(missed))
 
     def list_missed(self, rate: float | None, interval: tuple[float, float] | None, mean_return: float) -> list[str]:
         """Return a phrase for each gate that these scores miss."""

@@ -23,9 +23,9 @@ from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.load import check_playable
 from rlctl.policy.own_modules import KEYS, import_named
 from rlctl.policy.shipped import PRETRAINED
-from rlctl.run import lookup
-from rlctl.run.directory import refuse_links_out
-from rlctl.run.lookup import FoundPolicy
+from rlctl.runs import lookup
+from rlctl.runs.directory import refuse_links_out
+from rlctl.runs.lookup import FoundPolicy
 from rlctl.storage import files
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 
 from rlctl.policy import layers
+from rlctl.policy.file import OPSET
 from rlctl.version import __version__
 
-OPSET = 17  # onnxruntime 1.12 and newer read it
 IR_VERSION = 8  # the version of this opset; the onnx package would write its newest one, which older runtimes refuse
 BATCH = "batch"  # name of the dynamic dimension
 

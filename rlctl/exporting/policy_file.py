@@ -15,8 +15,8 @@ from rlctl.exporting.request import ExportRequest
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.named_actors import BASELINES
 from rlctl.policy.shipped import Provenance
-from rlctl.run import lookup
-from rlctl.run.lookup import FoundPolicy
+from rlctl.runs import lookup
+from rlctl.runs.lookup import FoundPolicy
 from rlctl.storage import validation
 
 

@@ -17,9 +17,9 @@ from rlctl.evaluation.players import find_player
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.exporting.export import ExportReport, export_policy
 from rlctl.exporting.request import ExportRequest, Format
-from rlctl.run import lookup
-from rlctl.runs.comparison import RunComparison, compare
-from rlctl.runs.significance import Verdict
+from rlctl.runs import lookup
+from rlctl.runs.compare.comparison import RunComparison, compare
+from rlctl.runs.compare.significance import Verdict
 from rlctl.storage import junit
 from rlctl.storage.junit import Case, Suite
 
@@ -57,7 +57,7 @@ class Result(enum.StrEnum):
 
 
 @dataclasses.dataclass(frozen=True)
-class Step:
+class GateStep:
     """A step of the gate."""
 
     name: str
@@ -74,7 +74,7 @@ class GateReport:
 
     task: str
     policy: Path
-    steps: list[Step]
+    steps: list[GateStep]
     gates: Gates
     checked: CheckReport | None = None
     evaluation: Evaluation | None = None
@@ -102,7 +102,7 @@ class GateReport:
         return suites
 
 
-def _make_case(classname: str, step: Step) -> Case:
+def _make_case(classname: str, step: GateStep) -> Case:
     tags = {Result.FAILED: "failure", Result.ERROR: "error", Result.SKIPPED: "skipped", Result.PASSED: "system-out"}
     text = "\n".join([step.summary, *step.problems])
     message = "" if step.result is Result.PASSED else (step.problems or (step.summary,))[0]
@@ -123,13 +123,13 @@ def run_gate(request: GateRequest, show: Callable[[object], None], *, quiet: boo
     found = _Findings(request, source, spec, (lambda result: None) if quiet else show)
     steps = [found.take("check", found.check), found.take("eval", found.play)]
     if request.against is None:
-        steps.append(Step("compare", Result.SKIPPED, "nothing to compare with: --against FILE"))
+        steps.append(GateStep("compare", Result.SKIPPED, "nothing to compare with: --against FILE"))
     else:
         steps.append(found.take("compare", found.compare))
     if request.export is None:
-        steps.append(Step("export", Result.SKIPPED, "not asked for: --export FILE"))
+        steps.append(GateStep("export", Result.SKIPPED, "not asked for: --export FILE"))
     elif any(step.exit_code for step in steps):
-        steps.append(Step("export", Result.SKIPPED, "nothing is written after a step that failed"))
+        steps.append(GateStep("export", Result.SKIPPED, "nothing is written after a step that failed"))
     else:
         steps.append(found.take("export", found.export))
     return GateReport(
@@ -157,7 +157,7 @@ class _Findings:
         self.comparison: RunComparison | None = None
         self.exported: list[ExportReport] = []
 
-    def take(self, name: str, step: Callable[[], tuple[str, list[str]]]) -> Step:
+    def take(self, name: str, step: Callable[[], tuple[str, list[str]]]) -> GateStep:
         """Return how a step ended; it returns a summary and what is wrong."""
         began = time.monotonic()
         try:
@@ -165,9 +165,9 @@ class _Findings:
         except RlctlError as error:
             result = Result.FAILED if error.exit_code == 1 else Result.ERROR
             first, *more = str(error).splitlines() or [""]
-            return Step(name, result, first, (first, *more), error.exit_code, time.monotonic() - began)
+            return GateStep(name, result, first, (first, *more), error.exit_code, time.monotonic() - began)
         result = Result.FAILED if problems else Result.PASSED
-        return Step(name, result, summary, tuple(problems), int(bool(problems)), time.monotonic() - began)
+        return GateStep(name, result, summary, tuple(problems), int(bool(problems)), time.monotonic() - began)
 
     def check(self) -> tuple[str, list[str]]:
         """Check the environment, with the parameters that the policy is evaluated with."""

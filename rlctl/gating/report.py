@@ -11,8 +11,8 @@ from rlctl.evaluation.evaluate import Evaluation
 from rlctl.evaluation.request import NO_GATES
 from rlctl.exporting import export
 from rlctl.gating.gate import GateReport, Result
-from rlctl.runs import comparison_report
-from rlctl.runs.comparison import RunComparison
+from rlctl.runs.compare import report as comparison_report
+from rlctl.runs.compare.comparison import RunComparison
 from rlctl.storage import files, junit
 
 _STYLES = {Result.PASSED: "green", Result.FAILED: "red", Result.ERROR: "red", Result.SKIPPED: "dim"}

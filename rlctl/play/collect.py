@@ -11,10 +11,10 @@ from rlctl.environments.dict_spaces import join, split
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import EpisodeFailed, TaskError
+from rlctl.play.episode import EpisodeInfo, RecordedEpisode, Trajectory
 from rlctl.play.messages import EpisodeResult, Play
 from rlctl.play.workers import Workers
 from rlctl.policy.actor import Exploration
-from rlctl.run.episode import EpisodeInfo, RecordedEpisode, Trajectory
 from rlctl.version import collect_versions
 
 _CONTACTS_MEASURED = 10  # the first recorded episodes, in which contacts are measured; it takes about 3 % of a step

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.environments.bullet_calls import BulletCall, record_calls
+from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
@@ -24,7 +25,6 @@ from rlctl.policy.named_actors import make_actor
 
 _HARMLESS = re.compile(r"setAdditionalSearchPath|\w*Debug\w*|get(Keyboard|Mouse)Events")
 """Functions that neither change nor read what a world simulates."""
-_MOST_CLIENTS = 1024  # of a process, in the wheels of PyBullet 3.2
 _STEPS = 3
 
 
@@ -74,14 +74,14 @@ def make_watched(spec: EnvSpec, teacher: EnvSpec | None = None) -> tuple[Any, Sh
     """
     if is_task(spec.constructor()):
         return spec.make_worlds(1, teacher=teacher), None
-    before = _find_clients()
+    before = set(find_clients())
     with record_calls(with_results=()) as calls:
         worlds: Any = spec.make_worlds(1, teacher=teacher)
-    if "pybullet" not in sys.modules or not _find_clients() | before:
+    if "pybullet" not in sys.modules or not {*find_clients(), *before}:
         return worlds, None
     with record_calls(with_results=()) as later:
         _try(worlds)
-    has_own = bool(_find_clients() - before)
+    has_own = bool(set(find_clients()) - before)
     how = _find_shared(worlds.env, calls.without_client | later.without_client, has_own=has_own)
     return worlds, SharedWorld(how, _read_own_memory()) if how else None
 
@@ -117,10 +117,3 @@ def _find_bare_imports(env: Any) -> str:
         if any(id(value) in functions for value in members.values()):
             return base.__module__
     return ""
-
-
-def _find_clients() -> set[int]:
-    pybullet = sys.modules.get("pybullet")
-    if pybullet is None:
-        return set()
-    return {client for client in range(_MOST_CLIENTS) if pybullet.getConnectionInfo(client)["isConnected"]}

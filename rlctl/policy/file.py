@@ -25,6 +25,7 @@ SQUASHED_GAUSSIAN = ("sac", "tqc", "crossq")
 DETERMINISTIC = ("td3", "ddpg")  # algorithms whose policy has no distribution to sample from
 ACTOR_CRITIC = (*SQUASHED_GAUSSIAN, *DETERMINISTIC)  # algorithms whose policy has a separate `actor`
 GRAPH = "graph/actor"  # the tensor that holds a user's network, an ONNX graph as bytes; see `rlctl.policy.onnx_policy`
+OPSET = 17  # of the ONNX graphs that rlctl writes; onnxruntime 1.12 and newer read it
 
 
 class Score(pydantic.BaseModel, extra="forbid"):

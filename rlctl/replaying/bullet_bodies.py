@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.bullet_worlds import find_clients
+from rlctl.environments.bullet_clients import find_clients
 from rlctl.task.pybullet.library import pybullet
 from rlctl.task.rotations import from_axis, invert, multiply, normalize, rotate
 

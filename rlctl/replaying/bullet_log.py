@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.checking.bullet_worlds import MOST_CLIENTS, find_clients
 from rlctl.environments.bullet_calls import Replacement, replace_functions
+from rlctl.environments.bullet_clients import MOST_CLIENTS, find_clients
 from rlctl.errors import UsageError
 from rlctl.replaying.mjcf import Mesh, connect_grid
 from rlctl.task.pybullet.library import pybullet, pybullet_data

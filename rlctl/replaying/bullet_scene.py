@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.bullet_worlds import MOST_CLIENTS
+from rlctl.environments.bullet_clients import MOST_CLIENTS
 from rlctl.replaying.bullet_bodies import list_body_ids, name_bodies, read_body, read_visuals
 from rlctl.replaying.bullet_log import BulletLog
 from rlctl.replaying.bullet_track import Key, Track

@@ -16,6 +16,7 @@ import numpy as np
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError, explain_missing_package
+from rlctl.play.episode import RecordedEpisode
 from rlctl.replaying.bullet_camera import Picture
 from rlctl.replaying.camera import Viewpoint
 from rlctl.replaying.recorder import (
@@ -32,7 +33,6 @@ from rlctl.replaying.report import FilmReport
 from rlctl.replaying.reproduce import find_difference
 from rlctl.replaying.scene import Env, encode_jpeg
 from rlctl.replaying.views import look_at, make_filmable
-from rlctl.run.episode import RecordedEpisode
 from rlctl.storage import files
 from rlctl.task import Sim
 

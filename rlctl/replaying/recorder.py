@@ -18,6 +18,7 @@ from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.environments.info import EnvInfo, describe, find_mujoco
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
+from rlctl.play.episode import EpisodeInfo, RecordedEpisode
 from rlctl.play.messages import format_hint
 from rlctl.play.playing import NoMoreActions, Played, Playing
 from rlctl.policy.actor import Actor, Rows
@@ -25,7 +26,6 @@ from rlctl.replaying.bullet_scene import TaskReader, WorldsReader
 from rlctl.replaying.drawable import DrawableEnv
 from rlctl.replaying.mujoco_scene import MujocoReader
 from rlctl.replaying.scene import Camera, Env, Scene, Warn
-from rlctl.run.episode import EpisodeInfo, RecordedEpisode
 from rlctl.task.env import TaskEnv
 from rlctl.task.worlds import WorldsStep
 from rlctl.version import collect_versions

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from rlctl import output
 from rlctl.environments.dict_spaces import Observations, split
 from rlctl.errors import UsageError
+from rlctl.play.episode import RecordedEpisode
 from rlctl.play.workers import Workers
 from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.recorder import Rollout, current_versions, play_episode, recorded_actions
 from rlctl.replaying.scene import Warn
-from rlctl.run.episode import RecordedEpisode
 
 _ONLY_OF_POLICIES = ("torch", "stable-baselines3", "sb3-contrib")
 """Packages that policies need, but recorded episodes, which contain the actions, do not."""

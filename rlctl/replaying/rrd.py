@@ -13,11 +13,11 @@ import rerun.blueprint as rrb
 
 from rlctl.environments import registry
 from rlctl.errors import ArtifactError
+from rlctl.play.episode import RecordedEpisode
 from rlctl.replaying.bodies import bounds, draw_scene
 from rlctl.replaying.curves import Plot, Timelines, send_curves, send_pictures
 from rlctl.replaying.recorder import Rollout
 from rlctl.replaying.scene import BodyMotion, Scene, Warn
-from rlctl.run.episode import RecordedEpisode
 from rlctl.storage import files
 
 Followed = dict[str, tuple[str, BodyMotion]]  # what the camera of a world follows: an entity, and its body

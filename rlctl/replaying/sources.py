@@ -6,12 +6,13 @@ from contextlib import closing
 from pathlib import Path
 
 from rlctl import output
-from rlctl.checking.bullet_worlds import find_clients
+from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.info import describe
 from rlctl.environments.registry import make_slug
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import UsageError
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, load_baseline, load_player
+from rlctl.play.episode import RecordedEpisode, load_episode, save_episode
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.policy.actor import Actor, Rows, as_rows
 from rlctl.policy.load import load_policy
@@ -32,9 +33,8 @@ from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.scene import Env
 from rlctl.replaying.world import WorldWatch
 from rlctl.replaying.world_readers import make_world_reader
-from rlctl.run.directory import RunDirectory, refuse_links_out
-from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
-from rlctl.run.lookup import find_owner, find_policy, locate_task
+from rlctl.runs.directory import RunDirectory, refuse_links_out
+from rlctl.runs.lookup import find_owner, find_policy, locate_task
 
 _EPISODES_TO_CHOOSE_FROM = 100
 _ROUNDING = 1e-9  # relative; sums of equal rewards in another order

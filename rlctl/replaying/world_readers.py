@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from rlctl.checking.bullet_worlds import find_clients
-from rlctl.checking.worlds import MOST_BODIES, WIDEST_RANGE
+from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.driven_joints import joint_name
 from rlctl.environments.info import find_mujoco
 from rlctl.replaying.bullet_bodies import BulletBody, name_bodies, read_bodies, read_body, read_pose, read_state
@@ -19,12 +18,14 @@ from rlctl.replaying.scene import Env
 from rlctl.replaying.world import BodySummary, JointSummary, Pose, Touch, WorldReader
 from rlctl.task.body import Body
 from rlctl.task.env import TaskEnv
+from rlctl.task.joints import WIDEST_RANGE
 from rlctl.task.pybullet.body import PybulletBody
 from rlctl.task.pybullet.library import pybullet
 
 if TYPE_CHECKING:
     import mujoco
 
+_MOST_BODIES = 20  # of a world that are named
 _NO_LIMIT = 1e5  # [N m, N, rad/s, m/s]; some models write more where a motor has no limit
 
 
@@ -56,7 +57,7 @@ def _read_clients(clients: Sequence[int]) -> dict[str, BulletBody]:
         bodies = [body for body in read_bodies([client]) if not body.is_soft]
         where = f" (client {client})" if len(clients) > 1 else ""
         pairs = sorted(zip(name_bodies(bodies), bodies, strict=True), key=lambda pair: _rank(pair[1]))
-        named |= {name + where: body for name, body in pairs[:MOST_BODIES]}
+        named |= {name + where: body for name, body in pairs[:_MOST_BODIES]}
     return named
 
 

@@ -1,1 +1,1 @@
-"""`rlctl runs` and `rlctl push`: list, show, diagnose, compare, report, remove and upload runs."""
+"""What trainings leave: the folder of a run, its lock, how runs are found, listed and judged; `report`, `compare`."""

@@ -8,10 +8,10 @@ import socket
 from pathlib import Path
 
 from rlctl.errors import ArtifactError, RlctlError
-from rlctl.run.directory import RunDirectory
-from rlctl.run.lookup import find_run
 from rlctl.runs.diagnosis.findings import diagnose, format_finding
-from rlctl.runs.summary import read_table
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.lookup import find_run
+from rlctl.runs.tables import read_table
 from rlctl.version import __version__, collect_versions
 
 _LINES = 20  # last lines of a table or log

@@ -13,9 +13,9 @@ from rich.text import Text
 from rlctl import output
 from rlctl.environments import registry
 from rlctl.errors import ArtifactError, UsageError, did_you_mean, short_repr
-from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
-from rlctl.run.group import find_group, read_group
-from rlctl.run.lookup import describe_source_change, find_run
+from rlctl.runs.directory import ROOT, RunDirectory, is_being_written, is_group
+from rlctl.runs.group import find_group, read_group
+from rlctl.runs.lookup import describe_source_change, find_run
 from rlctl.runs.summary import RunSummary, find_runs, list_waiting, summarize
 
 _SORT_KEYS = {

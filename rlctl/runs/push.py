@@ -9,8 +9,8 @@ from rlctl.errors import UsageError
 from rlctl.hub import store
 from rlctl.policy import own_modules
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.run.directory import RunDirectory, refuse_links_out
-from rlctl.run.lookup import find_run
+from rlctl.runs.directory import RunDirectory, refuse_links_out
+from rlctl.runs.lookup import find_run
 
 _CARD = "README.md"
 _PRIVATE = ("folder", "command", "host", "pid")  # keys of run.json about the machine that trained it; not uploaded

@@ -1,25 +1,18 @@
 """The summary of a run, read from the small files of its folder; a damaged folder has a summary too."""
 
 import contextlib
-import csv
 import dataclasses
-import io
 import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from rlctl.errors import ArtifactError
-from rlctl.policy.file import Score
-from rlctl.run.directory import ROOT, RunDirectory, is_being_written, is_group
-from rlctl.run.group import find_run_of_seed, list_jobs, read_job
-from rlctl.storage import untrusted
-
-Rows = list[dict[str, float | None]]  # of a table, oldest first; an empty field is None
-_LARGEST = 1e100  # larger numbers are ignored: plots and sums would overflow
-_STANDARD_ERRORS = 1.645
-"""A success rate is lower beyond this many standard errors: 5 % of equal policies count as lower (one-sided)."""
+from rlctl.runs.best import find_best_row
+from rlctl.runs.directory import ROOT, RunDirectory, is_being_written, is_group
+from rlctl.runs.group import find_run_of_seed, list_jobs, read_job
+from rlctl.runs.tables import LARGEST, last_row, read_table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,10 +116,10 @@ def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
 
 
 def _first_number(*values: object) -> float | None:
-    """Return the first value that is a number, or the text of one, and below `_LARGEST`."""
+    """Return the first value that is a number, or the text of one, and below `LARGEST`."""
     for value in values:
         with contextlib.suppress(ValueError, OverflowError, TypeError):
-            if abs(number := float(value)) < _LARGEST:  # type: ignore[arg-type]
+            if abs(number := float(value)) < LARGEST:  # type: ignore[arg-type]
                 return number
     return None
 
@@ -156,88 +149,3 @@ def list_waiting(root: Path = ROOT) -> Iterator[RunSummary]:
                 if find_run_of_seed(folder, job.seed) is None:
                     path = folder / f"(seed {job.seed})"
                     yield RunSummary(path, task=job.task, seed=job.seed, state=job.state, reason=job.describe())
-
-
-def read_table(path: Path) -> Rows:
-    """Return a table's rows with numbers; rows cut short by a killed process or without numbers are left out.
-
-    Infinite and absurdly large values are None. Raises `ArtifactError` for what is not a table.
-    """
-    if not path.exists():
-        return []
-    lines = io.StringIO(untrusted.read_bytes(path).decode(errors="replace"), newline="")
-    names, *rows = _parse(path, lines) or [[]]
-    tables = (dict(zip(names, row, strict=True)) for row in rows if len(row) == len(names))
-    return [numbers for row in tables if (numbers := _numbers(row)) is not None and numbers.get("steps") is not None]
-
-
-def _parse(path: Path, lines: Iterable[str]) -> list[list[str]]:
-    try:
-        return list(csv.reader(lines))
-    except csv.Error as error:  # a field that is too long
-        raise ArtifactError(f"{path}: damaged: {error}") from None
-
-
-def _numbers(row: dict[str, str]) -> dict[str, float | None] | None:
-    try:
-        numbers = {name: float(value) if value else None for name, value in row.items()}
-    except ValueError:
-        return None
-    return {name: value if value is not None and abs(value) < _LARGEST else None for name, value in numbers.items()}
-
-
-def list_points(rows: Rows, column: str) -> list[tuple[float, float]]:
-    """Return the steps and the values of a column where it has finite ones."""
-    pairs = ((row.get("steps"), row.get(column)) for row in rows)
-    return [
-        (steps, value) for steps, value in pairs if steps is not None and value is not None and math.isfinite(value)
-    ]
-
-
-def is_lower(success: float, highest: float, episodes: float) -> bool:
-    """Return whether a success rate is lower than the highest by more than chance, over `episodes` episodes each."""
-    pooled = (success + highest) / 2
-    standard_error = math.sqrt(max(2 * pooled * (1 - pooled), 0.0) / max(episodes, 1))
-    return highest - success > _STANDARD_ERRORS * standard_error
-
-
-def is_better(new: Score, best: Score | None, highest: float, episodes: float) -> bool:
-    """Return whether a policy is better than the best so far: by success, and by return where success cannot tell.
-
-    `highest` is the highest success rate so far, in [0, 1]. Success cannot tell where neither rate is lower than it by
-    more than chance; comparing with the highest keeps many small losses from adding up.
-    """
-    if best is None:
-        return True
-    if new.success is None or best.success is None:
-        return new.mean_return > best.mean_return
-    highest = max(highest, new.success)
-    new_is_lower, best_is_lower = (is_lower(score.success or 0.0, highest, episodes) for score in (new, best))
-    if new_is_lower != best_is_lower:
-        return best_is_lower
-    return (new.mean_return, new.success) > (best.mean_return, best.success)
-
-
-def find_best_row(rows: Rows) -> dict[str, float | None] | None:
-    """Return the evaluation that selected the training's best policy; None if no row has a return."""
-    best_row, best_score, highest = None, None, 0.0
-    for row in rows:
-        if (mean_return := row.get("return")) is None:
-            continue
-        score = Score(success=row.get("success"), mean_return=mean_return)
-        if is_better(score, best_score, highest, row.get("episodes") or 1):
-            best_row, best_score = row, score
-        highest = max(highest, score.success or 0.0)
-    return best_row
-
-
-def last_row(path: Path) -> dict[str, str] | None:
-    """Return the last whole row of a table without parsing the others; raises `ArtifactError` as `read_table`."""
-    if not path.exists():
-        return None
-    header, _, rows = untrusted.read_bytes(path).partition(b"\n")
-    whole, _, _ = rows.rpartition(b"\n")
-    if not whole.strip():
-        return None
-    names, values = _parse(path, (line.decode(errors="replace") for line in (header, whole.rpartition(b"\n")[2])))
-    return dict(zip(names, values, strict=True)) if len(names) == len(values) else None

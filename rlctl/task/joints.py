@@ -11,6 +11,8 @@ from gymnasium import spaces
 from rlctl.errors import TaskError, check_name, short_repr
 
 Command = Literal["", "position", "step", "speed", "torque"]
+WIDEST_RANGE = 1e3  # wider limits are none: some models write 1e16
+
 _KINDS: dict[Command, str] = {"position": "scale", "step": "step", "speed": "speed", "torque": "torque"}
 
 

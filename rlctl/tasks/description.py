@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic_core import to_jsonable_python
 
-from rlctl.checking.values import Leaf, find_leaves
 from rlctl.environments import installed, registry
+from rlctl.environments.leaves import Leaf, find_leaves
 from rlctl.environments.registry import call_plugin
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError

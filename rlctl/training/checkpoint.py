@@ -26,12 +26,12 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 from rlctl.environments.dict_spaces import split
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 from rlctl.storage import files
+from rlctl.training.progress import Progress
 from rlctl.training.rollouts import WorkerVecEnv
 from rlctl.training.snapshot import Tensors
 from rlctl.training.stacked_replay import StackedRows
-from rlctl.training.status import Progress
 from rlctl.version import collect_versions
 
 FORMAT = 1

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.errors import ArtifactError
+from rlctl.play.episode import load_episode
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.own_modules import describe_change
 from rlctl.policy.torch_policy import describe_network
-from rlctl.run.directory import RunDirectory
-from rlctl.run.episode import load_episode
+from rlctl.runs.directory import RunDirectory
 from rlctl.storage import files
 from rlctl.storage.table import Table
 from rlctl.training import checkpoint, snapshot

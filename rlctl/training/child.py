@@ -22,7 +22,7 @@ def main(connection: Connection, request: dict[str, Any], command: Sequence[str]
 
 
 def _train(connection: Connection, content: dict[str, Any]) -> int:
-    from rlctl.run.train_request import TrainRequest
+    from rlctl.runs.train_request import TrainRequest
     from rlctl.training.signals import HandledSignals
 
     with HandledSignals(_interrupt), collect(), redirect_stdout():

@@ -20,9 +20,9 @@ from rlctl.environments.info import EnvInfo
 from rlctl.environments.registry import make_slug
 from rlctl.errors import ArtifactError, UsageError, describe_exception, explain_missing_package
 from rlctl.output import format_count
+from rlctl.play.episode import load_episode
 from rlctl.policy.file import list_actor_tensors
 from rlctl.recipe.recipe import ON_POLICY
-from rlctl.run.episode import load_episode
 from rlctl.storage import files
 from rlctl.training.rollouts import Rollouts, to_network_layout
 from rlctl.training.snapshot import observation_statistics

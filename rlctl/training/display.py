@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from typing import Any, Self
 
 from rlctl import output
-from rlctl.run.directory import RunDirectory
-from rlctl.runs.summary import find_best_row, read_table
+from rlctl.runs.best import find_best_row
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.tables import read_table
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _ASCII_BLOCKS = "_.-=+*#@"

@@ -11,13 +11,14 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, EpisodeFailed, RlctlError, TaskError, UsageError
 from rlctl.evaluation.episode_statistics import mean_return, success_rate
 from rlctl.play.collect import Episode, play_episodes
+from rlctl.play.episode import STEP_LABEL, EpisodeInfo, RecordedEpisode, save_episode
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers
 from rlctl.policy.actor import Exploration
 from rlctl.policy.file import PolicyFile, PolicyInfo, Score
-from rlctl.run.episode import STEP_LABEL, EpisodeInfo, RecordedEpisode, save_episode
+from rlctl.runs.best import is_better
 from rlctl.runs.diagnosis.findings import Grade, diagnose
-from rlctl.runs.summary import is_better, read_table
+from rlctl.runs.tables import read_table
 from rlctl.training import measurements
 from rlctl.training.checkpoints import Checkpoints
 from rlctl.training.display import Display, format_score

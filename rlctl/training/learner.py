@@ -22,9 +22,9 @@ from rlctl.policy.file import PolicyFile
 from rlctl.recipe.recipe import Recipe
 from rlctl.recipe.stages import FollowingLevel, Promotion, Stage, format_title
 from rlctl.training.display import percent
+from rlctl.training.progress import Progress
 from rlctl.training.rollouts import Rollouts
 from rlctl.training.snapshot import pack
-from rlctl.training.status import Progress
 
 
 class Curriculum:

@@ -18,8 +18,8 @@ from rlctl.policy.actor import Exploration
 from rlctl.policy.file import DETERMINISTIC
 from rlctl.recipe.hindsight import find_problem
 from rlctl.recipe.recipe import Hindsight, Recipe
+from rlctl.training.progress import Progress
 from rlctl.training.rollouts import Check, Rollouts, WorkerVecEnv, to_network_layout
-from rlctl.training.status import Progress
 
 
 class OffPolicyRollouts(Rollouts):

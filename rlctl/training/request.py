@@ -13,15 +13,15 @@ from rlctl.errors import ArtifactError, TaskError
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.printed_lines import collect, print_line
 from rlctl.recipe.recipe import Recipe
-from rlctl.run.directory import RunDirectory
-from rlctl.run.train_request import TrainRequest
 from rlctl.runs.diagnosis.findings import Finding, diagnose, format_end
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training import status
 from rlctl.training.display import duration, make_display, percent
+from rlctl.training.progress import Progress
 from rlctl.training.setup import set_up
 from rlctl.training.signals import StopSignals
 from rlctl.training.start import Start, find_start
-from rlctl.training.status import Progress
 from rlctl.training.tracking import track
 
 

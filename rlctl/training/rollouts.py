@@ -26,8 +26,8 @@ from rlctl.recipe.recipe import Recipe
 from rlctl.task.mirror import Mirror
 from rlctl.training.own_networks import write_graph
 from rlctl.training.privileged import name_as_sb3, widen, widen_space
+from rlctl.training.progress import Progress
 from rlctl.training.snapshot import Tensors, observation_statistics, pack, select_actor
-from rlctl.training.status import Progress
 from rlctl.training.updates.choice import choose_learner
 
 

@@ -29,11 +29,12 @@ from rlctl.printed_lines import PrintedLines
 from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import ON_POLICY, Recipe
 from rlctl.recipe.stages import FollowingLevel
-from rlctl.run import directory
-from rlctl.run.directory import RunDirectory
+from rlctl.runs import directory
+from rlctl.runs.directory import RunDirectory
 from rlctl.training import status
 from rlctl.training.callbacks import Callbacks
 from rlctl.training.display import Display
+from rlctl.training.progress import Progress
 from rlctl.training.start import Start
 from rlctl.training.tracking import track
 from rlctl.training.warm_start import load_source
@@ -150,7 +151,7 @@ def _build_learner(
         raise RecipeError(f"level: {start.task} is a plain Gymnasium environment; only tasks have levels")
     # A policy that begins trained is evaluated first: it may be better than all later ones.
     next_eval = 0 if start.is_trained else recipe.eval.every_steps or recipe.total_timesteps
-    progress = start.checkpoint.state.progress if start.checkpoint else status.Progress(next_eval)
+    progress = start.checkpoint.state.progress if start.checkpoint else Progress(next_eval)
     env = WorkerVecEnv(workers, recipe.seed)
     model, line = build_on_device(recipe, env, start.request.device, cuda_available=torch.cuda.is_available())
     if line is not None:

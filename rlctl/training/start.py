@@ -23,9 +23,9 @@ from rlctl.hub import store
 from rlctl.policy import own_modules
 from rlctl.recipe.recipe import Recipe, validate
 from rlctl.recipe.sources import describe_other_algorithm, describe_rounding, resolve_with_stages
-from rlctl.run import lookup
-from rlctl.run.directory import RunDirectory, RunLock
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs import lookup
+from rlctl.runs.directory import RunDirectory, RunLock
+from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.callbacks import Callback, Sb3Callback, call_callback, is_of_sb3
 from rlctl.training.distilling.teacher import Teacher

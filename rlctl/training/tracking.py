@@ -25,7 +25,7 @@ from rlctl.errors import RlctlError, UsageError, explain_missing_package
 from rlctl.printed_lines import LineReader
 from rlctl.processes.child_process import ChildEndedError, ChildProcess
 from rlctl.recipe.recipe import Recipe, flatten
-from rlctl.run.directory import TUNE_FILE, RunDirectory, is_group
+from rlctl.runs.directory import TUNE_FILE, RunDirectory, is_group
 from rlctl.storage import files, yaml_text
 
 _EVERY_S = 3.0

@@ -20,7 +20,7 @@ from rlctl.errors import Interrupted
 from rlctl.play.workers import available_cores
 from rlctl.printed_lines import LineReader
 from rlctl.processes.child_process import ChildEndedError, ChildProcess
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training.signals import HandledSignals
 
 _CORES_PER_TRAINING = 2  # one for the workers, one for the updates

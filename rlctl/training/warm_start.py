@@ -13,7 +13,7 @@ from rlctl.errors import UsageError
 from rlctl.policy.file import PolicyFile, PolicyInfo, list_actor_tensors
 from rlctl.policy.shipped import PRETRAINED
 from rlctl.recipe.recipe import Recipe
-from rlctl.run.lookup import find_policy
+from rlctl.runs.lookup import find_policy
 
 # With other values the same tensors compute other actions.
 _SAME_FUNCTION = ("activation_fn", "use_sde", "squash_output", "use_expln", "clip_mean", "batch_norm_eps")

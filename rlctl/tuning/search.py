@@ -15,8 +15,8 @@ from optuna.trial import TrialState
 from rlctl.environments import registry
 from rlctl.environments.spec import merge
 from rlctl.errors import RunTaken, UsageError
-from rlctl.run.directory import RunDirectory
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.trainings import Trainings
 from rlctl.tuning.space import get_value, nest

@@ -18,9 +18,10 @@ from rlctl.environments.spec import merge
 from rlctl.errors import ArtifactError
 from rlctl.recipe.recipe import Recipe
 from rlctl.recipe.sources import read, resolve_with_stages
-from rlctl.run.directory import TUNE_FILE, RunDirectory
-from rlctl.run.group import find_run_of_seed
-from rlctl.runs.summary import RunSummary, list_points, read_table, summarize
+from rlctl.runs.directory import TUNE_FILE, RunDirectory
+from rlctl.runs.group import find_run_of_seed
+from rlctl.runs.summary import RunSummary, summarize
+from rlctl.runs.tables import list_points, read_table
 from rlctl.storage import files, yaml_text
 from rlctl.tuning.space import Dimension, get_value, list_values, nest
 from rlctl.tuning.tune_request import Metric

@@ -98,7 +98,7 @@ def _train(settings: dict) -> tuple[float, int, float, float, float]:
 
 
 def _run(settings: dict) -> None:
-    from rlctl.run.train_request import TrainRequest
+    from rlctl.runs.train_request import TrainRequest
     from rlctl.training.request import run_training
 
     with tempfile.TemporaryDirectory() as folder:

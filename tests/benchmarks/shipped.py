@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 
 GOOD = 0.95  # success rate over the recipe's evaluation episodes
 _POLL_S = 0.02

@@ -22,9 +22,9 @@ from rlctl.entry_points import OURS
 from rlctl.environments import installed, registry
 from rlctl.evaluation.group_scores import evaluate_group
 from rlctl.evaluation.request import EvalRequest
-from rlctl.run.directory import GROUP_FILE
-from rlctl.run.group import Group, parse_seeds, read_group
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.directory import GROUP_FILE
+from rlctl.runs.group import Group, parse_seeds, read_group
+from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files
 
 BEGIN, END = "<!-- scores: make train-all -->\n", "<!-- end of scores -->\n"

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 from tests.benchmarks.shipped import read_csv
 from tests.benchmarks.zoo import OFF_POLICY, PPO_REACH_OF_ZOO, ZOO_ENVS
 

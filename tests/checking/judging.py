@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from rlctl.checking import children, families
-from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.check import judge
 from rlctl.checking.records import Records
 from rlctl.checking.rules import RULES
+from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.spec import EnvSpec
 from rlctl.task.pybullet.library import pybullet
 

@@ -5,7 +5,7 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.checking.action_trials import find_dimensions
-from rlctl.checking.values import find_leaves
+from rlctl.environments.leaves import find_leaves
 from tests.checking.judging import case, check_case, findings, found, rules_of, verdict_of
 
 FILE = "broken_actions.py"

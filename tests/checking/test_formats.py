@@ -21,7 +21,7 @@ from rlctl.checking.check import CheckReport, CheckVerdict, judge
 from rlctl.checking.formats import FORMATS, pair_targets, show_notes, to_text
 from rlctl.checking.records import Built, Finished, Records
 from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, choose_rules, find_rule
-from rlctl.checking.values import find_leaves
+from rlctl.environments.leaves import find_leaves
 from rlctl.errors import UsageError
 from tests import fork_server
 from tests.checking.judging import records_of

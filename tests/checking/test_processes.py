@@ -10,8 +10,9 @@ import pytest
 
 from rlctl.checking import families
 from rlctl.checking.check import check, judge
+from rlctl.checking.experiments import Check
 from rlctl.checking.records import Records
-from rlctl.checking.rules import Check, choose_rules
+from rlctl.checking.rules import choose_rules
 from rlctl.checking.tool_formats import read_baseline
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError

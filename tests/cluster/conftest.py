@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.train_request import TrainRequest
 from tests.cluster import fake_slurm
 from tests.evaluation.conftest import block_run as block_run
 from tests.training.conftest import ENVS, TINY

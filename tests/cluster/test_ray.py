@@ -18,8 +18,8 @@ from rlctl.cluster.executors import choose_cell_player, choose_executor
 from rlctl.cluster.ray_trainings import connect
 from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.vary import measure_robustness
-from rlctl.run.group import read_job
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.group import read_job
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training.request import run_training
 from rlctl.training.seeds import train_seeds
 from tests.cluster.conftest import LINE, wait_for

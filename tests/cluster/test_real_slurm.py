@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from rlctl.cluster.executors import choose_executor
-from rlctl.run.group import read_job
+from rlctl.runs.group import read_job
 from rlctl.training.request import run_training
 from rlctl.training.seeds import train_seeds
 from tests.cluster import real_slurm

@@ -10,8 +10,8 @@ import pytest
 
 from rlctl.cluster.executors import choose_executor
 from rlctl.errors import TaskError, UsageError
-from rlctl.run.group import list_jobs, read_group, read_job
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.group import list_jobs, read_group, read_job
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training.request import run_training as train_run
 from rlctl.training.seeds import train_seeds
 from rlctl.training.trainings import Detached

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import rlctl
-from rlctl.run.directory import RunDirectory
-from rlctl.run.episode import load_episode
-from rlctl.runs.summary import read_table
+from rlctl.play.episode import load_episode
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.tables import read_table
 from rlctl.training import checkpoint
 
 VERSIONS = sorted(path for path in Path(__file__).parent.iterdir() if path.name[0].isdigit())

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from rlctl.policy.file import PolicyFile
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 from tests.crash.trials import Ended, Trials, only_run, resume
 from tests.training.comparing import assert_same_run
 

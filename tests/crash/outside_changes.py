@@ -7,7 +7,7 @@ import os
 import shutil
 import time
 
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 
 
 def begin(what, after=0, until=None):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rlctl.errors import ArtifactError
+from rlctl.play.episode import load_episode
 from rlctl.policy.file import PolicyFile
-from rlctl.run.directory import RunDirectory
-from rlctl.run.episode import load_episode
+from rlctl.runs.directory import RunDirectory
 from tests.crash.conftest import PARTS, parts
 from tests.crash.contract import assert_quiet, assert_same_end
 from tests.crash.damage import Damage, all_damage

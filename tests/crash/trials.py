@@ -12,7 +12,7 @@ from pathlib import Path
 
 import psutil
 
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 from tests import fork_server
 from tests.training.conftest import ENVS
 

@@ -12,9 +12,9 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
+from rlctl.play.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.policy.file import PolicyFile, compute_digest
-from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.request import run_training
 from tests.training.conftest import ENVS, SMALL_PPO

@@ -8,7 +8,7 @@ import pytest
 
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 from tests.play.policies import linear
 
 ENVS = Path(__file__).with_name("envs.py")

@@ -15,8 +15,8 @@ from rlctl.evaluation.junit import make_group_suite, make_suite
 from rlctl.evaluation.report import as_json
 from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.play.messages import EpisodeResult
-from rlctl.run.train_request import TrainRequest
-from rlctl.runs.summary import read_table
+from rlctl.runs.tables import read_table
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training.request import run_training
 from tests import fork_server
 from tests.training.conftest import ENVS, SMALL_PPO
@@ -150,7 +150,7 @@ def test_stochastic_repeats_with_its_seed(reach_run):
 )
 def test_gates(evaluation, gates, message):
     with pytest.raises(AnswerIsNo, match=message):
-        gates.check(evaluation)
+        evaluation.check(gates)
 
 
 def test_a_bound_that_no_episodes_reach_is_refused_before_they_are_played(reach_run):

@@ -8,15 +8,15 @@ import pytest
 
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
-from rlctl.gating.gate import GateReport, GateRequest, Result, Step
+from rlctl.gating.gate import GateReport, GateRequest, GateStep, Result
 from rlctl.gating.report import as_json, to_markdown
 from rlctl.storage import junit
 from tests.evaluation.conftest import block_run  # noqa: F401 - a fixture
 
-PASSED = Step("check", Result.PASSED, "no findings")
-MISSED = Step("eval", Result.FAILED, "success 50 %", ("success rate 0.500 is below 0.9",), exit_code=1, seconds=2.0)
-DAMAGED = Step("compare", Result.ERROR, "used.onnx: damaged", ("used.onnx: damaged",), exit_code=5)
-LEFT_OUT = Step("export", Result.SKIPPED, "nothing is written after a step that failed")
+PASSED = GateStep("check", Result.PASSED, "no findings")
+MISSED = GateStep("eval", Result.FAILED, "success 50 %", ("success rate 0.500 is below 0.9",), exit_code=1, seconds=2.0)
+DAMAGED = GateStep("compare", Result.ERROR, "used.onnx: damaged", ("used.onnx: damaged",), exit_code=5)
+LEFT_OUT = GateStep("export", Result.SKIPPED, "nothing is written after a step that failed")
 
 
 def make_report(*steps):

@@ -11,7 +11,7 @@ import rlctl
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.hub import store
 from rlctl.policy.file import PolicyFile
-from rlctl.run.lookup import find_policy, find_run, locate_task
+from rlctl.runs.lookup import find_policy, find_run, locate_task
 from rlctl.runs.push import push_run
 from rlctl.storage import files
 from tests.robot.serve.serving import write_policy

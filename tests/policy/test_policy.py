@@ -17,7 +17,7 @@ from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile, PolicyInfo, compute_digest
 from rlctl.policy.network import Network
 from rlctl.policy.torch_policy import TorchActor, build_network, pin_threads
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
 DICT = spaces.Dict({"a": spaces.Box(-np.inf, np.inf, (3,), np.float32), "b": spaces.Discrete(4)})

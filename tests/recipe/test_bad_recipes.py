@@ -4,7 +4,7 @@ import pytest
 
 from rlctl.errors import RecipeError, UsageError
 from rlctl.recipe.sources import parse_settings, resolve
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training.request import run_training
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(

@@ -59,7 +59,7 @@ def test_the_command(rlctl):
 
 def test_a_recipe_has_no_path_of_this_machine(tmp_path):
     from rlctl.recipe.recipe import Recipe
-    from rlctl.run.directory import RunDirectory
+    from rlctl.runs.directory import RunDirectory
 
     run = RunDirectory(tmp_path)
     run.write_recipe(Recipe())

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from rlctl.environments.spec import EnvSpec
+from rlctl.play.episode import save_episode
 from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.recorder import Rollout, play_episode
-from rlctl.run.episode import save_episode
 from rlctl.task.pybullet.library import pybullet
 from rlctl_manipulation.reach import JOINT_STEP
 
@@ -68,7 +68,7 @@ def episode_file(reached, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def run(tmp_path_factory):
     """A run of reach that was trained for a moment, with one recording."""
-    from rlctl.run.train_request import TrainRequest
+    from rlctl.runs.train_request import TrainRequest
     from rlctl.training.request import run_training
 
     settings = {

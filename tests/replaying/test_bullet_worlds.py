@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rlctl.environments.spec import EnvSpec
+from rlctl.play.episode import load_episode, save_episode
 from rlctl.replaying.bullet_bodies import place_links, read_bodies, read_body, read_state
 from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.mjcf import ShapeKind, read_shapes
@@ -19,7 +20,6 @@ from rlctl.replaying.replay import run_replay
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.rrd import write_rrd
-from rlctl.run.episode import load_episode, save_episode
 
 p = pytest.importorskip("pybullet", reason="PyBullet is not installed")
 pybullet_data = pytest.importorskip("pybullet_data")

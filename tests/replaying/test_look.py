@@ -8,11 +8,11 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import PolicyError, UsageError
+from rlctl.play.episode import load_episode
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.sources import TaskSource
 from rlctl.replaying.window import open_window, show_episodes
-from rlctl.run.episode import load_episode
 from tests.replaying.conftest import ENVS, as_json
 from tests.replaying.reading import column
 from tests.runs.test_listing import on_terminal

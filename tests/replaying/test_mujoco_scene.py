@@ -7,13 +7,13 @@ import pytest
 
 from rlctl.engine import MUJOCO, PYBULLET
 from rlctl.environments.spec import EnvSpec
+from rlctl.play.episode import load_episode, save_episode
 from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.mjcf import ShapeKind
 from rlctl.replaying.mujoco_scene import find_mujoco_bounds
 from rlctl.replaying.recorder import play_episode
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.rrd import write_rrd
-from rlctl.run.episode import load_episode, save_episode
 from tests.replaying.reading import column, entities, static
 
 mujoco = pytest.importorskip("mujoco")

@@ -9,12 +9,12 @@ from PIL import Image
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
+from rlctl.play.episode import save_episode
 from rlctl.replaying.camera import find_distance
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.report import ReplayResult, show
 from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.window import show_episodes
-from rlctl.run.episode import save_episode
 from rlctl.task.pybullet.library import pybullet
 from tests.replaying.conftest import play
 

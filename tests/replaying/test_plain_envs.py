@@ -5,11 +5,11 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
+from rlctl.play.episode import load_episode, save_episode
 from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.recorder import play_episode
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.replaying.rrd import write_rrd
-from rlctl.run.episode import load_episode, save_episode
 from tests.replaying.conftest import ENVS, play
 from tests.replaying.reading import column, entities, jpegs
 

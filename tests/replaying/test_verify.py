@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from rlctl.errors import ArtifactError
+from rlctl.play.episode import RecordedEpisode, load_episode, save_episode
 from rlctl.replaying.reproduce import find_difference, verify_episode
-from rlctl.run.episode import RecordedEpisode, load_episode, save_episode
 from tests.replaying.conftest import as_json, play
 
 pytestmark = pytest.mark.pybullet

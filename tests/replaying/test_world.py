@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rlctl.checking.bullet_worlds import find_clients
 from rlctl.engine import MUJOCO
+from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.spec import EnvSpec
 from rlctl.replaying.recorder import play_episode
 from rlctl.replaying.world import BodySummary, Contact, JointSummary, Motion, Pose, Touch, WorldSummary, WorldWatch

@@ -6,6 +6,8 @@ import os
 
 import pytest
 
+from rlctl.runs.directory import RunDirectory
+
 METRICS = "steps,seconds,return,success\n"
 EVALS = "steps,seconds,episodes,success,return\n"
 
@@ -45,3 +47,23 @@ def hold_lock():
     yield hold
     for descriptor in held:
         os.close(descriptor)
+
+
+@pytest.fixture
+def root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "runs"
+
+
+@pytest.fixture
+def make_run(root):
+    def make(task: str, name: str, policy: str | None = "best") -> RunDirectory:
+        run = RunDirectory(root / task / name)
+        run.path.mkdir(parents=True)
+        run.write_status({"task": task})
+        if policy:
+            (run.path / "policies").mkdir()
+            (run.path / "policies" / f"{policy}.safetensors").write_bytes(b"")
+        return run
+
+    return make

@@ -13,14 +13,14 @@ from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.players import choose_spec, load_player
 from rlctl.evaluation.request import EvalRequest
 from rlctl.recipe.sources import resolve
-from rlctl.run.directory import RunDirectory
-from rlctl.run.train_request import TrainRequest
-from rlctl.runs.comparison import Candidate, RunComparison, Side, compare, find_recipe_changes
-from rlctl.runs.comparison_report import as_json, describe_candidate, format_needed, make_suite
+from rlctl.runs.compare.comparison import Candidate, RunComparison, Side, compare, find_recipe_changes
+from rlctl.runs.compare.margin import check_margin
+from rlctl.runs.compare.report import as_json, describe_candidate, format_needed, make_suite
+from rlctl.runs.compare.significance import Verdict
+from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import find_runs_of
-from rlctl.runs.margin import check_margin
 from rlctl.runs.report.write import write_report
-from rlctl.runs.significance import Verdict
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training.request import run_training
 from tests.training.conftest import ENVS, TINY
 
@@ -179,7 +179,7 @@ def test_a_margin_must_be_excluded(root):
 )
 def test_a_margin_that_cannot_be_shown_is_refused_before_playing(root, margin, message, monkeypatch):
     one, two = sorted((root / "0.9/Line").iterdir())
-    monkeypatch.setattr("rlctl.runs.comparison.run_evaluation", lambda *_: pytest.fail("played"))
+    monkeypatch.setattr("rlctl.runs.compare.comparison.run_evaluation", lambda *_: pytest.fail("played"))
     with pytest.raises(UsageError, match=message):
         compare([str(one), str(two)], EvalRequest(None, episodes=20), margin=margin)
 
@@ -271,6 +271,6 @@ def test_a_report_of_two_recipes_begins_with_the_verdict(root):
 def test_without_scipy_nothing_is_played(root, monkeypatch):
     one, two = sorted((root / "0.9/Line").iterdir())
     monkeypatch.setitem(sys.modules, "scipy.stats", None)
-    monkeypatch.setattr("rlctl.runs.comparison.run_evaluation", lambda *_: pytest.fail("played"))
+    monkeypatch.setattr("rlctl.runs.compare.comparison.run_evaluation", lambda *_: pytest.fail("played"))
     with pytest.raises(ModuleNotFoundError):
         compare([str(one), str(two)], EvalRequest(None, episodes=20))

@@ -10,10 +10,10 @@ from gymnasium import spaces
 
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
+from rlctl.play.episode import EpisodeInfo, RecordedEpisode, save_episode
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.run.directory import RunDirectory
-from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
 from rlctl.runs.diagnosis.findings import Grade, diagnose, format_end, list_signs
+from rlctl.runs.directory import RunDirectory
 
 UPDATES = 30
 STEPS = 1000 * np.arange(1, UPDATES + 1)

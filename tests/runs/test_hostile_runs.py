@@ -7,8 +7,9 @@ import random
 import pytest
 
 from rlctl.errors import ArtifactError, RlctlError
-from rlctl.run.directory import RunDirectory
-from rlctl.runs import listing, show
+from rlctl.runs import listing
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.report import show
 from rlctl.runs.report.write import write_report
 from rlctl.runs.summary import summarize
 

@@ -10,8 +10,8 @@ import time
 import pytest
 
 from rlctl.errors import ArtifactError
-from rlctl.run.directory import RunDirectory
-from rlctl.run.group import JOBS, Job, write_job
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.group import JOBS, Job, write_job
 from rlctl.runs.listing import format_changes, list_runs
 from rlctl.runs.summary import summarize
 

@@ -14,10 +14,10 @@ import pytest
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.robustness import Axis, Cell, Outcome, Robustness, RobustnessMap
+from rlctl.play.episode import EpisodeInfo, RecordedEpisode, save_episode
 from rlctl.recipe.sources import parse_settings, resolve
-from rlctl.run.directory import RunDirectory
-from rlctl.run.episode import EpisodeInfo, RecordedEpisode, save_episode
-from rlctl.runs import comparison_map
+from rlctl.runs.compare import maps as comparison_map
+from rlctl.runs.directory import RunDirectory
 from rlctl.runs.report import content, plots
 from rlctl.runs.report.write import write_report
 from rlctl.storage import files

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from rlctl.runs.significance import (
+from rlctl.runs.compare.significance import (
     ALPHA,
     Verdict,
     compare_episodes,

@@ -3,7 +3,7 @@
 import pytest
 
 from rlctl.policy.file import Score
-from rlctl.runs.summary import find_best_row, is_better, is_lower
+from rlctl.runs.best import find_best_row, is_better, is_lower
 
 
 def score(successes, mean_return, episodes=30):

@@ -11,9 +11,9 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.run.directory import RunDirectory, RunLock, is_being_written
-from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
-from rlctl.run.lookup import FoundPolicy, find_policy
+from rlctl.play.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
+from rlctl.runs.directory import RunDirectory, RunLock, is_being_written
+from rlctl.runs.lookup import FoundPolicy, find_policy
 from rlctl.storage import files, untrusted
 from rlctl.storage.table import Table
 

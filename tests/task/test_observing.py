@@ -106,8 +106,9 @@ def test_elements_of_a_plain_environment():
 
 
 def test_a_teacher_of_a_plain_environment_has_its_own_wrappers():
+    teacher = EnvSpec("teacher", observe=("2",), frame_stack=3)
     env = EnvSpec("student", observe=("0",)).wrap(
-        TeacherView(Pointer(), EnvSpec("teacher", observe=("2",), frame_stack=3))
+        TeacherView(Pointer(), teacher.observing, teacher.event_settings, teacher.wrap)
     )
     assert env.reset()[0].tolist() == [0.5]
     view = env.env

@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 from safetensors.numpy import load_file
 
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 from rlctl.training import checkpoint
 
 OF_TIME = ("seconds", "fps", "playing", "acting")

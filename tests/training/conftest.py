@@ -5,8 +5,8 @@ import pytest
 from rlctl.errors import TaskError
 from rlctl.play.seeds import Stream, episode_seed
 from rlctl.recipe import recipe
-from rlctl.run.directory import RunDirectory
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training import checkpoints
 from rlctl.training.request import TrainResult, run_training
 from rlctl.training.rollouts import WorkerVecEnv

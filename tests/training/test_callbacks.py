@@ -13,8 +13,8 @@ from rlctl.cli.train import TrainFlags
 from rlctl.errors import Interrupted, RecipeError, TaskError, UsageError
 from rlctl.policy import own_modules
 from rlctl.recipe.recipe import validate
-from rlctl.run.directory import RunDirectory
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.train_request import TrainRequest
 from tests.training import own_callbacks
 from tests.training.comparing import Killed, assert_same_run
 from tests.training.conftest import SMALL_PPO

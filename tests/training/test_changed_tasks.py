@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rlctl.errors import ArtifactError, Interrupted, TaskError, UsageError
-from rlctl.run import lookup
+from rlctl.runs import lookup
 from rlctl.training import checkpoint
 from tests.training.comparing import Killed, assert_same_run, replay_buffer, rows
 from tests.training.conftest import ENVS, TINY

@@ -10,11 +10,11 @@ from rlctl import load_policy
 from rlctl.errors import RecipeError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
+from rlctl.play.episode import load_episode
 from rlctl.play.workers import available_cores
 from rlctl.policy.file import PolicyFile
 from rlctl.replaying.reproduce import verify_episode
-from rlctl.run.episode import load_episode
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training import checkpoint
 from rlctl.training.display import LiveDisplay
 from rlctl.training.request import run_training

@@ -12,11 +12,11 @@ from rlctl.environments.dict_spaces import take_row
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
+from rlctl.play.episode import load_episode
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.load import load_policy
-from rlctl.run.directory import RunDirectory
-from rlctl.run.episode import load_episode
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training import demonstrations
 from rlctl.training.loop import TrainingLoop
 from rlctl.training.seeds import train_seeds

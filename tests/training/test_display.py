@@ -7,7 +7,7 @@ import time
 import pytest
 from rich.console import Console
 
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 from rlctl.training import display as display_module
 from rlctl.training.display import Display, LiveDisplay
 

@@ -17,7 +17,7 @@ from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.load import load_policy
 from rlctl.policy.torch_policy import build_network
 from rlctl.recipe.recipe import merge
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 from rlctl.training.distilling import distill as distilling
 from rlctl.training.distilling import labelled_steps
 from rlctl.training.distilling.distill import distill, make_settings

@@ -163,7 +163,7 @@ def test_on_one_core_and_resumed_on_all(train, resume, kill_after, use_cores, ca
 
 
 def newest_other_than(run):
-    from rlctl.run.directory import RunDirectory
+    from rlctl.runs.directory import RunDirectory
 
     (other,) = (each for each in run.path.parent.iterdir() if each != run.path)
     return RunDirectory(other)

@@ -3,9 +3,9 @@
 import pytest
 
 from rlctl.errors import TaskError, UsageError
+from rlctl.play.episode import load_episode
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.request import ReplayRequest
-from rlctl.run.episode import load_episode
 from tests.training.conftest import FAULTY, FAULTY_SEED, TINY
 
 pytestmark = pytest.mark.usefixtures("every_boundary", "no_child_left")
@@ -86,7 +86,7 @@ def test_it_is_of_the_stage_it_was_in(fail):
 
 def test_actions_for_another_space(fail):
     from rlctl.errors import ArtifactError
-    from rlctl.run.episode import save_episode
+    from rlctl.play.episode import save_episode
 
     _, run = fail(fault="raise")
     file = run.episode_file(0)

@@ -3,11 +3,11 @@
 import pytest
 
 from rlctl.errors import ArtifactError, TaskError, UsageError
+from rlctl.play.episode import load_episode
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.request import ReplayRequest
-from rlctl.run import lookup
-from rlctl.run.episode import load_episode
+from rlctl.runs import lookup
 from tests.training.comparing import Killed, rows
 from tests.training.conftest import FAULTY, TINY
 

@@ -33,7 +33,7 @@ def _two_workers():
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The run that nothing stops."""
-    from rlctl.run.train_request import TrainRequest
+    from rlctl.runs.train_request import TrainRequest
     from rlctl.training.request import run_training
 
     root = tmp_path_factory.mktemp("whole")

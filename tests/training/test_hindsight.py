@@ -13,14 +13,14 @@ from rlctl.errors import RecipeError, TaskError
 from rlctl.play.workers import Workers
 from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training import checkpoint
 from rlctl.training.algorithms import build_model
 from rlctl.training.learner import begin_next_episodes
 from rlctl.training.off_policy import OffPolicyRollouts, replay_arguments
+from rlctl.training.progress import Progress
 from rlctl.training.request import run_training
 from rlctl.training.rollouts import WorkerVecEnv
-from rlctl.training.status import Progress
 from tests.task import tasks
 from tests.training.conftest import ENVS, SMALL
 from tests.training.envs import Plane

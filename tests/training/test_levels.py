@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rlctl.errors import RecipeError, TaskError
+from rlctl.play.episode import load_episode
 from rlctl.play.messages import LevelRule
-from rlctl.run.directory import RunDirectory
-from rlctl.run.episode import load_episode
+from rlctl.runs.directory import RunDirectory
 from rlctl.training import checkpoint
 
 pytest.importorskip("mujoco")

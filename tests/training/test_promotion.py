@@ -3,7 +3,7 @@
 from rlctl.play.messages import EpisodeResult
 from rlctl.recipe.recipe import validate
 from rlctl.training.learner import Curriculum
-from rlctl.training.status import Progress
+from rlctl.training.progress import Progress
 
 
 def curriculum(*stages):

@@ -4,7 +4,7 @@ import pytest
 
 from rlctl.errors import RecipeError, UsageError
 from rlctl.recipe import recipe as recipes
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training.request import run_training
 
 

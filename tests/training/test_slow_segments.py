@@ -10,7 +10,7 @@ import pytest
 from rlctl.environments.spec import EnvSpec
 from rlctl.play.workers import Workers
 from rlctl.policy.actor import Exploration
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 from rlctl.training import display
 from rlctl.training.checkpoint import environment_tensors
 from rlctl.training.display import Display

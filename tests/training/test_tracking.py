@@ -16,8 +16,8 @@ import pytest
 
 import rlctl
 from rlctl.errors import RecipeError, UsageError
-from rlctl.run.directory import RunDirectory
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training import tracking
 from rlctl.training.seeds import train_seeds
 from rlctl.tuning.tune import tune

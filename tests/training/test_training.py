@@ -8,15 +8,15 @@ import pytest
 
 from rlctl import load_policy
 from rlctl.errors import ArtifactError, DivergedError, TaskError, UsageError
+from rlctl.play.episode import load_episode
 from rlctl.policy.actor import Rows
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
-from rlctl.run.directory import RunDirectory
-from rlctl.run.episode import load_episode
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.directory import RunDirectory
 from rlctl.runs.summary import summarize
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training import checkpoint
 from rlctl.training.request import TrainResult, run_training
 from tests import fork_server

@@ -7,7 +7,7 @@ from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.load import check_playable
-from rlctl.run.lookup import find_policy
+from rlctl.runs.lookup import find_policy
 
 _MOST_OTHERS = 20
 

@@ -17,6 +17,7 @@ from rlctl import output
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, explain_missing_package
+from rlctl.play.episode import save_episode
 from rlctl.play.seeds import Stream, episode_seed
 from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.recorder import DEFAULT_DT, Choose, LogEntry, Rollout, find_dt, make_reader, play_episode
@@ -24,7 +25,6 @@ from rlctl.replaying.reproduce import print_warning
 from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.scene import Env
 from rlctl.replaying.sources import PolicySource
-from rlctl.run.episode import save_episode
 from rlctl_robot.play.controls import Controls, PageMessage
 from rlctl_robot.play.drawing import describe_shapes, list_poses
 from rlctl_robot.play.request import PlayRequest

@@ -25,7 +25,7 @@ from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.policy.load import load_policy
 from rlctl.policy.policy import Policy
 from rlctl.policy.shipped import PRETRAINED
-from rlctl.run import lookup
+from rlctl.runs import lookup
 from rlctl.version import __version__
 from rlctl_robot.robot import packets
 from rlctl_robot.robot.commands import CommandCounts

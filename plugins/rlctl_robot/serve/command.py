@@ -24,7 +24,7 @@ def serve(
     """Serve a policy to robots: WebSocket and HTTP, with limits, watchdog, log and a live page."""
     from rlctl import output
     from rlctl.errors import UsageError
-    from rlctl.run.lookup import find_policy
+    from rlctl.runs.lookup import find_policy
     from rlctl_robot.serve.serve import make_server, run_server
 
     if sim is not None and not self_test:

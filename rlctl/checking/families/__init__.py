@@ -30,7 +30,8 @@ import importlib
 import pkgutil
 from collections.abc import Collection
 
-from rlctl.checking.rules import RULES, Check, Experiment
+from rlctl.checking.experiments import Check, Experiment
+from rlctl.checking.rules import RULES
 
 PROCESS_S = 18.0  # for the experiments of one process [s], besides importing and building
 MOST_GROWTH = 5.0  # times longer, for an environment whose steps are slow

@@ -10,18 +10,10 @@ from numpy.typing import NDArray
 
 from rlctl.checking import action_trials
 from rlctl.checking.action_trials import REWARD, ActionNumber, Frame, Trials
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.instance import Context, EnvironmentRaised
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact, Records
-from rlctl.checking.rules import (
-    NotApplicable,
-    NotJudged,
-    OutOfTime,
-    RuleFinding,
-    Severity,
-    check,
-    experiment,
-    list_names,
-)
+from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFinding, Severity, list_names
 
 MOST_DIMENSIONS = 64
 STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows

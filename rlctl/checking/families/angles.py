@@ -6,9 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.experiments import check
 from rlctl.checking.families import rewards
 from rlctl.checking.records import Records
-from rlctl.checking.rules import NotApplicable, RuleFinding, check
+from rlctl.checking.rules import NotApplicable, RuleFinding
 from rlctl.checking.transitions import Transitions, collect_transitions, find_unit_pairs
 
 NEAR_TURN = 1.0  # an angle that passes pi changes by 2 pi +- NEAR_TURN [rad]

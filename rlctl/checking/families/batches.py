@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.experiments import experiment
 from rlctl.checking.families.determinism import NEARLY
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance, describe
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, experiment, list_names
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.values import NUMBERS, find_batch
 from rlctl.environments.places import find_line
 from rlctl.errors import WorldFailed

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import Check, check, experiment
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.mujoco_worlds import FIELDS, read_kept_fields
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, CheckedEpisode, ChildMessage, Fact, Records, Series
-from rlctl.checking.rules import Check, NotJudged, RuleFinding, Severity, check, experiment, list_names
+from rlctl.checking.rules import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.values import find_unequal, read_attributes
 from rlctl.environments.success import SUCCESS
 

@@ -4,10 +4,11 @@ import contextlib
 from collections.abc import Iterator
 
 from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.instance import Context
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import ENDS, FIRST_SEED, CheckedEpisode, ChildMessage, Records, Shortened
-from rlctl.checking.rules import NotJudged, RuleFinding, Severity, check, experiment
+from rlctl.checking.rules import NotJudged, RuleFinding, Severity
 from rlctl.checking.values import find_assignment, read_generators, watch_unseeded
 
 EPISODES = (

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, Moment
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.families import rewards
 from rlctl.checking.families.episodes import EPISODES
 from rlctl.checking.families.incentives import FIRST, STARTS
@@ -15,10 +16,11 @@ from rlctl.checking.families.lateness import sample_ordinary_steps
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact, Records
 from rlctl.checking.regression import action_terms, fit_terms
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.transitions import Transitions, collect_transitions, find_float_leaves
-from rlctl.checking.values import Attribute, pick, read_attributes
+from rlctl.checking.values import Attribute, read_attributes
 from rlctl.checking.workspaces import Reach, find_chains, find_reach, measure_reach
+from rlctl.environments.leaves import pick
 
 SIZES = (1, 2, 3)  # of a place [numbers]
 MOST_CANDIDATES = 6

@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.families import rewards
 from rlctl.checking.instance import Context
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Records, Skipped
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.environments.success import SUCCESS
 
 LIKE_A_GOAL, LIKE_ANY = 0.9, 0.5  # of all rewards up to the last one: like a goal, like any; less: a failure

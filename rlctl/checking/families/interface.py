@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from rlctl.checking.experiments import RECORDING, check, experiment
 from rlctl.checking.instance import Context, EnvironmentRaised, display_error, find_missing_file, get_causes
 from rlctl.checking.records import FIRST_SEED, CallFailure, CheckedEpisode, ChildMessage, Form, Records
-from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.environments.graphics import opengl_fix
 from rlctl.environments.success import SUCCESS
 from rlctl.errors import RecipeError, UsageError

@@ -12,16 +12,17 @@ from typing import Any
 
 import gymnasium
 
-from rlctl.checking.bullet_worlds import find_clients
 from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.families.determinism import COMPARED_STEPS, compare, report, require_independent
 from rlctl.checking.families.interface import select_failures
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance, describe_failure
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Records, Skipped
-from rlctl.checking.rules import RULES, NotJudged, RuleFinding, Severity, check, experiment, list_names
+from rlctl.checking.rules import RULES, NotJudged, RuleFinding, Severity, list_names
 from rlctl.environments import registry
 from rlctl.environments.bullet_calls import BulletCall, record_calls
+from rlctl.environments.bullet_clients import find_clients
 
 IN_TURNS, AFTER_CLOSE = "two instances stepped alternately", "after another instance was closed"
 MOST_RESETS = 100

@@ -7,11 +7,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.experiments import check
 from rlctl.checking.families import rewards
 from rlctl.checking.families.units import find_rates
 from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.regression import EXACT, RewardFit, action_terms, fit_observation, fit_terms
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.transitions import Quantities, Transitions, collect_transitions, find_differences, find_simple
 
 MOST_ROWS = 1_200  # steps that rewards are fitted to

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl import missing_packages
-from rlctl.checking.bullet_worlds import ClientCalls, find_clients
 from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import RECORDING, check, experiment
 from rlctl.checking.instance import (
     Context,
     EnvironmentRaised,
@@ -29,10 +29,11 @@ from rlctl.checking.instance import (
     raised_by_environment,
 )
 from rlctl.checking.records import FIRST_SEED, Built, ChildMessage, Records, Skipped
-from rlctl.checking.rules import RECORDING, NotApplicable, NotJudged, RuleFinding, check, experiment
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.step_source import read_flags
 from rlctl.checking.values import find_assignment, find_author, flatten, is_task
 from rlctl.environments import registry
+from rlctl.environments.bullet_clients import ClientCalls, find_clients
 from rlctl.environments.dict_spaces import format_space
 from rlctl.environments.graphics import opengl_fix
 from rlctl.environments.info import describe_mujoco_model

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.experiments import experiment
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, experiment
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.values import is_task
 from rlctl.task.mirror import ACTION, Mirror
 

@@ -5,10 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.experiments import RECORDING, check
 from rlctl.checking.families.rewards import WITH_SEARCH
 from rlctl.checking.records import CheckedEpisode, Form, Records, Series
-from rlctl.checking.rules import RECORDING, NotJudged, RuleFinding, Severity, check, list_names
-from rlctl.checking.values import Leaf, name_leaf
+from rlctl.checking.rules import NotJudged, RuleFinding, Severity, list_names
+from rlctl.environments.leaves import Leaf, name_leaf
 
 ROUNDING = 1e-6  # Excess over a bound, relative to the bound, up to which it is float rounding
 LARGE_SHARE, SMALL_SHARE = 0.1, 0.005  # of all observations but the last ones, for an error, or a warning

@@ -9,17 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.checking.bullet_worlds import find_clients
+from rlctl.checking.experiments import experiment
 from rlctl.checking.families.derived import find_wrong_reads
 from rlctl.checking.families.robots import find_misuses
 from rlctl.checking.instance import Context, EnvironmentRaised, describe_failure
 from rlctl.checking.mujoco_calls import MujocoCalls, join_calls
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Shortened, Skipped
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, experiment, list_names
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.values import is_task
 from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
 from rlctl.checking.worlds import ANGULAR, JOINTS, VELOCITY, Array, Joint, Jump, Pair, WorldBody
 from rlctl.environments.bullet_calls import FULL_TURN, record_calls
+from rlctl.environments.bullet_clients import find_clients
 
 ENGINES = {"pybullet", "mujoco"}
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60)) + (("random", 2),) * 16

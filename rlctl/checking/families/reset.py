@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from rlctl.checking.action_trials import REWARD, Frame, Trials, find_differences
 from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.families.determinism import COMPARED_STEPS, LATE, compare, find_difference, report
 from rlctl.checking.families.rewards import has_succeeded
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Records
-from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFinding, check, experiment
+from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFinding
 from rlctl.checking.values import Attribute, find_assignment, find_unequal, flatten, read_attributes, read_generators
 
 HIDDEN_STEPS, FEWEST_COMPARED = 20, 5  # How many steps are compared with an attribute changed

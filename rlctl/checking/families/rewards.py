@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.instance import Context, EnvironmentRaised
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Records
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, check, experiment
+from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.environments.success import SUCCESS
 
 WITH_SEARCH = ("comparisons", "episodes", "starts", "search")  # they play the first process's instance

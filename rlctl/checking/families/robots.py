@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Iterator, Sequence
 
-from rlctl.checking.bullet_worlds import ClientCalls
 from rlctl.checking.families.joint_readings import find_misread_joints
 from rlctl.checking.families.motors import find_wrong_motors
 from rlctl.checking.families.readings import find_misread_quaternions, find_old_elements
@@ -11,6 +10,7 @@ from rlctl.checking.rules import RuleFinding, Severity, list_names
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import Array
 from rlctl.environments.bullet_calls import BulletCalls, ContactQuery
+from rlctl.environments.bullet_clients import ClientCalls
 
 FEWEST_QUERIES = 50
 LATE_LINK = 0.001  # [m]

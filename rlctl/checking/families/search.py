@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, action_at, zero_action
+from rlctl.checking.experiments import experiment
 from rlctl.checking.families import rewards
 from rlctl.checking.families.reset import play_after_ends
 from rlctl.checking.instance import Context
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Shortened, Skipped
-from rlctl.checking.rules import NotJudged, RuleFinding, experiment
+from rlctl.checking.rules import NotJudged, RuleFinding
 
 MOST_STEPS, MOST_EPISODES = 4_500, 60  # in all: they find the goal of the bundled `reach` from most seeds
 ENOUGH_EPISODES, STEPS_AFTER = 11, 2_000  # Of a slow environment; of the episodes after the search

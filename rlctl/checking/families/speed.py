@@ -7,11 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments import check, experiment
 from rlctl.checking.instance import Context, Instance, Timer
 from rlctl.checking.profiling import Profile, Stopwatch, TimedCall, find_own_code
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import ChildMessage, Fact, Records
-from rlctl.checking.rules import NotJudged, RuleFinding, Severity, check, experiment, list_names
+from rlctl.checking.rules import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.values import find_author, find_batch, is_task
 from rlctl.environments.bullet_calls import visible_to_profilers
 from rlctl.output import format_duration

@@ -6,9 +6,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.experiments import check
 from rlctl.checking.families import rewards
 from rlctl.checking.records import Records
-from rlctl.checking.rules import NotApplicable, RuleFinding, check
+from rlctl.checking.rules import NotApplicable, RuleFinding
 from rlctl.checking.transitions import Quantities, Transitions, collect_transitions, find_lengths, find_unit_pairs
 
 MOST_ROWS = 2_000

@@ -5,8 +5,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import split_names
-from rlctl.run.episode import RecordedEpisode
-from rlctl.runs.diagnosis.history import History
+from rlctl.play.episode import RecordedEpisode
+from rlctl.runs.diagnosis.history import RunHistory
 
 Array = NDArray[np.float64]
 
@@ -18,7 +18,7 @@ _MOST_POSITION_SPEED = 50.0  # [m/s]
 _MOST_OVERLAP = 0.05  # [m]; feet that hit the ground reach 0.02, a fall 0.03
 
 
-def _actions(run: History) -> list[Array]:
+def _actions(run: RunHistory) -> list[Array]:
     """Return each episode's actions, shape (T, elements), as fractions of half their range; empty without limits."""
     if run.env is None:
         return []
@@ -30,7 +30,7 @@ def _actions(run: History) -> list[Array]:
     return [((actions - middle) / half).reshape(len(actions), -1).astype(np.float64) for actions in long]
 
 
-def shakes(run: History) -> str | None:
+def shakes(run: RunHistory) -> str | None:
     """Actions reverse from step to step by a large part of their range."""
     changes = []
     for actions in _actions(run):
@@ -46,7 +46,7 @@ def shakes(run: History) -> str | None:
     )
 
 
-def alternates(run: History) -> str | None:
+def alternates(run: RunHistory) -> str | None:
     """An action changes its direction in nearly every step; no motor or robot can follow that."""
     measured = [_measure_changes(actions) for actions in _actions(run)]
     if not measured:
@@ -69,7 +69,7 @@ def _measure_changes(actions: Array) -> Array:
     return np.stack([reversals, np.abs(change).mean(axis=0)])
 
 
-def stands_still(run: History) -> str | None:
+def stands_still(run: RunHistory) -> str | None:
     """The actions are nearly zero."""
     sizes = [float(np.abs(actions).mean()) for actions in _actions(run)]
     if not sizes or run.progress < 0.5 or (largest := max(sizes)) > 0.05:
@@ -77,17 +77,17 @@ def stands_still(run: History) -> str | None:
     return f"the mean size of actions is {largest:.1%} of half the action range"
 
 
-def mostly_constant_reward(run: History) -> str | None:
+def mostly_constant_reward(run: RunHistory) -> str | None:
     """Most of the positive reward is the same in every step, whatever the policy does."""
     return _describe_constant_reward(run, 0.7)
 
 
-def only_constant_reward(run: History) -> str | None:
+def only_constant_reward(run: RunHistory) -> str | None:
     """Nearly all of the positive reward is the same in every step."""
     return _describe_constant_reward(run, 0.9)
 
 
-def _describe_constant_reward(run: History, least: float) -> str | None:
+def _describe_constant_reward(run: RunHistory, least: float) -> str | None:
     weights = run.env.reward_weights if run.env is not None else {}
     shares = [share for episode in run.episodes if (share := _constant_share(episode, weights)) is not None]
     if not shares or (share := float(np.median(shares))) < least:
@@ -106,7 +106,7 @@ def _constant_share(episode: RecordedEpisode, weights: dict[str, float]) -> floa
     return float(positive[constant].sum()) / total if total > 0 else None
 
 
-def impossible_motion(run: History) -> str | None:
+def impossible_motion(run: RunHistory) -> str | None:
     """Speeds, or jumps of positions, that no real robot reaches."""
     if run.env is None:
         return None
@@ -128,7 +128,7 @@ def _fast(name: str, unit: str, rows: Array, control_dt: float | None) -> list[t
     return [(float(speeds.max() / limit), f"{name} moves at up to {speeds.max():,.0f} {kind} in a recorded episode")]
 
 
-def bodies_overlap(run: History) -> str | None:
+def bodies_overlap(run: RunHistory) -> str | None:
     """Bodies overlap far in half of the episodes of the last evaluations."""
     depths = run.evaluation_curve("overlap").values[-2:]
     if not len(depths) or (depth := float(depths.min())) < _MOST_OVERLAP:
@@ -136,7 +136,7 @@ def bodies_overlap(run: History) -> str | None:
     return f"bodies overlap by {100 * depth:.0f} cm or more in half of the episodes of the last evaluations"
 
 
-def badly_scaled_observations(run: History) -> str | None:
+def badly_scaled_observations(run: RunHistory) -> str | None:
     """Observations are not normalised, and their scales differ by a factor of 1,000."""
     settings = run.recipe.get("normalize")
     if (isinstance(settings, dict) and settings.get("observation", True)) or not run.episodes:
@@ -153,7 +153,7 @@ def badly_scaled_observations(run: History) -> str | None:
     return f"not normalised: the standard deviation of {large} is {most:.2g}, that of {small} is {least:.2g}"
 
 
-def _named_observations(episode: RecordedEpisode, run: History) -> dict[str, Array]:
+def _named_observations(episode: RecordedEpisode, run: RunHistory) -> dict[str, Array]:
     """Return observations by name, each of shape (T + 1, elements)."""
     sizes = run.env.observation_sizes if run.env is not None else {}
     return {

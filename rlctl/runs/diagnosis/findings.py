@@ -16,9 +16,9 @@ import yaml
 
 from rlctl.errors import UsageError, check_name
 from rlctl.recipe.hyperparameters import ON_POLICY
-from rlctl.run.directory import RunDirectory
 from rlctl.runs.diagnosis import episode_signs, record_signs, signs
-from rlctl.runs.diagnosis.history import History
+from rlctl.runs.diagnosis.history import RunHistory
+from rlctl.runs.directory import RunDirectory
 
 _NOT = "not "
 
@@ -74,9 +74,9 @@ def list_signs() -> dict[str, signs.Sign]:
     }
 
 
-def diagnose(run: RunDirectory | History) -> list[Finding]:
+def diagnose(run: RunDirectory | RunHistory) -> list[Finding]:
     """Return what the records of a run show, warnings first; raises `ArtifactError` for a table that is not CSV."""
-    history = run if isinstance(run, History) else History(run)
+    history = run if isinstance(run, RunHistory) else RunHistory(run)
     functions = list_signs()
     read_sign = functools.cache(lambda name: functions[name](history))
     texts = _texts()["findings"]
@@ -88,7 +88,7 @@ def diagnose(run: RunDirectory | History) -> list[Finding]:
     return sorted(findings, key=lambda finding: list(Grade).index(finding.grade))
 
 
-def _check(text: dict[str, Any], read_sign: Callable[[str], str | None], history: History) -> Finding | None:
+def _check(text: dict[str, Any], read_sign: Callable[[str], str | None], history: RunHistory) -> Finding | None:
     matches = [
         names
         for names in text["when"]
@@ -109,7 +109,7 @@ def _check(text: dict[str, Any], read_sign: Callable[[str], str | None], history
     )
 
 
-def _settings(names: Iterable[str], history: History) -> Iterable[Setting]:
+def _settings(names: Iterable[str], history: RunHistory) -> Iterable[Setting]:
     for name in names:
         row = _texts()["settings"][name]
         if name not in history.parameters or (row.get("on_policy") and history.recipe.get("algo") not in ON_POLICY):

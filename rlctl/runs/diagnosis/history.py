@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RlctlError
+from rlctl.play.episode import RecordedEpisode, load_episode
 from rlctl.policy.file import PolicyFile
 from rlctl.recipe import recipe, sources
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
-from rlctl.run.directory import RunDirectory
-from rlctl.run.episode import RecordedEpisode, load_episode
-from rlctl.runs.summary import Rows, list_points, read_table
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.tables import Rows, list_points, read_table
 
 Array = NDArray[np.float64]
 _Record = TypeVar("_Record")
@@ -58,7 +58,7 @@ class Curve:
         return float((last - first) / error)
 
 
-class History:
+class RunHistory:
     """Reads the records of a run; a missing record is empty, a table that is not CSV is an `ArtifactError`."""
 
     def __init__(self, run: RunDirectory) -> None:

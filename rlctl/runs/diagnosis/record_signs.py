@@ -8,12 +8,12 @@ import numpy as np
 from rlctl.output import format_count
 from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import Recipe
-from rlctl.runs.diagnosis.history import FEW_ROWS, LEAST_ROWS, Curve, History
+from rlctl.runs.diagnosis.history import FEW_ROWS, LEAST_ROWS, Curve, RunHistory
 
 _MOST_NORMALIZED_REWARD = 10.0  # where SB3's `VecNormalize` clips
 
 
-def critic_explains_nothing(run: History) -> str | None:
+def critic_explains_nothing(run: RunHistory) -> str | None:
     """The value function explains nothing of the returns."""
     explained = run.curve("explained_variance")
     if len(explained) < LEAST_ROWS:
@@ -22,7 +22,7 @@ def critic_explains_nothing(run: History) -> str | None:
     return f"explained variance {median:.2f} (median of the second half)" if median < 0.1 else None
 
 
-def values_explode(run: History) -> str | None:
+def values_explode(run: RunHistory) -> str | None:
     """The critic predicts more than rewards can add up to."""
     value, most = run.curve("value"), _largest_value(run)
     if len(value) < FEW_ROWS or most is None:
@@ -34,7 +34,7 @@ def values_explode(run: History) -> str | None:
     return f"the critic predicts up to {peak:.3g} (last third: {last:.3g}), but rewards add up to {most:.3g} at most"
 
 
-def gradients_explode(run: History) -> str | None:
+def gradients_explode(run: RunHistory) -> str | None:
     """Gradients are far larger than errors of the value function can explain."""
     norm, most = run.curve("gradient_norm"), _largest_value(run)
     if len(norm) < FEW_ROWS or most is None or (peak := float(norm.values.max())) < 1000 * max(most, 1.0):
@@ -42,7 +42,7 @@ def gradients_explode(run: History) -> str | None:
     return f"the gradient norm reaches {peak:.2g}, but rewards add up to {most:.3g} at most"
 
 
-def _largest_value(run: History) -> float | None:
+def _largest_value(run: RunHistory) -> float | None:
     """Return the most that discounted rewards can add up to, as the critic sees them; None where it is not known."""
     gamma, settings = run.parameters.get("gamma"), run.recipe.get("normalize")
     if not isinstance(gamma, float) or not 0 <= gamma < 1 or not run.episodes:
@@ -53,19 +53,19 @@ def _largest_value(run: History) -> float | None:
     return max(largest / (1 - gamma), float(np.abs(run.curve("return").values).max(initial=0.0)))
 
 
-def policy_hardly_changes(run: History) -> str | None:
+def policy_hardly_changes(run: RunHistory) -> str | None:
     """Updates change nothing, before a schedule has lowered the learning rate."""
     change = _read_change(run) if len(run.metrics) >= LEAST_ROWS else None
     return change.describe(".1e") if change and change.kl <= 1e-4 and change.clipped <= 1e-3 else None
 
 
-def policy_jumps(run: History) -> str | None:
+def policy_jumps(run: RunHistory) -> str | None:
     """Updates change the policy several times more than PPO intends."""
     change = _read_change(run)
     return change.describe() if change and (change.kl >= 0.2 or change.clipped >= 0.55) else None
 
 
-def policy_is_replaced(run: History) -> str | None:
+def policy_is_replaced(run: RunHistory) -> str | None:
     """Each update replaces the policy by a very different one, and none of them is good."""
     change = _read_change(run)
     return change.describe() if change and not run.is_good and change.kl >= 1 and change.clipped >= 0.7 else None
@@ -82,13 +82,13 @@ class _Change(NamedTuple):
         return f"approx_kl {self.kl:{form}}, clip fraction {self.clipped:.1%} (medians)"
 
 
-def _read_change(run: History) -> _Change | None:
+def _read_change(run: RunHistory) -> _Change | None:
     curves = [run.curve(name).values for name in ("approx_kl", "clip_fraction")]
     early = [values[: (2 * len(values) + 2) // 3] for values in curves]
     return _Change(*(float(np.median(values)) for values in early)) if min(map(len, curves)) >= FEW_ROWS else None
 
 
-def exploration_vanishes(run: History) -> str | None:
+def exploration_vanishes(run: RunHistory) -> str | None:
     """The policy is almost deterministic halfway through the training, or from the beginning."""
     if len(curve := _exploration(run)) < LEAST_ROWS:
         return None
@@ -98,12 +98,12 @@ def exploration_vanishes(run: History) -> str | None:
     return f"exploration {curve.values[0]:.2g} at first, {half:.2g} halfway (1 is half the range of an action)"
 
 
-def _exploration(run: History) -> Curve:
+def _exploration(run: RunHistory) -> Curve:
     measured = run.curve("exploration")
     return measured if len(measured) else run.curve("std")
 
 
-def exploration_does_not_fall(run: History) -> str | None:
+def exploration_does_not_fall(run: RunHistory) -> str | None:
     """The policy is as random at the end as at the beginning, or more so."""
     if len(curve := _exploration(run)) < LEAST_ROWS or run.progress < 0.5:
         return None
@@ -111,7 +111,7 @@ def exploration_does_not_fall(run: History) -> str | None:
     return f"exploration {first:.2g} in the first third, {last:.2g} in the last" if last >= 0.97 * first else None
 
 
-def exploration_explodes(run: History) -> str | None:
+def exploration_explodes(run: RunHistory) -> str | None:
     """The policy becomes far more random than the actions' range."""
     if len(curve := _exploration(run)) < FEW_ROWS:
         return None
@@ -120,7 +120,7 @@ def exploration_explodes(run: History) -> str | None:
     return f"exploration grows from {first:.2g} to {last:.2g} of half the action range" if grows else None
 
 
-def saturated(run: History) -> str | None:
+def saturated(run: RunHistory) -> str | None:
     """Nearly all actions are at a limit of their range."""
     curve = run.curve("action_saturation")
     if len(curve) < FEW_ROWS or (last := curve.thirds()[1]) < 0.8:
@@ -128,19 +128,19 @@ def saturated(run: History) -> str | None:
     return f"{last:.0%} of the actions are at a limit in the last third"
 
 
-def learner_slow(run: History) -> str | None:
+def learner_slow(run: RunHistory) -> str | None:
     """Updates take most of the time."""
     shares = _read_shares(run)
     return shares.describe() if shares and shares.learner >= 0.75 else None
 
 
-def policy_slow(run: History) -> str | None:
+def policy_slow(run: RunHistory) -> str | None:
     """Choosing actions takes more time than stepping the environments."""
     shares = _read_shares(run)
     return shares.describe() if shares and shares.policy > max(0.4, shares.environments) else None
 
 
-def environments_slow(run: History) -> str | None:
+def environments_slow(run: RunHistory) -> str | None:
     """Slow environments take most of the time."""
     shares = _read_shares(run)
     if shares is None or shares.environments < 0.5 or shares.learner > 0.2 or shares.steps_per_s > 300:
@@ -164,7 +164,7 @@ class _Shares(NamedTuple):
         )
 
 
-def _read_shares(run: History) -> _Shares | None:
+def _read_shares(run: RunHistory) -> _Shares | None:
     playing = run.curve("playing")
     if len(playing) < LEAST_ROWS:
         return None
@@ -176,18 +176,18 @@ def _median(curve: Curve) -> float:
     return float(np.median(curve.values)) if len(curve) else 0.0
 
 
-def observations_outside(run: History) -> str | None:
+def observations_outside(run: RunHistory) -> str | None:
     """Observations were outside their space."""
     count = run.status.get("observations_outside")
     return f"outside their space: {format_count(count, 'observation')}" if isinstance(count, int) and count else None
 
 
-def diverged(run: History) -> str | None:
+def diverged(run: RunHistory) -> str | None:
     """Losses or weights were not finite."""
     return str(run.status.get("error")).partition("\n")[0] if run.status.get("status") == "diverged" else None
 
 
-def model_file_missing(run: History) -> str | None:
+def model_file_missing(run: RunHistory) -> str | None:
     """The run failed because a model could not be loaded."""
     error = str(run.status.get("error") or "")
     names = (".urdf", ".xml", ".sdf", ".mjcf", ".obj", ".stl")
@@ -196,7 +196,7 @@ def model_file_missing(run: History) -> str | None:
     return error.partition("\n")[0]
 
 
-def last_stage_never_begun(run: History) -> str | None:
+def last_stage_never_begun(run: RunHistory) -> str | None:
     """The training is over, and ended before the last stage of its curriculum."""
     reached = run.curve("stage").values
     if run.status.get("status") != "finished" or not len(reached) or reached[-1] >= run.stage_count:
@@ -204,7 +204,7 @@ def last_stage_never_begun(run: History) -> str | None:
     return f"the training ended in stage {reached[-1]:.0f} of {run.stage_count}"
 
 
-def stage_never_succeeds(run: History) -> str | None:
+def stage_never_succeeds(run: RunHistory) -> str | None:
     """A stage before the last took a large part of all steps, and none of its episodes succeeded."""
     reached, success = run.curve("stage"), run.curve("success")
     if not len(reached) or not len(success) or reached.values[-1] >= run.stage_count:
@@ -217,7 +217,7 @@ def stage_never_succeeds(run: History) -> str | None:
     return f"no episode succeeded in stage {stage:.0f} of {run.stage_count}, which has taken {spent:,.0f} steps"
 
 
-def goals_without_hindsight(run: History) -> str | None:
+def goals_without_hindsight(run: RunHistory) -> str | None:
     """The environment has goals and a sparse reward, and was trained without hindsight replay."""
     if run.env is None or not run.recipe or has_sparse_reward([episode.rewards for episode in run.episodes]) is False:
         return None

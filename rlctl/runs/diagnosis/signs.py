@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, History
+from rlctl.runs.diagnosis.history import LEAST_ROWS, Curve, RunHistory
 
-Sign = Callable[[History], str | None]
+Sign = Callable[[RunHistory], str | None]
 
 _LEAST_RETURNS = 6
 _LEAST_EVALUATIONS = 4
@@ -19,7 +19,7 @@ _LARGE_FALL = 0.4  # fraction of the largest return
 _SAME = 0.1  # difference of success rates of evaluations that chance explains
 
 
-def flat(run: History) -> str | None:
+def flat(run: RunHistory) -> str | None:
     """Neither the training's return nor the evaluations' rises, with half of the training done."""
     if run.progress < 0.5:
         return None
@@ -39,7 +39,7 @@ def flat(run: History) -> str | None:
     return "; ".join(parts)
 
 
-def no_longer_rises(run: History) -> str | None:
+def no_longer_rises(run: RunHistory) -> str | None:
     """Evaluations reach the time limit, but their return hardly rises after the middle of the training."""
     returns, lengths = run.evaluation_curve("return"), run.evaluation_curve("length")
     if len(returns) < _LEAST_EVALUATIONS or run.progress < 0.5 or run.is_good:
@@ -63,7 +63,7 @@ def _rises(success: Curve) -> bool:
     return len(success) > 1 and float(success.values[1:].max() - success.values[0]) > 0.1
 
 
-def success_rises(run: History) -> str | None:
+def success_rises(run: RunHistory) -> str | None:
     """The success rate of the evaluations rises, so the policy does more than collect a constant reward."""
     success = run.evaluation_curve("success")
     if len(success) < 2 or not _rises(success):
@@ -71,7 +71,7 @@ def success_rises(run: History) -> str | None:
     return f"success of the evaluations rises from {success.values[0]:.1%} to {success.values[1:].max():.1%}"
 
 
-def never_succeeds(run: History) -> str | None:
+def never_succeeds(run: RunHistory) -> str | None:
     """Success is reported, but hardly any episode succeeds."""
     curves = [curve for curve in run.successes if len(curve)]
     if not curves or run.progress < 0.5 or (best := max(float(curve.values.max()) for curve in curves)) > _NEVER:
@@ -79,7 +79,7 @@ def never_succeeds(run: History) -> str | None:
     return f"success at most {best:.1%}"
 
 
-def seldom_succeeds(run: History) -> str | None:
+def seldom_succeeds(run: RunHistory) -> str | None:
     """Success is reported, and fewer than half of the episodes succeed at best."""
     curves = [curve for curve in run.successes if len(curve)]
     if not curves or run.progress < 0.5 or (best := max(float(curve.values.max()) for curve in curves)) >= _HALF:
@@ -87,7 +87,7 @@ def seldom_succeeds(run: History) -> str | None:
     return f"success at most {best:.1%}"
 
 
-def succeeds_by_exploring(run: History) -> str | None:
+def succeeds_by_exploring(run: RunHistory) -> str | None:
     """Training episodes succeed with exploration noise, but evaluations never do, up to the end."""
     evaluated, trained, reached = run.evaluation_curve("success"), run.curve("success"), run.curve("stage")
     successes = trained.values
@@ -101,7 +101,7 @@ def succeeds_by_exploring(run: History) -> str | None:
     return f"success at most {evaluated.values.max():.1%} in {len(evaluated)} evaluations, {best:.0%} while training"
 
 
-def short_episodes(run: History) -> str | None:
+def short_episodes(run: RunHistory) -> str | None:
     """Episodes are ended early by termination, in evaluations as in training, and do not become longer."""
     lengths, evaluated, terminated = run.curve("length"), run.evaluation_curve("length"), run.curve("terminated")
     if len(lengths) < _LEAST_RETURNS or not len(evaluated) or (len(terminated) and terminated.values.mean() < 0.9):
@@ -114,7 +114,7 @@ def short_episodes(run: History) -> str | None:
     return f"episodes last {last:.0f} steps of {longest:.0f}, {first:.0f} in the first third"
 
 
-def swings(run: History) -> str | None:
+def swings(run: RunHistory) -> str | None:
     """The return falls again and again by a large part of its range."""
     curve = run.curve("return") if len(run.curve("return")) >= LEAST_ROWS else run.evaluation_curve("return")
     if len(curve) < _LEAST_RETURNS:
@@ -139,7 +139,7 @@ def _count_drops(curve: Curve, least: float) -> int:
     return drops
 
 
-def collapsed(run: History) -> str | None:
+def collapsed(run: RunHistory) -> str | None:
     """The return rose, then fell and did not recover, in training and in evaluations."""
     parts = []
     for curve, what, least in (
@@ -172,7 +172,7 @@ def _find_fall(curve: Curve) -> tuple[float, float, float, float] | None:
     return float(smooth[0]), float(smooth[at]), end, float(curve.steps[min(at + window - 1, len(curve) - 1)])
 
 
-def return_falls(run: History) -> str | None:
+def return_falls(run: RunHistory) -> str | None:
     """The return is far lower at the end than at the beginning; three rows suffice."""
     curve = run.curve("return")
     if len(curve) < _LEAST_TO_FALL:
@@ -186,7 +186,7 @@ def return_falls(run: History) -> str | None:
     return f"return falls from {first:.4g} to {last:.4g} at step {curve.steps[-1]:,.0f}"
 
 
-def ends_low(run: History) -> str | None:
+def ends_low(run: RunHistory) -> str | None:
     """The training is over, and in its second half the success rate neither rose nor reached a half."""
     curve = run.evaluation_curve("success")
     if len(curve) < _LEAST_EVALUATIONS or run.progress < 1:
@@ -201,7 +201,7 @@ def ends_low(run: History) -> str | None:
     )
 
 
-def early_peak(run: History) -> str | None:
+def early_peak(run: RunHistory) -> str | None:
     """The best evaluation was long ago, and those at the end are worse."""
     curve = run.evaluation_curve("return")
     if len(curve) < _LEAST_EVALUATIONS or run.progress < 0.5:
@@ -217,7 +217,7 @@ def early_peak(run: History) -> str | None:
     )
 
 
-def penalties_dominate(run: History) -> str | None:
+def penalties_dominate(run: RunHistory) -> str | None:
     """At the end the negative reward terms sum to more than three times the positive ones."""
     means = {name: curve.thirds()[1] for name, curve in run.terms().items() if len(curve) >= 3}
     negative = -sum(value for value in means.values() if value < 0)
@@ -229,7 +229,7 @@ def penalties_dominate(run: History) -> str | None:
     return f"per episode rewards are {positive:.3g} and penalties -{negative:.3g}; the largest penalty is {largest}"
 
 
-def episodes_shrink(run: History) -> str | None:
+def episodes_shrink(run: RunHistory) -> str | None:
     """The return rises while episodes are terminated sooner and sooner."""
     lengths, terminated = run.curve("length"), run.curve("terminated")
     if len(lengths) < _LEAST_RETURNS or run.curve("return").rise() < 3:
@@ -241,7 +241,7 @@ def episodes_shrink(run: History) -> str | None:
     return f"episodes shrink from {first:.0f} to {last:.0f} steps while the return rises" if shrinks else None
 
 
-def return_rises(run: History) -> str | None:
+def return_rises(run: RunHistory) -> str | None:
     """The training's return rises."""
     curve = run.curve("return")
     if len(curve) < _LEAST_RETURNS or curve.rise() < 3:
@@ -250,7 +250,7 @@ def return_rises(run: History) -> str | None:
     return f"return rises from {first:.4g} to {last:.4g}"
 
 
-def distance_grows(run: History) -> str | None:
+def distance_grows(run: RunHistory) -> str | None:
     """Episodes end farther and farther from the goal."""
     curve = run.curve("distance")
     if len(curve) < _LEAST_RETURNS or run.progress < 0.5 or curve.rise() < 3:
@@ -259,7 +259,7 @@ def distance_grows(run: History) -> str | None:
     return f"the distance to the goal grows from {first:.3g} to {last:.3g}" if last > 1.2 * first else None
 
 
-def time_limit_terminates(run: History) -> str | None:
+def time_limit_terminates(run: RunHistory) -> str | None:
     """Every episode ends at the same step as terminated: a time limit that should truncate."""
     lengths, terminated = run.curve("length"), run.curve("terminated")
     if len(lengths) < 5 or len(terminated) < 5 or np.ptp(lengths.values) > 0 or terminated.values.min() < 1:

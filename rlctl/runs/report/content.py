@@ -12,15 +12,15 @@ import numpy as np
 from rlctl.environments import installed
 from rlctl.errors import ArtifactError, RlctlError, UsageError, short_repr
 from rlctl.output import format_duration
+from rlctl.play.episode import RecordedEpisode
 from rlctl.recipe.recipe import NOT_SET, Recipe
 from rlctl.recipe.stages import format_value
-from rlctl.run.directory import is_group
-from rlctl.run.episode import RecordedEpisode
-from rlctl.runs.comparison import find_recipe_changes
+from rlctl.runs.compare.comparison import find_recipe_changes
 from rlctl.runs.diagnosis.findings import Finding
+from rlctl.runs.directory import is_group
 from rlctl.runs.listing import find_runs_of
-from rlctl.runs.show import RunDescription
-from rlctl.runs.summary import Rows, list_points
+from rlctl.runs.report.show import RunDescription
+from rlctl.runs.tables import Rows, list_points
 
 _SETTINGS_NAMED = 3  # in the name of a recipe
 _GOOD_SUCCESS = 0.5

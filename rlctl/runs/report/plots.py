@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import UsageError
 from rlctl.evaluation.robustness import Axis, Cell, FailedCell, PushTest, Robustness, RobustnessMap
-from rlctl.runs.comparison_map import MapComparison, MapDifference
+from rlctl.runs.compare.maps import MapComparison, MapDifference
 from rlctl.runs.report.content import RecipeRuns, RunReport, mean_curve
 
 _SIZE = (4.4, 2.7)  # [inches]: the width of a phone, so that text is readable there

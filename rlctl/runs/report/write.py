@@ -10,12 +10,12 @@ import jinja2
 from rlctl import output
 from rlctl.errors import RlctlError
 from rlctl.evaluation.request import EvalRequest
-from rlctl.runs.comparison import compare_runs
-from rlctl.runs.comparison_report import describe_candidate, describe_seeds, describe_tests
+from rlctl.runs.compare.comparison import compare_runs
+from rlctl.runs.compare.report import describe_candidate, describe_seeds, describe_tests
 from rlctl.runs.report import content
 from rlctl.runs.report.content import RunReport
-from rlctl.runs.show import describe_robustness, tabulate
-from rlctl.runs.summary import Rows
+from rlctl.runs.report.show import describe_robustness, tabulate
+from rlctl.runs.tables import Rows
 from rlctl.storage import files
 
 _PICTURES = 6  # of an episode

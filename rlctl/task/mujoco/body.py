@@ -18,7 +18,7 @@ from rlctl.task.mujoco.world import Array, Rows
 from rlctl.task.rotations import rotate
 
 if TYPE_CHECKING:
-    from rlctl.task.mujoco.sim import MujocoSim
+    from rlctl.task.mujoco.owner import BodyOwner
 
 XYZW, WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
 """Indices that reorder MuJoCo's quaternions (w, x, y, z) for rlctl, and back."""
@@ -35,7 +35,7 @@ class MujocoBody(MujocoMotors):
 
     engine = "MuJoCo"
 
-    def __init__(self, sim: MujocoSim, parts: Parts) -> None:
+    def __init__(self, sim: BodyOwner, parts: Parts) -> None:
         super().__init__(sim, parts)
         self.name, self.file, self.fixed = parts.name, parts.file.path, parts.fixed
         self.base_name, self.terrain = parts.base_name, parts.terrain
@@ -138,7 +138,7 @@ class MujocoBody(MujocoMotors):
         positions = sim.data.xipos[[self.find_link(link) for link in links]]
         return [(x, y, z) for x, y, z in positions.tolist()]
 
-    def _single(self, method: str) -> MujocoSim:
+    def _single(self, method: str) -> BodyOwner:
         """Return the simulation; raises `UsageError` if it has many worlds."""
         if self._sim.world.count not in (None, 1):
             raise UsageError(

@@ -8,13 +8,10 @@ constant force on those joints whose damper gave more than its limit.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from rlctl.task.mujoco.world import MujocoWorld
 
 IDEAL_DAMPING = 1000.0
 """Damping of an ideal motor, in units of inertia / time of a physics step. A wheel moves a robot that is 100 times as
@@ -28,10 +25,22 @@ def make_ideal_motors(motors: int) -> NDArray[np.float64]:
     return np.zeros((motors, 5))
 
 
+class SteppedWorld(Protocol):
+    """A `MujocoWorld`, for its ideal motors."""
+
+    mujoco: Any
+    mj_model: Any
+    mj_data: Any
+    extra: dict[str, NDArray[Any]]
+
+    def model(self, name: str) -> NDArray[Any]:
+        """Return a field of the model, or one of `extra`, to change it."""
+
+
 class IdealMotors:
     """The ideal motors of a single world; `MujocoWorld.extra` has their values, which a reset restores."""
 
-    def __init__(self, world: MujocoWorld) -> None:
+    def __init__(self, world: SteppedWorld) -> None:
         self._world = world
 
     def switch_on(self, motors: Any, *, damping: Any, max_force: Any, gain: Any, max_speed: Any) -> None:

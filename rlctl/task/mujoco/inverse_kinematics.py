@@ -9,14 +9,14 @@ import numpy as np
 from rlctl.task.body import Array
 
 if TYPE_CHECKING:
+    from rlctl.task.mujoco.owner import BodyOwner
     from rlctl.task.mujoco.parts import Parts
-    from rlctl.task.mujoco.sim import MujocoSim
 
 _STEPS, _CLOSE, _DAMPING = 100, 1e-4, 0.05  # -, [m] and [rad], -
 _LONGEST = 0.3  # [rad or m], of a step of one joint
 
 
-def solve(sim: MujocoSim, parts: Parts, link: int, position: Array, turn: Array | None) -> Array:
+def solve(sim: BodyOwner, parts: Parts, link: int, position: Array, turn: Array | None) -> Array:
     """Return joint positions, shape (joints,), that bring a link's frame to a pose; `turn` is (w, x, y, z)."""
     mujoco, model = sim.mujoco, sim.model
     data: Any = mujoco.MjData(model)

@@ -19,7 +19,7 @@ from rlctl.task.mujoco.parts import Parts, find_slice
 from rlctl.task.mujoco.world import Rows
 
 if TYPE_CHECKING:
-    from rlctl.task.mujoco.sim import MujocoSim
+    from rlctl.task.mujoco.owner import BodyOwner
 
 _UNLIMITED = 1e9  # [N m or N]
 _USUAL_SPEED = 10.0  # [rad/s or m/s], of joints whose file gives no limit
@@ -42,7 +42,7 @@ class _Mode(NamedTuple):
 class MujocoMotors(Body):
     """The part of `MujocoBody` that drives its joints."""
 
-    def __init__(self, sim: MujocoSim, parts: Parts) -> None:
+    def __init__(self, sim: BodyOwner, parts: Parts) -> None:
         self._sim, self.parts = sim, parts
         self._fields = sim.fields
         self._modes: dict[tuple[str, ...], _Mode] = {}

@@ -17,8 +17,8 @@ from rlctl.policy.actor import Exploration
 from rlctl.policy.file import PolicyFile
 from rlctl.recipe.recipe import ON_POLICY, Recipe
 from rlctl.recipe.sources import resolve_with_stages
-from rlctl.run import lookup
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs import lookup
+from rlctl.runs.train_request import TrainRequest
 from rlctl.training import request as training
 from rlctl.training.distilling.distill_request import DistillRequest
 from rlctl.training.distilling.teacher import Teacher

@@ -18,9 +18,9 @@ from rlctl.training import snapshot
 from rlctl.training.demonstrations import set_noise
 from rlctl.training.distilling.labelled_steps import LabelledSteps
 from rlctl.training.on_policy import OnPolicyRollouts
+from rlctl.training.progress import Progress
 from rlctl.training.rollouts import Check, WorkerVecEnv
 from rlctl.training.snapshot import Tensors
-from rlctl.training.status import Progress
 
 TEACHER_SHARE = 0.2
 """Share of the distillation in which the teacher also acts, in fewer and fewer environments."""

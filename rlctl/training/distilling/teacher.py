@@ -9,7 +9,7 @@ from rlctl.errors import ArtifactError
 from rlctl.play import messages
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.load import load_policy
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 from rlctl.storage import files
 
 

@@ -28,7 +28,7 @@ STEP = "command: step\nscale: 0.03\nmeasured: {position: joint_positions}\n"
 
 @pytest.fixture(scope="module")
 def reach_server(tmp_path_factory):
-    from rlctl.run.lookup import find_policy
+    from rlctl.runs.lookup import find_policy
 
     server = RunningServer(find_policy("reach", PRETRAINED).file, watchdog=False)
     yield server
@@ -151,7 +151,7 @@ def serve_answer(metadata, answer):
 
 @pytest.mark.pybullet
 def test_self_test(tmp_path):
-    from rlctl.run.lookup import find_policy
+    from rlctl.runs.lookup import find_policy
     from rlctl_robot.serve.request import ServeRequest
     from rlctl_robot.serve.serve import make_server
 

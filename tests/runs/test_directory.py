@@ -12,7 +12,7 @@ import pytest
 
 from rlctl.errors import ArtifactError, RunTaken, UsageError
 from rlctl.recipe.recipe import Recipe
-from rlctl.run import directory
+from rlctl.runs import directory
 
 
 def error(kind, call, *arguments):
@@ -106,7 +106,7 @@ def test_a_file_system_without_locks_keeps_nobody_out(monkeypatch, root, make_ru
 def test_a_lock_ends_with_its_process(root, make_run):
     run = make_run("reach", "2026-01-01_10-00-00_s0")
     code = (
-        "import sys, time; from pathlib import Path; from rlctl.run.directory import RunDirectory\n"
+        "import sys, time; from pathlib import Path; from rlctl.runs.directory import RunDirectory\n"
         f"lock = RunDirectory(Path({json.dumps(str(run.path))})).lock(); print('locked', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as writer:

@@ -18,7 +18,7 @@ from rlctl.hub import store
 from rlctl.output import format_duration
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.shipped import PRETRAINED, find_shipped_policy
-from rlctl.run.directory import GROUP_FILE, ROOT, TUNE_FILE, RunDirectory, is_group
+from rlctl.runs.directory import GROUP_FILE, ROOT, TUNE_FILE, RunDirectory, is_group
 
 _MOST_COMPARED = 50  # older runs whose scores are looked at
 _IN_TASK = ("*/run.json", "*_seeds/*/run.json")

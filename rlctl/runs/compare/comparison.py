@@ -18,13 +18,14 @@ from rlctl.evaluation.evaluate import Evaluation, run_evaluation
 from rlctl.evaluation.request import EvalRequest
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference, find_mixed
-from rlctl.run.directory import RunDirectory
-from rlctl.run.lookup import describe_source_change
+from rlctl.runs.compare.margin import check_margin
+from rlctl.runs.compare.policy_alone import PolicyAlone, find_same_policy, reports_success
+from rlctl.runs.compare.significance import MeanDifference, Quantity, Verdict, compare_episodes, compare_seeds
+from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import find_runs_of
-from rlctl.runs.margin import check_margin
-from rlctl.runs.policy_alone import PolicyAlone, find_same_policy, reports_success
-from rlctl.runs.significance import MeanDifference, Quantity, Verdict, compare_episodes, compare_seeds
-from rlctl.runs.summary import read_table, summarize
+from rlctl.runs.lookup import describe_source_change
+from rlctl.runs.summary import summarize
+from rlctl.runs.tables import read_table
 
 THRESHOLD = 0.9  # the default threshold, a success rate
 _POLICIES = (".safetensors", ".onnx")

@@ -13,9 +13,9 @@ from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.policy.file import PolicyFile, PolicyInfo, Score
-from rlctl.run import directory, lookup
-from rlctl.run.directory import RunDirectory
-from rlctl.run.lookup import find_policy, find_run
+from rlctl.runs import directory, lookup
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.lookup import find_policy, find_run
 
 
 def error(kind, call, *arguments):

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.run.directory import GROUP_FILE, ROOT, RunDirectory, create_group_folder, is_group
-from rlctl.run.lookup import find_run, refuse_tuning
-from rlctl.run.train_request import TrainRequest
+from rlctl.runs.directory import GROUP_FILE, ROOT, RunDirectory, create_group_folder, is_group
+from rlctl.runs.lookup import find_run, refuse_tuning
+from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files
 
 VERSION = 2  # of the format of `group.json`

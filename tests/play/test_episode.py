@@ -8,7 +8,7 @@ import pytest
 from rlctl.environments.named_task import EPISODE
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.run.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
+from rlctl.play.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.storage import files
 
 INFO = EpisodeInfo(

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.policy.load import load_policy
-from rlctl.run.directory import RunDirectory
+from rlctl.runs.directory import RunDirectory
 from rlctl.storage import files
 
 

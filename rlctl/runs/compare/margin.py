@@ -3,7 +3,7 @@
 import math
 
 from rlctl.errors import UsageError
-from rlctl.runs.significance import find_least_pairs, find_smallest_loss
+from rlctl.runs.compare.significance import find_least_pairs, find_smallest_loss
 
 
 def check_margin(margin: float, episodes: int, *, of_success: bool) -> None:

@@ -11,19 +11,20 @@ from rlctl.errors import ArtifactError
 from rlctl.evaluation import robustness
 from rlctl.evaluation.robustness import Robustness
 from rlctl.recipe.stages import format_value
-from rlctl.run.directory import RunDirectory
-from rlctl.run.lookup import describe_source_change
 from rlctl.runs.diagnosis.findings import diagnose, format_finding
-from rlctl.runs.diagnosis.history import History
+from rlctl.runs.diagnosis.history import RunHistory
+from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import as_json
-from rlctl.runs.summary import Rows, list_points, summarize
+from rlctl.runs.lookup import describe_source_change
+from rlctl.runs.summary import summarize
+from rlctl.runs.tables import Rows, list_points
 
 _EVALUATIONS_SHOWN = 12
 _ALWAYS_SHOWN = ("steps", "success", "return")
 _PLOT_SIZE = (90, 13)  # columns and lines of a curve
 
 
-class RunDescription(History):
+class RunDescription(RunHistory):
     """Everything that `rlctl runs show` prints about a run."""
 
     def __init__(self, run: RunDirectory) -> None:

@@ -8,8 +8,8 @@ from rlctl import output
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.request import judge
 from rlctl.recipe.stages import format_value
-from rlctl.runs import significance
-from rlctl.runs.comparison import Candidate, EvaluatedRun, RunComparison, Side
+from rlctl.runs.compare import significance
+from rlctl.runs.compare.comparison import Candidate, EvaluatedRun, RunComparison, Side
 from rlctl.storage.junit import Suite, make_gate_case
 from rlctl.version import collect_versions
 

@@ -1,1 +1,0 @@
-"""The run folder: the names of its files, finding runs and policies, episodes, groups."""

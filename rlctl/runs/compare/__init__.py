@@ -1,0 +1,1 @@
+"""`rlctl runs compare`: whether a policy, or a recipe, is better than another."""
