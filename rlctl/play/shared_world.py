@@ -22,6 +22,7 @@ from rlctl.play.messages import SharedWorld
 from rlctl.play.playing import Playing, Worlds
 from rlctl.play.seeds import Stream, episode_seed
 from rlctl.policy.named_actors import make_actor
+from rlctl.storage.untrusted import measure_free_memory
 
 _HARMLESS = re.compile(r"setAdditionalSearchPath|\w*Debug\w*|get(Keyboard|Mouse)Events")
 """Functions that neither change nor read what a world simulates."""
@@ -40,24 +41,16 @@ def explain_processes(world: SharedWorld, n_envs: int) -> str:
 
 def check_memory(task: str, world: SharedWorld, n_envs: int) -> None:
     """Raise `TaskError` if the memory that is free is too little for a process per environment."""
-    fit = max(1, int(_MEMORY_SHARE * _read_free_memory() / max(world.process_bytes, 1)))
+    free = measure_free_memory()
+    if free is None:
+        return
+    fit = max(1, int(_MEMORY_SHARE * free / max(world.process_bytes, 1)))
     if n_envs > fit:
         raise TaskError(
             f"task {task!r}: {world.how} (RL808), so environments in one process would share one PyBullet world; each "
             f"needs its own process, and the free memory is enough for {fit:,}, not for {n_envs:,}\n"
             f"{_FIX}, or use --n-envs {fit}"
         )
-
-
-def _read_free_memory() -> int:
-    """Return how much memory can still be used [bytes]; a very large number where that is not known."""
-    free = [2**60]
-    with contextlib.suppress(OSError, IndexError):
-        free.append(1024 * int(re.findall(r"MemAvailable: +(\d+)", Path("/proc/meminfo").read_text())[0]))
-    group = Path("/sys/fs/cgroup")
-    with contextlib.suppress(OSError, ValueError):  # "max": no limit
-        free.append(int((group / "memory.max").read_text()) - int((group / "memory.current").read_text()))
-    return min(free)
 
 
 def _read_own_memory() -> int:

@@ -1,5 +1,7 @@
 """PyBullet environments that would share the world of their process get a process each; all others do not."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
 from rlctl.play.messages import Play, SharedWorld
 from rlctl.play.shared_world import check_memory
+from rlctl.storage import untrusted
 from tests.play.conftest import ENVS
 
 pytestmark = [pytest.mark.usefixtures("no_child_left"), pytest.mark.pybullet]
@@ -95,6 +98,19 @@ def test_too_little_memory_for_so_many_processes():
     with pytest.raises(TaskError, match=r"walker.py:9 calls loadURDF .*RL808.* not for 64\npass .* or use --n-envs 1$"):
         check_memory("walker.py:Walker", world, 64)
     check_memory("walker.py:Walker", world, 1)
+
+
+def test_the_group_of_a_container_or_job_limits_the_processes(monkeypatch, tmp_path):
+    own = Path("/proc/self/cgroup").read_text().rpartition("0::")[2].strip()
+    group = tmp_path / own.strip("/") if own else tmp_path
+    group.mkdir(parents=True, exist_ok=True)
+    for name, text in {"memory.max": 10 * 2**20, "memory.current": 0, "memory.stat": "file 0\n"}.items():
+        (group / name).write_text(str(text))
+    monkeypatch.setattr(untrusted, "_CGROUPS", tmp_path)
+    # 0.8 * 10 MiB are enough for 4 processes of 2 MiB.
+    world = SharedWorld("walker.py:9 calls loadURDF without physicsClientId", process_bytes=2 * 2**20)
+    with pytest.raises(TaskError, match="enough for 4, not for 5"):
+        check_memory("walker.py:Walker", world, 5)
 
 
 def test_an_error_in_the_trial_is_reported_by_the_first_episode(start, write_module):
