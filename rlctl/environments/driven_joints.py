@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -81,18 +82,31 @@ def measure_order(env: gymnasium.Env[Any, Any]) -> list[int] | None:
     low, high = (np.ravel(np.clip(bound, -1e3, 1e3)) for bound in (space.low, space.high))
     zero = np.clip(0.0, low, high)
     far = np.where(high - zero >= zero - low, high, low)
+    driven = []
     try:
-        probe = _copy(env)
+        with _raise_by_environment():
+            probe = _copy(env)
         plain = _record_controls(probe, space, zero)
-        driven = []
         for element in range(zero.size):
             changed = zero.copy()
             changed[element] = (zero[element] + far[element]) / 2
             driven.append(_find_first_change(plain, _record_controls(probe, space, changed)))
-    except Exception:  # of the environment's code; whoever steps it reports them
+    except _RaisedByEnvironmentError:  # whoever steps it reports the cause
         return None
     order = [indices[0] for indices in driven if len(indices) == 1]
     return order if len(order) == zero.size and len(set(order)) == zero.size else None
+
+
+class _RaisedByEnvironmentError(Exception):
+    """A call of the environment's code has raised; an exception from the code around it is a mistake of rlctl."""
+
+
+@contextlib.contextmanager
+def _raise_by_environment() -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        raise _RaisedByEnvironmentError from error
 
 
 def _copy(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
@@ -115,13 +129,17 @@ def _record_controls(env: gymnasium.Env[Any, Any], space: spaces.Box, action: Ar
     import mujoco
 
     rows: list[Array] = []
-    env.reset(seed=0)
+    with _raise_by_environment():
+        env.reset(seed=0)
     before = mujoco.get_mjcb_control()
     mujoco.set_mjcb_control(lambda model, data: rows.append(data.ctrl.copy()))
     try:
         for _ in range(_STEPS):
-            _, _, terminated, truncated, _ = env.step(action.reshape(space.shape).astype(space.dtype))
-            if terminated or truncated:
+            own = action.reshape(space.shape).astype(space.dtype)
+            with _raise_by_environment():
+                _, _, terminated, truncated, _ = env.step(own)
+                is_over = bool(terminated or truncated)
+            if is_over:
                 break
     finally:
         mujoco.set_mjcb_control(before)
@@ -131,6 +149,8 @@ def _record_controls(env: gymnasium.Env[Any, Any], space: spaces.Box, action: Ar
 def _find_first_change(plain: Sequence[Array], changed: Sequence[Array]) -> list[int]:
     """Return the indices that differ in the first substep with a difference: until then the states were equal."""
     for one, other in zip(plain, changed, strict=False):
+        if one.shape != other.shape:  # of different models: an environment may step several
+            return []
         if (differ := one != other).any():
             return np.flatnonzero(differ).tolist()
     return []

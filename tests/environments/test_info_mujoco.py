@@ -98,6 +98,15 @@ def test_joints_are_left_out_where_the_order_is_not_known(env):
     assert describe(env()).joints is None
 
 
+def test_an_error_that_is_not_of_the_environment_is_raised_while_the_order_is_measured(monkeypatch):
+    def fail():
+        raise RuntimeError("a mistake of rlctl")
+
+    monkeypatch.setattr(mujoco, "get_mjcb_control", fail)
+    with pytest.raises(RuntimeError, match="a mistake of rlctl"):
+        describe(Arm())
+
+
 def test_measuring_the_order_leaves_the_environment_alone():
     env = Arm()
     env.reset(seed=7)
