@@ -173,6 +173,7 @@ def _all_but_best(runs: list[RunSummary], count: int) -> list[RunSummary]:
 def plan_prune(runs: Sequence[str] = (), root: Path = ROOT) -> Removal:
     """Find the checkpoints of finished runs, by default of all; they are needed only to train longer.
 
+    A folder of checkpoints that is a link is left out, with a warning: only its owner knows who else uses the target.
     Raises `UsageError` for a named run that has not finished.
     """
     named = [summarize(run.path) for text in runs for run in find_runs_of(text)]
@@ -181,7 +182,13 @@ def plan_prune(runs: Sequence[str] = (), root: Path = ROOT) -> Removal:
             raise UsageError(f"{run.path}: {run.state}; only the checkpoints of finished runs can be removed")
     candidates = named if runs else [run for run in list_runs(root=root) if run.state == "done"]
     folders = [RunDirectory(run.path).checkpoint(0).parent for run in candidates if not is_being_written(run.path)]
-    return _measure([folder for folder in folders if folder.is_dir()])
+    links = [folder for folder in folders if folder.is_symlink()]
+    output.print_notes(_describe_link(folder) for folder in links)
+    return _measure([folder for folder in folders if folder.is_dir() and folder not in links])
+
+
+def _describe_link(folder: Path) -> str:
+    return f"warning: {folder} is a link and is not removed; its checkpoints are in {folder.resolve()}"
 
 
 def _measure(paths: list[Path]) -> Removal:
@@ -218,4 +225,4 @@ def remove(removal: Removal) -> None:
             path.rename(renamed)
             shutil.rmtree(renamed)
         except OSError as error:
-            raise ArtifactError(f"{path}: cannot be removed: {error.strerror}") from None
+            raise ArtifactError(f"{path}: cannot be removed: {error.strerror or error}") from None

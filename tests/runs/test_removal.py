@@ -126,6 +126,17 @@ def test_prune_frees_checkpoints_of_finished_runs_only(write_run):
     assert (stopped / "checkpoints").exists()
 
 
+def test_checkpoints_behind_a_link_are_named_and_left(write_run, rlctl, tmp_path):
+    run, elsewhere = write_run("reach/2026-01-01_00-00-00_s0"), tmp_path / "large-disk"
+    (run / "checkpoints").rename(elsewhere)
+    (run / "checkpoints").symlink_to(elsewhere)
+    done = rlctl("runs", "prune", "--yes")
+    assert (done.returncode, done.stdout) == (0, "nothing to remove\n")
+    assert done.stderr.startswith("warning: runs/reach/2026-01-01_00-00-00_s0/checkpoints is a link and is not removed")
+    assert str(elsewhere) in done.stderr
+    assert list((run / "checkpoints").iterdir())
+
+
 def test_only_what_is_named_is_pruned_and_a_dry_run_removes_nothing(write_run, rlctl):
     one, two = (write_run(f"{task}/2026-01-01_00-00-00_s0") for task in ("reach", "ant"))
     stopped = write_run("reach/2026-01-01_00-00-01_s0", "interrupted")
