@@ -5,7 +5,6 @@ import dataclasses
 import difflib
 import os
 import re
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -158,7 +157,7 @@ def describe_source_change(run: RunDirectory) -> str | None:
     """Return how the source of a run's task has changed since the run began; None if it has not, or is not known."""
     try:
         status = run.status()
-        task, digest = locate_task(str(status["task"]), run), status.get("source_sha256")
+        task, digest = _locate_source(str(status["task"]), run), status.get("source_sha256")
     except ArtifactError:
         return None
     return _describe_source_change(task, digest, "the run began")
@@ -211,23 +210,51 @@ def locate_task(task: str, run: RunDirectory | None) -> str:
     """Return a task with the absolute path of its file, if the training named it by a relative path.
 
     A run that has been moved uses the same relative path from the current folder. A module that is found nowhere else
-    is imported from the folder of the training. A downloaded run names no folder of this machine.
+    is imported from the folder of the training, which becomes the last entry of `sys.path`: call this only for a task
+    that is imported next. A downloaded run names no folder of this machine.
     """
+    place = task.rpartition(":")[0]
+    if place.endswith(".py"):
+        return _locate_source(task, run)
+    folder = _find_training_folder(task, run)
+    if folder is not None and folder.is_dir() and registry.find_source_file(task) is None:
+        registry.append_to_path(str(folder))  # the workers get the same path
+    return task
+
+
+def _locate_source(task: str, run: RunDirectory | None) -> str:
+    """Return a task with the absolute path of its file, also if the training named it by a module; imports nothing."""
+    folder = _find_training_folder(task, run)
+    if folder is None or run is None:
+        return task
     place, _, name = task.rpartition(":")
-    if run is None or not place or Path(place).expanduser().is_absolute() or store.is_cached(run.path):
-        return task
-    folder = run.status().get("folder")
-    if not isinstance(folder, str):
-        return task
     if not place.endswith(".py"):
-        if registry.find_source_file(f"{place}:{name}") is None and Path(folder).is_dir() and folder not in sys.path:
-            sys.path.append(folder)  # the workers get the same path
-        return task
-    if not (original := Path(folder) / place).is_file():
+        file = None
+        if registry.find_source_file(task) is None:
+            file = _find_module_below(folder, place)
+        return task if file is None else f"{file}:{name}"
+    if not (original := folder / place).is_file():
         return task
     here = Path(place)
     moved = not run.path.resolve().is_relative_to(folder)
     return task if here.is_file() and (moved or here.samefile(original)) else f"{original}:{name}"
+
+
+def _find_training_folder(task: str, run: RunDirectory | None) -> Path | None:
+    """Return the folder in which a training was started, to which the name of its task may be relative."""
+    place = task.rpartition(":")[0]
+    if run is None or not place or Path(place).expanduser().is_absolute() or store.is_cached(run.path):
+        return None
+    folder = run.status().get("folder")
+    return Path(folder) if isinstance(folder, str) else None
+
+
+def _find_module_below(folder: Path, module: str) -> Path | None:
+    *parents, last = module.split(".")
+    for file in (folder.joinpath(*parents, last, "__init__.py"), folder.joinpath(*parents, f"{last}.py")):
+        if file.is_file():
+            return file
+    return None
 
 
 def _describe_choice(

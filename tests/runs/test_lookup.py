@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from rlctl.policy.file import PolicyFile, PolicyInfo, Score
 from rlctl.runs import directory, lookup
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.lookup import find_policy, find_run
+from rlctl.storage import files
 
 
 def error(kind, call, *arguments):
@@ -233,6 +235,21 @@ def test_a_task_by_path_is_found_from_other_folders(root, make_run, tmp_path, mo
     assert lookup.locate_task("swing.py:Swing", moved) == "swing.py:Swing"
     assert lookup.locate_task("reach", moved) == "reach"
     assert lookup.locate_task("swing.py:Swing", None) == "swing.py:Swing"
+
+
+def test_looking_for_changes_of_a_source_does_not_change_what_is_imported(tmp_path, monkeypatch):
+    run = RunDirectory(tmp_path / "project" / "runs" / "Swing" / "2026-01-01_10-00-00_s0")
+    run.path.mkdir(parents=True)
+    source = tmp_path / "project" / "swinging_ropes.py"
+    source.write_text("")
+    status = {"task": "swinging_ropes:Swing", "folder": str(tmp_path / "project"), "source_sha256": files.digest(b"")}
+    run.status_file.write_text(json.dumps(status))
+    monkeypatch.chdir(tmp_path)
+    before = list(sys.path)
+    assert lookup.describe_source_change(run) is None
+    source.write_text("changed = True")
+    assert "has changed" in lookup.describe_source_change(run)
+    assert sys.path == before
 
 
 def test_trials_of_a_tuning_are_not_the_latest(root, make_run):
