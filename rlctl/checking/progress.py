@@ -7,10 +7,11 @@ for a processor. Linux counts that in `schedstat`; elsewhere it is the ordinary 
 import ctypes
 import dataclasses
 import mmap
-import os
 import time
 from pathlib import Path
 from typing import Any
+
+from rlctl.processes.child_process import grow_anonymous_file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +41,7 @@ class CallProgress:
         if descriptor is None:
             self._now = _Memory()
         else:
-            os.ftruncate(descriptor, ctypes.sizeof(_Memory))
+            grow_anonymous_file(descriptor, ctypes.sizeof(_Memory))
             self._now = _Memory.from_buffer(mmap.mmap(descriptor, ctypes.sizeof(_Memory)))
         self._called: set[str] = set()
         self._entered, self._began = "", 0.0

@@ -2,7 +2,6 @@
 
 import dataclasses
 import mmap
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ from rlctl.environments.dict_spaces import split_space
 from rlctl.environments.info import EnvInfo
 from rlctl.play.messages import EpisodeResult
 from rlctl.policy.file import PolicyFile
+from rlctl.processes.child_process import grow_anonymous_file
 
 Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]  # shape and dtype per name
 
@@ -43,8 +43,7 @@ def map_arrays(descriptor: int, layout: Layout) -> dict[str, NDArray[Any]]:
         offsets[name] = size
         bytes_needed = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
         size += -(-max(bytes_needed, 1) // _ALIGNMENT) * _ALIGNMENT
-    if os.fstat(descriptor).st_size < size:
-        os.ftruncate(descriptor, size)
+    grow_anonymous_file(descriptor, size)
     memory = mmap.mmap(descriptor, size)
     return {
         name: np.ndarray(shape, dtype, buffer=memory, offset=offsets[name]) for name, (shape, dtype) in layout.items()

@@ -177,3 +177,14 @@ def anonymous_file() -> int:
 
     with tempfile.TemporaryFile() as file:
         return os.dup(file.fileno())
+
+
+def grow_anonymous_file(descriptor: int, size: int) -> None:
+    """Let a file of `anonymous_file` have at least `size` bytes; an `OSError` names what has no path."""
+    if os.fstat(descriptor).st_size >= size:
+        return
+    try:
+        os.ftruncate(descriptor, size)
+    except OSError as error:
+        error.filename = f"memory of {size:,} bytes that processes share"
+        raise

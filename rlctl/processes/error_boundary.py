@@ -1,6 +1,7 @@
 """Turns exceptions into messages and exit codes; handles streams that are closed or not UTF-8."""
 
 import contextlib
+import errno
 import os
 import sys
 from collections.abc import Callable
@@ -112,6 +113,8 @@ def report_unexpected(error: Exception) -> int:
     if isinstance(error, OSError) and error.strerror:
         place = f"{error.filename}: " if error.filename else ""
         print(f"error: {place}{error.strerror}", file=sys.stderr)
+        if error.errno == errno.EFBIG:
+            print(_explain_file_limit(), file=sys.stderr)
         return 5
     if isinstance(error, ModuleNotFoundError) and (missing := explain_left_out(error.name)):
         print(f"error: {missing}", file=sys.stderr)
@@ -121,6 +124,16 @@ def report_unexpected(error: Exception) -> int:
     traceback.print_exc()
     print(f"error: a bug in rlctl {__version__} or a library; please report it with the lines above", file=sys.stderr)
     return 70
+
+
+def _explain_file_limit() -> str:
+    """Return what limits the size of files, the process or the file system."""
+    import resource
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if limit == resource.RLIM_INFINITY:
+        return "the file system takes no files of this size"
+    return f"files of this process may have {limit:,} bytes; raise that limit: ulimit -f unlimited"
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:

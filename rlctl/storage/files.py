@@ -68,7 +68,7 @@ def write_text(path: Path, content: str) -> None:
 def write_result(path: Path, content: bytes) -> None:
     """Write a file that the user named: atomically, but directly into a device, a pipe, or `/dev/stdout`."""
     if path.is_relative_to("/dev") or (path.exists() and not path.is_file()):
-        with path.open("ab") as file:
+        with name_in_errors(path), path.open("ab") as file:
             file.write(content)
     else:
         write_bytes(path.resolve() if path.is_symlink() else path, content)

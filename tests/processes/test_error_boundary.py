@@ -91,3 +91,29 @@ def test_an_interruption_is_said():
 def test_memory_that_is_refused(error, capsys):
     assert error_boundary.report_unexpected(error) == 5
     assert capsys.readouterr().err.startswith("error: not enough memory")
+
+
+FILES_OF_ONE_KB = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))
+from pathlib import Path
+from rlctl.processes import error_boundary
+from rlctl.processes.child_process import anonymous_file, grow_anonymous_file
+from rlctl.storage import files
+sys.exit(error_boundary.run(lambda: {call}))
+"""
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        ("files.write_bytes(Path('policy.bin'), bytes(4096))", "policy.bin"),
+        ("files.append(Path('table.csv'), bytes(4096), 0)", "table.csv"),
+        ("grow_anonymous_file(anonymous_file(), 4096)", "memory of 4,096 bytes that processes share"),
+    ],
+)
+def test_a_file_that_may_not_be_so_large_is_named(call, name, tmp_path):
+    script = FILES_OF_ONE_KB.format(call=call)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path, check=False)
+    limit = "files of this process may have 1,024 bytes; raise that limit: ulimit -f unlimited"
+    assert (done.returncode, done.stderr) == (5, f"error: {name}: File too large\n{limit}\n")
