@@ -15,8 +15,10 @@ import subprocess
 import sys
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 from rlctl.processes import messages
@@ -35,15 +37,18 @@ _BOOTSTRAP = (
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 """Signals that ask a training to stop; clusters send the last two before a job's time is over."""
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_MARK = "RLCTL_CHILD_PROCESSES"
+"""Variable with the identifiers of the children in which a process runs; its own children inherit it."""
+_MOST_ROUNDS = 5  # what is killed may have started others in the meantime
 start_process: Callable[..., "subprocess.Popen[bytes]"] = subprocess.Popen
 """Starts a child. Tests start many: they replace it by a function that forks a prepared process."""
 
 
 class ChildProcess:
-    """A process that runs `main(connection, **arguments)` of a module; `close` kills it and its process group.
+    """A process that runs `main(connection, **arguments)` of a module; `close` kills it and what it has started.
 
-    The group also ends when the parent does. With `one_thread` numeric libraries use one thread. Raises `OSError` if
-    the process cannot be started.
+    These are its process group and, on Linux, processes in sessions of their own. The group also ends when the parent
+    does. With `one_thread` numeric libraries use one thread. Raises `OSError` if the process cannot be started.
     """
 
     def __init__(self, main: str, arguments: Mapping[str, Any], *, one_thread: bool = True, **options: Any) -> None:
@@ -55,7 +60,9 @@ class ChildProcess:
         lifeline, self._lifeline = os.pipe()
         job = {"main": main, "sys_path": sys.path, "connection": theirs.fileno(), "lifeline": lifeline}
         options["pass_fds"] = (theirs.fileno(), lifeline, *options.get("pass_fds", ()))
-        options["env"] = {**os.environ, **(_ONE_THREAD if one_thread else {}), **options.get("env", {})}
+        self._identifier = uuid.uuid4().hex
+        mark = {_MARK: f"{os.environ.get(_MARK, '')}:{self._identifier}"}
+        options["env"] = {**os.environ, **(_ONE_THREAD if one_thread else {}), **options.get("env", {}), **mark}
         try:
             with theirs, open(lifeline, "rb"), _block_signals():
                 self.process = start_process(
@@ -98,7 +105,10 @@ class ChildProcess:
         return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
 
     def close(self, grace_s: float = 0.0) -> None:
-        """Kill the process group, after `grace_s` seconds in which the child may end. A second call does nothing."""
+        """Kill the child and what it has started, after `grace_s` seconds in which it may end by itself.
+
+        A second call does nothing.
+        """
         if self._lifeline < 0:
             return
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -106,6 +116,7 @@ class ChildProcess:
         with contextlib.suppress(ProcessLookupError, PermissionError):  # no process is left, or only ended ones
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
+        _kill_marked(self._identifier)
         self.connection.close()
         os.close(self._lifeline)  # only now: closing it kills the child
         self._lifeline = -1
@@ -128,6 +139,26 @@ class Standstill:
         if progress != self._progress:
             self._progress, self._since = progress, now
         return now - self._since
+
+
+def _kill_marked(identifier: str) -> None:
+    """Kill the processes that a child has started in sessions of their own, where the system lists processes."""
+    for _ in range(_MOST_ROUNDS):
+        marked = _find_marked(identifier)
+        if not marked:
+            return
+        for pid in marked:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def _find_marked(identifier: str) -> list[int]:
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has ended, or is another user's
+            if identifier.encode() in (folder / "environ").read_bytes():
+                found.append(int(folder.name))
+    return found
 
 
 def run_main(job: dict[str, Any]) -> None:

@@ -25,7 +25,7 @@ def answer(connection, **arguments):
     if arguments.get("exits"):
         os._exit(arguments["exits"])
     if arguments.get("starts"):
-        child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+        child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], **arguments["starts"])
         messages.send(connection, child.pid)
     if arguments.get("prints"):
         os.write(connection.fileno(), struct.pack("!i", 5) + b"hello")
@@ -88,14 +88,26 @@ def test_how_a_child_ended_is_reported(started):
     assert child.describe_end() == "was killed by SIGABRT"
 
 
-def test_closing_kills_what_the_child_has_started(started):
-    child, *_ = started(starts=True)
+@pytest.mark.parametrize("options", [{"stdin": None}, {"start_new_session": True}])
+def test_closing_kills_what_the_child_has_started(started, options):
+    child, *_ = started(starts=options)
     child.receive()
     grandchild = child.receive()
     child.close()
     child.close()
     assert child.process.poll() == -signal.SIGKILL
     assert wait_until_dead(grandchild)
+
+
+def test_closing_kills_what_is_left_of_a_child_that_has_ended(started):
+    child, *_ = started(starts={"start_new_session": True})
+    child.receive()
+    left = child.receive()
+    child.send("go on")
+    child.process.wait(timeout=60)
+    assert is_alive(left)
+    child.close()
+    assert wait_until_dead(left)
 
 
 def test_a_child_ends_with_its_parent():
