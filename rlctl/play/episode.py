@@ -1,6 +1,7 @@
 """Recorded episodes: `.npz` files with everything needed to reproduce one, bit for bit."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,31 @@ def save_episode(path: Path, episode: RecordedEpisode) -> None:
             **{f"observations/{key}" if key else "observations": value for key, value in observations.items()},
         },
     )
+
+
+def save_next_episode(folder: Path, episode: RecordedEpisode) -> Path:
+    """Write an episode under the next number of a folder and return its file; no other process gets that number."""
+    path = _reserve_number(folder)
+    try:
+        save_episode(path, episode)
+    except BaseException:
+        files.remove(path)
+        raise
+    return path
+
+
+def _reserve_number(folder: Path) -> Path:
+    """Create an empty file under the first number after those of all episodes and recordings."""
+    folder.mkdir(parents=True, exist_ok=True)
+    taken = [int(file.stem) for file in folder.glob("*.*") if file.stem.isdecimal()]
+    for number in itertools.count(max(taken, default=-1) + 1):
+        path = folder / f"{number:06d}.npz"
+        try:
+            path.touch(exist_ok=False)
+        except FileExistsError:  # another process was faster
+            continue
+        return path
+    raise AssertionError
 
 
 def load_episode(path: Path) -> RecordedEpisode:

@@ -12,7 +12,7 @@ from rlctl.environments.registry import make_slug
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import UsageError
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, load_baseline, load_player
-from rlctl.play.episode import RecordedEpisode, load_episode, save_episode
+from rlctl.play.episode import RecordedEpisode, load_episode, save_episode, save_next_episode
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.policy.actor import Actor, Rows, as_rows
 from rlctl.policy.load import load_policy
@@ -104,9 +104,8 @@ class _NewEpisodes:
             for number, seed in enumerate(self.seeds):
                 choose = self.begin(env, seed)
                 rollout = play_episode(env, spec, seed, choose, policy=self.name, draw=print_warning, watch=self.watch)
-                recording = self.choose_recording(number)
-                episode = recording.with_suffix(".npz")
-                save_episode(episode, rollout.episode)
+                episode = self.save(number, rollout.episode)
+                recording = episode.with_suffix(".rrd")
                 title, several = f"{spec.task} / episode {recording.stem}", len(self.seeds) > 1
                 write_rrd(recording, rollout, title=title, warn=print_warning, several=several)
                 episodes.append(summarize(rollout, recording, episode))
@@ -123,17 +122,20 @@ class _NewEpisodes:
                 print_warning(f"warning: seed {episode.seed}: {returns}; {advice}")
         return ReplayResult(self.spec.task, self.name, episodes, policy_file=self.described, choice=self._choice)
 
-    def choose_recording(self, number: int) -> Path:
-        """Return `--output`, or the next number in that folder, or the default for the episode of a number."""
-        if self._output is None:
-            return self._default_recording(number)
-        if self._output.suffix == ".rrd":
-            return self._output
-        numbers = [int(file.stem) for file in self._output.glob("*.*") if file.stem.isdecimal()]
-        following = max(numbers, default=-1) + 1
-        return self._output / RunDirectory(self._output).episode_file(following).with_suffix(".rrd").name
+    def save(self, number: int, episode: RecordedEpisode) -> Path:
+        """Write an episode as `--output`, or under the next number in that folder, or in the default place.
 
-    def _default_recording(self, number: int) -> Path:
+        Return its file; the recording next to it has the same name.
+        """
+        if self._output is None:
+            return self._save_by_default(number, episode)
+        if self._output.suffix != ".rrd":
+            return save_next_episode(self._output, episode)
+        file = self._output.with_suffix(".npz")
+        save_episode(file, episode)
+        return file
+
+    def _save_by_default(self, number: int, episode: RecordedEpisode) -> Path:
         raise NotImplementedError
 
 
@@ -157,12 +159,12 @@ class PolicySource(_NewEpisodes):
         self._policy.reset()
         return lambda observation, step: self._policy.predict(observation)
 
-    def _default_recording(self, number: int) -> Path:
-        """Return the next number in the run, or (without a run) in ./episodes."""
+    def _save_by_default(self, number: int, episode: RecordedEpisode) -> Path:
+        """Write an episode under the next number in the run, or (without a run) in ./episodes."""
         if self._run is not None:
             refuse_links_out(self._run.path)
         owner = self._run or RunDirectory(Path())
-        return owner.episode_file(owner.next_episode_number()).with_suffix(".rrd")
+        return save_next_episode(owner.episodes, episode)
 
 
 class TaskSource(_NewEpisodes):
@@ -212,11 +214,13 @@ class TaskSource(_NewEpisodes):
             return result
         return dataclasses.replace(result, world=self._world.summarize())
 
-    def _default_recording(self, number: int) -> Path:
-        """Return `./TASK-POLICY.rrd`, which the next look replaces; `-2`, `-3` for further episodes."""
+    def _save_by_default(self, number: int, episode: RecordedEpisode) -> Path:
+        """Write `./TASK-POLICY.npz`, which the next look replaces; `-2`, `-3` for further episodes."""
         policy = "server" if self.name.startswith(SERVER) else make_slug(self.name)
         count = f"-{number + 1}" if number else ""
-        return Path(f"{make_slug(self.spec.task)}-{policy}{count}.rrd")
+        file = Path(f"{make_slug(self.spec.task)}-{policy}{count}.npz")
+        save_episode(file, episode)
+        return file
 
 
 def load_located(path: Path) -> RecordedEpisode:

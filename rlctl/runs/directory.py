@@ -78,11 +78,6 @@ class RunDirectory:
         """Return the file of a recorded episode."""
         return self.episodes / f"{number:06d}.npz"
 
-    def next_episode_number(self) -> int:
-        """Return the number of the next recorded episode."""
-        numbers = [int(file.stem) for file in self.episodes.glob("*.npz") if file.stem.isdecimal()]
-        return max(numbers, default=-1) + 1
-
     def recipe(self) -> Recipe:
         """Read the resolved recipe; raises `ArtifactError` if it is missing or was changed later."""
         from rlctl.recipe.recipe import validate

@@ -11,7 +11,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, EpisodeFailed, RlctlError, TaskError, UsageError
 from rlctl.evaluation.episode_statistics import mean_return, success_rate
 from rlctl.play.collect import Episode, play_episodes
-from rlctl.play.episode import STEP_LABEL, EpisodeInfo, RecordedEpisode, save_episode
+from rlctl.play.episode import STEP_LABEL, EpisodeInfo, RecordedEpisode, save_next_episode
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers
 from rlctl.policy.actor import Exploration
@@ -69,7 +69,7 @@ class EvaluationEpisodes:
         self._latest = recorded = [episode.describe(self._spec, self._goal, policy) for episode in episodes]
         scores = [(episode.result.success is True, episode.result.total_reward) for episode in episodes]
         for index in dict.fromkeys((0, scores.index(min(scores)))):
-            self._write(recorded[index])
+            save_next_episode(self._checkpoints.run.episodes, recorded[index])
 
     def record(self, count: int) -> list[Path]:
         """Save the last `count` episodes of the last evaluation with recordings; return the recordings' paths."""
@@ -77,7 +77,7 @@ class EvaluationEpisodes:
         for episode in self._latest[-count:] if count else []:
             from rlctl.replaying.reproduce import record_episode
 
-            path = self._write(episode)
+            path = save_next_episode(self._checkpoints.run.episodes, episode)
             recording = path.with_suffix(".rrd")
             title = f"{self._checkpoints.run.path.name} / episode {path.stem}"
             record_episode(episode, recording, title=title, several=count > 1)
@@ -101,14 +101,9 @@ class EvaluationEpisodes:
         actions = np.asarray(error.actions).reshape(-1, *shape)  # if the reset failed there are no actions
         episode = RecordedEpisode(actions, nothing, nothing, nothing.reshape(0, 0), info)
         written: list[Path] = []
-        self._checkpoints.attempt("failed episode", lambda: written.append(self._write(episode)))
+        folder = self._checkpoints.run.episodes
+        self._checkpoints.attempt("failed episode", lambda: written.append(save_next_episode(folder, episode)))
         return error.with_hint(f"to reproduce it: rlctl replay {shlex.quote(str(written[0]))}") if written else error
-
-    def _write(self, episode: RecordedEpisode) -> Path:
-        run = self._checkpoints.run
-        path = run.episode_file(run.next_episode_number())
-        save_episode(path, episode)
-        return path
 
 
 class Evaluator:

@@ -1,6 +1,9 @@
 """Recorded episodes: written, read, and refused when they cannot be what they should."""
 
+import dataclasses
 import json
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ import pytest
 from rlctl.environments.named_task import EPISODE
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
-from rlctl.play.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
+from rlctl.play.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode, save_next_episode
 from rlctl.storage import files
 
 INFO = EpisodeInfo(
@@ -115,3 +118,32 @@ def test_of_an_episode_that_failed_there_are_the_actions_alone(path):
 )
 def test_an_episode_knows_the_evaluation_that_played_it(policy, step):
     assert INFO.model_copy(update={"policy": policy}).evaluated_at == step
+
+
+def test_episodes_are_numbered_on(tmp_path):
+    for name in ("000002.npz", "000010.npz", "best.npz", "000011.rrd"):
+        (tmp_path / name).write_bytes(b"")
+    recorded = episode(np.zeros((4, 2)))
+    file = save_next_episode(tmp_path, recorded)
+    assert file == tmp_path / "000012.npz"  # 11 has a recording, which would be replaced
+    assert load_episode(file).info == INFO
+
+
+def test_episodes_that_are_saved_at_once_get_numbers_of_their_own(tmp_path):
+    count, recorded = 8, episode(np.zeros((4, 2)))
+    barrier = threading.Barrier(count)
+
+    def save(_):
+        barrier.wait()
+        return [save_next_episode(tmp_path, recorded) for _ in range(5)]
+
+    with ThreadPoolExecutor(count) as threads:
+        saved = [file for files_of_one in threads.map(save, range(count)) for file in files_of_one]
+    assert sorted(file.name for file in saved) == [f"{number:06d}.npz" for number in range(5 * count)]
+
+
+def test_a_number_is_free_again_if_its_episode_cannot_be_saved(tmp_path):
+    recorded = dataclasses.replace(episode(np.zeros((4, 2))), terms=np.array([object()]))
+    with pytest.raises(ValueError, match="Object arrays"):
+        save_next_episode(tmp_path, recorded)
+    assert list(tmp_path.iterdir()) == []

@@ -61,16 +61,6 @@ def test_half_written_checkpoints_do_not_count(root, make_run):
     assert [folder.name for folder in run.checkpoints()] == ["000000100", "000000200"]
 
 
-def test_episodes_are_numbered_on(root, make_run):
-    run = make_run("reach", "2026-01-01_10-00-00_s0")
-    assert run.next_episode_number() == 0
-    run.episodes.mkdir()
-    for name in ("000002.npz", "000010.npz", "best.npz", "000011.rrd"):
-        (run.episodes / name).write_bytes(b"")
-    assert run.next_episode_number() == 11
-    assert run.episode_file(11) == run.episodes / "000011.npz"
-
-
 def test_status(root, make_run):
     run = make_run("reach", "2026-01-01_10-00-00_s0")
     run.write_status({"status": "running", "steps": 0})

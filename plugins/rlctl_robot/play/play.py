@@ -17,7 +17,6 @@ from rlctl import output
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, explain_missing_package
-from rlctl.play.episode import save_episode
 from rlctl.play.seeds import Stream, episode_seed
 from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.recorder import DEFAULT_DT, Choose, LogEntry, Rollout, find_dt, make_reader, play_episode
@@ -275,8 +274,7 @@ class Game:
         info = rollout.episode.info.model_copy(update={"steered": True})
         log = sorted([*rollout.log, *self._log], key=lambda entry: entry.step)
         steered = dataclasses.replace(rollout, episode=dataclasses.replace(rollout.episode, info=info), log=log)
-        recording = self._source.choose_recording(len(self.result.recordings))
-        save_episode(recording.with_suffix(".npz"), steered.episode)
+        recording = self._source.save(len(self.result.recordings), steered.episode).with_suffix(".rrd")
         title = f"{self._spec.task} / episode {recording.stem}, steered by a person"
         write_rrd(recording, steered, title=title, warn=self._warn)
         self.result.recordings.append(recording)
