@@ -15,6 +15,7 @@ from numpy.lib import format as npy
 
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.storage import untrusted
+from rlctl.storage.csv_text import CsvReader
 from rlctl_robot.diagnose.signals import Array
 
 _WHOLE_CSV = 48 * 2**20  # [bytes]; of larger files windows are read
@@ -59,12 +60,8 @@ def read_header(path: Path) -> TableHeader:
             names = [name for member in _read_members(path, archive) for name in member.column_names()]
     elif path.suffix.lower() in (".csv", ".txt"):
         with untrusted.open_file(path) as file:
-            names = [name.strip() for name in _split_line(path, _read_line(path, file), 1)]
-        if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
-            raise ArtifactError(
-                f"{path}, line 1: columns are separated by semicolons or tabs; "
-                "write commas between columns, and points in numbers"
-            )
+            line = _read_line(path, file)
+        names = [name.strip() for name in _split_line(path, CsvReader(line), line, 1)]
         if twice := [name for name in names if names.count(name) > 1]:
             raise ArtifactError(f"{path}, line 1: column {twice[0]!r} is given twice")
     else:
@@ -97,9 +94,9 @@ def _read_line(path: Path, file: BinaryIO) -> str:
         raise ArtifactError(f"{path}: not a CSV file: {error}") from None
 
 
-def _split_line(path: Path, line: str, number: int) -> list[str]:
+def _split_line(path: Path, reader: CsvReader, line: str, number: int) -> list[str]:
     try:
-        return next(csv.reader([line]), [])
+        return reader.split(line)
     except csv.Error as error:
         raise ArtifactError(f"{path}, line {number}: {error}") from None
 
@@ -111,6 +108,7 @@ def _read_csv(header: TableHeader, used: Collection[str]) -> LogTable:
     rows: list[int] = []
     windows: list[int] = []
     with untrusted.open_file(path) as file:
+        reader = CsvReader(_read_line(path, file))
         size = file.seek(0, io.SEEK_END)
         starts = [0] if size <= _WHOLE_CSV else np.linspace(0, size * 0.99, _WINDOWS).astype(int).tolist()
         for start in starts:
@@ -118,7 +116,7 @@ def _read_csv(header: TableHeader, used: Collection[str]) -> LogTable:
             most = None if size <= _WHOLE_CSV else _WINDOW_ROWS
             for number, line in _read_lines(path, file, start, most):
                 if line.strip():
-                    values.append(_read_row(path, header, line, number, indices))
+                    values.append(_read_row(header, reader, line, number, indices))
                     rows.append(number)
             windows.append(len(values) - begin)
     array = np.array(values, np.float64).reshape(len(values), len(indices))
@@ -141,28 +139,20 @@ def _read_lines(path: Path, file: BinaryIO, start: int, most: int | None) -> Ite
         yield (count if most is None else position), line
 
 
-def _read_row(path: Path, header: TableHeader, line: str, number: int, indices: dict[str, int]) -> list[float]:
-    row = _split_line(path, line, number)
-    if len(row) != len(header.names):
-        raise ArtifactError(f"{path}, line {number}: {len(row)} values for {len(header.names)} columns")
+def _read_row(header: TableHeader, reader: CsvReader, line: str, number: int, indices: dict[str, int]) -> list[float]:
+    path, columns = header.path, len(header.names)
+    row = _split_line(path, reader, line, number)
+    if len(row) != columns:
+        why = reader.explain_count(len(row), columns)
+        raise ArtifactError(f"{path}, line {number}: {len(row)} values for {columns} columns{why}")
     numbers = []
     for name, index in indices.items():
-        value = _read_number(row[index])
+        value = reader.read_number(row[index])
         if not math.isfinite(value):
-            text = short_repr(row[index].strip())
-            raise ArtifactError(f"{path}, line {number}, column {name}: {text!r} is not a finite number")
+            text, why = short_repr(row[index].strip()), reader.explain_number(row[index])
+            raise ArtifactError(f"{path}, line {number}, column {name}: {text!r} is not a finite number{why}")
         numbers.append(value)
     return numbers
-
-
-def _read_number(text: str) -> float:
-    """Return a number, NaN for text that is none; `1_7`, which Python takes for 17, is none in a file."""
-    if "_" in text:
-        return math.nan
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
 
 
 @dataclasses.dataclass(frozen=True)

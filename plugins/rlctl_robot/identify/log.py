@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError, UsageError, check_name
 from rlctl.storage import files, untrusted
+from rlctl.storage.csv_text import CsvReader
 
 Array = NDArray[np.float64]
 
@@ -106,28 +107,32 @@ def _take_targets(path: Path, columns: Mapping[str, Array], positions: Array, ex
 
 def _read_columns(path: Path) -> tuple[dict[str, Array], list[int]]:
     try:
-        rows = list(csv.reader(io.StringIO(untrusted.read_bytes(path, _MAX_SIZE).decode("utf-8-sig"))))
+        content = untrusted.read_bytes(path, _MAX_SIZE).decode("utf-8-sig")
+        reader = CsvReader(content.partition("\n")[0])
+        rows = list(csv.reader(io.StringIO(content), delimiter=reader.delimiter))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ArtifactError(f"{path}: not a CSV file: {error}") from None
     names = [name.strip() for name in rows[0]] if rows else []
     numbered = [(line, row) for line, row in enumerate(rows[1:], start=2) if row]
     if len(numbered) < MIN_ROWS:
         raise ArtifactError(f"{path}: {len(numbered)} rows; a log needs at least {MIN_ROWS}; record a few seconds")
-    values = np.array([_read_row(path, line, row, names) for line, row in numbered])
+    values = np.array([_read_row(path, reader, line, row, names) for line, row in numbered])
     return dict(zip(names, values.T, strict=True)), [line for line, _ in numbered]
 
 
-def _read_row(path: Path, line: int, row: list[str], names: list[str]) -> list[float]:
+def _read_row(path: Path, reader: CsvReader, line: int, row: list[str], names: list[str]) -> list[float]:
     if len(row) != len(names):
-        raise ArtifactError(f"{path}, line {line}: {len(row)} values for {len(names)} columns")
+        why = reader.explain_count(len(row), len(names))
+        raise ArtifactError(f"{path}, line {line}: {len(row)} values for {len(names)} columns{why}")
     numbers = []
     for name, text in zip(names, row, strict=True):
-        try:
-            number = float(text)
-        except ValueError:
-            number = math.nan
-        if not math.isfinite(number) and name.startswith(_USED):  # other columns may hold anything
-            raise ArtifactError(f"{path}, line {line}: {name} is {text.strip()!r}, not a finite number")
+        if not name.startswith(_USED):  # other columns may hold anything
+            numbers.append(math.nan)
+            continue
+        number = reader.read_number(text)
+        if not math.isfinite(number):
+            why = reader.explain_number(text)
+            raise ArtifactError(f"{path}, line {line}: {name} is {text.strip()!r}, not a finite number{why}")
         numbers.append(number)
     return numbers
 

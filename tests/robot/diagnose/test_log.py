@@ -80,10 +80,33 @@ def test_text_in_a_number_names_line_and_column(tmp_path, info, rows, value):
         read_robot_log(write(tmp_path / "log.csv", rows), info)
 
 
-def test_semicolons_are_named(tmp_path, info):
-    path = tmp_path / "log.csv"
-    path.write_text("time;positions_0;positions_1\n0,1;2,5;3\n")
-    with pytest.raises(ArtifactError, match="line 1: columns are separated by semicolons or tabs; write commas"):
+def write_with_commas(path, rows, delimiter=";"):
+    lines = [NAMES, *([str(value).replace(".", ",") for value in row] for row in rows)]
+    path.write_text("\n".join(delimiter.join(line) for line in lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+def test_decimal_commas_are_read_where_columns_are_separated_otherwise(tmp_path, info, rows, delimiter):
+    log = read_robot_log(write_with_commas(tmp_path / "log.csv", rows, delimiter), info)
+    same = read_robot_log(write(tmp_path / "points.csv", rows), info)
+    assert (log.signals.observations == same.signals.observations).all()
+    assert (log.signals.actions == same.signals.actions).all()
+
+
+def test_numbers_of_two_decimal_marks_are_refused(tmp_path, info, rows):
+    path = write_with_commas(tmp_path / "log.csv", rows)
+    path.write_text(path.read_text().replace(";50,6", ";50.6"))
+    with pytest.raises(
+        ArtifactError, match=r"'50\.6' is not a finite number; numbers before it have ',' as decimal mark"
+    ):
+        read_robot_log(path, info)
+
+
+def test_decimal_commas_between_commas_are_named(tmp_path, info, rows):
+    path = write_with_commas(tmp_path / "log.csv", rows, ",")
+    fix = "if commas are also in numbers, separate columns by semicolons"
+    with pytest.raises(ArtifactError, match=f"line 2: 16 values for 8 columns; {fix}"):
         read_robot_log(path, info)
 
 

@@ -204,6 +204,12 @@ def test_logs_that_cannot_be_used(change, message, real, tmp_path):
         read_log(path, EXPECTED)
 
 
+def test_semicolons_and_decimal_commas(real, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(real.read_text().replace(",", ";").replace(".", ","))
+    np.testing.assert_array_equal(read_log(path, EXPECTED).positions, read_log(real, EXPECTED).positions)
+
+
 def test_columns_that_are_not_used_may_hold_anything(real, tmp_path):
     header, *rows = real.read_text().splitlines()
     path = tmp_path / "log.csv"
