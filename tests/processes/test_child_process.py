@@ -81,6 +81,7 @@ def test_a_child_gets_its_arguments_and_its_lines_are_read(started):
 
 def test_how_a_child_ended_is_reported(started):
     child, *_ = started(exits=9)
+    child.receive()  # a loaded machine may take longer to start it than the end is waited for
     assert child.describe_end() == "ended with exit code 9"
     child, *_ = started()
     child.receive()

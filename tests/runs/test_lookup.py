@@ -12,7 +12,7 @@ import pytest
 from rlctl.environments import registry
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import ArtifactError, UsageError
+from rlctl.errors import PLAY_OTHERS, ArtifactError, UsageError
 from rlctl.policy.file import PolicyFile, PolicyInfo, Score
 from rlctl.runs import directory, lookup
 from rlctl.runs.directory import RunDirectory
@@ -268,5 +268,5 @@ def test_a_file_that_is_no_policy(root, make_run):
     run = make_run("reach", "2026-01-01_10-00-00_s0")
     run.metrics_file.write_text("steps\n")
     assert error(ArtifactError, find_policy, str(run.metrics_file), "best", root) == (
-        f"{run.metrics_file}: neither a run nor a policy (.safetensors, .onnx); its run: {run.path}"
+        f"{run.metrics_file}: neither a run nor a policy (.safetensors, .onnx); its run: {run.path}. {PLAY_OTHERS}"
     )
