@@ -18,7 +18,7 @@ from rlctl.environments.dict_spaces import map_parts, stack, take_row
 from rlctl.play.collect import Episode, play_episodes
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers
-from rlctl.policy.actor import Rows
+from rlctl.policy.actor import Rows, as_rows
 from rlctl.policy.c_policy import CActor
 from rlctl.policy.file import PolicyFile, Tensors
 from rlctl.policy.onnx_policy import OnnxActor
@@ -273,7 +273,7 @@ def measure_sb3(torch_actor: TorchActor) -> float:
     """Return the time that SB3 takes for one normalised observation [us]."""
     space = torch_actor.info.env.spaces()[0]
     space.seed(0)
-    normalized: Any = torch_actor.normalize(space.sample())
+    normalized: Any = take_row(torch_actor.normalize(as_rows(space.sample())), 0)
     return _measure_median_us(lambda: torch_actor.network.predict(normalized, deterministic=True))
 
 

@@ -41,6 +41,14 @@ def multiply(rows: Array, weight: Array) -> Array:
     return product
 
 
+def as_row(vector: Array) -> Array:
+    """Return a vector as a matrix of one row, which shares its memory.
+
+    With rows of its own shape, NumPy calculates twice as fast as with a vector.
+    """
+    return vector.reshape(1, *vector.shape)
+
+
 def apply(layers: Iterable[Layer], value: Any) -> Array:
     """Apply layers one after the other."""
     for layer in layers:
@@ -54,10 +62,16 @@ class Linear(Layer):
 
     weight: Array  # shape (outputs, inputs)
     bias: Array
+    _transposed: Array = dataclasses.field(init=False)
+    _bias: Array = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        self._transposed, self._bias = self.weight.T, as_row(self.bias)
 
     def __call__(self, value: Array) -> Array:
-        result = multiply(value, self.weight)
-        result += self.bias
+        # As `multiply` does, without the call.
+        result: Array = value.dot(self._transposed) if len(value) == 1 else multiply(value, self.weight)
+        result += self._bias
         return result
 
 
@@ -102,23 +116,27 @@ class Normalize(Layer):
     variance: Array
     clip: float
     epsilon: float = 1e-8  # what SB3's VecNormalize adds to the variance
+    _mean: Array = dataclasses.field(init=False)
     _deviation: Array = dataclasses.field(init=False)
     _high: Array = dataclasses.field(init=False)
     _low: Array = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
+        self._mean = as_row(self.mean)
         # Arrays, because NumPy takes twice as long for a scalar and so few elements.
-        self._high = np.full(np.shape(self.mean), self.clip)
+        self._high = np.full(self._mean.shape, self.clip)
         self._low = -self._high
         self.prepare()
 
     def prepare(self) -> None:
         """Compute the standard deviation from the variance."""
-        self._deviation = np.sqrt(self.variance + self.epsilon)
+        self._deviation = as_row(np.sqrt(self.variance + self.epsilon))
 
     def __call__(self, value: Array) -> Array:
         # In float64 as VecNormalize: an element with little variance is multiplied by up to 10,000.
-        normalized: Array = (value - self.mean) / self._deviation
+        normalized: Array = value.astype(np.float64)  # a subtraction of two types takes longer
+        normalized -= self._mean
+        normalized /= self._deviation
         np.minimum(normalized, self._high, out=normalized)
         np.maximum(normalized, self._low, out=normalized)
         return normalized.astype(np.float32)
@@ -159,7 +177,8 @@ class Flatten(Layer):
     """Flattens each row to one dimension, in float32."""
 
     def __call__(self, value: Any) -> Array:
-        return np.asarray(value, np.float32).reshape(len(value), -1)
+        flat = np.asarray(value, np.float32)
+        return flat if flat.ndim == 2 else flat.reshape(len(flat), -1)
 
 
 @dataclasses.dataclass(slots=True)

@@ -15,7 +15,7 @@ from rlctl.environments.dict_spaces import is_image, split_space
 from rlctl.errors import UsageError
 from rlctl.policy import layers
 from rlctl.policy.file import ACTOR_CRITIC, DETERMINISTIC, GRAPH, SQUASHED_GAUSSIAN, PolicyFile
-from rlctl.policy.layers import Activation, Array, Layer, Linear, apply
+from rlctl.policy.layers import Activation, Array, Layer, Linear, apply, as_row
 
 if TYPE_CHECKING:
     from rlctl.policy.onnx_policy import OwnGraph
@@ -58,6 +58,7 @@ class Network:
         self._uses_expln = bool(info.policy_kwargs.get("use_sde") and info.policy_kwargs.get("use_expln"))
         self.std: Array | None = None
         """Standard deviations of the present `log_std`."""
+        self._std_row: Array | None = None
         self._log_std_layer = read.linear(name) if f"{name}.weight" in read.tensors else None
         self.prepare()
 
@@ -70,6 +71,7 @@ class Network:
                 layer.prepare()
         if self.log_std is not None:
             self.std = _expln(self.log_std) if self._uses_expln else np.exp(self.log_std)
+            self._std_row = as_row(self.std)
 
     def compute_latent(self, observations: Any, states: Array | None = None) -> Array:
         """Return the head's input, shape (k, size); advances the states of an LSTM by one step."""
@@ -86,11 +88,11 @@ class Network:
         return apply(self.trunk, value)
 
     def compute_std(self, latent: Array) -> Array:
-        """Return the standard deviations of Gaussian actions, shape (k, elements), or (elements,) if all are equal."""
+        """Return the standard deviations of Gaussian actions, shape (k, elements), or (1, elements) if all are equal."""
         if self._log_std_layer is not None:
             return np.exp(np.clip(self._log_std_layer(latent), -20.0, 2.0))
-        assert self.std is not None  # called for Gaussian heads only
-        return self.std
+        assert self._std_row is not None  # called for Gaussian heads only
+        return self._std_row
 
 
 def _expln(log_std: Array) -> Array:
@@ -153,6 +155,8 @@ class _Reader:
             sizes = space.n if isinstance(space, spaces.Discrete) else space.nvec
             return [layers.OneHot(f"one_hot/{key}", np.asarray(sizes))]
         result: list[Layer] = [self.normalize[key]] if key in self.normalize else []
+        if result and len(space.shape or ()) == 1:
+            return result
         if not is_image(space):
             return [*result, layers.Flatten("flatten")]
         shape, relu = space.shape or (), Activation("relu")

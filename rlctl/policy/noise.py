@@ -1,5 +1,7 @@
 """Random numbers of actions: they depend only on the seed of the episode and on the step."""
 
+import functools
+
 import numpy as np
 
 from rlctl.policy.actor import Array, Rows
@@ -15,57 +17,55 @@ class Noise:
     def __init__(self, count: int, size: int) -> None:
         """Draw for actions of `size` elements."""
         self._count, self._size = count, size
-        self._kinds: dict[str, _Blocks] = {}
 
-    def sample(self, rows: Rows) -> Array:
-        """Return standard normal numbers for the policy's distribution, shape (k, size)."""
-        return self._draw("sample", rows)
+    @functools.cached_property
+    def sample(self) -> "Blocks":
+        """Standard normal numbers for the policy's distribution, `size` in each step."""
+        return Blocks("sample", self._count, self._size)
 
-    def disturb(self, rows: Rows) -> Array:
-        """Return standard normal numbers, independent of those of `sample`, shape (k, size)."""
-        return self._draw("disturb", rows)
+    @functools.cached_property
+    def disturb(self) -> "Blocks":
+        """Standard normal numbers, independent of those of `sample`, `size` in each step."""
+        return Blocks("disturb", self._count, self._size)
 
-    def uniform(self, rows: Rows) -> Array:
-        """Return uniform numbers in [0, 1), shape (k, size + 1)."""
-        return self._draw("uniform", rows)
-
-    def _draw(self, kind: str, rows: Rows) -> Array:
-        if kind not in self._kinds:
-            self._kinds[kind] = _Blocks(kind, self._count, self._size)
-        return self._kinds[kind].draw(rows)
+    @functools.cached_property
+    def uniform(self) -> "Blocks":
+        """Uniform numbers in [0, 1), `size + 1` in each step."""
+        return Blocks("uniform", self._count, self._size)
 
 
-class _Blocks:
+class Blocks:
     """The present block of steps of each row, of one kind of random numbers."""
 
     def __init__(self, kind: str, count: int, size: int) -> None:
         self._kind, self._size = kind, size
-        self._drawn = np.full((count, 2), -1, np.int64)  # seed and number of the block of each row
+        self._drawn = [(-1, -1)] * count  # seed and number of the block of each row
         one = draw_noise(0, 0, size)[kind]
         self._numbers = np.zeros((count, *one.shape), one.dtype)
 
     def draw(self, rows: Rows) -> Array:
-        if len(rows) == 1:  # arithmetic with Python's numbers takes a fifth of the time
-            row, seed = rows.index.item(), rows.seed.item()
+        """Return the numbers of the present steps of rows, shape (k, numbers)."""
+        numbers: Array
+        if len(rows.index) == 1:  # arithmetic with Python's numbers takes a fifth of the time
+            row = rows.index.item()
             block, place = divmod(rows.step.item(), NOISE_BLOCK)
-            if self._drawn[row].tolist() != [seed, block]:
-                self._fill(row, seed, block)
-            one: Array = self._numbers[row, place : place + 1]
-            return one
+            self._fill(row, rows.seed.item(), block)
+            numbers = self._numbers[row, place : place + 1]
+            return numbers
         blocks, places = np.divmod(rows.step, NOISE_BLOCK)
-        drawn = self._drawn[rows.index]
-        for k in np.flatnonzero((drawn[:, 0] != rows.seed) | (drawn[:, 1] != blocks)).tolist():
-            self._fill(int(rows.index[k]), int(rows.seed[k]), int(blocks[k]))
-        numbers: Array = self._numbers[rows.index, places]
+        for row, seed, block in zip(rows.index.tolist(), rows.seed.tolist(), blocks.tolist(), strict=True):
+            self._fill(row, seed, block)
+        numbers = self._numbers[rows.index, places]
         return numbers
 
     def _fill(self, row: int, seed: int, block: int) -> None:
-        self._drawn[row] = seed, block
-        self._numbers[row] = draw_noise(seed, block, self._size)[self._kind]
+        if self._drawn[row] != (seed, block):
+            self._drawn[row] = seed, block
+            self._numbers[row] = draw_noise(seed, block, self._size)[self._kind]
 
 
 def draw_noise(seed: int, block: int, size: int) -> dict[str, Array]:
-    """Return the random numbers of a block of steps of an episode, by the names of `Noise`'s methods."""
+    """Return the random numbers of a block of steps of an episode, by the names of `Noise`."""
     generator = make_generator(seed, _STEP_NOISE, block)
     normal = generator.standard_normal((NOISE_BLOCK, 2, size), np.float32)
     uniform = generator.random((NOISE_BLOCK, size + 1))

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from rlctl.errors import DivergedError, in_world, short_repr
 from rlctl.policy.actor import Array, Exploration, Rows, as_stored
 from rlctl.policy.file import DETERMINISTIC, PolicyFile
-from rlctl.policy.layers import apply
+from rlctl.policy.layers import apply, as_row
 from rlctl.policy.network import Network
 from rlctl.policy.noise import Noise, draw_matrix
 from rlctl.policy.policy import FileActor
@@ -29,8 +29,9 @@ class NumpyActor(FileActor):
         _, self._space = info.env.spaces()
         self._shape = self._space.shape or ()
         self._is_box = isinstance(self._space, spaces.Box)
+        self._is_vector = self._is_box and len(self._shape) == 1 and self._space.dtype == np.float32
         if isinstance(self._space, spaces.Box):
-            self._low, self._high = self._space.low.ravel(), self._space.high.ravel()
+            self._low, self._high = as_row(self._space.low.ravel()), as_row(self._space.high.ravel())
         self._noise = Noise(count, max(1, math.prod(self._shape)))
         self._matrices = _Matrices(count) if info.policy_kwargs.get("use_sde") else None
         self._state = None if self.network.lstm is None else self.network.lstm.make_state(count)
@@ -62,7 +63,7 @@ class NumpyActor(FileActor):
         """
         exploration, network = self._exploration, self.network
         if exploration.warmup:
-            return self._act_uniform(self._noise.uniform(rows))
+            return self._act_uniform(self._noise.uniform.draw(rows))
         if self._state is None:
             latent = network.compute_latent(observations)
         else:
@@ -74,27 +75,28 @@ class NumpyActor(FileActor):
             return self._act_discrete(value, rows)
         if exploration.stochastic and self._algo not in DETERMINISTIC:
             value = value + self._sample(latent, rows)
-        if not math.isfinite(np.add.reduce(value, axis=None)):
-            _refuse(value, rows)
+        _check_finite(value, rows)
         if not network.is_squashed:
             action = np.minimum(np.maximum(value, self._low), self._high)  # a third of np.clip's time
             return value, self._shape_actions(action)
         if network.ends_with_tanh:
             value = np.tanh(value)
         if exploration.action_noise:
-            noise = np.float32(exploration.action_noise) * self._noise.disturb(rows)
+            noise = np.float32(exploration.action_noise) * self._noise.disturb.draw(rows)
             value = np.clip(value + noise, -1.0, 1.0)
         return value, self._unscale(value)
 
     def _sample(self, latent: Array, rows: Rows) -> Array:
         """Return the noise of the policy's distribution, shape (k, elements)."""
         if self._matrices is None:
-            return self.network.compute_std(latent) * self._noise.sample(rows)
+            return self.network.compute_std(latent) * self._noise.sample.draw(rows)
         assert self.network.std is not None  # of gSDE's parameter
-        matrices = self._matrices.of(rows, self.network.std, len(self._low), self._exploration.sde_every)
-        return np.matmul(latent[:, None, :], matrices)[:, 0]
+        period = self._exploration.sde_every
+        return self._matrices.multiply(latent, rows, self.network.std, self._low.size, period)
 
     def _shape_actions(self, values: Array) -> Array:
+        if self._is_vector and values.dtype == np.float32:
+            return values
         return values.astype(self._space.dtype, copy=False).reshape(len(values), *self._shape)
 
     def _unscale(self, value: Array) -> Array:
@@ -112,7 +114,7 @@ class NumpyActor(FileActor):
     def _act_discrete(self, values: Array, rows: Rows) -> tuple[Array, Array]:
         exploration, space = self._exploration, self._space
         needs_numbers = exploration.stochastic or exploration.epsilon
-        uniform = self._noise.uniform(rows) if needs_numbers else None
+        uniform = self._noise.uniform.draw(rows) if needs_numbers else None
         sampled = None if uniform is None or self._algo == "dqn" else uniform[:, :-1]
         if isinstance(space, spaces.MultiBinary):
             probability = 1.0 / (1.0 + np.exp(-values))
@@ -133,29 +135,33 @@ class _Matrices:
     """gSDE's exploration matrix of each row."""
 
     def __init__(self, count: int) -> None:
-        self._is_drawn = np.zeros(count, bool)
+        self._is_drawn = [False] * count
         self._matrices: Array = np.zeros((count, 0, 0), np.float32)
 
     def forget(self) -> None:
         """Draw new ones for the next actions."""
-        self._is_drawn[:] = False
+        self._is_drawn = [False] * len(self._is_drawn)
 
-    def of(self, rows: Rows, std: Array, actions: int, period: int) -> Array:
-        """Return the matrices of rows, shape (k, latent, actions), new ones each `period` steps of an episode."""
+    def multiply(self, latent: Array, rows: Rows, std: Array, actions: int, period: int) -> Array:
+        """Return the noise of rows, shape (k, actions); each has a new matrix every `period` steps of an episode."""
         if not self._matrices.size:
             self._matrices = np.zeros((len(self._is_drawn), len(std), actions), np.float32)
-        is_new = ~self._is_drawn[rows.index]
-        if period:
-            is_new |= rows.step % period == 0
-        for k in np.flatnonzero(is_new).tolist():
-            self._matrices[rows.index[k]] = draw_matrix(std, int(rows.seed[k]), int(rows.step[k]), actions)
-        self._is_drawn[rows.index] = True
-        matrices: Array = self._matrices[rows.index]
-        return matrices
+        for k, row in enumerate(rows.index.tolist()):
+            if not self._is_drawn[row] or (period and rows.step[k] % period == 0):
+                self._matrices[row] = draw_matrix(std, int(rows.seed[k]), int(rows.step[k]), actions)
+                self._is_drawn[row] = True
+        if len(latent) == 1:
+            one: Array = latent.dot(self._matrices[row])  # the same bits in a third of the time
+            return one
+        return np.matmul(latent[:, None, :], self._matrices[rows.index])[:, 0]
 
 
-def _refuse(values: Array, rows: Rows) -> None:
-    """Raise `DivergedError` for the first row that is not finite, if there is one: the sum of all may overflow."""
+def _check_finite(values: Array, rows: Rows) -> None:
+    """Raise `DivergedError` for the first row that is not finite."""
+    total = sum(values[0].tolist()) if len(values) == 1 else values.sum()  # Python is faster with few numbers
+    if math.isfinite(total):
+        return
+    # The sum of finite numbers may overflow.
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1)).tolist():
         with in_world(int(rows.index[k])):
             raise DivergedError(f"the policy's action is not finite: {short_repr(values[k].tolist())}")

@@ -175,7 +175,10 @@ class OnnxActor(FileActor):
 
     def _act_one(self, observation: Any, row: int, seed: int, step: int) -> Any:
         batch = {key: np.asarray(part)[None] for key, part in split(observation).items()}
-        return self._run(batch, self._state[row : row + 1])[0]
+        actions = self._run(batch, self._state[row : row + 1])
+        if len(actions) != 1:
+            raise ValueError(f"it returns {len(actions)} actions for one observation")
+        return actions[0]
 
     def act_together(self, observations: Any) -> Array:
         """Return the actions for the first observations of several episodes, in one call."""

@@ -42,13 +42,14 @@ class Policy:
         with new noise in every episode. Raises `ValueError` for an observation of another shape, `UsageError` if an
         exported policy shall sample.
         """
-        rows = join({key: part[None] for key, part in self.read_observation(observation).items()})
+        rows = self._read_row(observation)
         if deterministic is not self._is_deterministic:
             self.actor.explore(_MEAN if deterministic else _SAMPLE)
             self._is_deterministic = deterministic
-        action = self.actor.act(rows, self._row)[1][0]
-        self._row.step[0] += 1
-        return np.asarray(action)
+        row = self._row
+        action: NDArray[Any] = np.asarray(self.actor.act(rows, row)[1][0])
+        row.step[0] += 1
+        return action
 
     def reset(self) -> None:
         """Begin an episode: forget the recurrent state."""
@@ -56,8 +57,8 @@ class Policy:
         self.actor.prepare()
         self.actor.begin(self._row)
 
-    def read_observation(self, observation: Any) -> dict[str, NDArray[Any]]:
-        """Return the parts of an observation by key, in their dtypes; raises `ValueError` for another shape."""
+    def _read_row(self, observation: Any) -> Any:
+        """Return an observation as a batch of one row, in its dtypes; raises `ValueError` for another shape."""
         raw_parts, parts = split(observation), {}
         for key, (shape, dtype) in self._parts.items():
             value = np.asarray(raw_parts[key], dtype) if key in raw_parts else None
@@ -68,8 +69,8 @@ class Policy:
                 expected = join({key: shape for key, (shape, _) in self._parts.items()})
                 problem = f"observation of shape {map_parts(np.shape, observation)}, the policy expects {expected}"
                 raise ValueError(problem + _describe_additions(self.info.spec))
-            parts[key] = value
-        return parts
+            parts[key] = value[None]
+        return join(parts)
 
     def try_once(self, *, deterministic: bool = True) -> None:
         """Act once on an observation of zeros; raises `ValueError` for an action that does not fit the action space.

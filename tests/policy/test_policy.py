@@ -111,9 +111,10 @@ def test_normalisation_by_hand(path):
     mean, var = tensors["normalize//mean"], tensors["normalize//var"]
     expected = np.clip((observation - mean) / np.sqrt(var + 1e-8), -10.0, 10.0)
     assert expected[4] == 10.0
-    (normalize, _) = Network(PolicyFile.read(path)).parts[""]
-    np.testing.assert_array_equal(normalize(observation), expected.astype(np.float32))
-    np.testing.assert_array_equal(TorchActor.load(path).normalize(observation), expected.astype(np.float32))
+    (normalize,) = Network(PolicyFile.read(path)).parts[""]
+    rows = observation[None]
+    np.testing.assert_array_equal(normalize(rows)[0], expected.astype(np.float32))
+    np.testing.assert_array_equal(TorchActor.load(path).normalize(rows)[0], expected.astype(np.float32))
 
 
 def rewrite(path, metadata):
