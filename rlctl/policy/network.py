@@ -88,7 +88,7 @@ class Network:
         return apply(self.trunk, value)
 
     def compute_std(self, latent: Array) -> Array:
-        """Return the standard deviations of Gaussian actions, shape (k, elements), or (1, elements) if all are equal."""
+        """Return the standard deviations of Gaussian actions, shape (k, elements); (1, elements) if all are equal."""
         if self._log_std_layer is not None:
             return np.exp(np.clip(self._log_std_layer(latent), -20.0, 2.0))
         assert self._std_row is not None  # called for Gaussian heads only

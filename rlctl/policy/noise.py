@@ -11,7 +11,7 @@ NOISE_BLOCK = 64
 _STEP_NOISE, _MATRIX = 0, 1  # random streams: noise of steps, gSDE's matrices
 
 
-class Noise:
+class StepNoise:
     """Random numbers of the steps of the episodes in `count` rows; they do not depend on which were drawn before."""
 
     def __init__(self, count: int, size: int) -> None:
@@ -19,22 +19,22 @@ class Noise:
         self._count, self._size = count, size
 
     @functools.cached_property
-    def sample(self) -> "Blocks":
+    def sample(self) -> "NumbersOfSteps":
         """Standard normal numbers for the policy's distribution, `size` in each step."""
-        return Blocks("sample", self._count, self._size)
+        return NumbersOfSteps("sample", self._count, self._size)
 
     @functools.cached_property
-    def disturb(self) -> "Blocks":
+    def disturb(self) -> "NumbersOfSteps":
         """Standard normal numbers, independent of those of `sample`, `size` in each step."""
-        return Blocks("disturb", self._count, self._size)
+        return NumbersOfSteps("disturb", self._count, self._size)
 
     @functools.cached_property
-    def uniform(self) -> "Blocks":
+    def uniform(self) -> "NumbersOfSteps":
         """Uniform numbers in [0, 1), `size + 1` in each step."""
-        return Blocks("uniform", self._count, self._size)
+        return NumbersOfSteps("uniform", self._count, self._size)
 
 
-class Blocks:
+class NumbersOfSteps:
     """The present block of steps of each row, of one kind of random numbers."""
 
     def __init__(self, kind: str, count: int, size: int) -> None:
@@ -65,7 +65,7 @@ class Blocks:
 
 
 def draw_noise(seed: int, block: int, size: int) -> dict[str, Array]:
-    """Return the random numbers of a block of steps of an episode, by the names of `Noise`."""
+    """Return the random numbers of a block of steps of an episode, by the names of `StepNoise`."""
     generator = make_generator(seed, _STEP_NOISE, block)
     normal = generator.standard_normal((NOISE_BLOCK, 2, size), np.float32)
     uniform = generator.random((NOISE_BLOCK, size + 1))

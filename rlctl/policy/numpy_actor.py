@@ -14,7 +14,7 @@ from rlctl.policy.actor import Array, Exploration, Rows, as_stored
 from rlctl.policy.file import DETERMINISTIC, PolicyFile
 from rlctl.policy.layers import apply, as_row
 from rlctl.policy.network import Network
-from rlctl.policy.noise import Noise, draw_matrix
+from rlctl.policy.noise import StepNoise, draw_matrix
 from rlctl.policy.policy import FileActor
 
 
@@ -32,7 +32,7 @@ class NumpyActor(FileActor):
         self._is_vector = self._is_box and len(self._shape) == 1 and self._space.dtype == np.float32
         if isinstance(self._space, spaces.Box):
             self._low, self._high = as_row(self._space.low.ravel()), as_row(self._space.high.ravel())
-        self._noise = Noise(count, max(1, math.prod(self._shape)))
+        self._noise = StepNoise(count, max(1, math.prod(self._shape)))
         self._matrices = _Matrices(count) if info.policy_kwargs.get("use_sde") else None
         self._state = None if self.network.lstm is None else self.network.lstm.make_state(count)
 

@@ -16,7 +16,7 @@ import numpy as np
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from rlctl_robot.serve.session import load_served_policy
+from rlctl.policy.load import load_policy
 
 
 def encode(value: Any) -> Any:
@@ -32,7 +32,7 @@ def decode(value: dict[Any, Any]) -> Any:
 
 
 async def answer(socket: ServerConnection) -> None:
-    actor = load_served_policy(Path(sys.argv[1])).make_actor()
+    policy = load_policy(Path(sys.argv[1]))
     packer = msgpack.Packer(default=encode)
     await socket.send(packer.pack({}))
     before_s = None
@@ -41,7 +41,7 @@ async def answer(socket: ServerConnection) -> None:
             begin = time.monotonic()
             request = msgpack.unpackb(await socket.recv(), object_hook=decode)
             begin_acting = time.monotonic()
-            action = actor.predict(request["observation"])
+            action = policy.predict(request["observation"])
             timing = {"infer_ms": (time.monotonic() - begin_acting) * 1e3}
             if before_s is not None:
                 timing["prev_total_ms"] = before_s * 1e3

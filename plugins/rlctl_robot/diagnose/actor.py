@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 
+from rlctl.policy.actor import Rows, as_stored
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.layers import Activation, Clip, Flatten, Linear, Normalize
-from rlctl.policy.network import Network
 from rlctl.policy.numpy_actor import NumpyActor
-from rlctl.policy.policy import Policy
+from rlctl.policy.policy import FileActor
 from rlctl_robot.diagnose.signals import Array, LoggedSignals
 
 _IN_ROWS = (Linear, Activation, Normalize, Flatten, Clip)
@@ -27,18 +27,18 @@ class Variant:
 RIGHT = Variant("")
 
 
-class LoggedPolicy:
-    """A policy file that acts on rows of observations, deterministically."""
+class LoggedActor(FileActor):
+    """A policy file that acts deterministically on the observations of a log; its actions have float64."""
 
     def __init__(self, policy: PolicyFile) -> None:
-        self._network = network = Network(policy)
+        self._actor = NumpyActor(policy)
+        self._network = network = self._actor.network
         self.info = policy.info
         _, space = policy.info.env.spaces()
         self.low, self.high = (np.ravel(getattr(space, end)).astype(np.float64) for end in ("low", "high"))
         self._layers = [*network.parts.get("", []), *network.trunk, *network.head]
         self.in_rows = network.own is None and network.lstm is None
         self.in_rows = self.in_rows and all(isinstance(layer, _IN_ROWS) for layer in self._layers)
-        self._policy = None if self.in_rows else Policy(NumpyActor(policy))
         self.normalize = next((layer for layer in self._layers if isinstance(layer, Normalize)), None)
 
     def variants(self) -> list[Variant]:
@@ -55,17 +55,18 @@ class LoggedPolicy:
             found.append(Variant("the logged actions are in [-1, 1], not scaled to the bounds", unscales=False))
         return found
 
-    def act(self, observations: Array, variant: Variant = RIGHT) -> Array:
-        """Return the actions for observations of shape (rows, elements), shape (rows, actions)."""
-        assert self.in_rows  # recurrent and convolutional policies act step by step, see `act_all`
+    def compute(self, observations: Array, variant: Variant = RIGHT) -> Array:
+        """Return the actions for observations of shape (rows, elements), shape (rows, actions).
+
+        Raises `AssertionError` for recurrent and convolutional policies, which act step by step.
+        """
+        assert self.in_rows
         value = observations
         for layer in self._layers:
             if isinstance(layer, Normalize):
                 for _ in range(variant.normalizes):
                     value = layer(value)
-            elif isinstance(layer, Linear):
-                value = value @ layer.weight.T + layer.bias
-            elif not isinstance(layer, Flatten):
+            elif not isinstance(layer, Flatten):  # it would round the observations
                 value = layer(value)
         network = self._network
         if not network.is_squashed:
@@ -74,24 +75,26 @@ class LoggedPolicy:
             value = np.tanh(value)
         return self.low + 0.5 * (value + 1.0) * (self.high - self.low) if variant.unscales else value
 
-    def reset(self) -> None:
+    def begin(self, rows: Rows) -> None:
         """Begin an episode of a recurrent policy."""
-        if self._policy is not None:
-            self._policy.reset()
+        self._actor.begin(rows)
 
-    def act_step(self, observation: Array) -> Array:
-        """Return the action for the next observation of an episode, shape (elements,)."""
-        if self._policy is None:
-            return self.act(observation[None])[0]
-        shape = self.info.env.spaces()[0].shape or ()
-        return np.ravel(self._policy.predict(observation.astype(np.float32).reshape(shape))).astype(np.float64)
+    def act(self, observations: Array, rows: Rows) -> tuple[Array, Array]:
+        """Return the actions for the next observations of episodes, shape (k, elements)."""
+        if self.in_rows:
+            actions = self.compute(observations)
+        else:
+            shape = self.info.env.spaces()[0].shape or ()
+            seen = observations.astype(np.float32).reshape(len(observations), *shape)
+            actions = as_stored(self._actor.act(seen, rows)[1]).astype(np.float64)
+        return actions, actions
 
-    def act_all(self, signals: LoggedSignals) -> Array:
-        """Return the actions for all rows, segment by segment, with a recurrent state that begins with each."""
-        if self._policy is None:
-            return self.act(signals.observations)
-        actions = []
+    def act_on_log(self, signals: LoggedSignals) -> Array:
+        """Return the actions for all rows of a log, with a recurrent state that begins with each segment."""
+        if self.in_rows:
+            return self.compute(signals.observations)
+        row, actions = Rows.one(), []
         for start, length in zip(signals.starts, signals.lengths, strict=True):
-            self.reset()
-            actions += [self.act_step(row) for row in signals.observations[start : start + length]]
-        return np.array(actions, np.float64)
+            self.begin(row)
+            actions += [self.act(signals.observations[k : k + 1], row)[0] for k in range(start, start + length)]
+        return np.concatenate(actions)

@@ -11,7 +11,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError
 from rlctl.limits.limits import Limits, read_limits
 from rlctl.policy.file import PolicyFile
-from rlctl_robot.diagnose.actor import RIGHT, LoggedPolicy
+from rlctl_robot.diagnose.actor import RIGHT, LoggedActor
 from rlctl_robot.diagnose.candidates import list_candidates, make_normalised
 from rlctl_robot.diagnose.correction import Correction, correct
 from rlctl_robot.diagnose.evidence import Likelihood, Scorer
@@ -98,7 +98,7 @@ class Doctor:
     ) -> None:
         """`steps` of rollouts in simulation in total; by default as many as the observation needs."""
         self.policy, self.spec, self._others, self._seed = policy, spec, others, seed
-        self.actor = LoggedPolicy(policy)
+        self.actor = LoggedActor(policy)
         width = int(np.prod(policy.info.env.spaces()[0].shape or ()))
         steps = steps or int(np.clip(_STEPS_PER_ELEMENT * width, _FEWEST_STEPS, _MOST_STEPS))
         self.likelihood = Likelihood(record_reference(spec, self.actor, steps, seed))
@@ -171,7 +171,7 @@ class Doctor:
                 if len(unknown) < len(std):
                     match = Matcher(self.actor, signals, std, self.candidates, unknown, limited).match(pairs=False)
             return self._decide_normalisation(match, signals)
-        difference = np.minimum(np.abs(signals.actions - self.actor.act_all(signals)) / std, 1.0)
+        difference = np.minimum(np.abs(signals.actions - self.actor.act_on_log(signals)) / std, 1.0)
         difference = difference if limited is None else difference[~limited]
         return PolicyMatch(float(difference.mean()), float(difference.mean()))
 
@@ -236,7 +236,7 @@ class Doctor:
     def _find_other_policy(self, signals: LoggedSignals) -> str:
         std = self.likelihood.reference.statistics[ACTIONS].std
         for other in self._others:
-            difference = np.abs(signals.actions - LoggedPolicy(other).act_all(signals)) / std
+            difference = np.abs(signals.actions - LoggedActor(other).act_on_log(signals)) / std
             if float(np.minimum(difference, 1.0).mean()) < SAME:
                 return f"actions: they are those of the policy {other.path}"
         return ""

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from rlctl_robot.diagnose.actor import RIGHT, LoggedPolicy, Variant
+from rlctl_robot.diagnose.actor import RIGHT, LoggedActor, Variant
 from rlctl_robot.diagnose.candidates import make_offset, make_scale
 from rlctl_robot.diagnose.correction import Correction, correct
 from rlctl_robot.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
@@ -65,7 +65,7 @@ class Matcher:
 
     def __init__(
         self,
-        actor: LoggedPolicy,
+        actor: LoggedActor,
         signals: LoggedSignals,
         std: Array,
         candidates: Sequence[Correction],
@@ -104,7 +104,7 @@ class Matcher:
         observations, actions = corrected.observations[self._middle], corrected.actions[self._middle]
         if self._unknown:
             observations = self._complete(observations, actions, variant)
-        residuals: Array = (actions - self._actor.act(observations, variant)) / self._std
+        residuals: Array = (actions - self._actor.compute(observations, variant)) / self._std
         return residuals
 
     def _complete(self, observations: Array, actions: Array, variant: Variant) -> Array:
@@ -112,7 +112,7 @@ class Matcher:
         columns = list(self._unknown)
         best = observations.copy()
         best[:, columns] = list(self._unknown.values())
-        residuals = (actions - self._actor.act(best, variant)) / self._std
+        residuals = (actions - self._actor.compute(best, variant)) / self._std
         damping = np.ones(len(best))
         for _ in range(_ITERATIONS):
             slopes = np.stack([self._slope(best, column, variant) for column in columns], axis=2)
@@ -123,7 +123,7 @@ class Matcher:
             steps = np.linalg.solve(squares, slopes.transpose(0, 2, 1) @ residuals[..., None])[..., 0]
             tried = best.copy()
             tried[:, columns] += steps
-            errors = (actions - self._actor.act(tried, variant)) / self._std
+            errors = (actions - self._actor.compute(tried, variant)) / self._std
             is_better = np.square(errors).sum(axis=1) < np.square(residuals).sum(axis=1)
             best[is_better], residuals[is_better] = tried[is_better], errors[is_better]
             damping = np.where(is_better, damping / 4, damping * 4)
@@ -136,7 +136,7 @@ class Matcher:
         for sign in (1, -1):
             moved = observations.copy()
             moved[:, column] += sign * step
-            ends.append(self._actor.act(moved, variant))
+            ends.append(self._actor.compute(moved, variant))
         slope: Array = (ends[0] - ends[1]) / (2 * step) / self._std
         return slope
 
@@ -191,7 +191,7 @@ class Matcher:
 
     def _fit_actions(self, before: Sequence[Correction], variant: Variant) -> list[_ExplainedActions]:
         corrected = correct(self._windows, before)
-        computed = self._actor.act(corrected.observations[self._middle], variant)
+        computed = self._actor.compute(corrected.observations[self._middle], variant)
         logged = corrected.actions[self._middle]
         size = logged.shape[1]
         centred = logged - logged.mean(axis=0)

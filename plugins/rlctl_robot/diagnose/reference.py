@@ -18,7 +18,7 @@ from rlctl.policy.actor import Actor, Rows
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings, delay
 from rlctl.task.events.event import Widening
-from rlctl_robot.diagnose.actor import LoggedPolicy
+from rlctl_robot.diagnose.actor import LoggedActor
 from rlctl_robot.diagnose.candidates import TermStatistics, list_candidates
 from rlctl_robot.diagnose.correction import EVERYTHING, Correction
 from rlctl_robot.diagnose.signals import ACTIONS, Array, LoggedSignals
@@ -41,7 +41,7 @@ class Recordings:
     allowed_delay: int  # [control steps]: how late actions can be by the task's own events
 
 
-def record_reference(spec: EnvSpec, actor: LoggedPolicy, steps: int, seed: int = 0) -> Recordings:
+def record_reference(spec: EnvSpec, actor: LoggedActor, steps: int, seed: int = 0) -> Recordings:
     """Play the policy in its task for so many control steps in total.
 
     Raises `UsageError` for a task whose observations or actions are not flat vectors of numbers.
@@ -63,7 +63,7 @@ def record_reference(spec: EnvSpec, actor: LoggedPolicy, steps: int, seed: int =
 
 
 def record_mistakes(
-    spec: EnvSpec, actor: LoggedPolicy, mistakes: Sequence[Sequence[Correction]], steps: int, seed: int = 0
+    spec: EnvSpec, actor: LoggedActor, mistakes: Sequence[Sequence[Correction]], steps: int, seed: int = 0
 ) -> LoggedSignals:
     """Play the policy in its task with each of the combinations of mistakes, for so many control steps in total."""
     with contextlib.closing(spec.make()) as env:
@@ -86,7 +86,7 @@ def measure_statistics(signals: LoggedSignals) -> dict[str, TermStatistics]:
 
 
 class _ReferencePlayer:
-    def __init__(self, env: Any, actor: LoggedPolicy, rng: np.random.Generator) -> None:
+    def __init__(self, env: Any, actor: LoggedActor, rng: np.random.Generator) -> None:
         self._env, self._actor, self._rng = env, actor, rng
         sizes = actor.info.env.observation_sizes
         self._sizes = dict(sizes) or {EVERYTHING: math.prod(env.observation_space.shape)}
@@ -130,7 +130,7 @@ class _ReferencePlayer:
     def _play_episode(self, mistakes: Sequence[Correction], noise: float) -> tuple[Array, Array]:
         first = np.zeros(1, np.int64)
         mistaken = _MistakenActor(self._actor, mistakes, noise * self._range, self._sizes, self._rng)
-        self._actor.reset()
+        self._actor.begin(Rows.one())
         playing = Playing(GymWorlds(self._env))
         observations = playing.begin(first, [int(self._rng.integers(2**31))])
         length = int(self._rng.integers(_SHORT, _LONG))
@@ -145,7 +145,7 @@ class _MistakenActor(Actor):
 
     def __init__(
         self,
-        actor: LoggedPolicy,
+        actor: LoggedActor,
         mistakes: Sequence[Correction],
         noise: Array,
         sizes: Mapping[str, int],
@@ -172,7 +172,7 @@ class _MistakenActor(Actor):
             if one.delay:
                 measured = self.observations[max(0, step - one.delay)][part]
             seen[part] = one.undo(measured)
-        action = actor.act_step(seen)
+        action = actor.act(seen[None], rows)[1][0]
         for one in self._mistakes:
             if one.term == ACTIONS:
                 action = one.change(action)

@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError, short_repr
+from rlctl.limits.limited import Limited
 from rlctl.limits.limits import Limits
 from rlctl.limits.observation import WHOLE, ObservationError
-from rlctl.limits.safety_filter import SafetyFilter
-from rlctl.policy.actor import as_rows
+from rlctl.policy.actor import Actor, Rows, as_rows
 from rlctl.policy.file import DETERMINISTIC, PolicyFile, PolicyInfo
 from rlctl.policy.load import check_playable
 from rlctl.policy.network import Network
 from rlctl.policy.numpy_actor import NumpyActor
-from rlctl.policy.policy import Policy
 from rlctl.storage import files, untrusted
 
 
@@ -30,7 +29,7 @@ class ServedPolicy:
     file: Path
     info: PolicyInfo
     sha256: str  # of the file
-    make_actor: Callable[[], Policy]  # returns the policy of one client, with its own recurrent state
+    make_actor: Callable[[], Actor]  # returns the policy of one client, with its own recurrent state
     network: Network | None = None  # None for an ONNX file, which outputs only the action
 
     def measure_spread(self, observation: Any) -> float | None:
@@ -64,9 +63,9 @@ def load_served_policy(file: Path) -> ServedPolicy:
 
         exported = OnnxActor.load(file)
         info, session = exported.info, exported.session
-        return ServedPolicy(file, info, sha256, lambda: Policy(OnnxActor(info, session)))
+        return ServedPolicy(file, info, sha256, lambda: OnnxActor(info, session))
     actor = check_playable(PolicyFile.read(file)).actor_only()
-    return ServedPolicy(file, actor.info, sha256, lambda: Policy(NumpyActor(actor)), Network(actor))
+    return ServedPolicy(file, actor.info, sha256, lambda: NumpyActor(actor), Network(actor))
 
 
 _MAX_AGE_S = 1e9
@@ -79,8 +78,9 @@ class Session:
         self.number = number
         self._policy = policy
         self._served = policy()
-        self._actor = self._served.make_actor()
-        self.safety = SafetyFilter(self._served.info.env, limits)
+        self._limited = Limited(self._served.make_actor(), self._served.info.env, limits, holds_on_errors=True)
+        self._row = Rows.one()
+        (self.safety,) = self._limited.filters
         periods, dt = self.safety.limits.watchdog_periods, self.safety.control_dt
         self._watchdog_s = periods * dt if periods and dt else None
         self._last_s: float | None = None
@@ -102,23 +102,22 @@ class Session:
         self.check_watchdog(time.monotonic())
         self._adopt_policy()
         error = ""
-        policy_action = None
         infer_s = 0.0
         try:
             observation, age_s = self._read(request)
         except ObservationError as problem:
             error = str(problem)
             self.safety.fail("invalid observation", short_repr(error, 200))
+            action = self.safety.limit(None)
         else:
             self.observation = observation
-            if self.safety.observe(observation, age_s):
-                begin = time.perf_counter()
-                try:
-                    policy_action = self._actor.predict(observation)
-                except Exception as problem:  # whatever a network's library raises: the robot holds
-                    error = f"the policy cannot act: {short_repr(str(problem), 200)}"
-                infer_s = time.perf_counter() - begin
-        self.action = action = self.safety.limit(policy_action)
+            self._limited.ages_s = [age_s]
+            action = self._limited.act(as_rows(observation), self._row)[1][0]
+            infer_s = self._limited.acting_s
+            if (failure := self._limited.error) is not None:
+                error = f"the policy cannot act: {short_repr(str(failure), 200)}"
+            self._row.step[0] += 1
+        self.action = action
         answer: dict[str, Any] = {
             "actions": action.reshape(1, -1) if action.ndim < 2 else action[None],
             "server_timing": {"infer_ms": infer_s * 1000.0},
@@ -152,7 +151,7 @@ class Session:
 
     def _adopt_policy(self) -> None:
         if (policy := self._policy()) is not self._served:
-            self._served, self._actor = policy, policy.make_actor()
+            self._served, self._limited.actor = policy, policy.make_actor()
             self.safety.begin_blend()
 
     def reset(self) -> None:
@@ -161,7 +160,8 @@ class Session:
             self.safety.resume()
         self._by_watchdog = False
         self.episode += 1
-        self._actor.reset()
+        self._row = Rows.one()
+        self._limited.actor.begin(self._row)
         self.safety.reset()
 
     def order(self, order: str) -> None:

@@ -42,10 +42,10 @@ from rlctl.exporting.request import ExportRequest
 from rlctl.exporting.verify import Latency, change_last_bits, measure_sb3
 from rlctl.limits.doubts import list_doubts
 from rlctl.limits.limits import Limits, read_limits
+from rlctl.policy.actor import Actor
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.onnx_policy import encode
-from rlctl.policy.policy import FileActor, Policy
 from rlctl.policy.torch_policy import TorchActor, pin_threads
 from rlctl.storage import files
 
@@ -178,10 +178,9 @@ class _Export:
         files.write_text(example, write_example(controller, [program.undo(inputs) for inputs in recorded[0].inputs]))
         return example
 
-    def _make_reference(self, actor: FileActor, is_limited: bool) -> verify.LimitedPolicy:
-        return verify.LimitedPolicy(
-            _describe_controller(self.policy), Policy(actor), self.limits if is_limited else None
-        )
+    def _make_reference(self, actor: Actor, is_limited: bool) -> Actor:
+        """Return what a controller is compared with: the policy in Python, within the limits."""
+        return actor if self.limits is None or not is_limited else self.player.limit(actor, self.limits)
 
     @functools.lru_cache(maxsize=2)  # noqa: B019 (for one export)
     def _record(self, is_limited: bool) -> list[verify.Recorded]:

@@ -15,6 +15,7 @@ from rlctl.exporting.c_source import FLAGS, CSource
 from rlctl.exporting.controller.graph import LAST_ACTION, TARGET, name_input
 from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.exporting.controller.program_mapping import ProgramMapping
+from rlctl.policy.actor import Actor, Array, Rows, act_one_by_one
 from rlctl.policy.c_policy import action_type
 from rlctl.policy.load import LIBRARY_SUFFIX
 from rlctl.policy.onnx_policy import ACTION, open_session
@@ -28,12 +29,16 @@ REASONS = (
 ORDERS = ("reset", "stop", "hold", "home", "resume")
 
 
-class Controller(abc.ABC):
-    """A controller: quantities in, an action and the joints' targets out."""
+class Controller(Actor):
+    """A controller in one environment: quantities in, an action and the joints' targets out."""
 
     @abc.abstractmethod
-    def begin(self) -> None:
+    def begin(self, rows: Rows | None = None) -> None:
         """Begin an episode."""
+
+    def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
+        """Return the action for the quantities of one row."""
+        return act_one_by_one(observations, rows, lambda inputs, row, seed, step: self.step(inputs)[0])
 
     @abc.abstractmethod
     def step(self, inputs: Inputs) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
@@ -58,7 +63,7 @@ class CController(Controller):
         self.library.rlctl_state_size.restype = ctypes.c_size_t
         # In units of a double, so that the memory is aligned.
         self._memory = np.zeros(-(-self.library.rlctl_state_size() // 8), np.float64)
-        self.state = self._memory.ctypes.data_as(ctypes.c_void_p)
+        self._pointer = self._memory.ctypes.data_as(ctypes.c_void_p)
         self._layout, self._has_target = layout, has_target
         self.action = np.zeros(layout.action_size, action_type(layout.env))
         self._target = np.zeros(layout.action_size)
@@ -67,25 +72,25 @@ class CController(Controller):
         self.dtype = layout.dtype
         self._values = np.zeros(layout.input_size, layout.dtype)
         self.may_send = False
-        self.library.rlctl_init(self.state)
+        self.library.rlctl_init(self._pointer)
 
     @property
     def status(self) -> tuple[str, str]:
         """State and reason of the limits."""
         return STATUS[self._status[0]], REASONS[self._status[1]]
 
-    def begin(self) -> None:
+    def begin(self, rows: Rows | None = None) -> None:
         """Begin an episode, and end what the limits hold."""
-        self.library.rlctl_begin(self.state)
+        self.library.rlctl_begin(self._pointer)
 
     def order(self, order: str) -> None:
         """Give an order: one of `ORDERS`."""
-        self.library.rlctl_order(self.state, ctypes.c_int(ORDERS.index(order)))
+        self.library.rlctl_order(self._pointer, ctypes.c_int(ORDERS.index(order)))
 
     def step(self, inputs: Inputs | None, age_s: float = 0.0) -> tuple[NDArray[Any], NDArray[np.float64] | None]:
         """Return copies of action and targets."""
         pointer = None if inputs is None else self._point_to(inputs)
-        self.may_send = bool(self.library.rlctl_step(self.state, pointer, ctypes.c_double(age_s), *self._outputs))
+        self.may_send = bool(self.library.rlctl_step(self._pointer, pointer, ctypes.c_double(age_s), *self._outputs))
         action = self.action.reshape(self._layout.action_space.shape).copy()
         return action, self._target.copy() if self._has_target else None
 
@@ -95,7 +100,7 @@ class CController(Controller):
         """Take a step of a recorded episode."""
         own = requested.ravel().astype(self.action.dtype)
         pointers = self._point_to(inputs), own.ctypes.data_as(ctypes.c_void_p)
-        self.library.rlctl_follow(self.state, *pointers, *self._outputs)
+        self.library.rlctl_follow(self._pointer, *pointers, *self._outputs)
         target = self._target.copy() if self._has_target else None
         return own.reshape(self._layout.action_space.shape), self.action.copy(), target
 
@@ -107,12 +112,12 @@ class CController(Controller):
         """Return the action of the limits alone, for a policy's action."""
         pointers = [None if array is None else array.ctypes.data_as(ctypes.c_void_p) for array in (values, requested)]
         outputs = self._outputs[0], self._outputs[2]
-        self.library.rlctl_limit(self.state, pointers[0], ctypes.c_double(age_s), pointers[1], *outputs)
+        self.library.rlctl_limit(self._pointer, pointers[0], ctypes.c_double(age_s), pointers[1], *outputs)
         return self.action
 
     def play(self, rows: NDArray[Any]) -> None:
         """Take a step for each row of inputs in a C loop, to measure its time; rows have shape (steps, inputs)."""
-        self.library.rlctl_play(self.state, rows.ctypes.data_as(ctypes.c_void_p), ctypes.c_long(len(rows)))
+        self.library.rlctl_play(self._pointer, rows.ctypes.data_as(ctypes.c_void_p), ctypes.c_long(len(rows)))
 
 
 class OnnxController(Controller):
@@ -129,7 +134,7 @@ class OnnxController(Controller):
         self._dtypes = {port.name: _DTYPES[port.type] for port in self.session.get_inputs()}
         self.begin()
 
-    def begin(self) -> None:
+    def begin(self, rows: Rows | None = None) -> None:
         """Begin an episode: zeros in place of the state."""
         self._state = dict(self._states)
 
@@ -158,7 +163,7 @@ class MappedController(Controller):
     def __init__(self, controller: Controller, mapping: ProgramMapping) -> None:
         self._controller, self._mapping = controller, mapping
 
-    def begin(self) -> None:
+    def begin(self, rows: Rows | None = None) -> None:
         """Begin an episode."""
         self._controller.begin()
 

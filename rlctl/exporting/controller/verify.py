@@ -16,51 +16,16 @@ from rlctl.errors import TaskError
 from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
 from rlctl.exporting.controller.players import CController, Controller, Inputs
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, compare_episodes
+from rlctl.limits.limited import Limited
 from rlctl.limits.limits import Limits
-from rlctl.limits.safety_filter import SafetyFilter
 from rlctl.play.collect import MOST_STEPS, Episode
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.playing import Playing
 from rlctl.play.seeds import Stream, episode_seeds
-from rlctl.policy.actor import Actor, Rows
-from rlctl.policy.policy import Policy
+from rlctl.policy.actor import Actor, Rows, as_rows
 
 _MIN_OBSERVATIONS = 2000
 _TIMED_STEPS, _MEAN_OF = 3000, 10
-
-
-class LimitedPolicy:
-    """The policy in Python, within the limits: what a controller is compared with."""
-
-    requested: NDArray[Any]
-    """The policy's last action, before the limits; zeros where it could not act."""
-
-    def __init__(self, layout: ControllerLayout, policy: Policy, limits: Limits | None) -> None:
-        self._layout, self._policy = layout, policy
-        self._safety = None if limits is None else SafetyFilter(layout.inputs_info, limits)
-
-    @property
-    def target(self) -> NDArray[Any] | None:
-        """A copy of the last target, where the limits bound targets."""
-        command = None if self._safety is None else self._safety.command
-        return None if command is None or command.target is None else command.target.copy()
-
-    def begin(self) -> None:
-        """Begin an episode, and end what the limits hold."""
-        self._policy.reset()
-        if self._safety is not None:
-            self._safety.resume()
-            self._safety.reset()
-
-    def act(self, observation: Any, inputs: Inputs) -> NDArray[Any]:
-        """Return the action for what the policy observes and what the robot measures."""
-        if self._safety is None:
-            self.requested = self._policy.predict(observation)
-            return self.requested
-        values = np.concatenate([np.ravel(value) for value in inputs.values()]).astype(self._layout.dtype)
-        is_sound = self._safety.observe(values)
-        self.requested = self._policy.predict(observation) if is_sound else np.zeros(self._layout.action_size)
-        return np.asarray(self._safety.limit(self.requested if is_sound else None))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,12 +44,29 @@ class TaskPlayer:
 
     def __init__(self, layout: ControllerLayout, env: gymnasium.Env[Any, Any], task: str) -> None:
         self._layout, self._env, self._task = layout, env, task
+        self._inputs: Inputs = {}
 
-    def play(self, seed: int, act: Callable[[Any, Inputs], NDArray[Any]]) -> Recorded:
-        """Play an episode; raises `TaskError` if the environment fails or the episode does not end."""
+    def limit(self, actor: Actor, limits: Limits) -> Limited:
+        """Return an actor within limits, whose filter observes what the robot measures."""
+        return Limited(actor, self._layout.inputs_info, limits, measure=self._join_inputs)
+
+    def _join_inputs(self, row: int) -> NDArray[Any]:
+        return np.concatenate([np.ravel(value) for value in self._inputs.values()]).astype(self._layout.dtype)
+
+    def measure(self, observation: Any) -> Inputs:
+        """Return what the robot measures in the present step."""
+        self._inputs = self._layout.measure(observation, getattr(self._env.unwrapped, "measured", {}))
+        return self._inputs
+
+    def play(self, seed: int, actor: Actor, watch: Callable[[], None] = lambda: None) -> Recorded:
+        """Play an episode; raises `TaskError` if the environment fails or the episode does not end.
+
+        A `Controller` observes what the robot measures. `watch` is called when the actor has acted.
+        """
         worlds, first = GymWorlds(self._env), np.zeros(1, np.int64)
-        playing, recorder = Playing(worlds), _MeasuringActor(self._layout, self._env, act)
+        playing, recorder = Playing(worlds), _MeasuringActor(self, actor, watch)
         observations = call_plugin(self._task, lambda: playing.begin(first, [seed]))
+        actor.begin(playing.select(first))
         steps = playing.play(recorder, first, observations)
         while call_plugin(self._task, lambda: next(steps, None)) is not None:
             if worlds.step_of[0] == MOST_STEPS:
@@ -95,23 +77,22 @@ class TaskPlayer:
 
 
 class _MeasuringActor(Actor):
-    """Acts on what is observed and on what the robot measures, and keeps both."""
+    """Another actor, with a record of what the robot measured and of the actions."""
 
-    def __init__(
-        self, layout: ControllerLayout, env: gymnasium.Env[Any, Any], act: Callable[[Any, Inputs], NDArray[Any]]
-    ) -> None:
-        self._layout, self._inner, self._act = layout, env.unwrapped, act
+    def __init__(self, player: TaskPlayer, actor: Actor, watch: Callable[[], None]) -> None:
+        self._player, self._actor, self._watch = player, actor, watch
         self.measured: list[Inputs] = []
         self.actions: list[NDArray[Any]] = []
 
     def act(self, observations: Any, rows: Rows) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the action of the only row."""
-        observation = take_row(observations, 0)
-        inputs = self._layout.measure(observation, getattr(self._inner, "measured", {}))
-        action = np.array(self._act(observation, inputs))
+        inputs = self._player.measure(take_row(observations, 0))
+        seen = as_rows(inputs) if isinstance(self._actor, Controller) else observations
+        stored, actions = self._actor.act(seen, rows)
+        self._watch()
         self.measured.append(inputs)
-        self.actions.append(action)
-        return action[None], action[None]
+        self.actions.append(np.array(actions[0]))
+        return stored, actions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,23 +104,29 @@ class ControllerAgreement:
     max_target_difference: float | None  # in the unit of the targets; None without targets
 
 
-def record(player: TaskPlayer, reference: LimitedPolicy) -> list[Recorded]:
+def record(player: TaskPlayer, reference: Actor) -> list[Recorded]:
     """Play `EPISODES` episodes, and more until `_MIN_OBSERVATIONS` are recorded."""
     recorded: list[Recorded] = []
     while len(recorded) < EPISODES or sum(len(episode.actions) for episode in recorded) < _MIN_OBSERVATIONS:
         seed = episode_seeds(0, Stream.VERIFY, len(recorded) + 1)[-1]
-        reference.begin()
-        between: list[tuple[NDArray[Any], NDArray[Any] | None]] = []
+        between: list[tuple[NDArray[Any] | None, NDArray[Any] | None]] = []
 
-        def act(observation: Any, inputs: Inputs, between: list[Any] = between) -> NDArray[Any]:
-            action = reference.act(observation, inputs)
-            between.append((reference.requested, reference.target))
-            return action
+        def watch(between: list[Any] = between) -> None:
+            if isinstance(reference, Limited):
+                between.append((reference.requested[0], _find_target(reference)))
 
-        played = player.play(seed, act)
-        requested, targets = map(list, zip(*between, strict=True))
-        recorded.append(dataclasses.replace(played, requested=requested, targets=targets))
+        played = player.play(seed, reference, watch)
+        if not isinstance(reference, Limited):
+            between += [(action, None) for action in played.actions]
+        requested = [np.zeros(np.size(played.actions[0])) if action is None else action for action, _ in between]
+        recorded.append(dataclasses.replace(played, requested=requested, targets=[target for _, target in between]))
     return recorded
+
+
+def _find_target(limited: Limited) -> NDArray[Any] | None:
+    """Return a copy of the last target, where the limits bound targets."""
+    command = limited.filters[0].command
+    return None if command is None or command.target is None else command.target.copy()
 
 
 def verify_controller(
@@ -162,19 +149,13 @@ def verify_controller(
                 worst = max(worst, _compare(agreement, wanted, targets))
     agreement.observations = sum(len(episode.actions) for episode in recorded)
 
-    def act(observation: Any, inputs: Inputs) -> NDArray[Any]:
-        return controller.step(inputs)[0]
-
-    actual = []
-    for episode in recorded[:EPISODES]:
-        controller.begin()
-        actual.append(player.play(episode.episode.result.seed, act).episode)
+    actual = [player.play(episode.episode.result.seed, controller).episode for episode in recorded[:EPISODES]]
     loop = compare_episodes([episode.episode for episode in recorded[:EPISODES]], actual)
     return ControllerAgreement(agreement, loop, None if target is None else worst)
 
 
 def check_conclusive(
-    player: TaskPlayer, reference: LimitedPolicy, changed: Iterable[LimitedPolicy], recorded: Sequence[Recorded]
+    player: TaskPlayer, reference: Actor, changed: Iterable[Actor], recorded: Sequence[Recorded]
 ) -> tuple[bool, bool]:
     """Return whether a policy repeats its recorded episodes, and whether they change with the last bits of its weights.
 
@@ -182,12 +163,8 @@ def check_conclusive(
     """
     episodes = [episode.episode for episode in recorded[:EPISODES]]
 
-    def play_again(reference: LimitedPolicy) -> ClosedLoop:
-        again = []
-        for episode in episodes:
-            reference.begin()
-            again.append(player.play(episode.result.seed, reference.act).episode)
-        return compare_episodes(episodes, again)
+    def play_again(actor: Actor) -> ClosedLoop:
+        return compare_episodes(episodes, [player.play(episode.result.seed, actor).episode for episode in episodes])
 
     loop = play_again(reference)
     repeats = loop.agrees and loop.max_return_difference == 0.0

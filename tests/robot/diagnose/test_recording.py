@@ -65,7 +65,7 @@ def record_through_server(file, order):
                     observation, _ = robot.env.reset(seed=step)
                 sent = np.array(observation)
                 sent[velocities] = sent[velocities[order]]
-                answer = client.act({"observation": sent, "reset": done})
+                answer = client.ask({"observation": sent, "reset": done})
                 action = np.asarray(answer["actions"], np.float32)[0]
                 observation, _, terminated, truncated, _ = robot.env.step(action)
                 done = terminated or truncated

@@ -35,7 +35,7 @@ class Answers(PolicyClient):
         with contextlib.suppress(PolicyError):  # the robot closes it
             request = self._unpack(self._run(self._socket.receive(20)))
             while True:
-                request = self.act(act(request))
+                request = self.ask(act(request))
 
 
 def control_by_websocket(port, act):

@@ -252,7 +252,7 @@ def test_a_program_that_disconnects():
     def leave(port):
         with contextlib.closing(Answers(f"ws://127.0.0.1:{port}")) as client:
             for _ in range(3):
-                client.act({"actions": [[0.0, 0.0]]})
+                client.ask({"actions": [[0.0, 0.0]]})
 
     start = Started(leave)
     report = run_robot(RobotRequest(SLIDER, port=0, fault=["drop=0"]), start, changes=UNCHANGED, gates=NO_GATES)

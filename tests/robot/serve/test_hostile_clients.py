@@ -55,7 +55,7 @@ def read_all(connection):
 
 def works(server):
     with server.client() as client:
-        return client.act(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]
+        return client.ask(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]
 
 
 def test_a_gigabyte(server):
@@ -109,7 +109,7 @@ def test_two_hundred_connections(server):
         idle = [socket.create_connection(("127.0.0.1", server.port), timeout=120) for _ in range(100)]
         for connection in idle:
             connection.sendall(b"POST /act HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\n{")
-        assert client.act(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]
+        assert client.ask(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]
         answers = [first.split(b"\r\n")[0] for _, first in opened]
         assert answers.count(b"HTTP/1.1 101 Switching Protocols") <= 7
         assert answers.count(b"HTTP/1.1 503 Service Unavailable") >= 93
@@ -124,7 +124,7 @@ def test_request_heads_that_never_end_are_timed_out(server, monkeypatch):
         slow.sendall(b"GET /metadata HTTP/1.1\r\nHost: localhost\r\nX-Slow: ")
         with contextlib.suppress(ConnectionResetError):
             assert slow.recv(1000) == b""  # closed
-        assert client.act(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]  # robots stay
+        assert client.ask(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]  # robots stay
 
 
 @pytest.mark.slow
@@ -144,7 +144,7 @@ def test_a_stop_is_served_with_few_file_descriptors_and_many_connections(tmp_pat
                 opened[-1].sendall(sent)
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/stop", b"", timeout=5) as answer:
             assert answer.status == 200
-        assert robot.act(OBSERVATION)["state"] == "stopped"
+        assert robot.ask(OBSERVATION)["state"] == "stopped"
         robot.close()
         for connection in opened:
             connection.close()

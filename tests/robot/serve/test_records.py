@@ -45,7 +45,7 @@ def test_a_recording_for_rerun(tmp_path):
     server = RunningServer(file, watchdog=False, rerun=tmp_path / "served.rrd")
     with server.client() as client:
         for _ in range(5):
-            client.act(OBSERVATION)
+            client.ask(OBSERVATION)
     server.close()
     _, actions = column(tmp_path / "served.rrd", "/client_2/action", timeline="time")
     assert actions.tolist() == [[6.0, 1.0]] * 5

@@ -46,15 +46,15 @@ def test_the_protocol(serve):
     with server.client() as client:
         assert client.metadata["observation"] == {"positions": [2], "goal": [3]}
         assert client.metadata["control_dt"] == 0.1
-        answer = client.act({"observation": FLAT})
+        answer = client.ask({"observation": FLAT})
         assert answer["actions"].tolist() == [[6.0, 1.0]]  # 1 + 2 + 3 and the first
         assert answer["state"] == "running"
         assert answer["server_timing"].keys() == {"infer_ms"}
         other_order = {"goal": [1, 2, 3], "positions": np.zeros(2)}
-        answer = client.act(other_order)
+        answer = client.ask(other_order)
         assert answer["actions"].tolist() == [[6.0, 1.0]]
         assert answer["server_timing"].keys() == {"infer_ms", "prev_total_ms"}
-        assert client.act({"observation": OBSERVATION})["actions"].tolist() == [[6.0, 1.0]]
+        assert client.ask({"observation": OBSERVATION})["actions"].tolist() == [[6.0, 1.0]]
 
 
 @pytest.mark.parametrize(
@@ -74,11 +74,11 @@ def test_the_protocol(serve):
 )
 def test_what_is_not_an_observation_gets_the_safe_action(serve, request_, error):
     with serve(limits="safe_action: [0.5, -0.5]").client() as client:
-        answer = client.act(request_)
+        answer = client.ask(request_)
         assert error in answer["error"]
         assert answer["actions"].tolist() == [[0.5, -0.5]]
         assert answer["state"] == "holding"
-        assert client.act(OBSERVATION)["state"] == "running"
+        assert client.ask(OBSERVATION)["state"] == "running"
 
 
 def pack_array(dtype="<f8", shape=(1,)):
@@ -105,7 +105,7 @@ def test_what_is_not_a_message_gets_a_text_frame(serve, content, error):
         with pytest.raises(PolicyError) as problem:
             client.send(content)
         assert error in str(problem.value)
-        assert client.act(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]
+        assert client.ask(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]
 
 
 def test_json_for_curl(serve):
@@ -126,7 +126,7 @@ def test_metrics(serve):
     server = serve(limits="limits: {all: {action: [-2, 2]}}")
     with server.client() as client:
         for _ in range(3):
-            client.act(OBSERVATION)
+            client.ask(OBSERVATION)
         text = server.get("/metrics")[1]
         live = json.loads(server.get("/live")[1])
     samples = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
@@ -150,7 +150,7 @@ def test_a_key(serve, tmp_path, monkeypatch):
         PolicyClient(f"ws://{server.address}")
     monkeypatch.setenv("RLCTL_API_KEY", "secret")
     with server.client() as client:
-        assert client.act(OBSERVATION)["state"] == "running"
+        assert client.ask(OBSERVATION)["state"] == "running"
 
 
 def test_an_unknown_path_is_refused_with_a_hint(serve):
@@ -190,17 +190,17 @@ def test_the_watchdog(serve, tmp_path):
     file = write_policy(tmp_path / "quick.safetensors", env=describe_env(control_dt=0.02))
     server = serve(file, watchdog=True, log=tmp_path / "log.jsonl")
     with server.client() as client:
-        assert client.act(OBSERVATION)["state"] == "running"
+        assert client.ask(OBSERVATION)["state"] == "running"
         time.sleep(0.2)  # ten periods
-        answer = client.act(OBSERVATION)
+        answer = client.ask(OBSERVATION)
         assert answer["state"] == "stopped"
         assert "watchdog: no observation for" in answer["reason"]
         assert answer["actions"].tolist() == [[0.0, 0.0]]
-        assert client.act({**OBSERVATION, "reset": True})["state"] == "running"
+        assert client.ask({**OBSERVATION, "reset": True})["state"] == "running"
         time.sleep(0.2)  # silent after a request that began an episode
-        assert client.act(OBSERVATION)["state"] == "stopped"
+        assert client.ask(OBSERVATION)["state"] == "stopped"
         server.post("/stop")  # now a person has stopped it
-        assert client.act({**OBSERVATION, "reset": True})["reason"] == "stop ordered"
+        assert client.ask({**OBSERVATION, "reset": True})["reason"] == "stop ordered"
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert ("state", "stopped") in [(line["kind"], line.get("name")) for line in lines]
     assert lines[0]["kind"] == "started"
@@ -212,33 +212,33 @@ def test_orders_are_for_all_clients_also_later_ones(serve):
         limits="{command: position, measured: {position: positions}, home: [0.5, 0.5], limits: {all: {speed: 1}}}"
     )
     with server.client() as one:
-        assert one.act(OBSERVATION)["actions"] == pytest.approx(np.array([[0.2, 0.3]]))  # 1 rad/s from 0.1 and 0.2
+        assert one.ask(OBSERVATION)["actions"] == pytest.approx(np.array([[0.2, 0.3]]))  # 1 rad/s from 0.1 and 0.2
         assert json.loads(server.post("/stop")[1])["order"] == "stop"
-        assert one.act({**OBSERVATION, "reset": True})["reason"] == "stop ordered"
+        assert one.ask({**OBSERVATION, "reset": True})["reason"] == "stop ordered"
         with server.client() as two:
-            assert two.act(OBSERVATION)["state"] == "stopped"
+            assert two.ask(OBSERVATION)["state"] == "stopped"
             server.post("/home")
             for _ in range(6):
-                answer = two.act(OBSERVATION)
+                answer = two.ask(OBSERVATION)
             assert answer["actions"] == pytest.approx(np.array([[0.5, 0.5]]))
             assert answer["state"] == "holding"
             server.post("/resume")
-            assert {one.act(OBSERVATION)["state"], two.act(OBSERVATION)["state"]} == {"running"}
+            assert {one.ask(OBSERVATION)["state"], two.ask(OBSERVATION)["state"]} == {"running"}
 
 
 def test_actions_by_hand(serve):
     server = serve()
     assert json.loads(server.post("/home")[1])["error"].startswith("the limits define no home")
     with server.client() as client:
-        client.act(OBSERVATION)
+        client.ask(OBSERVATION)
         assert server.post("/override", {"action": [1, -1]})[0] == 200
-        assert client.act({**OBSERVATION, "reset": True})["actions"].tolist() == [[1.0, -1.0]]
+        assert client.ask({**OBSERVATION, "reset": True})["actions"].tolist() == [[1.0, -1.0]]
         with server.client() as later:
-            assert later.act(OBSERVATION)["actions"].tolist() == [[1.0, -1.0]]
+            assert later.ask(OBSERVATION)["actions"].tolist() == [[1.0, -1.0]]
         for wrong in ({"action": [1]}, {"act": 1}, {"action": "up"}, [1, 2], {"action": [1e400, 0]}):
             assert server.post("/override", wrong)[0] == 400
         assert server.post("/override", {"action": None})[0] == 200
-        assert client.act(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]
+        assert client.ask(OBSERVATION)["actions"].tolist() == [[6.0, 1.0]]
 
 
 def test_another_policy_without_a_gap(serve, tmp_path):
@@ -249,7 +249,7 @@ def test_another_policy_without_a_gap(serve, tmp_path):
     def act():
         with server.client() as client:
             while not end.is_set():
-                seen.append(client.act(OBSERVATION)["actions"].tolist()[0])
+                seen.append(client.ask(OBSERVATION)["actions"].tolist()[0])
 
     thread = threading.Thread(target=act)
     thread.start()
@@ -283,10 +283,10 @@ def test_another_policy_without_a_gap(serve, tmp_path):
 def test_each_connection_is_an_episode(serve, tmp_path):
     server = serve(write_recurrent_policy(tmp_path / "recurrent.safetensors"))
     with server.client() as one, server.client() as two:
-        first = [one.act(OBSERVATION)["actions"].tolist() for _ in range(3)]
+        first = [one.ask(OBSERVATION)["actions"].tolist() for _ in range(3)]
         assert first[0] != first[1] != first[2]
-        assert [two.act(OBSERVATION)["actions"].tolist() for _ in range(3)] == first
-        assert one.act({**OBSERVATION, "reset": True})["actions"].tolist() == first[0]
+        assert [two.ask(OBSERVATION)["actions"].tolist() for _ in range(3)] == first
+        assert one.ask({**OBSERVATION, "reset": True})["actions"].tolist() == first[0]
 
 
 def test_a_file_that_is_not_a_policy(tmp_path):
@@ -309,11 +309,11 @@ def test_an_order_is_no_suggestion(serve):
 def test_the_robot_holds_whatever_the_policy_raises(serve, monkeypatch):
     server = serve()
 
-    def fail(self, observation, **options):
+    def fail(self, observations, rows):
         raise RuntimeError("out of memory")
 
     with server.client() as client:
-        client.act({"observation": FLAT})
+        client.ask({"observation": FLAT})
         monkeypatch.setattr(NumpyActor, "act", fail)
-        answer = client.act({"observation": FLAT})
+        answer = client.ask({"observation": FLAT})
     assert answer["error"] == "the policy cannot act: out of memory"
