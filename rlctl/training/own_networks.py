@@ -12,10 +12,10 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 
 from rlctl.environments.dict_spaces import SINGLE, join, split, split_space
 from rlctl.errors import RecipeError, describe_exception, short_repr
-from rlctl.exporting.layers import OPSET
 from rlctl.policy.actor import Rows, as_rows
 from rlctl.policy.file import ACTOR_CRITIC, GRAPH, PolicyFile, Tensors
 from rlctl.policy.numpy_actor import NumpyActor
+from rlctl.policy.onnx_graph import OPSET
 from rlctl.policy.onnx_policy import OWN_INPUT, OWN_OUTPUT
 from rlctl.policy.torch_policy import ACTIVATIONS, TorchActor, is_own
 from rlctl.training.privileged import has_privileged_critic
