@@ -1,6 +1,6 @@
 """Writes a policy as one ONNX graph, from raw observations to actions of the environment's action space."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,11 +9,11 @@ from gymnasium import spaces
 
 from rlctl.environments.dict_spaces import SINGLE, split_space
 from rlctl.errors import UsageError
-from rlctl.exporting.layers import BATCH, Graph, concatenate, emit, emit_lstm
 from rlctl.policy import onnx_policy
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.policy.layers import Normalize, OneHot
+from rlctl.policy.layers import Layer, Normalize, OneHot
 from rlctl.policy.network import Network
+from rlctl.policy.onnx_graph import BATCH, Graph
 from rlctl.policy.onnx_policy import OwnGraph
 from rlctl.task.joints import Joints
 
@@ -45,14 +45,14 @@ def emit_actor(graph: Graph, policy: PolicyFile, inputs: Mapping[str, tuple[str,
     network, action_space = Network(policy), policy.info.env.spaces()[1]
     state: tuple[str, ...] = ()
     if network.own is None:
-        value = concatenate(graph, [_emit_part(graph, inputs[key], network, key) for key in network.parts])
+        value = graph.concatenate([_emit_part(graph, inputs[key], network, key) for key in network.parts])
     else:
         value = _emit_own(graph, inputs, network.own)
     if (lstm := network.lstm) is not None:
         names, shape = onnx_policy.STATE_INPUTS, (len(lstm.layers), BATCH, lstm.hidden_size)
         hidden, cell = (graph.input(name, np.float32, shape, _STATE_MEANING) for name in names)
-        value, state = emit_lstm(graph, value, (hidden, cell), lstm)
-    value = emit(graph, value, [*network.trunk, *network.head])
+        value, state = lstm.write_onnx(graph, value, (hidden, cell))
+    value = _emit(graph, value, [*network.trunk, *network.head])
     if isinstance(action_space, spaces.Box):
         # Exploration adds noise before this tanh; the deterministic action has none.
         value = graph.add("Tanh", value) if network.ends_with_tanh else value
@@ -80,18 +80,24 @@ def _describe_input(info: PolicyInfo) -> str:
     return ", ".join(parts) or "observation"
 
 
+def _emit(graph: Graph, value: str, layers: Iterable[Layer]) -> str:
+    for layer in layers:
+        value = layer.write_onnx(graph, value)
+    return value
+
+
 def _emit_part(graph: Graph, source: tuple[str, Any], network: Network, key: str) -> str:
     (value, dtype), layers = source, network.parts[key]
     if dtype != np.float32 and not isinstance(layers[0], Normalize | OneHot):
         value = graph.cast(value, np.float32)
-    return emit(graph, value, layers)
+    return _emit(graph, value, layers)
 
 
 def _emit_own(graph: Graph, inputs: Mapping[str, tuple[str, Any]], own: OwnGraph) -> str:
     """Add a user's network, from all parts of the observation to its last hidden layer."""
     values = {f"{onnx_policy.OWN_INPUT}{key}": value for key, (value, _) in inputs.items()}
     for key, layer in own.normalize.items():
-        values[f"{onnx_policy.OWN_INPUT}{key}"] = emit(graph, inputs[key][0], [layer])
+        values[f"{onnx_policy.OWN_INPUT}{key}"] = _emit(graph, inputs[key][0], [layer])
     values |= {name: graph.constant(name, weight) for name, weight in own.weights.items()}
     return graph.inline(onnx.ModelProto.FromString(own.content).graph, values)
 

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import SINGLE, split_space
 from rlctl.errors import AnswerIsNo, UsageError, short_repr
-from rlctl.exporting.c_layers import CWriter, write_array, write_number
+from rlctl.exporting.c_network import list_functions, write_action, write_network
 from rlctl.policy import own_modules
 from rlctl.policy.c_policy import action_type, observation_type
+from rlctl.policy.c_writer import CWriter, write_array, write_number
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.layers import ScaleImage
 from rlctl.policy.load import LIBRARY_SUFFIX
@@ -158,8 +159,9 @@ def write_c(policy: PolicyFile, file_name: str) -> CSource:
     if isinstance(layout.action_space, spaces.Box) and layout.action_space.dtype.kind != "f":
         raise UsageError(f"export --c: an action of type {layout.action_space.dtype} cannot be written as C")
     writer = CWriter()
-    value, size = writer.write(network, layout.sizes, "state->frames" if layout.frames > 1 else "observation")
-    writer.write_action(network, value, size, layout.action_space, layout.action_type)
+    source = "state->frames" if layout.frames > 1 else "observation"
+    value = write_network(writer, network, layout.sizes, source)
+    write_action(writer, network, value, layout.action_space, layout.action_type)
     state = []
     if layout.frames > 1:
         state += [f"{layout.type} frames[{layout.frames * layout.size}]; /* oldest first */", "int begun;"]
@@ -176,7 +178,7 @@ def write_c(policy: PolicyFile, file_name: str) -> CSource:
         "state": state,
         "prototype": f"void {name}_act(const {layout.type} *observation, {state_argument}{layout.action_type} *action)",
         "constants": writer.constants,
-        "functions": writer.find_functions(),
+        "functions": list_functions(writer),
         "statements": writer.statements,
     }
     header, source, harness = (render(file, values) for file in ("policy.h", "policy.c", "harness.c"))

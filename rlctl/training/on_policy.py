@@ -12,6 +12,7 @@ from sb3_contrib.common.recurrent.type_aliases import RNNStates
 from rlctl.environments.dict_spaces import join, split, split_space
 from rlctl.play.shared_arrays import SegmentArrays
 from rlctl.policy.actor import Exploration
+from rlctl.policy.layers import Normalize
 from rlctl.training.rollouts import Check, Rollouts, Statistics, to_network_layout
 from rlctl.training.updates.ppo import PpoUpdate
 
@@ -86,12 +87,8 @@ class OnPolicyRollouts(Rollouts):
     def _prepare(self, key: str, rows: NDArray[Any]) -> NDArray[Any]:
         """Return observations in the networks' form: normalised, images channels-first."""
         if key in self._statistics:
-            mean, var = self._statistics[key]
             normalizer = self.model.get_vec_normalize_env()
-            limit = normalizer.clip_obs
-            normalized = rows - mean
-            normalized /= np.sqrt(var + normalizer.epsilon)
-            rows = np.clip(normalized, -limit, limit, out=normalized).astype(np.float32)
+            rows = Normalize(key, *self._statistics[key], normalizer.clip_obs, normalizer.epsilon)(rows)
         return to_network_layout(rows, split_space(self.model.observation_space)[key])
 
     def _evaluate_segment(self, observations: Arrays, actions: NDArray[Any], final: Arrays) -> _SegmentValues:

@@ -9,9 +9,9 @@ from rlctl.exporting.actor import emit_actor, make_metadata
 from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Quantity, Stack
 from rlctl.exporting.controller.program_mapping import NO_MAPPING, ElementMap, ProgramMapping
 from rlctl.exporting.controller.symbols import GraphSymbol
-from rlctl.exporting.layers import BATCH, Graph, concatenate
 from rlctl.policy import onnx_policy
 from rlctl.policy.file import PolicyFile
+from rlctl.policy.onnx_graph import BATCH, Graph
 
 TARGET = "target"
 OBSERVATION, LAST_ACTION, STEPS = "state_observation", "state_action", "state_steps"
@@ -68,7 +68,7 @@ class _Writer:
             shape = (BATCH, layout.action_size)
             self._last_action = graph.input(LAST_ACTION, action_type, shape, f"last action; {_ZEROS}")
         newest = [self._compute(part) for part in layout.observed]
-        observation = self._stack(newest) if layout.stacks else concatenate(graph, newest)
+        observation = self._stack(newest) if layout.stacks else graph.concatenate(newest)
         emit_actor(graph, self._policy, self._split(observation))
         action = onnx_policy.ACTION
         if self._target is not None:
@@ -110,7 +110,7 @@ class _Writer:
             dt = graph.constant("controller/control_dt", np.float64(self._layout.env.control_dt))
             symbols = [GraphSymbol(graph, graph.add("Mul", self._read(self._steps), dt), 1)]
         parts: list[GraphSymbol] = term.compute(*symbols)
-        joined = concatenate(graph, [symbol.value for symbol in parts])
+        joined = graph.concatenate([symbol.value for symbol in parts])
         return graph.cast(joined, self._layout.dtype)
 
     def _read(self, value: str) -> str:
@@ -122,12 +122,12 @@ class _Writer:
         shape = (BATCH, layout.size)
         before = graph.input(OBSERVATION, layout.dtype, shape, f"last observation; {_ZEROS}")
         if layout.frames > 1:
-            newest = [concatenate(graph, newest)]
+            newest = [graph.concatenate(newest)]
         if layout.repeats_first:
             zero = graph.constant("controller/zero", np.array([0], np.int64))
             self._is_first = graph.add("Equal", self._steps, zero)
         parts = [self._append(stack, before, value) for stack, value in zip(layout.stacks, newest, strict=True)]
-        observation = concatenate(graph, parts)
+        observation = graph.concatenate(parts)
         self._add_state(graph.add("Identity", observation), OBSERVATION, layout.dtype, shape)
         return observation
 

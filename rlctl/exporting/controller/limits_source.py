@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rlctl.exporting.c_layers import write_array, write_number
 from rlctl.limits.bounds import Bounds
 from rlctl.limits.command import Command
 from rlctl.limits.fitting import FittedLimits
 from rlctl.limits.limits import Limits
 from rlctl.limits.observation import UNIT_SQUARES
+from rlctl.policy.c_writer import write_array, write_number
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

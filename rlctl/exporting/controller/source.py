@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.exporting import c_source
-from rlctl.exporting.c_layers import CWriter, write_number
+from rlctl.exporting.c_network import list_functions, write_action, write_network
 from rlctl.exporting.c_source import CFunction, CSource
 from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Quantity
 from rlctl.exporting.controller.limits_source import LimitsSource
@@ -15,6 +15,7 @@ from rlctl.exporting.controller.program_mapping import NO_MAPPING, ElementMap, P
 from rlctl.exporting.controller.symbols import CSymbol
 from rlctl.limits.fitting import fit_limits
 from rlctl.limits.limits import NO_LIMITS, Limits
+from rlctl.policy.c_writer import CWriter, write_number
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.network import Network
 from rlctl.version import __version__
@@ -74,8 +75,8 @@ class ControllerSource:
         layout, network, writer = self.layout, Network(policy), CWriter()
         described = CFunction(self.name, policy.info)
         sizes = {key: part.shape[0] for key, part in layout.parts.items()}  # type: ignore[index]  # vectors
-        value, size = writer.write(network, sizes, "state->observation")
-        writer.write_action(network, value, size, layout.action_space, described.action_type)
+        value = write_network(writer, network, sizes, "state->observation")
+        write_action(writer, network, value, layout.action_space, described.action_type)
         lstm = network.lstm
         hidden = 0 if lstm is None else len(lstm.layers) * lstm.hidden_size
         values: dict[str, Any] = {
@@ -98,7 +99,7 @@ class ControllerSource:
             "target_lines": [] if (one := self._mapping.targets) is None else self._write_targets(one),
             "term_lines": [line for part in layout.observed for line in self._write_term(part, described.type)],
             "constants": writer.constants,
-            "functions": writer.find_functions(),
+            "functions": list_functions(writer),
             "statements": writer.statements,
         }
         return {**values, "limits_code": self._write_limits(values)}

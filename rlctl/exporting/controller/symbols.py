@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from rlctl.exporting.layers import Graph
+from rlctl.policy.onnx_graph import Graph
 
 _C = {
     "add": "({} + {})",

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 
 from rlctl.environments.dict_spaces import join, map_parts, split
+from rlctl.policy.layers import standardize
 from rlctl.training.snapshot import observation_statistics
 from rlctl.training.stacked_replay import StackedRows
 from rlctl.training.updates.perceptrons import Floats
@@ -63,9 +64,8 @@ def _gather(model: Any, count: int, size: int) -> dict[str, Any]:
     def take_observations(observations: Any, rows: NDArray[Any]) -> Any:
         parts = {key: take(values, rows) for key, values in split(observations).items()}
         for key, rms in statistics.items():
-            parts[key] -= rms.mean  # in place: SB3's copies in double precision take five times as long
-            parts[key] /= np.sqrt(rms.var + env.epsilon)
-            np.clip(parts[key], -env.clip_obs, env.clip_obs, out=parts[key])
+            # In place and in single precision: SB3's copies in double precision take five times as long.
+            standardize(parts[key], rms.mean, np.sqrt(rms.var + env.epsilon), -env.clip_obs, env.clip_obs)
         return join(parts)
 
     last, returns, discounts = _sum_rewards(model, rows, take)
