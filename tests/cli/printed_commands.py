@@ -35,7 +35,7 @@ class Printed:
 def find_all() -> list[Printed]:
     """Return the commands in the texts of the package: code without docstrings and comments, YAML, pages, templates."""
     found = []
-    for file in sorted((ROOT / "rlctl").rglob("*")):
+    for file in sorted([*(ROOT / "rlctl").rglob("*"), *(ROOT / "plugins/rlctl_robot").rglob("*")]):
         if file.suffix not in (".py", ".yaml", ".html", ".tmpl"):
             continue
         content = file.read_text(encoding="utf-8")

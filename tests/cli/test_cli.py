@@ -99,7 +99,7 @@ def test_no_arguments_show_the_help(rlctl):
         (
             ["runs", "report", "latest", "--format", "txt"],
             2,
-            "Invalid value for '--format': Value error, 'txt' is not one of 'html', 'md', 'svg'",
+            "Invalid value for '--format': Value error, 'txt' is not one of 'html', 'md', 'table', 'svg', 'pdf', 'png'",
         ),
         (
             ["runs", "compare", "a", "b", "--gate", "better"],
