@@ -25,7 +25,7 @@ ELSEWHERE = ("CONTRIBUTING.md", "CHANGELOG.md", "plugins/*/README.md", "examples
 API = {  # modules, names with the classes that they return, or with `.*` all that a package imports from its modules
     "rlctl": [
         *("rlctl.check_env", "rlctl.train", "rlctl.evaluate", "rlctl.load_policy", "rlctl.make"),
-        *("rlctl.checking.rules.RuleFinding", "rlctl.training.request.TrainResult"),
+        *("rlctl.checking.rules.RuleFinding", "rlctl.launching.train.TrainResult"),
         *("rlctl.evaluation.evaluate.Evaluation", "rlctl.policy.policy.Policy"),
     ],
     "rlctl.task": ["rlctl.task.*"],

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from rlctl.checking.rules import RuleFinding
     from rlctl.environments.spec import EnvSpec
     from rlctl.evaluation.evaluate import Evaluation
+    from rlctl.launching.train import TrainResult
     from rlctl.policy.policy import Policy
-    from rlctl.training.request import TrainResult
 
 
 def make(
@@ -110,8 +110,8 @@ def train(
     `if __name__ == "__main__":`, because worker processes may import the script. Raises the exceptions of
     `rlctl.errors`.
     """
+    from rlctl.launching.train import run_training
     from rlctl.runs.train_request import TrainRequest
-    from rlctl.training.request import run_training
 
     request = TrainRequest(
         task=task,

@@ -276,10 +276,12 @@ def main(descriptor, commands):
     for name in FOR_WORKERS + (FOR_COMMANDS if commands else ()):
         importlib.import_module(name)
     if commands:
+        import rlctl.launching
         import rlctl.training
 
-        for module in pkgutil.iter_modules(rlctl.training.__path__, "rlctl.training."):
-            importlib.import_module(module.name)
+        for room in (rlctl.training, rlctl.launching):
+            for module in pkgutil.iter_modules(room.__path__, f"{room.__name__}."):
+                importlib.import_module(module.name)
     gc.collect()
     gc.freeze()
     _use_huge_pages()

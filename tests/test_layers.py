@@ -20,6 +20,7 @@ LAYERS = [
     {"api", "gym"},
     {"cluster"},
     {"tuning"},
+    {"launching"},
     {"training"},
     {"gating"},
     {"runs.report"},
@@ -143,6 +144,20 @@ OPEN_TO_COMMANDS = {
     *("recipe", "runs", "storage", "task", "version"),
 }
 """The rooms and modules that a plugin with commands may import; one with tasks imports `rlctl.task` alone."""
+
+
+OF_RESULTS = ("runs.diagnosis", "runs.summary", "runs.report", "runs.compare", "replaying", "exporting")
+
+
+def test_training_reaches_results_through_its_callbacks():
+    forbidden = tuple(f"rlctl.{room}" for room in OF_RESULTS)
+    wrong = [
+        f"{file.relative_to(ROOT)} imports {module}"
+        for file in files("rlctl/training")
+        for module in imports(file)
+        if module.startswith(forbidden)
+    ]
+    assert wrong == []
 
 
 def find_imports_of_rlctl(plugin: str, allowed: set[str]) -> list[str]:

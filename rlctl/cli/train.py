@@ -5,9 +5,9 @@ from typing import Annotated, Any
 
 from rlctl.arguments import choose_checkpoint, command_in_panels
 from rlctl.errors import UsageError
+from rlctl.launching.distill_request import DistillRequest
 from rlctl.options import Cluster, Jobs, Json, On, Option, Pretrained, Settings, Sim
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.distilling.distill_request import DistillRequest
 from rlctl.tuning.tune_request import TuneRequest
 
 
@@ -96,8 +96,8 @@ def train(
         from rlctl import output
         from rlctl.cluster.executors import choose_executor
         from rlctl.evaluation.report import show_group
-        from rlctl.training.seeds import train_seeds
-        from rlctl.training.trainings import Detached
+        from rlctl.launching.seeds import train_seeds
+        from rlctl.launching.trainings import Detached
 
         make_trainings = choose_executor(on, cluster, detach=detach)
         try:
@@ -108,7 +108,7 @@ def train(
         return result.check()
     if on is not None or detach or jobs is not None:
         raise UsageError("--jobs, --on and --detach need several seeds: give --seeds 0-4 or --resume GROUP")
-    from rlctl.training.request import run_training, show
+    from rlctl.launching.train import run_training, show
 
     return show(run_training(request), json)
 
@@ -139,8 +139,8 @@ class DistillFlags(RecipeFlags):
 )
 def distill(flags: DistillFlags, request: DistillRequest, pretrained: Pretrained = False, json: Json = None) -> None:
     """Train a student with other observations from a policy's actions (DAgger), and compare it with its teacher."""
-    from rlctl.training.distilling.distill import distill as run_distilling
-    from rlctl.training.distilling.distill import show
+    from rlctl.launching.distill import distill as run_distilling
+    from rlctl.launching.distill import show
 
     checkpoint = choose_checkpoint(request.checkpoint, pretrained)
     request = dataclasses.replace(request, checkpoint=checkpoint, settings=flags.merge())

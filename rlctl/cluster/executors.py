@@ -7,7 +7,7 @@ from pathlib import Path
 from rlctl.cluster.work import read_settings
 from rlctl.errors import UsageError
 from rlctl.evaluation.vary import PlayCells
-from rlctl.training.trainings import MakeTrainings, make_local_trainings
+from rlctl.launching.trainings import MakeTrainings, make_local_trainings
 
 VARIABLE = "RLCTL_ON"  # environment variable that replaces the default, `local`
 _NOT_ON_SLURM = {

@@ -25,10 +25,10 @@ from typing import Any
 from rlctl.cluster.work import PREEMPTED, TAKEN, ClusterSettings, Work, execute, make_work, mark_shared_folder
 from rlctl.environments import registry
 from rlctl.errors import TaskError, UsageError, explain_missing_package
+from rlctl.launching.trainings import NextSignal, Trainings
 from rlctl.play.workers import available_cores
 from rlctl.runs.group import Job, read_job, write_job
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.trainings import NextSignal, Trainings
 
 _BEAT_S = 0.5
 _POLL_S = 0.3

@@ -22,12 +22,12 @@ from types import FrameType
 from rlctl import output
 from rlctl.cluster.work import PREEMPTED, TAKEN, ClusterSettings, Work, execute, make_work, mark_shared_folder
 from rlctl.errors import TaskError, UsageError
+from rlctl.launching.trainings import Detached, NextSignal, Result, Trainings
 from rlctl.processes.child_process import Standstill
 from rlctl.runs.group import JOBS, Job, job_file, list_jobs, read_job, write_job
 from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.signals import HandledSignals
-from rlctl.training.trainings import Detached, NextSignal, Result, Trainings
 
 STOP_FILE = f"{JOBS}/stop"  # when this file exists, nodes save a checkpoint and stop their training
 BEAT_FILE = f"{JOBS}/beat"  # if it exists and does not change for `lease_s`, nodes do the same: the driver was killed

@@ -17,12 +17,12 @@ from pydantic import Field
 
 from rlctl.environments.registry import identify_task
 from rlctl.errors import ArtifactError, RlctlError
+from rlctl.launching.trainings import NextSignal, train_in_child
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.group import JOBS, find_run_of_seed, list_jobs
 from rlctl.runs.lookup import locate_task
 from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files, yaml_text
-from rlctl.training.trainings import NextSignal, train_in_child
 from rlctl.version import collect_versions
 
 FILE = Path("cluster.yaml")  # read if it exists and no other file is given

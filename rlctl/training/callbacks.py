@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import copy
 import functools
 import inspect
@@ -18,6 +19,9 @@ from rlctl.play.messages import EpisodeResult
 from rlctl.play.shared_arrays import SegmentArrays
 
 if TYPE_CHECKING:
+    from rlctl.recipe.recipe import Recipe
+    from rlctl.runs.directory import RunDirectory
+    from rlctl.training.display import Display
     from rlctl.training.learner import Learner
     from rlctl.training.snapshot import Tensors
 
@@ -44,6 +48,11 @@ class Training:
     def steps(self) -> int:
         """Environment steps so far."""
         return self._learner.steps
+
+    @property
+    def is_at_end(self) -> bool:
+        """Whether no step follows: this is the last boundary."""
+        return self._learner.is_at_end
 
     @property
     def policy(self) -> Any:
@@ -113,6 +122,15 @@ class Callback:
         vars(self).update(state)
 
 
+class Observer(Callback):
+    """A callback of rlctl itself, which changes nothing in the training. Checkpoints do not store it."""
+
+    @contextlib.contextmanager
+    def follow(self, run: RunDirectory, recipe: Recipe, display: Display) -> Iterator[None]:
+        """Entered when the run folder is ready, before the first step, and left after the last or after an error."""
+        yield
+
+
 def call_callback(name: str, call: Callable[[], Any], doing: str = "") -> Any:
     """Call code of a callback; raises `TaskError` for any exception."""
     try:
@@ -125,10 +143,16 @@ class Callbacks:
     """Calls the callbacks of a training, in the order of the recipe."""
 
     def __init__(
-        self, callbacks: Mapping[str, Callback], learner: Learner, folder: Path, warn: Callable[[str], None]
+        self,
+        callbacks: Mapping[str, Callback],
+        learner: Learner,
+        folder: Path,
+        warn: Callable[[str], None],
+        observers: Sequence[Observer] = (),
     ) -> None:
         self.running = ""  # name and moment of the callback that is running
         self._callbacks = callbacks
+        self._observers = observers
         self._training = Training(learner, folder)
         self._progress = learner.progress
         self._warn = functools.cache(warn)  # each warning once
@@ -154,7 +178,9 @@ class Callbacks:
         self.call("on_evaluation")
 
     def call(self, moment: str) -> None:
-        """Call a method of all callbacks, such as `on_end`."""
+        """Call a method of all observers and callbacks, such as `on_end`."""
+        for observer in self._observers:
+            getattr(observer, moment)(self._training)
         for name, callback in self._callbacks.items():
             self.running = f"callback {name}, {moment}"
             try:

@@ -17,7 +17,6 @@ from rlctl.play.workers import Workers
 from rlctl.policy.actor import Exploration
 from rlctl.policy.file import PolicyFile, PolicyInfo, Score
 from rlctl.runs.best import is_better
-from rlctl.runs.diagnosis.findings import Grade, diagnose
 from rlctl.runs.tables import read_table
 from rlctl.training import measurements
 from rlctl.training.checkpoints import Checkpoints
@@ -71,18 +70,10 @@ class EvaluationEpisodes:
         for index in dict.fromkeys((0, scores.index(min(scores)))):
             save_next_episode(self._checkpoints.run.episodes, recorded[index])
 
-    def record(self, count: int) -> list[Path]:
-        """Save the last `count` episodes of the last evaluation with recordings; return the recordings' paths."""
-        recordings = []
-        for episode in self._latest[-count:] if count else []:
-            from rlctl.replaying.reproduce import record_episode
-
-            path = save_next_episode(self._checkpoints.run.episodes, episode)
-            recording = path.with_suffix(".rrd")
-            title = f"{self._checkpoints.run.path.name} / episode {path.stem}"
-            record_episode(episode, recording, title=title, several=count > 1)
-            recordings.append(recording)
-        return recordings
+    def save_last(self, count: int) -> list[Path]:
+        """Save the last `count` episodes of the last evaluation; return their files."""
+        latest = self._latest[-count:] if count else []
+        return [save_next_episode(self._checkpoints.run.episodes, episode) for episode in latest]
 
     def keep_failed(self, error: RlctlError, spec: EnvSpec, evaluated_at: int | None = None) -> RlctlError:
         """Save the actions of a failed episode of `spec`, if known; return the error with a hint at the file."""
@@ -119,7 +110,6 @@ class Evaluator:
         self._checkpoints = checkpoints
         self._display = display
         self._highest_success = 0.0  # of all evaluations so far
-        self._reported_findings: set[str] = set()
 
     def restore(self) -> None:
         """Read the best score from the best policy's file, which may be newer than the checkpoint."""
@@ -150,11 +140,6 @@ class Evaluator:
         else:
             row = self._note(episodes, policy)
         progress.last_eval = steps
-        findings = [] if self._learner.is_at_end else diagnose(self._checkpoints.run)  # at the end all are printed
-        for finding in findings:
-            if finding.grade == Grade.WARNING and finding.id not in self._reported_findings:
-                self._reported_findings.add(finding.id)
-                self._display.message(finding.line)
         while progress.next_eval <= steps:
             progress.next_eval += self._recipe.eval.every_steps or self._recipe.total_timesteps
         return row

@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import shlex
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from rlctl.errors import ArtifactError, EpisodeFailed, Interrupted, TaskError
@@ -144,12 +145,15 @@ class TrainingLoop:
             lines.append(f"checkpoint at step {step:,} is intact; resume with: {self._resume_command}")
         return TaskError("\n".join(lines), details=error.details)
 
-    def write_end(self, recordings: int) -> list[Path]:
-        """Write the status `finished`; return recordings of the last evaluation's last episodes."""
+    def write_end(self, recordings: int, record: Callable[[list[Path]], list[Path]]) -> list[Path]:
+        """Write the status `finished`; return recordings of the last evaluation's last episodes.
+
+        `record` makes them of the files of these episodes.
+        """
         run, learner, best = self.checkpoints.run, self.learner, self.evaluator.best
         write = functools.partial(status.write_end, run, learner.steps, learner.progress, best)
         if not self.checkpoints.attempt("run.json", write):
             self.checkpoints.attempt("run.json", write)  # retry once
-        written = self.evaluator.episodes.record(recordings)
+        written = record(self.evaluator.episodes.save_last(recordings))
         self.callbacks.call("on_end")
         return written

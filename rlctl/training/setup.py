@@ -6,7 +6,7 @@ import contextlib
 import functools
 import shlex
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
@@ -32,11 +32,10 @@ from rlctl.recipe.stages import FollowingLevel
 from rlctl.runs import directory
 from rlctl.runs.directory import RunDirectory
 from rlctl.training import status
-from rlctl.training.callbacks import Callbacks
+from rlctl.training.callbacks import Callbacks, Observer
 from rlctl.training.display import Display
 from rlctl.training.progress import Progress
 from rlctl.training.start import Start
-from rlctl.training.tracking import track
 from rlctl.training.warm_start import load_source
 
 if TYPE_CHECKING:
@@ -52,7 +51,9 @@ _EXPERIMENTS = ("build", "comparisons", "episodes")  # what one child process ca
 
 
 @contextlib.contextmanager
-def set_up(start: Start, display: Display, printed: PrintedLines) -> Iterator[TrainingLoop]:
+def set_up(
+    start: Start, display: Display, printed: PrintedLines, observers: Sequence[Observer] = ()
+) -> Iterator[TrainingLoop]:
     """Open what a training needs; at the end stop its processes, and write an error that ended it to the run."""
     recipe, request = start.recipe, start.request
     specs = [spec.resolve() for spec in recipe.env_specs(start.task, named_by=RUN if start.run else "")]
@@ -89,7 +90,7 @@ def set_up(start: Start, display: Display, printed: PrintedLines) -> Iterator[Tr
         lock = start.lock or stack.enter_context(run.lock())
         if not lock.keeps_out:
             display.message(f"warning: {run.path}: this file system has no locks: let only one process train this run")
-        checkpoints = _open_run(run, start, learner, display)
+        checkpoints = _open_run(run, start, learner, display, observers)
         n_envs = count_envs(specs[-1], recipe.eval.episodes)
         episodes = EvaluationEpisodes(learner, functools.partial(make_workers, specs[-1], n_envs), checkpoints)
         stack.callback(episodes.close)
@@ -99,9 +100,8 @@ def set_up(start: Start, display: Display, printed: PrintedLines) -> Iterator[Tr
         printed.log_to(run.printed_file)
         printed.report()
         display.run_folder(run)
-        if recipe.track is not None:
-            stack.enter_context(track(run, recipe.track, display.message))
-            stack.callback(display.phase, f"sending to {recipe.track}")
+        for observer in observers:
+            stack.enter_context(observer.follow(run, recipe, display))
         try:
             yield TrainingLoop(learner, evaluator, checkpoints, display)
         except BaseException as error:
@@ -189,13 +189,15 @@ def _refuse_success_rates(start: Start) -> None:
             )
 
 
-def _open_run(run: RunDirectory, start: Start, learner: Learner, display: Display) -> Checkpoints:
+def _open_run(
+    run: RunDirectory, start: Start, learner: Learner, display: Display, observers: Sequence[Observer]
+) -> Checkpoints:
     from rlctl.training.checkpoints import Checkpoints
     from rlctl.training.metrics import make_logger
 
     resumed_at = None if start.run is None else start.step
     learner.model.set_logger(make_logger(run.tensorboard, display.message, resumed_at, start.recipe))
-    callbacks = Callbacks(start.callbacks, learner, run.path, display.message)
+    callbacks = Callbacks(start.callbacks, learner, run.path, display.message, observers)
     checkpoints = Checkpoints(learner, run, callbacks, display.message)
     for note in start.notes:
         display.message(note)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import importlib.util
 import inspect
 import os
 import re
@@ -18,7 +19,7 @@ import numpy as np
 
 from rlctl.environments import named_task, registry
 from rlctl.environments.registry import describe_task_changes
-from rlctl.errors import ArtifactError, RecipeError, RlctlError, UsageError
+from rlctl.errors import ArtifactError, RecipeError, RlctlError, UsageError, explain_missing_package
 from rlctl.hub import store
 from rlctl.policy import own_modules
 from rlctl.recipe.recipe import Recipe, validate
@@ -29,7 +30,6 @@ from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.callbacks import Callback, Sb3Callback, call_callback, is_of_sb3
 from rlctl.training.distilling.teacher import Teacher
-from rlctl.training.tracking import check_installed
 from rlctl.training.warm_start import find_source
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def _find_new(request: TrainRequest, task: str) -> Start:
     with preserve_process_state():
         recipe = own_modules.locate(resolve_with_stages(task, request.config, request.settings))
         callbacks = _load_callbacks(recipe)
-    check_installed(recipe)
+    _check_tracker(recipe)
     source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
     if request.demos is not None and (algo := recipe.algo) in ("dqn", "recurrent_ppo"):
         raise RecipeError(f"--demos: {algo} cannot clone demonstrations; use ppo, a2c, sac, tqc, crossq, td3 or ddpg")
@@ -131,7 +131,7 @@ def _find_checkpoint(request: TrainRequest) -> Start:
     lock = run.lock()  # before looking: a process that is training removes old checkpoints
     try:
         recipe = validate({**before.model_dump(by_alias=True), **request.settings}, "recipe")
-        check_installed(recipe)
+        _check_tracker(recipe)
         status = run.status()
         task = lookup.locate_task(status["task"], run)
         changes = describe_task_changes(status, task)
@@ -217,3 +217,8 @@ def preserve_process_state() -> Iterator[None]:
             torch.set_default_dtype(torch.float32)
             torch.set_default_device(None)
             torch.set_grad_enabled(True)
+
+
+def _check_tracker(recipe: Recipe) -> None:
+    if recipe.track is not None and importlib.util.find_spec(recipe.track) is None:
+        raise UsageError(explain_missing_package(f"--track {recipe.track}", recipe.track, recipe.track))

@@ -15,10 +15,10 @@ from optuna.trial import TrialState
 from rlctl.environments import registry
 from rlctl.environments.spec import merge
 from rlctl.errors import RunTaken, UsageError
+from rlctl.launching.trainings import Trainings
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files
-from rlctl.training.trainings import Trainings
 from rlctl.tuning.space import get_value, nest
 from rlctl.tuning.tuning import Trial, Tuning, find_best
 

@@ -98,8 +98,8 @@ def _train(settings: dict) -> tuple[float, int, float, float, float]:
 
 
 def _run(settings: dict) -> None:
+    from rlctl.launching.train import run_training
     from rlctl.runs.train_request import TrainRequest
-    from rlctl.training.request import run_training
 
     with tempfile.TemporaryDirectory() as folder:
         run_training(TrainRequest("reach", settings=settings, root=Path(folder), check=False))

@@ -5,7 +5,7 @@ import pytest
 from rlctl.cluster.executors import choose_cell_player, choose_executor
 from rlctl.cluster.work import ClusterSettings, read_settings
 from rlctl.errors import RecipeError, UsageError
-from rlctl.training.trainings import make_local_trainings
+from rlctl.launching.trainings import make_local_trainings
 
 
 @pytest.mark.parametrize(

@@ -18,10 +18,10 @@ from rlctl.cluster.executors import choose_cell_player, choose_executor
 from rlctl.cluster.ray_trainings import connect
 from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.vary import measure_robustness
+from rlctl.launching.seeds import train_seeds
+from rlctl.launching.train import run_training
 from rlctl.runs.group import read_job
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.request import run_training
-from rlctl.training.seeds import train_seeds
 from tests.cluster.conftest import LINE, wait_for
 from tests.cluster.driver import STOPS, Driver, assert_it_resumes, has_ended
 from tests.training.comparing import assert_same_run

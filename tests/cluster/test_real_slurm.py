@@ -9,9 +9,9 @@ import threading
 import pytest
 
 from rlctl.cluster.executors import choose_executor
+from rlctl.launching.seeds import train_seeds
+from rlctl.launching.train import run_training
 from rlctl.runs.group import read_job
-from rlctl.training.request import run_training
-from rlctl.training.seeds import train_seeds
 from tests.cluster import real_slurm
 from tests.cluster.conftest import wait_for
 from tests.cluster.driver import STOPS, Driver, assert_it_resumes, has_ended

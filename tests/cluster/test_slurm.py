@@ -10,11 +10,11 @@ import pytest
 
 from rlctl.cluster.executors import choose_executor
 from rlctl.errors import TaskError, UsageError
+from rlctl.launching.seeds import train_seeds
+from rlctl.launching.train import run_training as train_run
+from rlctl.launching.trainings import Detached
 from rlctl.runs.group import list_jobs, read_group, read_job
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.request import run_training as train_run
-from rlctl.training.seeds import train_seeds
-from rlctl.training.trainings import Detached
 from tests.cluster import fake_slurm
 from tests.cluster.conftest import wait_for
 from tests.training.comparing import assert_same_run

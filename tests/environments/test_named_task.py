@@ -12,11 +12,11 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
+from rlctl.launching.train import run_training
 from rlctl.play.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.policy.file import PolicyFile, compute_digest
 from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files
-from rlctl.training.request import run_training
 from tests.training.conftest import ENVS, SMALL_PPO
 
 ENV = """
@@ -47,7 +47,7 @@ class Outer:
     [
         "os:system", "posix:system", "builtins:exec", "subprocess:Popen", "subprocess:run", "shutil:rmtree",
         "runpy:run_path", "antigravity:geohash", "numpy:load", "numpy.lib.npyio:load", "torch:load", "yaml:unsafe_load",
-        "rlctl.storage.files:write_text", "rlctl.training.request:run_training", "gymnasium:make", "antigravity:Env-v0",
+        "rlctl.storage.files:write_text", "rlctl.launching.train:run_training", "gymnasium:make", "antigravity:Env-v0",
         "gymnasium.spaces:Box", "os:\0", "sys:modules",
     ],
 )  # fmt: skip

@@ -14,10 +14,10 @@ from rlctl.evaluation.group_scores import GroupScore, SeedScore
 from rlctl.evaluation.junit import make_group_suite, make_suite
 from rlctl.evaluation.report import as_json
 from rlctl.evaluation.request import EvalRequest, Gates
+from rlctl.launching.train import run_training
 from rlctl.play.messages import EpisodeResult
 from rlctl.runs.tables import read_table
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.request import run_training
 from tests import fork_server
 from tests.training.conftest import ENVS, SMALL_PPO
 

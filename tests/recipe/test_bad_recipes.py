@@ -3,9 +3,9 @@
 import pytest
 
 from rlctl.errors import RecipeError, UsageError
+from rlctl.launching.train import run_training
 from rlctl.recipe.sources import parse_settings, resolve
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.request import run_training
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 9)}]\n" for level in range(1, 10)

@@ -68,8 +68,8 @@ def episode_file(reached, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def run(tmp_path_factory):
     """A run of reach that was trained for a moment, with one recording."""
+    from rlctl.launching.train import run_training
     from rlctl.runs.train_request import TrainRequest
-    from rlctl.training.request import run_training
 
     settings = {
         "n_envs": 4,

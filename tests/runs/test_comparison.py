@@ -12,6 +12,7 @@ from rlctl.environments.spec import EnvSpec, merge
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.players import choose_spec, load_player
 from rlctl.evaluation.request import EvalRequest
+from rlctl.launching.train import run_training
 from rlctl.recipe.sources import resolve
 from rlctl.runs.compare.comparison import Candidate, RunComparison, Side, compare, find_recipe_changes
 from rlctl.runs.compare.margin import check_margin
@@ -21,7 +22,6 @@ from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import find_runs_of
 from rlctl.runs.report.write import write_report
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.request import run_training
 from tests.training.conftest import ENVS, TINY
 
 

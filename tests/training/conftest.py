@@ -3,12 +3,12 @@ from pathlib import Path
 import pytest
 
 from rlctl.errors import TaskError
+from rlctl.launching.train import TrainResult, run_training
 from rlctl.play.seeds import Stream, episode_seed
 from rlctl.recipe import recipe
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.train_request import TrainRequest
 from rlctl.training import checkpoints
-from rlctl.training.request import TrainResult, run_training
 from rlctl.training.rollouts import WorkerVecEnv
 from tests.training.comparing import Killed
 

@@ -10,6 +10,7 @@ from rlctl import load_policy
 from rlctl.errors import RecipeError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
+from rlctl.launching.train import run_training
 from rlctl.play.episode import load_episode
 from rlctl.play.workers import available_cores
 from rlctl.policy.file import PolicyFile
@@ -17,7 +18,6 @@ from rlctl.replaying.reproduce import verify_episode
 from rlctl.runs.train_request import TrainRequest
 from rlctl.training import checkpoint
 from rlctl.training.display import LiveDisplay
-from rlctl.training.request import run_training
 from tests.training.comparing import replay_buffer
 from tests.training.conftest import ENVS, SMALL, SMALL_PPO
 

@@ -12,6 +12,7 @@ from rlctl.environments.dict_spaces import take_row
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
+from rlctl.launching.seeds import train_seeds
 from rlctl.play.episode import load_episode
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.load import load_policy
@@ -19,7 +20,6 @@ from rlctl.runs.directory import RunDirectory
 from rlctl.runs.train_request import TrainRequest
 from rlctl.training import demonstrations
 from rlctl.training.loop import TrainingLoop
-from rlctl.training.seeds import train_seeds
 from tests.training.comparing import Killed, assert_same_run, rows
 from tests.training.conftest import ENVS, TINY
 

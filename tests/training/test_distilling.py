@@ -13,15 +13,15 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.request import ExportRequest
+from rlctl.launching import distill as distilling
+from rlctl.launching.distill import distill, make_settings
+from rlctl.launching.distill_request import DistillRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.load import load_policy
 from rlctl.policy.torch_policy import build_network
 from rlctl.recipe.recipe import merge
 from rlctl.runs.directory import RunDirectory
-from rlctl.training.distilling import distill as distilling
 from rlctl.training.distilling import labelled_steps
-from rlctl.training.distilling.distill import distill, make_settings
-from rlctl.training.distilling.distill_request import DistillRequest
 from rlctl.training.distilling.labelled_steps import LabelledSteps
 from tests.training.comparing import Killed, assert_same_run, rows
 from tests.training.conftest import ENVS

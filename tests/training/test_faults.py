@@ -33,8 +33,8 @@ def _two_workers():
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The run that nothing stops."""
+    from rlctl.launching.train import run_training
     from rlctl.runs.train_request import TrainRequest
-    from rlctl.training.request import run_training
 
     root = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:

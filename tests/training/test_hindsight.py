@@ -10,6 +10,7 @@ import pytest
 from rlctl import load_policy
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.errors import RecipeError, TaskError
+from rlctl.launching.train import run_training
 from rlctl.play.workers import Workers
 from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
@@ -19,7 +20,6 @@ from rlctl.training.algorithms import build_model
 from rlctl.training.learner import begin_next_episodes
 from rlctl.training.off_policy import OffPolicyRollouts, replay_arguments
 from rlctl.training.progress import Progress
-from rlctl.training.request import run_training
 from rlctl.training.rollouts import WorkerVecEnv
 from tests.task import tasks
 from tests.training.conftest import ENVS, SMALL

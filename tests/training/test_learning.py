@@ -5,8 +5,8 @@ import pytest
 from rlctl.environments.spec import EnvChanges
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.request import EvalRequest
+from rlctl.launching.train import run_training
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.request import run_training
 from tests.training.conftest import ENVS
 
 

@@ -3,9 +3,9 @@
 import pytest
 
 from rlctl.errors import RecipeError, UsageError
+from rlctl.launching.train import run_training
 from rlctl.recipe import recipe as recipes
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.request import run_training
 
 
 @pytest.mark.parametrize(

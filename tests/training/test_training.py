@@ -8,6 +8,7 @@ import pytest
 
 from rlctl import load_policy
 from rlctl.errors import ArtifactError, DivergedError, TaskError, UsageError
+from rlctl.launching.train import TrainResult, run_training
 from rlctl.play.episode import load_episode
 from rlctl.policy.actor import Rows
 from rlctl.policy.file import PolicyFile
@@ -18,7 +19,6 @@ from rlctl.runs.directory import RunDirectory
 from rlctl.runs.summary import summarize
 from rlctl.runs.train_request import TrainRequest
 from rlctl.training import checkpoint
-from rlctl.training.request import TrainResult, run_training
 from tests import fork_server
 from tests.training.conftest import ENVS, SMALL, SMALL_PPO
 

@@ -5,10 +5,10 @@ import pytest
 
 from rlctl.environments.spec import merge
 from rlctl.errors import ArtifactError, UsageError
+from rlctl.launching.train import run_training
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.shipped import find_shipped_policy
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.request import run_training
 from tests.training.comparing import rows
 from tests.training.conftest import ENVS, TINY
 

@@ -16,13 +16,13 @@ import pytest
 import yaml
 
 from rlctl.errors import ArtifactError, Interrupted, RecipeError, TaskError, UsageError
+from rlctl.launching.trainings import Trainings
 from rlctl.play.episode import load_episode
 from rlctl.runs import directory
 from rlctl.runs.directory import RunDirectory, is_being_written
 from rlctl.runs.group import read_group
 from rlctl.runs.listing import list_runs, plan_removal
 from rlctl.runs.lookup import find_run
-from rlctl.training.trainings import Trainings
 from rlctl.tuning.tune import tune
 from rlctl.tuning.tune_request import TuneRequest
 from rlctl.tuning.tuning import load

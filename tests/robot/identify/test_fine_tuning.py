@@ -6,8 +6,8 @@ import pytest
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.evaluation.evaluate import measure_score
 from rlctl.evaluation.request import EvalRequest
+from rlctl.launching.train import run_training
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.request import run_training
 from rlctl_robot.identify.excite import write_excitation
 from rlctl_robot.identify.follow import describe_expected, open_world
 from rlctl_robot.identify.identify import identify

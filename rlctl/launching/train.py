@@ -10,6 +10,8 @@ from typing import Any
 from rlctl import output
 from rlctl.environments.named_task import RUN
 from rlctl.errors import ArtifactError, TaskError
+from rlctl.launching.findings import WarnOfFindings
+from rlctl.launching.tracking import SendToTracker, track
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.printed_lines import collect, print_line
 from rlctl.recipe.recipe import Recipe
@@ -22,7 +24,6 @@ from rlctl.training.progress import Progress
 from rlctl.training.setup import set_up
 from rlctl.training.signals import StopSignals
 from rlctl.training.start import Start, find_start
-from rlctl.training.tracking import track
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,15 +60,32 @@ def run_training(request: TrainRequest, find: Callable[[TrainRequest], Start] = 
         verb = "resume" if start.run is not None else "train" if start.teacher is None else "distill"
         title = f"{verb} {start.task} ({how})"
         display = make_display(title, start.recipe.total_timesteps)
-        with display, collect() as printed, set_up(start, display, printed) as training:
+        observers = [WarnOfFindings(), SendToTracker()]
+        with display, collect() as printed, set_up(start, display, printed, observers) as training:
             signals.begin(training)
             training.run()
             signals.end()
-            recordings = training.write_end(request.record)
+            recordings = training.write_end(request.record, _record)
     run, learner, best = training.checkpoints.run, training.learner, training.evaluator.best
     _raise_if_evaluations_failed(run, learner.progress)
     seconds = time.monotonic() - start.began
     return TrainResult(run, start.task, start.recipe, learner.steps, learner.progress, best, seconds, recordings)
+
+
+def _record(episodes: list[Path]) -> list[Path]:
+    """Make recordings of files of episodes; return their paths."""
+    if not episodes:
+        return []
+    from rlctl.play.episode import load_episode
+    from rlctl.replaying.reproduce import record_episode
+
+    recordings = []
+    for file in episodes:
+        recording = file.with_suffix(".rrd")
+        title = f"{file.parent.parent.name} / episode {file.stem}"
+        record_episode(load_episode(file), recording, title=title, several=len(episodes) > 1)
+        recordings.append(recording)
+    return recordings
 
 
 def _report_finished(start: Start, run: RunDirectory, progress: Progress) -> TrainResult:

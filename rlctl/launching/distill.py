@@ -10,6 +10,8 @@ from rlctl import output
 from rlctl.environments.spec import EnvSpec, merge
 from rlctl.errors import RecipeError
 from rlctl.evaluation.episode_statistics import mean_return, success_interval, success_rate
+from rlctl.launching import train as training
+from rlctl.launching.distill_request import DistillRequest
 from rlctl.play.collect import Episode, play_episodes
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers, count_envs
@@ -19,8 +21,6 @@ from rlctl.recipe.recipe import ON_POLICY, Recipe
 from rlctl.recipe.sources import resolve_with_stages
 from rlctl.runs import lookup
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training import request as training
-from rlctl.training.distilling.distill_request import DistillRequest
 from rlctl.training.distilling.teacher import Teacher
 from rlctl.training.start import Start, find_start
 

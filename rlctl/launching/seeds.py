@@ -12,12 +12,12 @@ from rlctl.environments import named_task
 from rlctl.errors import RlctlError, UsageError
 from rlctl.evaluation.group_scores import GroupScore, evaluate_group
 from rlctl.evaluation.request import EvalRequest
+from rlctl.launching.trainings import MakeTrainings, make_local_trainings
 from rlctl.runs.directory import RunLock
 from rlctl.runs.group import Group, create_group, parse_seeds, read_group
 from rlctl.runs.train_request import TrainRequest
 from rlctl.storage import files
 from rlctl.training.start import check_arguments, find_start
-from rlctl.training.trainings import MakeTrainings, make_local_trainings
 
 
 class SeedsFailed(RlctlError):

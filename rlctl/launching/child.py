@@ -27,7 +27,7 @@ def _train(connection: Connection, content: dict[str, Any]) -> int:
 
     with HandledSignals(_interrupt), collect(), redirect_stdout():
         messages.send(connection, "ready")
-        from rlctl.training.request import run_training
+        from rlctl.launching.train import run_training
 
         run_training(TrainRequest.from_json(content))
     return 0

@@ -16,10 +16,10 @@ import pytest
 
 import rlctl
 from rlctl.errors import RecipeError, UsageError
+from rlctl.launching import tracking
+from rlctl.launching.seeds import train_seeds
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training import tracking
-from rlctl.training.seeds import train_seeds
 from rlctl.tuning.tune import tune
 from rlctl.tuning.tune_request import TuneRequest
 from tests.training.conftest import ENVS, SMALL_PPO

@@ -21,22 +21,34 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.environments import registry
-from rlctl.errors import RlctlError, UsageError, explain_missing_package
+from rlctl.errors import RlctlError
 from rlctl.printed_lines import LineReader
 from rlctl.processes.child_process import ChildEndedError, ChildProcess
 from rlctl.recipe.recipe import Recipe, flatten
 from rlctl.runs.directory import TUNE_FILE, RunDirectory, is_group
 from rlctl.storage import files, yaml_text
+from rlctl.training.callbacks import Observer
+from rlctl.training.display import Display
 
 _EVERY_S = 3.0
 _FILM_S = 30  # time limit of the film; PyBullet draws 5 to 15 pictures per second
 _END_S = 60.0  # how long a training that has ended waits
 
 
-def check_installed(recipe: Recipe) -> None:
-    """Raise `UsageError` if the recipe's tracker is not installed."""
-    if recipe.track is not None and importlib.util.find_spec(recipe.track) is None:
-        raise UsageError(explain_missing_package(f"--track {recipe.track}", recipe.track, recipe.track))
+class SendToTracker(Observer):
+    """Sends the run to the recipe's tracker while the training lasts."""
+
+    @contextlib.contextmanager
+    def follow(self, run: RunDirectory, recipe: Recipe, display: Display) -> Iterator[None]:
+        """Send while entered, and a while longer."""
+        if recipe.track is None:
+            yield
+            return
+        with track(run, recipe.track, display.message):
+            try:
+                yield
+            finally:
+                display.phase(f"sending to {recipe.track}")
 
 
 @contextlib.contextmanager
@@ -54,7 +66,7 @@ def track(run: RunDirectory, tracker: str, show: Callable[[str], None]) -> Itera
 
     reader = LineReader(warn)
     arguments, output = {"folder": str(run.path), "tracker": tracker}, reader.descriptor
-    child = ChildProcess("rlctl.training.tracking:main", arguments, stdout=subprocess.DEVNULL, stderr=output)
+    child = ChildProcess("rlctl.launching.tracking:main", arguments, stdout=subprocess.DEVNULL, stderr=output)
     reader.close_descriptor()
     try:
         yield

@@ -14,13 +14,13 @@ import pytest
 from rlctl.errors import ArtifactError, Interrupted, RecipeError, UsageError
 from rlctl.evaluation.group_scores import evaluate_group
 from rlctl.evaluation.request import EvalRequest, Gates
+from rlctl.launching.seeds import train_seeds
 from rlctl.runs.compare.comparison import find_runs_of
 from rlctl.runs.directory import RunLock, is_being_written
 from rlctl.runs.group import create_group, find_group, parse_seeds, read_group
 from rlctl.runs.listing import list_runs, plan_removal
 from rlctl.runs.lookup import find_policy, find_run
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training.seeds import train_seeds
 from tests.training.conftest import ENVS, TINY
 
 LINE = f"{ENVS}:Line"

@@ -2,8 +2,8 @@
 
 import dataclasses
 
+from rlctl.launching.train import list_next_commands
 from rlctl.policy.file import Score
-from rlctl.training.request import list_next_commands
 
 
 def test_a_policy_that_never_succeeded_is_not_to_be_exported_next(train):

@@ -124,7 +124,7 @@ def train_in_child(
     """Train in a child process that ends with this one; return its exit code, 128 + N after signal N."""
     reader = LineReader(receive)
     child = ChildProcess(
-        "rlctl.training.child:main",
+        "rlctl.launching.child:main",
         {"request": request.to_json(), "command": list(sys.argv if command is None else command)},
         one_thread=False,
         stdout=reader.descriptor,
