@@ -148,12 +148,17 @@ def read_message(error: BaseException) -> str:
         return f"(message unavailable: {type(another).__name__})"
 
 
+def name_kind(error: BaseException) -> str:
+    """Return the name of an exception's type; that of a row of worlds, which only rlctl knows, is `TaskError`."""
+    return (TaskError if isinstance(error, WorldFailed | ShapeError) else type(error)).__name__
+
+
 def describe_exception(error: BaseException, where: str = "") -> str:
     """Describe any exception in one line of limited length: `RuntimeError: the gripper fell off`.
 
     `where` comes after it, and last what to install for a module that is missing.
     """
-    name, text = type(error).__name__, " ".join(read_message(error).split())
+    name, text = name_kind(error), " ".join(read_message(error).split())
     if len(text) > _LONGEST:
         text = f"{text[:_LONGEST]}..."
     # Python decodes file names that are not UTF-8 to surrogates, which cannot be written as UTF-8.

@@ -25,7 +25,7 @@ from rlctl.environments.leaves import find_leaves
 from rlctl.environments.mujoco_version import mujoco_fix
 from rlctl.environments.places import find_line, format_place, is_own_file
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import RlctlError, TaskError, read_message
+from rlctl.errors import RlctlError, TaskError, name_kind, read_message
 from rlctl.missing_packages import advise
 from rlctl.version import PACKAGE_FOLDER
 
@@ -79,11 +79,11 @@ def raised_by_environment(error: BaseException) -> bool:
 def describe(error: BaseException) -> str:
     """Return an exception in a line, with the place in the environment's code."""
     if isinstance(error, RlctlError):  # of the task layer, which names the task and the step itself
-        return f"{type(error).__name__}: {error}"
+        return f"{name_kind(error)}: {error}"
     where = find_line(error)
     place = f" ({format_place(*where)})" if where else ""
     text = " ".join(read_message(error).split()) or "no message"
-    return f"{type(error).__name__}: {text}{place}{advise(error)}"
+    return f"{name_kind(error)}: {text}{place}{advise(error)}"
 
 
 def display_error(failure: CallFailure) -> str:

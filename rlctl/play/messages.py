@@ -14,11 +14,10 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import (
     EpisodeFailed,
     RlctlError,
-    ShapeError,
     TaskError,
-    WorldFailed,
     describe_exception,
     format_plugin_traceback,
+    name_kind,
 )
 from rlctl.policy.actor import Exploration
 from rlctl.policy.file import PolicyInfo
@@ -196,9 +195,7 @@ def describe_failure(error: BaseException) -> WorkerException:
     if isinstance(error, FailedInEpisode):
         where, error = error.where, error.__cause__ or error
     if isinstance(error, RlctlError):
-        # What is wrong with a row is known here: to the main process it is a task that failed.
-        kind = TaskError if isinstance(error, WorldFailed | ShapeError) else type(error)
-        return WorkerException(str(error), kind.__name__, error.details, where)
+        return WorkerException(str(error), name_kind(error), error.details, where)
     return WorkerException(describe_exception(error), "", format_plugin_traceback(error) or None, where)
 
 

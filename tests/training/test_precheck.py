@@ -50,6 +50,7 @@ def test_an_environment_that_cannot_be_built_is_the_workers_matter(train, small_
         train("Unbuilt", small_ppo, check=True)
 
 
+@pytest.mark.slow  # the check plays until its time is over, and the evaluation for a million steps
 def test_episodes_that_do_not_end_are_a_warning_before_the_training(train, small_ppo, write_module, capsys):
     source = """
         from tests.training.envs import Line

@@ -2,7 +2,7 @@
 
 Each joint has an actuator with the force `ctrl + b1 * position + b2 * velocity`, within a range. `drive_to` makes it a
 spring and a damper (b1 = -stiffness, b2 = -damping), `drive_at` a damper, `set_torques` a force. Without `set_drives`
-the motors of a single world are those of `IdealMotors`; those of many worlds are springs and dampers which come close.
+those of the wheels of a single world are `IdealMotors`; all others are springs and dampers which come close.
 """
 
 from __future__ import annotations
@@ -230,7 +230,9 @@ class MujocoMotors(Body):
             speed = np.where(given > 0, given, np.inf) if (given > 0).any() else None
         elif kind == "torque":
             damping = np.zeros(len(chosen))
-        is_ideal = self._sim.world.count is None and kind != "torque"
+        # Wheels carry a robot. The springs of arms and legs come close, without Python between physics steps.
+        is_wheel = bool(np.isinf(self.joint_high[chosen]).all())
+        is_ideal = is_wheel and self._sim.world.count is None and kind != "torque"
         if kind == "position" and self.parts.drives is not None:
             is_ideal = False
         if is_ideal:
