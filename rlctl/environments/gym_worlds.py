@@ -3,18 +3,19 @@
 import math
 import reprlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.environments.dict_spaces import join, split, split_space
+from rlctl.environments.dict_spaces import SINGLE, join, split, split_space
 from rlctl.environments.success import SUCCESS, find_success
 from rlctl.environments.teacher_view import TeacherView
 from rlctl.output import format_count
 from rlctl.task.calls import ONE_FLAG
 from rlctl.task.env import TaskEnv
+from rlctl.task.observation import is_finite
 from rlctl.task.worlds import EpisodeTotals, WorldsStep
 
 _STEP = ("observation", "reward", "terminated", "truncated", "info")
@@ -57,29 +58,41 @@ class GymWorlds:
         """Take a step with an action of shape (1, ...)."""
         self.step_of[0] += 1
         chosen = int(action[0]) if self._is_discrete else np.array(action[0])
-        observation, reward, terminated, truncated, info = _check_tuple(self.env.step(chosen), _STEP, "step")
-        reward = _to_float(reward, "reward")
+        result = self.env.step(chosen)
+        # What is as it should be is not looked at further: fast environments take a few microseconds themselves.
+        if result.__class__ is not tuple or len(result) != 5:
+            result = _check_tuple(result, _STEP, "step")
+        observation, reward, terminated, truncated, info = result
+        if reward.__class__ is not float:
+            reward = _to_float(reward, "reward")
         if not math.isfinite(reward):
             raise ValueError(f"reward is {reward}")
-        _check_info(info)
-        flags = ONE_FLAG[_to_bool(terminated, "terminated")], ONE_FLAG[_to_bool(truncated, "truncated")]
+        if info.__class__ is not dict:
+            _check_info(info)
+        if terminated.__class__ is not bool or truncated.__class__ is not bool:
+            terminated, truncated = _to_bool(terminated, "terminated"), _to_bool(truncated, "truncated")
         self.info = info
-        self._count(reward, info)
-        raw = self._no_terms
-        if self.weights:
-            raw = np.array([list(info["metrics"].values())])
-        success = _read_success(info)
-        successes = None if success is None else np.array([success])
-        return WorldsStep(self._writer.read(observation), np.array([reward]), *flags, raw, successes)
-
-    def _count(self, reward: float, info: Mapping[str, Any]) -> None:
         self._reward += reward
+        if "reward_terms" in info:
+            self._add_terms(info["reward_terms"])
+        raw = np.array([list(info["metrics"].values())]) if self.weights else self._no_terms
+        success = _read_success(info)
+        return WorldsStep(
+            self._writer.read(observation),
+            np.array([reward]),
+            ONE_FLAG[terminated],
+            ONE_FLAG[truncated],
+            raw,
+            None if success is None else ONE_FLAG[success],
+        )
+
+    def _add_terms(self, terms: Any) -> None:
         sums = self._sums
         try:
-            for name, value in info.get("reward_terms", {}).items():
+            for name, value in terms.items():
                 sums[name] = sums.get(name, 0.0) + value
         except (TypeError, AttributeError):
-            raise ValueError(f"info['reward_terms'] is {info['reward_terms']!r}, not a dict of numbers") from None
+            raise ValueError(f"info['reward_terms'] is {terms!r}, not a dict of numbers") from None
 
     def totals(self, world: int = 0) -> EpisodeTotals:
         """Return what the episode has added up to so far."""
@@ -182,49 +195,51 @@ def _check_info(info: Any) -> None:
         raise ValueError(f"info is {reprlib.repr(info)}, not a dict")
 
 
+class _Field(NamedTuple):
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    categories: NDArray[Any] | None  # the first and the last one
+    zeros: NDArray[Any]  # one per element
+
+
 class ObservationCheck:
     """Reads observations of an environment's space as rows."""
 
     def __init__(self, space: spaces.Space[Any]) -> None:
-        self._fields: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {}
-        parts = _flatten_space(space)
-        for key, part in parts.items():
+        self._fields: dict[str, _Field] = {}
+        for key, part in _flatten_space(space).items():
             if part.shape is None or part.dtype is None:
                 raise TypeError(f"{type(part).__name__} inside a Dict space is not supported")
-            self._fields[key] = part.shape, np.dtype(part.dtype)
-        self._categories = {key: _category_bounds(part) for key, part in parts.items()}
+            zeros = np.zeros(math.prod(part.shape), part.dtype)
+            self._fields[key] = _Field(part.shape, np.dtype(part.dtype), _category_bounds(part), zeros)
+        self._is_single = SINGLE in self._fields
 
     def read(self, observation: Any) -> Any:
         """Return a copy of an observation with a leading axis; raises `ValueError` for one that does not fit.
 
         A Dict inside a Dict becomes keys such as `achieved_goal/kettle`.
         """
+        if self._is_single and observation.__class__ is np.ndarray:
+            return self._read_part(SINGLE, observation)
         parts = split(observation)
         if isinstance(observation, dict) and any(isinstance(part, dict) for part in observation.values()):
             parts = _flatten(observation)
         if parts.keys() != self._fields.keys():
             raise ValueError(f"observation has the keys {sorted(parts)}, the space has {sorted(self._fields)}")
-        rows = {}
-        for key in self._fields:
-            value = np.asarray(parts[key])
-            self._check(key, value)
-            rows[key] = np.array(value, self._fields[key][1])[None]
-        return join(rows)
+        return join({key: self._read_part(key, np.asarray(parts[key])) for key in self._fields})
 
-    def _check(self, key: str, value: NDArray[Any]) -> None:
-        shape, dtype = self._fields[key]
+    def _read_part(self, key: str, value: NDArray[Any]) -> NDArray[Any]:
+        shape, dtype, limits, zeros = self._fields[key]
         if value.shape != shape:
             raise ValueError(f"{_named(key)} has shape {value.shape}, the space has {shape}")
         if value.dtype is not dtype and value.dtype.kind not in "biuf":
             raise ValueError(f"{_named(key)} is {reprlib.repr(value.tolist())}, not numbers")
-        # The sum is finite if all elements are, unless it overflows: then the slow check decides.
-        if value.dtype.kind == "f" and not math.isfinite(np.add.reduce(value, None)):
-            bad = np.flatnonzero(~np.isfinite(value))
-            if bad.size:
-                raise ValueError(f"{_named(key)} is not finite: element {bad[0]} is {value.ravel()[bad[0]]}")
-        limits = self._categories[key]
+        if value.dtype.kind == "f" and not is_finite(value, zeros):
+            bad = int(np.flatnonzero(~np.isfinite(value))[0])
+            raise ValueError(f"{_named(key)} is not finite: element {bad} is {value.ravel()[bad]}")
         if limits is not None and not ((limits[0] <= value) & (value <= limits[1])).all():
             raise ValueError(f"{_named(key)} is {value}, the space has {limits[0]} to {limits[1]}")
+        return np.array(value, dtype)[None]
 
 
 def _flatten_space(space: spaces.Space[Any]) -> dict[str, spaces.Space[Any]]:

@@ -16,10 +16,11 @@ def find_success(info: Mapping[str, Any]) -> Any:
 
     `success` may mean anything in an environment that does not report `is_success`: it counts if it is a bool, 0 or 1.
     """
-    if info.get(SUCCESS) is not None:
-        return info[SUCCESS]
+    success = info.get(SUCCESS)
+    if success is not None:
+        return success
     other = info.get(OTHER_SUCCESS)
-    return other if is_flag(other) else None
+    return other if other is not None and is_flag(other) else None
 
 
 def is_flag(value: Any) -> bool:

@@ -163,6 +163,7 @@ class _Segment(Actor):
         own = slice(self._first, self._first + self._worlds.count)
         self._segment = arrays.segment.by_step(own)  # arrays of shape (steps, worlds, ...)
         self._inside = arrays.inside[own]
+        self._steps, self._rows = self._inside[:, 1], self._inside[:, 2]
         self._ones = np.ones(self._worlds.count, np.int64)
         self.index: Index = np.zeros(1, np.int64)  # the worlds that play, for errors
         self._row = 0
@@ -200,15 +201,18 @@ class _Segment(Actor):
         self._inside[index, 0] = playing.seeds[index]
         observations = segment.observation.items()
         only = segment.observation[SINGLE] if list(segment.observation) == [SINGLE] else None
+        segment.terminated[:, index], segment.truncated[:, index] = False, False
         began = perf_counter()
         for played in playing.play(self, index, join(first)):
             result, row = played.result, self._row
             self._stepping_s += perf_counter() - self._acted_s
             self._acting_s += self._acted_s - began
             self.index = played.index
-            at, after = self._at(row, played.index), self._at(row + 1, played.index)
+            at = self._at(row, played.index)
+            after = row + 1 if at is row else (row + 1, played.index)
             segment.reward[at] = result.reward
-            segment.terminated[at], segment.truncated[at] = result.terminated, result.truncated
+            if len(played.ended):
+                segment.terminated[at], segment.truncated[at] = result.terminated, result.truncated
             if asked.record:
                 segment.terms[at] = result.terms
             if only is not None:
@@ -228,7 +232,7 @@ class _Segment(Actor):
                 break
             began = perf_counter()
         self._note_times()
-        self._inside[:, 1] = -1
+        self._steps[:] = -1
         # In the order of environments that play one after the other.
         return sorted(self._ended, key=lambda ended: ended.env)
 
@@ -255,10 +259,10 @@ class _Segment(Actor):
             stored[taught], action[taught] = label.reshape(stored.shape)[taught], label[taught]
         segment.stored[at], segment.action[at] = stored, action
         if at is row:
-            np.add(rows.step, self._ones, out=self._inside[:, 1])
-            self._inside[:, 2].fill(row)
+            np.add(rows.step, self._ones, out=self._steps)
+            self._rows.fill(row)
         else:
-            self._inside[rows.index, 1], self._inside[rows.index, 2] = rows.step + 1, row
+            self._steps[rows.index], self._rows[rows.index] = rows.step + 1, row
         self._acted_s = perf_counter()
         return stored, action
 
@@ -284,7 +288,7 @@ class _Segment(Actor):
             for result in results:
                 level = float(arrays.level[result.env])
                 arrays.level[result.env] = asked.levels.follow(level, result.success)
-        self._inside[ended, 2] = row + 1
+        self._rows[ended] = row + 1
         shown = self._episodes._begin(arrays, ended, [next(self._seeds[env]) for env in envs.tolist()])
         for key, part in shown.items():
             segment.observation[key][row + 1, ended] = part

@@ -54,10 +54,11 @@ class TaskCalls(Protocol):
     def observe(self) -> dict[str, Any]:
         """Return the observations or the quantities of terms by name, each of shape (n, ...)."""
 
-    def rewards(self, action: Any, weights: Mapping[str, float], step: int) -> Array:
+    def rewards(self, action: Any, weights: Mapping[str, float]) -> Array:
         """Return the reward and the raw terms in the order of `weights`, shape (n, 1 + terms).
 
-        Weighted terms are added in order, so that the last bits do not depend on the number of worlds.
+        Weighted terms are added in order, so that the last bits do not depend on the number of worlds. A term that is
+        not a number raises `WrongRow`.
         """
 
     def is_terminated(self) -> Flags:
@@ -123,12 +124,17 @@ class OneWorldCalls:
         if not isinstance(observed, dict) or not observed:
             raise not_by_name(self.name, "observe", observed)
         terms = self.task.observation_terms
-        return {
-            name: _add_axis_to_quantities(value) if name in terms else np.asarray(value)[None]
-            for name, value in observed.items()
-        }
+        rows: dict[str, Any] = {}
+        for name, value in observed.items():
+            if name not in terms:
+                rows[name] = np.asarray(value)[None]
+            elif isinstance(value, tuple):
+                rows[name] = tuple([_quantity_row(quantity) for quantity in value])
+            else:
+                rows[name] = _quantity_row(value)
+        return rows
 
-    def rewards(self, action: Any, weights: Mapping[str, float], step: int) -> Array:
+    def rewards(self, action: Any, weights: Mapping[str, float]) -> Array:
         """Return the reward and the raw terms, shape (1, 1 + terms)."""
         raw: Any = self.task.rewards(self._take(action))
         if not isinstance(raw, dict):
@@ -142,7 +148,7 @@ class OneWorldCalls:
                 row.append(term)
                 reward += weight * term
         except (TypeError, ValueError):
-            raise not_a_number(self.name, raw, step) from None
+            raise not_a_number(raw) from None
         row[0] = reward
         return np.array([row])
 
@@ -184,11 +190,10 @@ class OneWorldCalls:
         """Do nothing: a `Task` keeps what it likes."""
 
 
-def _add_axis_to_quantities(value: Any) -> Any:
-    """Return what a term is computed from: an array of shape (1, size), or a tuple of such."""
-    if isinstance(value, tuple):
-        return tuple(np.atleast_1d(quantity)[None] for quantity in value)
-    return np.atleast_1d(value)[None]
+def _quantity_row(value: Any) -> Any:
+    """Return a quantity that a term is computed from, which may be a number, as an array of shape (1, size)."""
+    array = np.asarray(value)
+    return array[None] if array.ndim else array.reshape(1, 1)
 
 
 class ManyWorldCalls:
@@ -243,7 +248,7 @@ class ManyWorldCalls:
             return tuple(self._read_part(method, name, quantity) for quantity in value)
         return read_rows(self.name, f"{method}()[{name!r}]", value, (self._worlds, size), np.float64)
 
-    def rewards(self, action: Any, weights: Mapping[str, float], step: int) -> Array:
+    def rewards(self, action: Any, weights: Mapping[str, float]) -> Array:
         """Return the reward and the raw terms, shape (n, 1 + terms)."""
         raw: Any = self.task.rewards(action)
         if not isinstance(raw, dict):

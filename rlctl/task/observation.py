@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rlctl.errors import RecipeError, TaskError, check_name, did_you_mean
 from rlctl.task.history import TermHistory
 from rlctl.task.layout import Layout
+from rlctl.task.returned import WrongRow
 from rlctl.task.task import TaskDefinition
 from rlctl.task.terms import Term
 
@@ -104,7 +105,7 @@ class View:
             name for name, value in first.items() if self._is_dict and np.asarray(value).dtype == np.uint8
         }
         self.space = self._make_space()
-        self._zeros = np.zeros(self.layout.size, np.float32)
+        self._zeros = np.zeros(worlds * self.layout.size, np.float32)
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -158,7 +159,7 @@ class View:
             raise self._shape_mismatch(parts) from None
         if rows.shape[1] != self.layout.size:
             raise self._shape_mismatch(parts)
-        if not is_zero(rows.dot(self._zeros)):  # 0, unless an element is not finite
+        if not is_finite(rows, self._zeros):
             raise self._not_finite(parts, rows)
         if self._bounds:
             rows = self._clip_rounding(rows, self.space.low, self.space.high, parts)
@@ -183,7 +184,7 @@ class View:
             raise self._out_of_bounds(parts)
         return clipped
 
-    def _shape_mismatch(self, parts: Mapping[str, Any]) -> "WrongRow":
+    def _shape_mismatch(self, parts: Mapping[str, Any]) -> WrongRow:
         now = {name: np.shape(value)[1:] for name, value in parts.items()}
         known = self._single_shapes
         if all(name in now and now[name] == self._shapes[name] for name in self._shapes):
@@ -194,7 +195,7 @@ class View:
             f"observation {name!r} has shape {now.get(name)} at step {{}}, {known.get(name)} at the first observation"
         )
 
-    def _not_finite(self, parts: Mapping[str, Any], rows: Any) -> "WrongRow":
+    def _not_finite(self, parts: Mapping[str, Any], rows: Any) -> WrongRow:
         for name, value in parts.items():
             bad = ~np.isfinite(value).reshape(len(value), -1).all(axis=1)
             if bad.any():
@@ -203,7 +204,7 @@ class View:
         row = 0 if rows is None else int((~np.isfinite(rows)).any(axis=1).argmax())
         return WrongRow("observation overflows float32 at step {}", row)
 
-    def _out_of_bounds(self, parts: Mapping[str, Any]) -> "WrongRow":
+    def _out_of_bounds(self, parts: Mapping[str, Any]) -> WrongRow:
         for name, (low, high) in self._bounds.items():
             values = np.asarray(parts[name], np.float64).reshape(len(parts[name]), -1)
             beyond = np.maximum(low - values, values - high)
@@ -215,14 +216,6 @@ class View:
                     int(row),
                 )
         return WrongRow("observation outside its bounds at step {}")
-
-
-class WrongRow(Exception):
-    """An observation of one of the rows is wrong; `{}` in the message stands for the step."""
-
-    def __init__(self, message: str, row: int = 0) -> None:
-        super().__init__(message)
-        self.row = row
 
 
 class TeacherSight:
@@ -247,11 +240,10 @@ class TeacherSight:
             self.seen[worlds] = now
 
 
-def is_zero(values: NDArray[Any]) -> bool:
-    """Return whether all values of an array of shape (k,) are 0; several times as fast for one as NumPy's functions."""
-    if len(values) == 1:
-        return bool(values.item() == 0)
-    return not np.count_nonzero(values)
+def is_finite(values: NDArray[Any], zeros: NDArray[Any]) -> bool:
+    """Return whether all values are finite; `zeros` has at least as many. A third of the time of NumPy's `isfinite`."""
+    flat = values.ravel()
+    return bool(flat.dot(zeros[: len(flat)]) == 0)  # 0 times any other value is NaN
 
 
 def compute_terms(name: str, terms: Mapping[str, Term], observed: Mapping[str, Any]) -> dict[str, Any]:

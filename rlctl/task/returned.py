@@ -7,15 +7,23 @@ from typing import Any
 from rlctl.errors import TaskError, short_repr
 
 
+class WrongRow(Exception):
+    """What a task returned for one of the rows is wrong; the last `{}` in the message stands for the step."""
+
+    def __init__(self, message: str, row: int = 0) -> None:
+        super().__init__(message)
+        self.row = row
+
+
 def not_by_name(task: str, method: str, value: Any) -> TaskError:
     """Return the error for a method that returned anything but a dict."""
     return TaskError(f"{task}: {method}() returned {short_repr(value)}, not a dict of values by name: {{'speed': ...}}")
 
 
-def not_a_number(task: str, raw: Mapping[str, Any], step: int) -> TaskError:
+def not_a_number(raw: Mapping[str, Any]) -> WrongRow:
     """Return the error for a reward term that is not a number."""
     name = next((name for name, value in raw.items() if not isinstance(value, numbers.Real)), "sum")
-    return TaskError(f"{task}: reward term {name!r} is {short_repr(raw.get(name))} at step {step}, not a number")
+    return WrongRow(f"reward term {name!r} is {short_repr(raw.get(name))} at step {{}}, not a number")
 
 
 def term_mismatch(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:

@@ -43,8 +43,13 @@ class Term:
         given = observed if isinstance(observed, tuple) else (observed,)
         if len(given) != (count := len(self.inputs) or 1):
             raise ValueError(f"{len(given)} quantities, expected {count}")
-        parts = self.compute(*(np.atleast_1d(np.asarray(value, np.float64)) for value in given))
+        parts = self.compute(*[_as_vector(value) for value in given])
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
+
+
+def _as_vector(value: Any) -> NDArray[np.float64]:
+    array = np.asarray(value, np.float64)
+    return array if array.ndim else array[None]
 
 
 @dataclasses.dataclass(frozen=True)

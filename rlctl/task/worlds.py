@@ -26,14 +26,14 @@ from rlctl.task.observation import (
     Observing,
     TeacherSight,
     View,
-    WrongRow,
     check_names,
     compute_terms,
-    is_zero,
+    is_finite,
 )
 from rlctl.task.privileged import CriticSight
 from rlctl.task.pybullet.library import is_installed
 from rlctl.task.pybullet.sim import PybulletSim
+from rlctl.task.returned import WrongRow
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_definition, check_parameters
 
@@ -102,9 +102,11 @@ class TaskWorlds:
             self.compute_reward = task.compute_reward
         # A space holds a random generator: one on the class would be shared by every instance.
         self.action_space = copy.deepcopy(task.action_space)
-        self._box = self.action_space if isinstance(self.action_space, spaces.Box) else None
-        if self._box is not None:
-            self._finite_test = np.zeros(math.prod(self._box.shape), self._box.dtype)
+        self._is_box = isinstance(self.action_space, spaces.Box)
+        if isinstance(self.action_space, spaces.Box):
+            box = self.action_space
+            self._low, self._high = box.low[None], box.high[None]
+            self._zero_actions = np.zeros(count * box.low.size, box.dtype)
         self.level = 1.0
         """How hard the next episodes are, where `reset` is not told."""
         self._all: Worlds = np.arange(count)
@@ -297,14 +299,20 @@ class TaskWorlds:
         return self.count == 1 or (len(worlds) == self.count and bool((worlds == self._all).all()))
 
     def _step(self, chosen: Any, worlds: Worlds) -> WorldsStep:
-        is_all = worlds is self._all
-        self.calls.act(self._spread(self._signals.act(chosen, worlds), worlds))
+        is_all, calls = worlds is self._all, self.calls
+        acted = self._signals.act(chosen, worlds)
         if is_all:
+            calls.act(acted)
             self.sim.step()
         else:
+            calls.act(self._spread(acted, worlds))
             self.sim.step(worlds)
-        terminated = self.calls.is_terminated()
-        gained = self.calls.rewards(self._spread(chosen, worlds), self.weights, int(self.step_of[worlds[0]]))
+            chosen = self._spread(chosen, worlds)
+        terminated = calls.is_terminated()
+        try:
+            gained = calls.rewards(chosen, self.weights)
+        except WrongRow as wrong:
+            self._fail(worlds[wrong.row], str(wrong))
         if is_all:
             np.add(self._gained, gained, out=self._gained)
         else:
@@ -312,20 +320,20 @@ class TaskWorlds:
             self._gained[worlds] += gained
         reward, terms = gained[:, 0], gained[:, 1:]
         truncated = self._find_truncated(terminated, worlds)
-        if not is_zero(reward * self._zeros[: len(reward)]):  # 0, unless a reward is not finite
+        if reward.dot(self._zeros[: len(reward)]) != 0:  # one is not finite
             self._check_reward(reward, terms, worlds)
         if self._acting.periods:
             self._run_due(worlds)
         success = None
         if self.has_success:
-            success = self.calls.is_success()
+            success = calls.is_success()
             if is_all:
                 self._last_success = success
             else:
                 success = success[worlds]
                 self._last_success[worlds] = success
         observation = self._observe(worlds)
-        self.calls.check_kept("a step")
+        calls.check_kept("a step")
         if is_all:
             self._last_terms = terms
         else:
@@ -342,33 +350,31 @@ class TaskWorlds:
 
     def _spread(self, values: Any, worlds: Worlds) -> Any:
         """Return values of some worlds as rows of all worlds; the others have zeros."""
-        if worlds is self._all:
-            return values
         full = np.zeros((self.count, *values.shape[1:]), values.dtype)
         full[worlds] = values
         return full
 
     def _check_action(self, action: Any, worlds: Worlds) -> Any:
-        if self._box is None:
+        if not self._is_box:
             for row, one in zip(worlds, action, strict=True):
                 if not self.action_space.contains(one):
                     raise WorldFailed(f"{self.name}: action {one!r} is not in {self.action_space}", int(row))
             return action
-        box = self._box
-        given = np.asarray(action, box.dtype)
-        if given.shape != (len(worlds), *box.shape):
-            expected = (len(worlds), *box.shape)
+        low, high = self._low, self._high
+        given = np.asarray(action, low.dtype)
+        if given.shape != (len(worlds), *low.shape[1:]):
             if self.count == 1:
-                raise TaskError(f"{self.name}: action of shape {given.shape[1:]}, the space has {box.shape}")
-            raise TaskError(f"{self.name}: actions of shape {given.shape}, expected {expected}")
-        clipped = np.minimum(np.maximum(given, box.low), box.high)
-        if not is_zero(clipped.reshape(len(worlds), -1).dot(self._finite_test)):  # 0, unless one is not finite
+                raise TaskError(f"{self.name}: action of shape {given.shape[1:]}, the space has {low.shape[1:]}")
+            raise TaskError(f"{self.name}: actions of shape {given.shape}, expected {(len(worlds), *low.shape[1:])}")
+        clipped = np.minimum(np.maximum(given, low), high)
+        if not is_finite(clipped, self._zero_actions):
             bad = ~np.isfinite(clipped).reshape(len(worlds), -1).all(axis=1)
             self._fail(worlds[bad.argmax()], "action is not finite at step {}")
         return clipped
 
     def _fail(self, world: Any, message: str) -> NoReturn:
-        raise WorldFailed(f"{self.name}: {message.replace('{}', str(self.step_of[world]))}", int(world))
+        before, _, after = message.rpartition("{}")
+        raise WorldFailed(f"{self.name}: {before}{self.step_of[world]}{after}", int(world))
 
     def _check_reward(self, reward: Array, terms: Array, worlds: Worlds) -> None:
         bad = ~np.isfinite(reward)

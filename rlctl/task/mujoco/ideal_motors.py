@@ -42,9 +42,11 @@ class IdealMotors:
 
     def __init__(self, world: SteppedWorld) -> None:
         self._world = world
+        self._may_act = False  # whether a motor was ideal in any episode
 
     def switch_on(self, motors: Any, *, damping: Any, max_force: Any, gain: Any, max_speed: Any) -> None:
         """Make motors ideal; with `gain` their targets are positions, with None velocities."""
+        self._may_act = True
         values = self._world.model("ideal motors")
         values[motors, _DAMPING], values[motors, _MAX_FORCE] = damping, max_force
         values[motors, _GAIN] = 0.0 if gain is None else gain
@@ -61,8 +63,7 @@ class IdealMotors:
     @property
     def is_used(self) -> bool:
         """Whether a motor is ideal."""
-        values = self._world.extra.get("ideal motors")
-        return values is not None and bool(values[:, _DAMPING].any())
+        return self._may_act and bool(self._world.extra["ideal motors"][:, _DAMPING].any())
 
     def step(self, substeps: int) -> None:
         """Take the physics steps of a control step; what depends on positions and velocities is up to date."""

@@ -32,6 +32,8 @@ class _Mode(NamedTuple):
     key: tuple[object, ...]
     joints: list[int]
     motors: Any  # their numbers
+    positions: Any  # numbers of their elements in `qpos`
+    velocities: Any  # and in `qvel`
     stiffness: Array
     damping: Array
     force: Array  # its limit [N m or N]
@@ -126,22 +128,22 @@ class MujocoMotors(Body):
 
     def _hold(self, mode: _Mode) -> Array:
         """Return the torques that hold the joints against gravity now, as PyBullet's ideal motors do."""
-        bias: Array = self._fields.derived("qfrc_bias")[..., self.parts.velocities][..., mode.joints]
+        bias: Array = self._fields.derived("qfrc_bias")[..., mode.velocities]
         return bias
 
     def _limit_approach(self, mode: _Mode, targets: Array, force: Array) -> Array:
         """Drive joints that are far from their target at their top speed instead, as PyBullet's motors do."""
         assert mode.max_speed is not None
-        error = targets - self._fields.data("qpos")[..., self._positions_of(mode)]
-        far = np.abs(error) * mode.stiffness > mode.max_speed * mode.damping
-        speed = np.minimum(mode.max_speed, np.abs(error) / self._sim._control_dt)
+        error = targets - self._fields.data("qpos")[..., mode.positions]
+        distance = np.abs(error)
+        far = distance * mode.stiffness > mode.max_speed * mode.damping
         biases = self._fields.model("actuator_biasprm")
         biases[..., mode.motors, 1] = np.where(far, 0.0, -mode.stiffness)
+        if not np.count_nonzero(far):
+            return force
+        speed = np.minimum(mode.max_speed, distance / self._sim._control_dt)
         result: Array = np.where(far, mode.damping * np.copysign(speed, error), force)
         return result
-
-    def _positions_of(self, mode: _Mode) -> Any:
-        return np.arange(self._sim.model.nq)[self.parts.positions][mode.joints]
 
     def drive_at(
         self, velocities: Array, *, max_force: float | Sequence[float] | None = None, joints: Sequence[str] = ()
@@ -242,6 +244,8 @@ class MujocoMotors(Body):
             key=key,
             joints=chosen,
             motors=motors,
+            positions=find_slice(np.arange(self._sim.model.nq)[self.parts.positions][chosen]),
+            velocities=find_slice(np.arange(self._sim.model.nv)[self.parts.velocities][chosen]),
             stiffness=stiffness if is_spring else 0.0 * damping,
             damping=damping,
             force=force,
@@ -285,6 +289,6 @@ class MujocoMotors(Body):
             return
         speeds = self._fields.data("qvel")
         joints = speeds[..., self.parts.velocities]
-        if np.abs(joints).max(initial=0.0) > self._cap:
+        if np.count_nonzero(np.abs(joints) > self._cap):
             speeds[..., self.parts.velocities] = np.clip(joints, -self._cap, self._cap)
             self._fields.touch()
