@@ -50,9 +50,7 @@ class Episodes:
 
     def as_rows(self, rows: Rows) -> Rows:
         """Return rows of worlds as those of actors."""
-        if not self._row:
-            return rows
-        return Rows(rows.index + self._row, rows.seed, rows.step)
+        return Rows(rows.index + self._row, rows.seed, rows.step) if self._row else rows
 
     def begin_rows(self, actor: Actor | None, index: Index) -> None:
         """Let an actor begin the episodes of worlds."""

@@ -287,7 +287,7 @@ class TaskWorlds:
 
     def step(self, action: Any, worlds: Worlds | None = None) -> WorldsStep:
         """Advance all worlds, or some, by a control step; `action` has a row for each of them, shape (k, ...)."""
-        if worlds is None or self._is_all(worlds):
+        if worlds is None or self.count == 1 or self._is_all(worlds):
             np.add(self.step_of, self._ones, out=self.step_of)
             return self._step(self._check_action(action, self._all), self._all)
         self.step_of[worlds] += 1
@@ -457,7 +457,7 @@ class TaskWorlds:
         return self._compute_terms(self.calls.observe())
 
     def _observe(self, worlds: Worlds) -> Observation:
-        exact = self.observe_exactly()
+        exact = self._compute_terms(self.calls.observe())
         if worlds is not self._all:
             exact = {name: value[worlds] for name, value in exact.items()}
         seen = self._signals.observe(exact, worlds)

@@ -19,8 +19,14 @@ class _Plan(NamedTuple):
     # The part of a call of `drive_to` that stays the same in later calls.
     limits: tuple[object, ...]
     joints: list[int]
+    links: list[int]  # of these joints
     impulses: list[float]  # force of a substep [N m or N]
     gains: list[float]
+
+
+def _as_key(limit: float | Sequence[float] | None) -> Any:
+    """Return a limit as what can be compared with `!=`, which two arrays cannot."""
+    return limit if limit is None or isinstance(limit, _NUMBER) else tuple(limit)
 
 
 class Motors(Body):
@@ -63,14 +69,10 @@ class Motors(Body):
         gain: float = 0.1,
         joints: Sequence[str] = (),
     ) -> None:
-        # Tuples, because two arrays cannot be compared by `!=`.
-        speeds, forces = (
-            limit if limit is None or isinstance(limit, _NUMBER) else tuple(limit) for limit in (max_speed, max_force)
-        )
-        limits = (speeds, forces, gain)
+        limits = (_as_key(max_speed), _as_key(max_force), gain)
         plan = self._plans.get(tuple(joints))
         if plan is None or plan.limits != limits:
-            plan = self._plans[tuple(joints)] = self._plan_motors(joints, speeds, forces, gain)
+            plan = self._plans[tuple(joints)] = self._plan_motors(joints, *limits)
         targets = self._read_values("positions", positions, len(plan.joints))
         self._forget_torques(plan.joints)
         impulses = self._apply_strength(plan.impulses, plan.joints)
@@ -78,8 +80,14 @@ class Motors(Body):
             pairs = zip(plan.joints, zip(targets, impulses, strict=True), strict=True)
             self._targets |= dict(pairs)
             return
-        self._command(
-            plan.joints, "POSITION_CONTROL", targetPositions=targets, forces=impulses, positionGains=plan.gains
+        pybullet.setJointMotorControlArray(
+            self.id,
+            plan.links,
+            pybullet.POSITION_CONTROL,
+            targetPositions=targets,
+            forces=impulses,
+            positionGains=plan.gains,
+            physicsClientId=self.client,
         )
 
     def _plan_motors(
@@ -94,7 +102,8 @@ class Motors(Body):
             given = self.joint_max_speed[chosen] if max_speed is None else max_speed
             self._limit_speeds(chosen, self._read_limits("max_speed", given, len(chosen)))
         impulses = self._motor_impulses(chosen, max_force)
-        return _Plan((max_speed, max_force, gain), chosen, impulses, [gain] * len(chosen))
+        links = [self.joint_indices[joint] for joint in chosen]
+        return _Plan((max_speed, max_force, gain), chosen, links, impulses, [gain] * len(chosen))
 
     def set_drives(
         self,
