@@ -149,8 +149,8 @@ def read_message(error: BaseException) -> str:
 
 
 def name_kind(error: BaseException) -> str:
-    """Return the name of an exception's type; that of a row of worlds, which only rlctl knows, is `TaskError`."""
-    return (TaskError if isinstance(error, WorldFailed | ShapeError) else type(error)).__name__
+    """Return the name of an exception's type; an error of one of the worlds is a `TaskError` to all but rlctl."""
+    return (TaskError if isinstance(error, WorldFailed) else type(error)).__name__
 
 
 def describe_exception(error: BaseException, where: str = "") -> str:

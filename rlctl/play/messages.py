@@ -14,6 +14,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import (
     EpisodeFailed,
     RlctlError,
+    ShapeError,
     TaskError,
     describe_exception,
     format_plugin_traceback,
@@ -195,7 +196,9 @@ def describe_failure(error: BaseException) -> WorkerException:
     if isinstance(error, FailedInEpisode):
         where, error = error.where, error.__cause__ or error
     if isinstance(error, RlctlError):
-        return WorkerException(str(error), name_kind(error), error.details, where)
+        # What is wrong with a row is known here: to the main process it is a task that failed.
+        kind = TaskError.__name__ if isinstance(error, ShapeError) else name_kind(error)
+        return WorkerException(str(error), kind, error.details, where)
     return WorkerException(describe_exception(error), "", format_plugin_traceback(error) or None, where)
 
 
