@@ -18,6 +18,7 @@ from rlctl.exporting.controller.graph import build_graph
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.onnx_policy import encode
 from rlctl.training.snapshot import pack
+from tests.exporting.controllers import plan_of
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "cpp"
 # A plugin for Unity: of the packages of Python and Node the one with ONNX Runtime's C++ headers, and Linux's library.
@@ -106,7 +107,7 @@ def test_loop_with_c(rlctl, tmp_path):
 
 def test_loop_with_a_recurrent_policy_in_c(tmp_path):
     file, policy = make_recurrent(tmp_path)
-    code = ControllerSource(file, "controller", None).write()
+    code = ControllerSource(file, plan_of(file), "controller", None).write()
     (tmp_path / "controller.c").write_text(code.source)
     (tmp_path / "controller.h").write_text(code.header)
     check_commands(policy, *play(build(tmp_path, f"-DCONTROLLER_C={tmp_path / 'controller.c'}")))
@@ -149,5 +150,5 @@ def test_loop_with_onnx_runtime(rlctl, tmp_path, onnxruntime):
     program = build(tmp_path, f"-DONNXRUNTIME_DIR={onnxruntime}")
     check_commands(load_reach(), *play(program, tmp_path / "controller.onnx"))
     file, policy = make_recurrent(tmp_path)
-    (tmp_path / "recurrent.onnx").write_bytes(encode(build_graph(file)))
+    (tmp_path / "recurrent.onnx").write_bytes(encode(build_graph(file, plan_of(file))))
     check_commands(policy, *play(program, tmp_path / "recurrent.onnx"))

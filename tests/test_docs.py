@@ -158,6 +158,7 @@ def test_mappings_have_known_keys():
 
 def test_limits_are_limits_of_reach():
     from rlctl.deploy import Limits, SafetyFilter
+    from rlctl.exporting.controller.plan import ControllerPlan
     from rlctl.exporting.controller.source import ControllerSource
     from rlctl.policy.file import PolicyFile
     from rlctl.policy.shipped import PRETRAINED
@@ -167,7 +168,8 @@ def test_limits_are_limits_of_reach():
     (block,) = [each for each in find_blocks("yaml") if is_limits(each) and "shoulder" not in each.text]
     limits = Limits.model_validate(yaml_text.load(block.text, str(block)))
     SafetyFilter(policy.info.env, limits)
-    ControllerSource(policy, "reach", limits)
+    plan = ControllerPlan(policy.info.env, policy.info.spec.frame_stack)
+    ControllerSource(policy, plan, "reach", limits)
 
 
 def test_other_files_can_be_read():

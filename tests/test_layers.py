@@ -139,7 +139,7 @@ def test_who_imports_torch():
 
 
 OPEN_TO_COMMANDS = {
-    *("arguments", "environments", "errors", "evaluation", "exporting.controller.layout"),
+    *("arguments", "environments", "errors", "evaluation", "exporting.controller.plan"),
     *("exporting.controller.observation", "limits", "options", "output", "play", "policy", "processes", "replaying"),
     *("recipe", "runs", "storage", "task", "version"),
 }

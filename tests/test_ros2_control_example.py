@@ -14,7 +14,7 @@ from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.policy import Policy
 from tests.exporting import controlled
-from tests.exporting.controllers import make_policy
+from tests.exporting.controllers import make_policy, plan_of
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "ros2_control"
 STUB = Path(__file__).parent / "ros2_stub"
@@ -37,7 +37,7 @@ def policy():
 @pytest.fixture(scope="module")
 def program(policy, tmp_path_factory):
     folder = tmp_path_factory.mktemp("ros2")
-    code = ControllerSource(policy, "controller", None).write()
+    code = ControllerSource(policy, plan_of(policy), "controller", None).write()
     (folder / "controller.h").write_text(code.header)
     (folder / "controller.c").write_text(code.source)
     run(folder, "gcc", "-std=c99", *FLAGS, "-c", "controller.c")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import SINGLE, join, split, split_space
 from rlctl.environments.success import SUCCESS, find_success
-from rlctl.environments.teacher_view import TeacherView
+from rlctl.environments.teacher_wrapper import TeacherWrapper
 from rlctl.output import format_count
 from rlctl.task.calls import ONE_FLAG
 from rlctl.task.env import TaskEnv
@@ -41,7 +41,7 @@ class GymWorlds:
         self.info: Mapping[str, Any] = {}
         """What the last reset or step returned beside the rest."""
         self._no_terms = np.zeros((1, 0))
-        self._teacher = _find_teacher_view(env)
+        self._teacher = _find_teacher_wrapper(env)
 
     def reset(self, worlds: NDArray[np.int64], seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
         """Begin the episode of a seed, of a task at this level; return its first observation, shape (1, ...)."""
@@ -148,9 +148,9 @@ class GymWorlds:
         self.env.close()
 
 
-def _find_teacher_view(env: Any) -> TeacherView | None:
+def _find_teacher_wrapper(env: Any) -> TeacherWrapper | None:
     while hasattr(env, "env"):
-        if isinstance(env, TeacherView):
+        if isinstance(env, TeacherWrapper):
             return env
         env = env.env
     return None

@@ -20,6 +20,7 @@ from rlctl.storage import validation
 from rlctl.task.commands import CommandTerm
 from rlctl.task.history import Start
 from rlctl.task.joints import Joints
+from rlctl.task.layout import Layout
 from rlctl.task.terms import Displacement, Distance, Gravity, LastAction, PhaseClock, Scaled, find_quantity_sizes
 
 if TYPE_CHECKING:
@@ -64,6 +65,11 @@ class EnvInfo(pydantic.BaseModel):
     def spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
         """Return the observation and the action space."""
         return space_from_json(self.observation_space), space_from_json(self.action_space)
+
+    @property
+    def layout(self) -> Layout:
+        """Where its named observations, and the values of their histories, are in the flat one."""
+        return Layout(self.observation_sizes, self.observation_history)
 
     def find_difference(self, other: EnvInfo, whose: str = "the environment's") -> str | None:
         """Describe how the spaces of `other` differ from these; None if they are equal."""

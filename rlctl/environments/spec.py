@@ -70,7 +70,7 @@ class EnvSpec:
     ) -> gymnasium.Env[Any, Any]:
         """Build the environment; raises `UsageError` for wrong names or parameters, `TaskError` if it fails.
 
-        With a `teacher` it also observes what a policy of that spec sees; see `rlctl.environments.teacher_view`.
+        With a `teacher` it also observes what a policy of that spec sees; see `rlctl.environments.teacher_wrapper`.
         Without `visuals` a task that draws nothing needs less memory: see `TaskEnv`.
         """
         constructor = self.constructor()
@@ -85,9 +85,9 @@ class EnvSpec:
             env = self._make_plain_env(constructor, render_mode)
         try:
             if teacher is not None:
-                from rlctl.environments.teacher_view import TeacherView
+                from rlctl.environments.teacher_wrapper import TeacherWrapper
 
-                env = TeacherView(env, teacher.observing, teacher.event_settings, teacher.wrap)
+                env = TeacherWrapper(env, teacher.observing, teacher.event_settings, teacher.wrap)
             return self.wrap(env)
         except RecipeError:
             env.close()

@@ -13,7 +13,7 @@ from rlctl.errors import RecipeError, UsageError, check_name
 from rlctl.limits.bounds import Bounds
 from rlctl.limits.defaults import fill_in, find_positions
 from rlctl.limits.limits import JointLimits, Limits
-from rlctl.limits.observation import MeasuredPositions, ObservationLayout, SensorChecks
+from rlctl.limits.observation import MeasuredPositions, ObservationReader, SensorChecks
 from rlctl.limits.steps import Steps, bound_targets
 from rlctl.task.joints import Joints
 from rlctl.task.terms import Scaled
@@ -35,7 +35,7 @@ class FittedLimits:
     """The limits of one policy, as arrays."""
 
     limits: Limits  # with what the policy knows in place of what they leave out
-    layout: ObservationLayout
+    reader: ObservationReader
     space: spaces.Space[Any]  # the action space
     control_dt: float | None
     steps: Steps | None  # steps that are bounded as targets
@@ -58,8 +58,8 @@ def fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
 
 @np.errstate(over="ignore", invalid="ignore")  # a later check refuses such numbers
 def _fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
-    layout = ObservationLayout(info)
-    limits = fill_in(limits, info, layout)
+    reader = ObservationReader(info)
+    limits = fill_in(limits, info, reader)
     control_dt = limits.control_dt or info.control_dt
     if control_dt is not None and not 1e-9 <= control_dt <= 1e9:
         raise RecipeError(f"limits: control_dt is {control_dt:g} s; it must be from 1e-9 to 1e9 s")
@@ -67,7 +67,7 @@ def _fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     count = math.prod(space.shape or ())
     bounds: Bounds | None = None
     steps = None
-    measured = _find_measured(limits.measured.position, layout, info, count)
+    measured = _find_measured(limits.measured.position, reader, info, count)
     if isinstance(space, spaces.Box):
         known = info.joints if info.joints is not None and len(info.joints.names) == count else None
         if limits.joints is not None and known is not None and limits.joints != list(known.names):
@@ -87,11 +87,11 @@ def _fit_limits(limits: Limits, info: EnvInfo) -> FittedLimits:
     if (limits.lowpass_hz or limits.blend_in_s) and control_dt is None:
         raise RecipeError(_NO_CONTROL_DT)
     _check_home(limits, bounds, home)
-    _check_measured(limits, bounds, measured, layout)
+    _check_measured(limits, bounds, measured, reader)
     safe = _make_safe_command(limits, bounds, count)
-    positions = measured or _find_measured(find_positions(info, layout), layout, info, count)
-    sensors = SensorChecks(limits, layout, control_dt, info, positions)
-    return FittedLimits(limits, layout, space, control_dt, steps, bounds, measured, sensors, home, safe)
+    positions = measured or _find_measured(find_positions(info, reader), reader, info, count)
+    sensors = SensorChecks(limits, reader.layout, control_dt, info, positions)
+    return FittedLimits(limits, reader, space, control_dt, steps, bounds, measured, sensors, home, safe)
 
 
 def _make_bounds(
@@ -239,11 +239,11 @@ def _gather(joints: list[JointLimits], key: str, default: float, end: int) -> Ar
     return np.array([default if (ends := getattr(joint, key)) is None else ends[end] for joint in joints])
 
 
-def _find_measured(name: str | None, layout: ObservationLayout, info: EnvInfo, count: int) -> MeasuredPositions | None:
+def _find_measured(name: str | None, reader: ObservationReader, info: EnvInfo, count: int) -> MeasuredPositions | None:
     if name is None:
         return None
-    check_name(name, layout.slices, "limits: measured.position: no observation", RecipeError, listed="Known")
-    part = layout.slices[name]
+    check_name(name, reader.layout.columns, "limits: measured.position: no observation", RecipeError, listed="Known")
+    part = reader.layout.columns[name]
     if (size := part.stop - part.start) != count:
         raise RecipeError(f"limits: measured.position: {name} has {size} elements, the action has {count}")
     term = info.observation_terms.get(name)
@@ -274,7 +274,7 @@ def _check_home(limits: Limits, bounds: Bounds | None, home: Array | None) -> No
 
 
 def _check_measured(
-    limits: Limits, bounds: Bounds | None, measured: MeasuredPositions | None, layout: ObservationLayout
+    limits: Limits, bounds: Bounds | None, measured: MeasuredPositions | None, reader: ObservationReader
 ) -> None:
     if measured is not None or bounds is None:
         return
@@ -283,7 +283,7 @@ def _check_measured(
     if needs_start or (not bounds.is_value and bounds.bounds_position) or limits.home is not None:
         raise RecipeError(
             "limits: these limits need the positions of the joints; write measured: {position: NAME} "
-            f"with the name of the observation, one of {', '.join(layout.slices)}"
+            f"with the name of the observation, one of {', '.join(reader.layout.columns)}"
         )
 
 

@@ -13,6 +13,7 @@ from rlctl.environments.dict_spaces import SINGLE, split, split_space
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import RecipeError, check_name, did_you_mean, short_repr
 from rlctl.limits.limits import Limits
+from rlctl.task.layout import Layout
 
 Array = NDArray[Any]
 
@@ -24,8 +25,8 @@ class ObservationError(ValueError):
     """The data is not an observation of this policy; the message gives the reason."""
 
 
-class ObservationLayout:
-    """Names, shapes and places of the parts of a policy's observation."""
+class ObservationReader:
+    """Reads what clients send as observations of a policy, by name or as a flat vector."""
 
     def __init__(self, info: EnvInfo) -> None:
         self.space, _ = info.spaces()
@@ -38,12 +39,9 @@ class ObservationLayout:
             named = len(shape) == 1 and sum(sizes.values()) == shape[0]
             self.shapes = {name: (size,) for name, size in sizes.items()} if named else {WHOLE: shape}
         self._dtypes = {name: np.dtype(parts.get(name, self.space).dtype) for name in self.shapes}
-        self.slices: dict[str, slice] = {}  # place of each named observation in the flat vector, which has no images
-        self.size = 0
-        for name, part in self.shapes.items():
-            if SINGLE in parts or not _is_image(parts[name]):
-                self.slices[name] = slice(self.size, self.size + math.prod(part))
-                self.size += math.prod(part)
+        numbers = [name for name in self.shapes if SINGLE in parts or not _is_image(parts[name])]
+        self.layout = Layout({name: math.prod(self.shapes[name]) for name in numbers})
+        """Place of each named observation in the flat vector, which has no images."""
 
     def read(self, values: Any) -> Any:
         """Return values by name, or the flat vector, in the policy's form; raises `ObservationError`."""
@@ -51,7 +49,7 @@ class ObservationLayout:
             parts = self._read_names(values)
             if isinstance(self.space, spaces.Dict):
                 return parts
-            return np.concatenate([parts[name].ravel() for name in self.slices]).reshape(self.space.shape or ())
+            return np.concatenate([parts[name].ravel() for name in self.layout.columns]).reshape(self.space.shape or ())
         if isinstance(self.space, spaces.Dict):
             raise ObservationError(f"this policy takes observations by name: {', '.join(self.shapes)}")
         return _convert(values, WHOLE, self.space.shape or (), np.dtype(self.space.dtype))
@@ -72,18 +70,18 @@ class ObservationLayout:
         if isinstance(self.space, spaces.Dict):
             return {name: np.asarray(observation[name]) for name in self.shapes}
         flat = np.asarray(observation).ravel()
-        return {name: flat[part].reshape(self.shapes[name]) for name, part in self.slices.items()}
+        return {name: flat[part].reshape(self.shapes[name]) for name, part in self.layout.columns.items()}
 
     def flatten(self, observation: Any) -> NDArray[np.float64]:
         """Return the numbers of an observation without its images, shape (size,); raises `ObservationError`."""
         parts = split(observation)
-        keys = [SINGLE] if SINGLE in parts else [*self.slices]
+        keys = [SINGLE] if SINGLE in parts else [*self.layout.columns]
         if missing := [key for key in keys if key not in parts]:
             raise ObservationError(f"observation names missing: {_join(missing)}")
         numbers = [read_numbers(parts[key]) for key in keys]
         values = numbers[0] if len(numbers) == 1 else np.concatenate([np.zeros(0), *numbers])
-        if values.size != self.size:
-            raise ObservationError(f"the observation has {values.size} numbers, the policy takes {self.size}")
+        if values.size != self.layout.size:
+            raise ObservationError(f"the observation has {values.size} numbers, the policy takes {self.layout.size}")
         return values
 
 
@@ -191,22 +189,22 @@ class SensorChecks:
     def __init__(
         self,
         limits: Limits,
-        layout: ObservationLayout,
+        layout: Layout,
         control_dt: float | None,
         info: EnvInfo,
         measured: MeasuredPositions | None = None,
     ) -> None:
         for name in limits.sensors:
-            check_name(name, layout.slices, "limits: sensors: no observation", RecipeError, listed="Known")
+            check_name(name, layout.columns, "limits: sensors: no observation", RecipeError, listed="Known")
         self._layout = layout
         self.oldest = math.inf if control_dt is None else limits.max_age_periods * control_dt
         self.low, self.high = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
         self.frozen: list[tuple[str, slice, int]] = []
         self._defaults: dict[str, str] = {}  # ranges by the name of the observation, for people
-        for name, ranges in find_command_ranges(info, layout.slices).items():
+        for name, ranges in find_command_ranges(info, layout.columns).items():
             low, high = np.array(ranges).T
             slack = _ROUNDING * (high - low)  # float32 rounds the ends, too
-            self.low[layout.slices[name]], self.high[layout.slices[name]] = low - slack, high + slack
+            self.low[layout.columns[name]], self.high[layout.columns[name]] = low - slack, high + slack
             self._defaults[name] = ", ".join(f"{least:g} to {most:g}" for least, most in ranges)
         joints = info.joints
         if measured is not None and joints is not None and joints.low and joints.high:
@@ -218,7 +216,7 @@ class SensorChecks:
             positions = self._name(measured.part.start).partition("[")[0]
             self._defaults[positions] = "the joints' range and as much again to each side, so that degrees are a fault"
         for name, sensor in limits.sensors.items():
-            part = layout.slices[name]
+            part = layout.columns[name]
             if sensor.range is not None:
                 self.low[part], self.high[part] = sensor.range
                 self._defaults.pop(name, None)
@@ -228,8 +226,8 @@ class SensorChecks:
                         f"limits: sensors.{name}.frozen_s: this policy has no control_dt; write control_dt: SECONDS"
                     )
                 self.frozen.append((name, part, max(2, round(min(sensor.frozen_s / control_dt, 1e9)))))
-        quaternions = find_quaternions(info, layout.slices)
-        self.quaternions = [layout.slices[name] for name in quaternions]
+        quaternions = find_quaternions(info, layout.columns)
+        self.quaternions = [layout.columns[name] for name in quaternions]
         self._norms = dict.fromkeys(quaternions, "norm 0.9 to 1.1")
         self._all_finite = b"\x01" * layout.size
         self.has_range = bool(np.isfinite(self.low).any())
@@ -288,7 +286,7 @@ class SensorChecks:
         return fault
 
     def _name(self, index: int) -> str:
-        for name, part in self._layout.slices.items():
+        for name, part in self._layout.columns.items():
             if part.start <= index < part.stop:
                 return name if part.stop - part.start == 1 else f"{name}[{index - part.start}]"
         return str(index)

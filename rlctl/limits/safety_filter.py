@@ -46,7 +46,7 @@ class SafetyFilter:
         if not isinstance(limits, Limits):
             limits = NO_LIMITS if limits is None else read_limits(Path(limits))
         fitted = fit_limits(limits, info)
-        self.limits, self.layout, self.control_dt = fitted.limits, fitted.layout, fitted.control_dt
+        self.limits, self.reader, self.control_dt = fitted.limits, fitted.reader, fitted.control_dt
         self._space, self._measured, self._home = fitted.space, fitted.measured, fitted.home
         self._sensors = fitted.sensors
         bounds = fitted.bounds
@@ -158,7 +158,7 @@ class SafetyFilter:
         if observation is None:
             return self.fail("missing")
         try:
-            values = self.layout.flatten(observation)
+            values = self.reader.flatten(observation)
             (age,) = (age_s,) if type(age_s) is float else read_numbers(age_s)  # most calls need no array
         except ValueError as error:  # no numbers, or an age that is not one number
             return self.fail("invalid observation", short_repr(str(error), 200))

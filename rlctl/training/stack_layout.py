@@ -8,10 +8,10 @@ from gymnasium import spaces
 
 from rlctl.play.workers import Workers
 from rlctl.training.rollouts import to_network_layout
-from rlctl.training.stacked_replay import StackLayout
+from rlctl.training.stacked_replay import Stacking
 
 
-def find_layout(workers: Workers, space: spaces.Space[Any]) -> StackLayout | None:
+def find_layout(workers: Workers, space: spaces.Space[Any]) -> Stacking | None:
     """Return the layout of a network's observations; None without histories and for dictionaries."""
     info, stacked = workers.info, workers.spec.frame_stack
     shape = info.spaces()[0].shape
@@ -23,16 +23,9 @@ def find_layout(workers: Workers, space: spaces.Space[Any]) -> StackLayout | Non
         source = np.concatenate([numbers] * stacked, axis=-1)
         back = np.broadcast_to(stacked - 1 - np.arange(shape[-1]) // newest[-1], shape)
     elif info.observation_history:
-        frames = {name: info.observation_history.get(name, 1) for name in info.observation_sizes}
-        sources, backs, first = [], [], 0
-        for name, size in info.observation_sizes.items():
-            newest_size = size // frames[name]
-            sources.append(first + np.arange(size) % newest_size)
-            backs.append(frames[name] - 1 - np.arange(size) // newest_size)
-            first += newest_size
-        source, back = np.concatenate(sources), np.concatenate(backs)
+        source, back = info.layout.find_sources()
     else:
         return None
     source, back = (to_network_layout(part, space).ravel() for part in (source, back))
     privileged = np.arange(sum(workers.privileged_sizes.values()))
-    return StackLayout(np.concatenate([source, source.max() + 1 + privileged]), np.append(back, 0 * privileged))
+    return Stacking(np.concatenate([source, source.max() + 1 + privileged]), np.append(back, 0 * privileged))

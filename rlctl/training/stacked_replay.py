@@ -15,7 +15,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 Numbers = NDArray[np.int64]
 
 
-class StackLayout:
+class Stacking:
     """Which value each element of an observation is: `source` in the newest values, `back` steps ago; both flat."""
 
     def __init__(self, source: Numbers, back: Numbers) -> None:
@@ -28,7 +28,7 @@ class StackLayout:
         """The elements of an observation that are newest values, in the order of these."""
 
 
-def store_once(buffer: Any, layout: StackLayout | None, start: str) -> None:
+def store_once(buffer: Any, layout: Stacking | None, start: str) -> None:
     """Let a buffer store each value once, if its observations are histories; `start` is what fills them at first."""
     if layout is not None and type(buffer) in (ReplayBuffer, NStepReplayBuffer) and not buffer.optimize_memory_usage:
         stacks = Stacks(buffer, layout, start == "first")
@@ -41,7 +41,7 @@ class Stacks:
     It holds some transitions more than the buffer, of which the oldest histories have values.
     """
 
-    def __init__(self, buffer: ReplayBuffer, layout: StackLayout, repeats_first: bool) -> None:
+    def __init__(self, buffer: ReplayBuffer, layout: Stacking, repeats_first: bool) -> None:
         self.buffer, self.layout, self._repeats_first = buffer, layout, repeats_first
         self.shape: tuple[int, ...] = buffer.obs_shape
         self.dtype = buffer.observations.dtype

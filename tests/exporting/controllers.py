@@ -6,6 +6,7 @@ from gymnasium import spaces
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.exporting.c_source import find_compiler
+from rlctl.exporting.controller.plan import ControllerPlan
 from rlctl.exporting.controller.players import CController, compile_controller
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.file import PolicyFile, PolicyInfo
@@ -42,9 +43,14 @@ def make_arm(low=-10.0, high=10.0, dtype=np.float32, **fields):
     )
 
 
+def plan_of(policy):
+    """Return what a policy's controller takes, computes and returns."""
+    return ControllerPlan(policy.info.env, policy.info.spec.frame_stack)
+
+
 def build_controller(policy, folder, limits=None, name="controller"):
     """Write a controller and compile it; warnings are errors. Return its source and what acts."""
-    source = ControllerSource(policy, name, limits)
+    source = ControllerSource(policy, plan_of(policy), name, limits)
     strict = [*find_compiler(), "-Werror", "-Wdouble-promotion"]
     library = compile_controller(source.write(), folder, strict)
-    return source, CController(source.layout, library, has_target=source.target is not None)
+    return source, CController(source.plan, library, has_target=source.target is not None)

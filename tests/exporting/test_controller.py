@@ -11,7 +11,7 @@ from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.graph import build_graph
-from rlctl.exporting.controller.layout import ControllerLayout
+from rlctl.exporting.controller.plan import ControllerPlan
 from rlctl.exporting.controller.players import OnnxController
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.numpy_actor import NumpyActor
@@ -21,7 +21,7 @@ from rlctl.policy.torch_policy import TorchActor
 from rlctl.task import Joints, terms
 from rlctl.task.history import TermHistory
 from rlctl.task.rotations import normalize
-from tests.exporting.controllers import build_controller, make_arm, make_policy
+from tests.exporting.controllers import build_controller, make_arm, make_policy, plan_of
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler (cc, or $CC) on this machine")
 TERMS = {
@@ -100,8 +100,8 @@ def test_terms_and_histories(history, start, tmp_path):
     env = make_env(history, start)
     policy = make_policy(env, seed=4)
     source, in_c = build_controller(policy, tmp_path)
-    onnx = OnnxController(encode(build_graph(policy)))
-    assert [quantity.name for quantity in source.layout.quantities] == ["orientation", "angles", "hand", "goal", "int"]
+    onnx = OnnxController(encode(build_graph(policy, plan_of(policy))))
+    assert [quantity.name for quantity in source.plan.quantities] == ["orientation", "angles", "hand", "goal", "int"]
     assert play(Policy(NumpyActor(policy)), [in_c, onnx], env) < 1e-5
     assert in_c.may_send
 
@@ -113,7 +113,7 @@ def test_a_stack_of_frames_and_an_lstm(small, train, write, tmp_path):
     actor = TorchActor.load(path)
     policy = Policy(actor)
     _, in_c = build_controller(actor.file, tmp_path)
-    controllers = [in_c, OnnxController(encode(build_graph(actor.file)))]
+    controllers = [in_c, OnnxController(encode(build_graph(actor.file, plan_of(actor.file))))]
     rng = np.random.default_rng(0)
     for _ in range(2):
         policy.reset()
@@ -155,7 +155,7 @@ def test_targets_by_hand(command, expected, tmp_path):
     policy = dataclasses.replace(policy, tensors=tensors)
     source, in_c = build_controller(policy, tmp_path)
     inputs = {**draw_inputs(np.random.default_rng(0)), "angles": np.array([0.25, -0.3], np.float32)}
-    for controller in (in_c, OnnxController(encode(build_graph(policy)))):
+    for controller in (in_c, OnnxController(encode(build_graph(policy, plan_of(policy))))):
         action, target = controller.step({name: inputs[name] for name in source_names(source)})
         assert action.tolist() == [1.0, -0.25]
         assert target == pytest.approx(expected, abs=1e-7)
@@ -165,7 +165,7 @@ def test_targets_by_hand(command, expected, tmp_path):
 
 
 def source_names(source):
-    return [quantity.name for quantity in source.layout.quantities]
+    return [quantity.name for quantity in source.plan.quantities]
 
 
 @needs_compiler
@@ -223,7 +223,7 @@ def test_a_quantity_with_the_name_of_an_output():
         update={"observation_sizes": {"positions": 2, "target": 3}}
     )
     policy = make_policy(env)
-    model = build_graph(policy)
+    model = build_graph(policy, plan_of(policy))
     assert [port.name for port in model.graph.input] == ["positions", "target_input"]
     assert {entry.key: entry.value for entry in model.metadata_props}["input_names"] == "positions,target_input"
     inputs = {"positions": np.ones(2), "target": np.zeros(3)}
@@ -233,7 +233,7 @@ def test_a_quantity_with_the_name_of_an_output():
 
 def test_the_header_and_the_metadata_name_everything(tmp_path):
     policy = commanding(action_scale=[0.5, 0.5])
-    code = ControllerSource(policy, "arm-1.c", None).write("A step took 1.0 us.")
+    code = ControllerSource(policy, plan_of(policy), "arm-1.c", None).write("A step took 1.0 us.")
     for line in (
         "A step took 1.0 us.",
         "float input_int[1];",
@@ -244,7 +244,7 @@ def test_the_header_and_the_metadata_name_everything(tmp_path):
         "double target[ARM_1_C_ACTION_SIZE]; /* rad or m, of the joints arm_1_c_action_names */",
     ):
         assert line in code.header
-    model = build_graph(policy)
+    model = build_graph(policy, plan_of(policy))
     metadata = {entry.key: entry.value for entry in model.metadata_props}
     assert metadata["input_names"] == "orientation,angles,hand,goal,int"
     assert metadata["input_sizes"] == "4,2,3,3,1"
@@ -254,6 +254,10 @@ def test_the_header_and_the_metadata_name_everything(tmp_path):
     path.write_bytes(encode(model))
     with pytest.raises(ArtifactError, match="a controller takes what a robot measures; give the policy"):
         OnnxActor.load(path)
+
+
+def write_code(policy, limits=None):
+    return ControllerSource(policy, plan_of(policy), "c", limits).write()
 
 
 def test_what_cannot_be_a_controller():
@@ -268,12 +272,12 @@ def test_what_cannot_be_a_controller():
         (inner, "nothing"),
     ):
         with pytest.raises(UsageError, match=message):
-            ControllerLayout(env)
+            ControllerPlan(env)
     with pytest.raises(UsageError, match="no input has the joints' positions: 'last' is computed inside"):
-        ControllerSource(commanding(action_step=[1.0, 1.0], measured="last"), "c", None)
+        write_code(commanding(action_step=[1.0, 1.0], measured="last"))
     wrong = Limits.model_validate({"command": "position", "scale": 0.3})
     with pytest.raises(RecipeError, match="scale and offset differ from the task's"):
-        ControllerSource(commanding(action_scale=[0.5, 0.5]), "c", wrong)
+        write_code(commanding(action_scale=[0.5, 0.5]), wrong)
     unknown = Limits.model_validate({"sensors": {"gravity": {"range": [-1, 1]}}})
     with pytest.raises(RecipeError, match="limits: sensors: no observation 'gravity'"):
-        ControllerSource(commanding(), "c", unknown)
+        write_code(commanding(), unknown)

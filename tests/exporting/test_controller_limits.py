@@ -12,7 +12,7 @@ from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.players import STATUS
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.task import terms
-from tests.exporting.controllers import build_controller, make_arm, make_policy
+from tests.exporting.controllers import build_controller, make_arm, make_policy, plan_of
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler (cc, or $CC) on this machine")
 JOINTS = ["shoulder", "elbow"]
@@ -111,8 +111,8 @@ def compare(arm, options, count, seed, folder):
     """Run both filters, which must give the same bits; return how often each state and reason came."""
     limits = Limits.model_validate({"joints": JOINTS, **options})
     source, controller = build_controller(make_policy(make_arm(**arm)), folder, limits)
-    safety = SafetyFilter(source.layout.inputs_info, limits, clock=lambda: 0.0)
-    space = source.layout.action_space
+    safety = SafetyFilter(source.plan.inputs_info, limits, clock=lambda: 0.0)
+    space = source.plan.action_space
     rng, seen, position = np.random.default_rng(seed), collections.Counter[str](), None
     last, is_frozen = np.zeros(5), False
     for row, age, order in zip(*draw_steps(rng, count, space.dtype), strict=True):
@@ -170,7 +170,8 @@ def test_limits_in_c_are_those_in_python(case, tmp_path):
 def test_the_file_compiles_as_c_plus_plus(case, tmp_path):
     arm, options = CASES[case]
     limits = Limits.model_validate({"joints": JOINTS, **options})
-    code = ControllerSource(make_policy(make_arm(**arm)), "arm", limits).write()
+    policy = make_policy(make_arm(**arm))
+    code = ControllerSource(policy, plan_of(policy), "arm", limits).write()
     (tmp_path / "arm.h").write_text(code.header)
     (tmp_path / "arm.c").write_text(code.source)
     strict = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only"]
@@ -197,7 +198,7 @@ def test_default_ranges_of_orientations_and_commands(tmp_path):
     header = source.write().header
     assert " * Inputs older than 0.3 s (max_age_periods: 3) are a fault.\n" in header
     assert " *   command: -0.5 to 1, -0.7 to 0.7\n *   orientation: norm 0.9 to 1.1\n" in header
-    safety = SafetyFilter(source.layout.inputs_info)
+    safety = SafetyFilter(source.plan.inputs_info)
     for orientation, command, is_sound in [
         ([0, 0, 0, 1], [1.0, -0.7], True),  # -0.7 is lower in float32
         ([0, 0, 0, 0], [0, 0], False),  # a sensor that has not started

@@ -6,7 +6,7 @@ import pytest
 from rlctl.errors import RecipeError, RlctlError, UsageError
 from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.graph import build_graph
-from rlctl.exporting.controller.layout import ControllerLayout
+from rlctl.exporting.controller.plan import ControllerPlan
 from rlctl.exporting.controller.players import CController, MappedController, OnnxController, compile_controller
 from rlctl.exporting.controller.program_mapping import read_mapping
 from rlctl.exporting.controller.source import ControllerSource
@@ -14,7 +14,7 @@ from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.onnx_policy import encode
 from rlctl.policy.policy import Policy
 from rlctl.task import Joints, terms
-from tests.exporting.controllers import make_arm, make_policy
+from tests.exporting.controllers import make_arm, make_policy, plan_of
 
 MAPPING = """
 observations:
@@ -31,7 +31,7 @@ def policy():
 @pytest.fixture
 def mapping(policy, tmp_path):
     (tmp_path / "mapping.yaml").write_text(MAPPING)
-    return read_mapping(tmp_path / "mapping.yaml", ControllerLayout(policy.info.env, policy.info.spec.frame_stack))
+    return read_mapping(tmp_path / "mapping.yaml", ControllerPlan(policy.info.env, policy.info.spec.frame_stack))
 
 
 def test_values_and_their_inverse(mapping):
@@ -46,14 +46,14 @@ def test_values_and_their_inverse(mapping):
 @pytest.mark.parametrize("form", ["onnx", "c"])
 def test_a_controller_maps_its_inputs(policy, mapping, tmp_path, form):
     if form == "onnx":
-        controller = OnnxController(encode(build_graph(policy, mapping)))
+        controller = OnnxController(encode(build_graph(policy, plan_of(policy), mapping)))
     else:
         if find_compiler() is None:
             pytest.skip("no C compiler")
-        source = ControllerSource(policy, "controller", None, mapping)
+        source = ControllerSource(policy, plan_of(policy), "controller", None, mapping)
         code = source.write()
         assert " *   goal: order [1, 2, 0]," in code.header
-        controller = CController(source.layout, compile_controller(code, tmp_path, find_compiler()), has_target=False)
+        controller = CController(source.plan, compile_controller(code, tmp_path, find_compiler()), has_target=False)
     right = {"positions": np.array([0.1, 0.2]), "goal": np.array([10.0, -30.0, 23.0])}
     wrong = {"positions": right["positions"], "goal": np.array([10.0, 20.0, 30.0])}
     expected = Policy(NumpyActor(policy)).predict(np.concatenate([*right.values()]).astype(np.float32))
@@ -81,7 +81,7 @@ def test_a_controller_maps_its_inputs(policy, mapping, tmp_path, form):
 def test_what_does_not_fit(policy, tmp_path, text, error, message):
     (tmp_path / "mapping.yaml").write_text(text)
     with pytest.raises(error) as caught:
-        read_mapping(tmp_path / "mapping.yaml", ControllerLayout(policy.info.env, policy.info.spec.frame_stack))
+        read_mapping(tmp_path / "mapping.yaml", ControllerPlan(policy.info.env, policy.info.spec.frame_stack))
     assert message in str(caught.value)
 
 
@@ -108,15 +108,15 @@ def legs():
 
 def read(policy, tmp_path, text):
     (tmp_path / "mapping.yaml").write_text(text)
-    return read_mapping(tmp_path / "mapping.yaml", ControllerLayout(policy.info.env, policy.info.spec.frame_stack))
+    return read_mapping(tmp_path / "mapping.yaml", ControllerPlan(policy.info.env, policy.info.spec.frame_stack))
 
 
 @pytest.mark.parametrize("text", [LIKE, SAME, INDEXED])
 def test_targets_are_the_programs(legs, tmp_path, text):
     mapping = read(legs, tmp_path, TARGETS.replace("TARGET", text))
     inputs = {"positions": np.array([0.3, -0.2]), "orientation": np.array([0.0, 0.6, 0.0, 0.8])}
-    _, target = OnnxController(encode(build_graph(legs))).step(inputs)
-    mapped = OnnxController(encode(build_graph(legs, mapping)))
+    _, target = OnnxController(encode(build_graph(legs, plan_of(legs)))).step(inputs)
+    mapped = OnnxController(encode(build_graph(legs, plan_of(legs), mapping)))
     # Policy: left 0.3, right -0.2. Program: right first, (-0.2 - 0.25) / 0.5 = -0.9 and 0.3 / -0.5 = -0.6.
     program = {"positions": np.array([-0.9, -0.6]), "orientation": np.array([0.8, 0.0, 0.6, 0.0])}
     expected = [(target[1] - 0.25) / 0.5, target[0] / -0.5]
@@ -130,7 +130,7 @@ def test_targets_are_the_programs(legs, tmp_path, text):
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_targets_and_units_in_c(legs, tmp_path):
     mapping = read(legs, tmp_path, TARGETS.replace("TARGET", LIKE))
-    source = ControllerSource(legs, "controller", None, mapping)
+    source = ControllerSource(legs, plan_of(legs), "controller", None, mapping)
     code = source.write()
     assert "float positions[2]; /* the program's value [half turns]: right, left */" in code.header
     assert "float orientation[4]; /* the program's value [quaternion w, x, y, z] */" in code.header
@@ -140,14 +140,14 @@ def test_targets_and_units_in_c(legs, tmp_path):
     units = code.source.partition("controller_input_units")[2].partition(";")[0]
     assert '"half turns"' in units
     assert '"quaternion w, x, y, z"' in units
-    controller = CController(source.layout, compile_controller(code, tmp_path, find_compiler()), has_target=True)
+    controller = CController(source.plan, compile_controller(code, tmp_path, find_compiler()), has_target=True)
     program = {"positions": np.array([-0.9, -0.6]), "orientation": np.array([0.8, 0.0, 0.6, 0.0])}
-    expected = OnnxController(encode(build_graph(legs, mapping))).step(program)[1]
+    expected = OnnxController(encode(build_graph(legs, plan_of(legs), mapping))).step(program)[1]
     assert controller.step(program)[1] == pytest.approx(expected, abs=1e-5)
     other = read(legs, tmp_path, "observations: {positions: {scale: 2}}")
     assert (
         "float positions[2]; /* the program's value: left, right */"
-        in ControllerSource(legs, "controller", None, other).write().header
+        in ControllerSource(legs, plan_of(legs), "controller", None, other).write().header
     )
 
 
@@ -171,4 +171,4 @@ def test_a_computed_term_is_not_mapped(tmp_path):
     env = make_arm(observation_terms={"goal": terms.Gravity("orientation")}, quantity_sizes={"orientation": 4})
     (tmp_path / "mapping.yaml").write_text("observations: {goal: {sign: [1, 1, -1]}}")
     with pytest.raises(UsageError, match="goal is computed inside the controller, from orientation; map that instead"):
-        read_mapping(tmp_path / "mapping.yaml", ControllerLayout(env, 1))
+        read_mapping(tmp_path / "mapping.yaml", ControllerPlan(env, 1))

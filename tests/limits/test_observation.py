@@ -5,7 +5,7 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.environments.info import EnvInfo, space_to_json
-from rlctl.limits.observation import ObservationError, ObservationLayout
+from rlctl.limits.observation import ObservationError, ObservationReader
 from tests.limits.conftest import make_filter, observe_at, run_filter
 
 ACTION = space_to_json(spaces.Box(-1, 1, (1,)))
@@ -19,7 +19,7 @@ DICT = spaces.Dict(
 
 
 def layout(space, **options):
-    return ObservationLayout(EnvInfo(observation_space=space_to_json(space), action_space=ACTION, **options))
+    return ObservationReader(EnvInfo(observation_space=space_to_json(space), action_space=ACTION, **options))
 
 
 def test_names_in_any_order():
@@ -35,7 +35,7 @@ def test_a_dict_space_with_a_picture():
     observation = parts.read({"mode": 2, "camera": np.ones((4, 4, 3), np.uint8), "pose": [0.5, 1]})
     assert DICT.contains({**observation, "mode": int(observation["mode"])})
     assert parts.flatten(observation).tolist() == [2.0, 0.5, 1.0]  # in the order of the space, without the picture
-    assert parts.slices == {"mode": slice(0, 1), "pose": slice(1, 3)}
+    assert parts.layout.columns == {"mode": slice(0, 1), "pose": slice(1, 3)}
     with pytest.raises(ObservationError, match="takes observations by name: "):
         parts.read([1.0, 2.0])
 

@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
-from rlctl.environments.teacher_view import TeacherView
+from rlctl.environments.teacher_wrapper import TeacherWrapper
 from rlctl.environments.wrappers import select_observations
 from rlctl.errors import RecipeError
 from rlctl.task.env import TaskEnv
@@ -108,7 +108,7 @@ def test_elements_of_a_plain_environment():
 def test_a_teacher_of_a_plain_environment_has_its_own_wrappers():
     teacher = EnvSpec("teacher", observe=("2",), frame_stack=3)
     env = EnvSpec("student", observe=("0",)).wrap(
-        TeacherView(Pointer(), teacher.observing, teacher.event_settings, teacher.wrap)
+        TeacherWrapper(Pointer(), teacher.observing, teacher.event_settings, teacher.wrap)
     )
     assert env.reset()[0].tolist() == [0.5]
     view = env.env

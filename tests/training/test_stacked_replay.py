@@ -13,7 +13,7 @@ from rlctl.task.history import TermHistory
 from rlctl.task.layout import Layout
 from rlctl.training import algorithms
 from rlctl.training.checkpoint import ReplaySegments
-from rlctl.training.stacked_replay import StackedRows, StackLayout, store_once
+from rlctl.training.stacked_replay import StackedRows, Stacking, store_once
 from tests.training.envs import Image, Line
 
 __all__ = ("Line",)  # loaded by path
@@ -41,7 +41,7 @@ def make_buffer(kind, *, once, start="first"):
     space = spaces.Box(-np.inf, np.inf, (WIDTH,), np.float32)
     options = {"n_steps": 3} if kind is NStepReplayBuffer else {}
     buffer = kind(ROWS * ENVS, space, spaces.Box(-1, 1, (1,), np.float32), "cpu", n_envs=ENVS, **options)
-    store_once(buffer, StackLayout(SOURCE, BACK) if once else None, start)
+    store_once(buffer, Stacking(SOURCE, BACK) if once else None, start)
     return buffer
 
 

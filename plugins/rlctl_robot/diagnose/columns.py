@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError, check_name
-from rlctl.exporting.controller.layout import ControllerLayout
+from rlctl.exporting.controller.plan import ControllerPlan
 from rlctl.storage import yaml_text
 from rlctl.storage.validation import Section
 from rlctl_robot.diagnose.signals import ACTIONS
@@ -105,7 +105,7 @@ def _find_inputs(finder: "_Finder", info: EnvInfo, size: int) -> dict[str, tuple
     computed = [name for name, term in info.observation_terms.items() if name not in term.inputs and name in sizes]
     if sum(sizes.values()) != size or all(finder.find_exact(name, sizes[name]) for name in computed):
         return {}
-    columns = {part.name: finder.find_exact(part.name, part.size) for part in ControllerLayout(info).quantities}
+    columns = {part.name: finder.find_exact(part.name, part.size) for part in ControllerPlan(info).quantities}
     return {name: some for name, some in columns.items() if some} if all(columns.values()) else {}
 
 

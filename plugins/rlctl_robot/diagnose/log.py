@@ -8,8 +8,8 @@ import numpy as np
 
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError
-from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.exporting.controller.observation import ControllerObservation
+from rlctl.exporting.controller.plan import ControllerPlan
 from rlctl_robot.diagnose.columns import ColumnAssignment, assign_columns
 from rlctl_robot.diagnose.recording import read_recording
 from rlctl_robot.diagnose.signals import Array, LoggedSignals
@@ -72,7 +72,7 @@ def _compute_observations(
     info: EnvInfo, sizes: Mapping[str, int], inputs: Array, actions: Array, lengths: Sequence[int]
 ) -> Array:
     """Return what the policy observes for the inputs of a controller, a row per step."""
-    observation, ends = ControllerObservation(ControllerLayout(info)), np.cumsum(list(sizes.values()))[:-1]
+    observation, ends = ControllerObservation(ControllerPlan(info)), np.cumsum(list(sizes.values()))[:-1]
     rows = []
     for start, length in zip(np.cumsum([0, *lengths[:-1]]).tolist(), lengths, strict=True):
         observation.begin()

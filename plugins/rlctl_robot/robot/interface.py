@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import short_repr
-from rlctl.exporting.controller.layout import ControllerLayout
 from rlctl.exporting.controller.observation import ControllerObservation
-from rlctl.limits.observation import ObservationLayout
+from rlctl.exporting.controller.plan import ControllerPlan
+from rlctl.limits.observation import ObservationReader
 from rlctl.policy.named_actors import ZeroActor
 
 Array = NDArray[Any]
@@ -28,8 +28,8 @@ class Interface(abc.ABC):
 
     def __init__(self, env: Any, info: EnvInfo) -> None:
         self._env, self._info, self._space = env, info, env.action_space
-        self._layout = ObservationLayout(info)
-        self.shapes: dict[str, tuple[int, ...]] = self._layout.shapes
+        self._reader = ObservationReader(info)
+        self.shapes: dict[str, tuple[int, ...]] = self._reader.shapes
         """The shape of each part of what is sent, in its order."""
         self.units = dict(info.observation_units)
         self._zero = ZeroActor(self._space).action
@@ -38,7 +38,7 @@ class Interface(abc.ABC):
     def sizes(self) -> tuple[int, int] | None:
         """Numbers that are sent and taken; None for images and discrete actions, which are not vectors of numbers."""
         is_vector = isinstance(self._space, spaces.Box) and all(len(shape) < 2 for shape in self.shapes.values())
-        if not is_vector or list(self._layout.slices) != list(self._layout.shapes):
+        if not is_vector or list(self._reader.layout.columns) != list(self._reader.shapes):
             return None
         return sum(map(math.prod, self.shapes.values())), math.prod(self._space.shape or ())
 
@@ -72,7 +72,7 @@ class PolicyInterface(Interface):
 
     def measure(self, observation: Any) -> dict[str, Array]:
         """Return the parts of the observation by name."""
-        return self._layout.name_parts(observation)
+        return self._reader.name_parts(observation)
 
     def read(self, values: Any) -> Array:
         """Return an action within its bounds."""
@@ -87,7 +87,7 @@ class PolicyInterface(Interface):
 
     def observe(self, sent: Parts, step: int) -> Any:
         """Return what was sent, in the policy's form."""
-        return self._layout.read(sent)
+        return self._reader.read(sent)
 
     def find_command(self, action: Array, sent: Parts) -> Array:
         """Return the action itself."""
@@ -102,7 +102,7 @@ class ControllerInterface(Interface):
 
     def __init__(self, env: Any, info: EnvInfo) -> None:
         super().__init__(env, info)
-        self._controller = ControllerLayout(info)
+        self._controller = ControllerPlan(info)
         self._target = self._controller.find_target(None)
         self.shapes = {part.name: (part.size,) for part in self._controller.quantities}
         self.units = {part.name: part.unit for part in self._controller.quantities if part.unit}
@@ -138,7 +138,7 @@ class ControllerInterface(Interface):
     def observe(self, sent: Parts, step: int) -> Any:
         """Return the observation as a controller computes it; the last action is the policy's own."""
         parts = self._observation.observe(sent, step, self._last_action)
-        return self._layout.read({name: parts[name] for name in self._layout.shapes})
+        return self._reader.read({name: parts[name] for name in self._reader.shapes})
 
     def find_command(self, action: Array, sent: Parts) -> Array:
         """Return the joints' targets for an action."""

@@ -17,7 +17,7 @@ from aiohttp import web
 from rlctl.errors import RlctlError, short_repr
 from rlctl.limits.bounds import SafetyEvent
 from rlctl.limits.limits import Limits
-from rlctl.limits.observation import ObservationLayout
+from rlctl.limits.observation import ObservationReader
 from rlctl.play import remote_messages as messages
 from rlctl.version import __version__
 from rlctl_robot.serve.records import EventLog, Measurements, RerunLog
@@ -44,7 +44,7 @@ class PolicyServer:
         self._manual: Any | None = None  # the action of an override; None: the policy acts
         self._order: str | None = None  # the operator's last order, which later clients get too; None: no order
         self._limits = limits
-        shapes = ObservationLayout(policy.info.env).shapes
+        shapes = ObservationReader(policy.info.env).shapes
         self.largest_message = 64 * sum(map(math.prod, shapes.values())) + 64 * 1024  # text with names
         """Largest size of a request [bytes]."""
         # The first answer of a process is slow, because libraries load modules for it: no robot shall wait for that.
@@ -63,7 +63,7 @@ class PolicyServer:
             "policy": self.policy.file.name,
             "training_steps": info.training_steps,
             "control_dt": self.posting.safety.control_dt,
-            "observation": {name: list(shape) for name, shape in self.posting.safety.layout.shapes.items()},
+            "observation": {name: list(shape) for name, shape in self.posting.safety.reader.shapes.items()},
             "observation_units": dict(info.env.observation_units),
             "action_meaning": info.env.action_meaning,
             "env": info.env.model_dump(mode="json"),
@@ -179,13 +179,13 @@ class PolicyServer:
             self._write_fault(session, "deadline", seconds, dt)
 
     def _record(self, recording: RerunLog, session: Session, infer_ms: float) -> None:
-        root, layout, now = f"client_{session.number}", session.safety.layout, time.time()
+        root, reader, now = f"client_{session.number}", session.safety.reader, time.time()
         recording.add(f"{root}/action", session.action, now)
         recording.add(f"{root}/infer_ms", infer_ms, now)
         recording.add(f"{root}/episode", float(session.episode), now)
         if session.observation is not None:
-            flat = layout.flatten(session.observation)
-            for name, part in layout.slices.items():
+            flat = reader.flatten(session.observation)
+            for name, part in reader.layout.columns.items():
                 recording.add(f"{root}/observation/{name}", flat[part].copy(), now)
 
     def give_order(self, order: str) -> int:
@@ -252,7 +252,7 @@ def _describe_policy(policy: ServedPolicy) -> dict[str, Any]:
 
 def _describe(session: Session) -> dict[str, Any]:
     safety = session.safety
-    flat = None if session.observation is None else safety.layout.flatten(session.observation)
+    flat = None if session.observation is None else safety.reader.flatten(session.observation)
     return {
         "number": session.number,
         "state": safety.state,
@@ -262,7 +262,8 @@ def _describe(session: Session) -> dict[str, Any]:
         "control_error": safety.control_error,
         "action": None if session.action is None else session.action.ravel()[:32],
         "observation": {
-            name: [] if flat is None else flat[part][:32] for name, part in list(safety.layout.slices.items())[:16]
+            name: [] if flat is None else flat[part][:32]
+            for name, part in list(safety.reader.layout.columns.items())[:16]
         },
         "events": [dataclasses.asdict(event) for event in safety.find_last_events(8)],
     }

@@ -145,9 +145,9 @@ class Session:
         is_number = isinstance(age_s, int | float | np.number) and not isinstance(age_s, bool)
         if not is_number or abs(age_s) > _MAX_AGE_S:
             raise ObservationError(f"age_s is {short_repr(age_s)}, not a number of seconds")
-        layout = self.safety.layout
-        is_flat = list(fields) == [WHOLE] and WHOLE not in layout.shapes
-        return layout.read(fields[WHOLE] if is_flat else fields), float(age_s)
+        reader = self.safety.reader
+        is_flat = list(fields) == [WHOLE] and WHOLE not in reader.shapes
+        return reader.read(fields[WHOLE] if is_flat else fields), float(age_s)
 
     def _adopt_policy(self) -> None:
         if (policy := self._policy()) is not self._served:

@@ -20,7 +20,7 @@ from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
 from rlctl.exporting.controller.example import ROWS, write_example
 from rlctl.exporting.controller.graph import build_graph
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
+from rlctl.exporting.controller.plan import ControllerPlan, JointTarget
 from rlctl.exporting.controller.players import (
     CController,
     Controller,
@@ -90,18 +90,14 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
         check_environment(source.file, torch_actor.info, built)
         # Policies that were trained before their task declared its terms do not contain them.
         policy = torch_actor.file.with_info(env=built)
-        layout = _describe_controller(policy)
+        plan = ControllerPlan(built, policy.info.spec.frame_stack)
         output.print_notes([] if limits is None else list_doubts(limits, policy.info.env))
-        mapping = NO_MAPPING if request.mapping is None else read_mapping(request.mapping, layout)
-        export = _Export(torch_actor, policy, verify.TaskPlayer(layout, env, spec.task), limits, mapping)
+        mapping = NO_MAPPING if request.mapping is None else read_mapping(request.mapping, plan)
+        export = _Export(torch_actor, policy, plan, verify.TaskPlayer(plan, env, spec.task), limits, mapping)
         write = {"onnx": export.write_onnx, "c": export.write_c}
         return [write[form](target.with_suffix(f".{form}")) for form in request.formats]
     finally:
         env.close()
-
-
-def _describe_controller(policy: PolicyFile) -> ControllerLayout:
-    return ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
 
 
 def _choose_spec(spec: EnvSpec, sim: Engine | None) -> EnvSpec:
@@ -115,16 +111,17 @@ class _Export:
 
     torch_actor: TorchActor
     policy: PolicyFile
+    plan: ControllerPlan
     player: verify.TaskPlayer
     limits: Limits | None
     mapping: ProgramMapping
 
     def write_onnx(self, path: Path) -> ControllerReport:
         """Write and verify the ONNX file, which has no limits."""
-        model = build_graph(self.policy, self.mapping)
+        model = build_graph(self.policy, self.plan, self.mapping)
         content = encode(model)
         controller = OnnxController(content)
-        target = _describe_controller(self.policy).find_target(None)
+        target = self.plan.find_target(None)
         fields, recorded = self._verify(path, controller, target, is_limited=False)
         inputs = recorded[0].inputs[0]
         median = float(np.median(timeit.repeat(lambda: controller.step(inputs), number=1, repeat=330)[30:])) * 1e6
@@ -147,7 +144,7 @@ class _Export:
 
     def write_c(self, path: Path) -> ControllerReport:
         """Write and verify the C file and its header, with the limits."""
-        source = ControllerSource(self.policy, path.stem, self.limits, self.mapping)
+        source = ControllerSource(self.policy, self.plan, path.stem, self.limits, self.mapping)
         compiler, median, example = find_compiler(), None, None
         command = os.environ.get("CC") or "cc"
         fields: dict[str, Any] = {"not_verified": f"there is no C compiler {command!r}; set CC to one"}
@@ -155,7 +152,7 @@ class _Export:
         if compiler is not None:
             with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
                 library = compile_controller(code, Path(folder), compiler)
-                controller = CController(source.layout, library, has_target=source.target is not None)
+                controller = CController(self.plan, library, has_target=source.target is not None)
                 fields, recorded = self._verify(path, controller, source.target, is_limited=self.limits is not None)
                 median, longest = verify.measure_step(controller, recorded)
                 example = self._write_example(path, controller, recorded)
@@ -218,7 +215,7 @@ class _Export:
         median: float | None,
         fields: dict[str, Any],
     ) -> ControllerReport:
-        sizes = {part.name: part.size for part in _describe_controller(self.policy).quantities}
+        sizes = {part.name: part.size for part in self.plan.quantities}
         details = {**details, "input_sizes": sizes, "mapping": self.mapping.describe()}
         details["target"] = "" if target is None else target.formula
         if median is not None:

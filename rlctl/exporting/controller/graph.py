@@ -6,12 +6,13 @@ import numpy as np
 import onnx
 
 from rlctl.exporting.actor import emit_actor, make_metadata
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Quantity, Stack
+from rlctl.exporting.controller.plan import ControllerPlan, JointTarget, Observed, Quantity
 from rlctl.exporting.controller.program_mapping import NO_MAPPING, ElementMap, ProgramMapping
 from rlctl.exporting.controller.symbols import GraphSymbol
 from rlctl.policy import onnx_policy
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.onnx_graph import BATCH, Graph
+from rlctl.task.layout import Part
 
 TARGET = "target"
 OBSERVATION, LAST_ACTION, STEPS = "state_observation", "state_action", "state_steps"
@@ -20,9 +21,9 @@ _TAKEN = {onnx_policy.ACTION, TARGET, *onnx_policy.STATE_INPUTS, OBSERVATION, LA
 _ZEROS = "zeros when an episode begins, then the output of the step before"
 
 
-def build_graph(policy: PolicyFile, mapping: ProgramMapping = NO_MAPPING) -> onnx.ModelProto:
+def build_graph(policy: PolicyFile, plan: ControllerPlan, mapping: ProgramMapping = NO_MAPPING) -> onnx.ModelProto:
     """Write a policy's controller, without limits, as ONNX. Raises `UsageError` for one that cannot be written."""
-    return _Writer(policy, mapping).write()
+    return _Writer(policy, plan, mapping).write()
 
 
 def name_input(quantity: str) -> str:
@@ -32,16 +33,15 @@ def name_input(quantity: str) -> str:
 
 
 class _Writer:
-    def __init__(self, policy: PolicyFile, mapping: ProgramMapping) -> None:
+    def __init__(self, policy: PolicyFile, plan: ControllerPlan, mapping: ProgramMapping) -> None:
         self._policy, self._graph, self._mapping = policy, Graph(), mapping
-        self._layout = ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
-        self._target = self._layout.find_target(None)
-        self._inputs = {part.name: self._add_input(part) for part in self._layout.quantities}
+        self._plan = plan
+        self._target = self._plan.find_target(None)
+        self._inputs = {part.name: self._add_input(part) for part in self._plan.quantities}
         self._inputs |= {name: self._map_input(name, one) for name, one in mapping.inputs.items()}
         self._states: list[str] = []
         self._steps = ""
-        layout = self._layout
-        if "time" in layout.internal or (layout.stacks and layout.repeats_first):
+        if "time" in plan.internal or (plan.stacks and plan.repeats_first):
             self._steps = self._graph.input(STEPS, np.int64, (BATCH, 1), f"steps of the episode; {_ZEROS}")
 
     def _add_input(self, part: Quantity) -> str:
@@ -49,11 +49,11 @@ class _Writer:
         text = f"[{unit}]" if unit else ""
         if part.name in self._mapping.inputs:
             text = self._mapping.inputs[part.name].of_program
-        return graph.input(name_input(part.name), self._layout.dtype, shape, text)
+        return graph.input(name_input(part.name), self._plan.dtype, shape, text)
 
     def _map_input(self, name: str, one: ElementMap) -> str:
         """Add the mapping from the program's values of an input to the policy's."""
-        return self._graph.cast(self._map(f"mapping/{name}", self._inputs[name], one), self._layout.dtype)
+        return self._graph.cast(self._map(f"mapping/{name}", self._inputs[name], one), self._plan.dtype)
 
     def _map(self, name: str, given: str, one: ElementMap) -> str:
         graph = self._graph
@@ -62,19 +62,19 @@ class _Writer:
         return graph.add("Add", value, graph.constant(f"{name}/offset", one.offset))
 
     def write(self) -> onnx.ModelProto:
-        graph, layout, info = self._graph, self._layout, self._policy.info
-        action_type = np.result_type(np.float32, layout.action_space.dtype)
-        if "last_action" in layout.internal:
-            shape = (BATCH, layout.action_size)
+        graph, plan, info = self._graph, self._plan, self._policy.info
+        action_type = np.result_type(np.float32, plan.action_space.dtype)
+        if "last_action" in plan.internal:
+            shape = (BATCH, plan.action_size)
             self._last_action = graph.input(LAST_ACTION, action_type, shape, f"last action; {_ZEROS}")
-        newest = [self._compute(part) for part in layout.observed]
-        observation = self._stack(newest) if layout.stacks else graph.concatenate(newest)
+        newest = [self._compute(part) for part in plan.observed]
+        observation = self._stack(newest) if plan.stacks else graph.concatenate(newest)
         emit_actor(graph, self._policy, self._split(observation))
         action = onnx_policy.ACTION
         if self._target is not None:
             self._emit_target(action, self._target)
-        if "last_action" in layout.internal:
-            self._add_state(graph.add("Identity", action), LAST_ACTION, action_type, (BATCH, layout.action_size))
+        if "last_action" in plan.internal:
+            self._add_state(graph.add("Identity", action), LAST_ACTION, action_type, (BATCH, plan.action_size))
         if self._steps:
             after = graph.add("Add", self._steps, graph.constant("controller/one", np.array([1], np.int64)))
             self._add_state(after, STEPS, np.int64, (BATCH, 1))
@@ -83,7 +83,7 @@ class _Writer:
 
     def _describe(self) -> dict[str, str]:
         """Return the policy's metadata, with the inputs; what the file is not, a policy of `rlctl`, is left out."""
-        metadata, quantities = make_metadata(self._policy.info), self._layout.quantities
+        metadata, quantities = make_metadata(self._policy.info), self._plan.quantities
         del metadata[onnx_policy.METADATA_KEY]
         metadata.pop("state", None)
         states = ", ".join(self._states)
@@ -102,57 +102,57 @@ class _Writer:
         graph, term = self._graph, part.term
         if term is None:
             return self._inputs[part.name]
-        sizes = {quantity.name: quantity.size for quantity in self._layout.quantities}
+        sizes = {quantity.name: quantity.size for quantity in self._plan.quantities}
         symbols = [GraphSymbol(graph, self._read(self._inputs[name]), sizes[name]) for name in term.inputs]
         if term.internal == "last_action":
             symbols = [GraphSymbol(graph, self._read(self._last_action), part.size)]
         elif term.internal == "time":
-            dt = graph.constant("controller/control_dt", np.float64(self._layout.env.control_dt))
+            dt = graph.constant("controller/control_dt", np.float64(self._plan.env.control_dt))
             symbols = [GraphSymbol(graph, graph.add("Mul", self._read(self._steps), dt), 1)]
         parts: list[GraphSymbol] = term.compute(*symbols)
         joined = graph.concatenate([symbol.value for symbol in parts])
-        return graph.cast(joined, self._layout.dtype)
+        return graph.cast(joined, self._plan.dtype)
 
     def _read(self, value: str) -> str:
         return self._graph.cast(value, np.float64)
 
     def _stack(self, newest: list[str]) -> str:
         """Add the histories: the last values of the state, and the newest."""
-        graph, layout = self._graph, self._layout
-        shape = (BATCH, layout.size)
-        before = graph.input(OBSERVATION, layout.dtype, shape, f"last observation; {_ZEROS}")
-        if layout.frames > 1:
+        graph, plan = self._graph, self._plan
+        shape = (BATCH, plan.size)
+        before = graph.input(OBSERVATION, plan.dtype, shape, f"last observation; {_ZEROS}")
+        if plan.frames > 1:
             newest = [graph.concatenate(newest)]
-        if layout.repeats_first:
+        if plan.repeats_first:
             zero = graph.constant("controller/zero", np.array([0], np.int64))
             self._is_first = graph.add("Equal", self._steps, zero)
-        parts = [self._append(stack, before, value) for stack, value in zip(layout.stacks, newest, strict=True)]
+        parts = [self._append(stack, before, value) for stack, value in zip(plan.stacks, newest, strict=True)]
         observation = graph.concatenate(parts)
-        self._add_state(graph.add("Identity", observation), OBSERVATION, layout.dtype, shape)
+        self._add_state(graph.add("Identity", observation), OBSERVATION, plan.dtype, shape)
         return observation
 
-    def _append(self, stack: Stack, before: str, newest: str) -> str:
+    def _append(self, stack: Part, before: str, newest: str) -> str:
         if stack.frames == 1:
             return newest
         graph = self._graph
         places = np.arange(stack.start + stack.size, stack.start + stack.size * stack.frames)
         older = graph.add("Gather", before, graph.constant(f"controller/older_{stack.start}", places), axis=1)
         value = graph.add("Concat", older, newest, axis=1)
-        if not self._layout.repeats_first:
+        if not self._plan.repeats_first:
             return value
         return graph.add("Where", self._is_first, graph.add("Concat", *[newest] * stack.frames, axis=1), value)
 
     def _split(self, observation: str) -> dict[str, tuple[str, Any]]:
         """Return the parts of the policy's observation by key."""
-        layout, parts = self._layout, dict[str, tuple[str, Any]]()
-        for key, space in layout.parts.items():
+        plan, parts = self._plan, dict[str, tuple[str, Any]]()
+        for key, space in plan.parts.items():
             value = observation
-            if len(layout.parts) > 1:
-                starts = [part.start for part in layout.observed if part.key == key]
+            if len(plan.parts) > 1:
+                starts = [part.start for part in plan.observed if part.key == key]
                 places = self._graph.constant(f"controller/{key}", np.arange(space.shape[0]) + starts[0])  # type: ignore[index]
                 value = self._graph.add("Gather", observation, places, axis=1)
             parts[key] = value, space.dtype
-            if space.dtype != layout.dtype:
+            if space.dtype != plan.dtype:
                 parts[key] = self._graph.cast(value, space.dtype), space.dtype
         return parts
 
@@ -169,7 +169,7 @@ class _Writer:
             value = graph.add("Min", value, graph.constant("target/high", target.high))
         if (one := self._mapping.targets) is not None:
             value = self._map("mapping/target", value, one)
-        graph.output(value, TARGET, np.float64, (BATCH, self._layout.action_size), self._describe_target(target))
+        graph.output(value, TARGET, np.float64, (BATCH, self._plan.action_size), self._describe_target(target))
 
     def _describe_target(self, target: JointTarget) -> str:
         one = self._mapping.targets

@@ -36,7 +36,7 @@ class LimitsSource:
     @property
     def quantities(self) -> int:
         """Numbers that are checked."""
-        return self.fitted.layout.size
+        return self.fitted.reader.layout.size
 
     @property
     def is_value(self) -> bool:

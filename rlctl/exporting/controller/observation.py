@@ -6,16 +6,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.exporting.controller.layout import ControllerLayout
+from rlctl.exporting.controller.plan import ControllerPlan
 from rlctl.task.history import TermHistory
 
 
 class ControllerObservation:
     """Computes terms and histories as an exported controller does."""
 
-    def __init__(self, layout: ControllerLayout) -> None:
-        self._layout = layout
-        self._history = TermHistory(1, layout.env.observation_history, layout.env.history_start)
+    def __init__(self, plan: ControllerPlan) -> None:
+        self._plan = plan
+        self._history = TermHistory(1, plan.env.observation_history, plan.env.history_start)
 
     def begin(self) -> None:
         """Begin an episode: the histories are empty."""
@@ -26,13 +26,13 @@ class ControllerObservation:
     ) -> dict[str, NDArray[Any]]:
         """Return the parts of the observation by name, for the inputs of a step of the episode."""
         newest = {}
-        for part in self._layout.observed:
+        for part in self._plan.observed:
             if part.term is None:
                 newest[part.name] = inputs[part.name]
             elif part.term.internal == "last_action":
                 newest[part.name] = last_action
             elif part.term.internal == "time":
-                newest[part.name] = part.term(np.array([step * (self._layout.env.control_dt or 0.0)]))
+                newest[part.name] = part.term(np.array([step * (self._plan.env.control_dt or 0.0)]))
             else:
                 newest[part.name] = part.term(tuple(inputs[name] for name in part.term.inputs))
         rows = {name: np.asarray(value)[None] for name, value in newest.items()}

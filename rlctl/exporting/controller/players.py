@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rlctl.errors import AnswerIsNo, short_repr
 from rlctl.exporting.c_source import FLAGS, CSource
 from rlctl.exporting.controller.graph import LAST_ACTION, TARGET, name_input
-from rlctl.exporting.controller.layout import ControllerLayout
+from rlctl.exporting.controller.plan import ControllerPlan
 from rlctl.exporting.controller.program_mapping import ProgramMapping
 from rlctl.policy.actor import Actor, Array, Rows, act_one_by_one
 from rlctl.policy.c_policy import action_type
@@ -58,19 +58,19 @@ class Controller(Actor):
 class CController(Controller):
     """A controller that `compile_controller` has compiled."""
 
-    def __init__(self, layout: ControllerLayout, library: Path, *, has_target: bool) -> None:
+    def __init__(self, plan: ControllerPlan, library: Path, *, has_target: bool) -> None:
         self.library = ctypes.CDLL(str(library))
         self.library.rlctl_state_size.restype = ctypes.c_size_t
         # In units of a double, so that the memory is aligned.
         self._memory = np.zeros(-(-self.library.rlctl_state_size() // 8), np.float64)
         self._pointer = self._memory.ctypes.data_as(ctypes.c_void_p)
-        self._layout, self._has_target = layout, has_target
-        self.action = np.zeros(layout.action_size, action_type(layout.env))
-        self._target = np.zeros(layout.action_size)
+        self._plan, self._has_target = plan, has_target
+        self.action = np.zeros(plan.action_size, action_type(plan.env))
+        self._target = np.zeros(plan.action_size)
         self._status = np.zeros(2, np.intc)
         self._outputs = [array.ctypes.data_as(ctypes.c_void_p) for array in (self.action, self._target, self._status)]
-        self.dtype = layout.dtype
-        self._values = np.zeros(layout.input_size, layout.dtype)
+        self.dtype = plan.dtype
+        self._values = np.zeros(plan.input_size, plan.dtype)
         self.may_send = False
         self.library.rlctl_init(self._pointer)
 
@@ -91,7 +91,7 @@ class CController(Controller):
         """Return copies of action and targets."""
         pointer = None if inputs is None else self._point_to(inputs)
         self.may_send = bool(self.library.rlctl_step(self._pointer, pointer, ctypes.c_double(age_s), *self._outputs))
-        action = self.action.reshape(self._layout.action_space.shape).copy()
+        action = self.action.reshape(self._plan.action_space.shape).copy()
         return action, self._target.copy() if self._has_target else None
 
     def follow(
@@ -102,10 +102,10 @@ class CController(Controller):
         pointers = self._point_to(inputs), own.ctypes.data_as(ctypes.c_void_p)
         self.library.rlctl_follow(self._pointer, *pointers, *self._outputs)
         target = self._target.copy() if self._has_target else None
-        return own.reshape(self._layout.action_space.shape), self.action.copy(), target
+        return own.reshape(self._plan.action_space.shape), self.action.copy(), target
 
     def _point_to(self, inputs: Inputs) -> ctypes.c_void_p:
-        self._values[:] = np.concatenate([np.ravel(inputs[part.name]) for part in self._layout.quantities])
+        self._values[:] = np.concatenate([np.ravel(inputs[part.name]) for part in self._plan.quantities])
         return self._values.ctypes.data_as(ctypes.c_void_p)
 
     def limit(self, values: NDArray[np.float64] | None, age_s: float, requested: NDArray[Any] | None) -> NDArray[Any]:

@@ -11,7 +11,7 @@ import pydantic
 from numpy.typing import NDArray
 
 from rlctl.errors import RecipeError, UsageError, check_name
-from rlctl.exporting.controller.layout import ControllerLayout, Quantity
+from rlctl.exporting.controller.plan import ControllerPlan, Quantity
 from rlctl.storage import yaml_text
 from rlctl.storage.validation import Number, Section, Whole
 
@@ -121,37 +121,37 @@ def _shorten(values: NDArray[Any]) -> str:
 NO_MAPPING = ProgramMapping()
 
 
-def read_mapping(path: Path, layout: ControllerLayout) -> ProgramMapping:
+def read_mapping(path: Path, plan: ControllerPlan) -> ProgramMapping:
     """Read the mapping of a controller from YAML.
 
     Raises `RecipeError` for a mapping that does not fit the policy, `UsageError` for what a controller cannot do.
     """
-    mapping, target = yaml_text.read_model(path, MappingFile), layout.find_target(None)
+    mapping, target = yaml_text.read_model(path, MappingFile), plan.find_target(None)
     if mapping.actions is not None:
         instead = "the controller returns targets of joints: map them with targets:"
         if target is None:
             instead = "change the action where the program sends it"
         raise UsageError(f"{path}: actions: what diagnose prints there is of the policy's action; {instead}")
-    computed = {part.name: part.term.inputs for part in layout.observed if part.term is not None}
-    quantities = {quantity.name: quantity for quantity in layout.quantities}
+    computed = {part.name: part.term.inputs for part in plan.observed if part.term is not None}
+    quantities = {quantity.name: quantity for quantity in plan.quantities}
     maps = {}
     for name, value in mapping.observations.items():
         if name not in quantities and name in computed:
             inputs = ", ".join(computed[name]) or "its own state"
             raise UsageError(f"{path}: {name} is computed inside the controller, from {inputs}; map that instead")
         check_name(name, quantities, f"{path}: the controller has no input", RecipeError)
-        maps[name] = _map_input(f"{path}: {name}", value, quantities[name], layout)
+        maps[name] = _map_input(f"{path}: {name}", value, quantities[name], plan)
     if mapping.targets is None:
         return ProgramMapping(maps)
     if target is None:
         raise UsageError(f"{path}: targets: the task does not describe what an action commands, so there are none")
-    return ProgramMapping(maps, _map_targets(f"{path}: targets", mapping.targets, layout, maps, target.unit))
+    return ProgramMapping(maps, _map_targets(f"{path}: targets", mapping.targets, plan, maps, target.unit))
 
 
-def _map_input(where: str, value: MappedValue, quantity: Quantity, layout: ControllerLayout) -> ElementMap:
+def _map_input(where: str, value: MappedValue, quantity: Quantity, plan: ControllerPlan) -> ElementMap:
     if value.like is not None:
         raise UsageError(f"{where}: like: only targets can be like an observation")
-    names = _name_elements(quantity, layout)
+    names = _name_elements(quantity, plan)
     order = _read_order(where, value, quantity.size, names)
     back = np.argsort(order)
     one = _read_numbers(where, value, order, quantity.unit)
@@ -159,9 +159,9 @@ def _map_input(where: str, value: MappedValue, quantity: Quantity, layout: Contr
 
 
 def _map_targets(
-    where: str, value: MappedValue, layout: ControllerLayout, maps: Mapping[str, ElementMap], unit: str
+    where: str, value: MappedValue, plan: ControllerPlan, maps: Mapping[str, ElementMap], unit: str
 ) -> ElementMap:
-    size, names = layout.action_size, list(layout.env.joints.names if layout.env.joints is not None else [])
+    size, names = plan.action_size, list(plan.env.joints.names if plan.env.joints is not None else [])
     if value.like is not None:
         if value.model_fields_set != {"like"}:
             raise RecipeError(f"{where}: like and other keys exclude each other")
@@ -177,9 +177,9 @@ def _map_targets(
     return _name(one, [names[index] for index in order], unit)
 
 
-def _name_elements(quantity: Quantity, layout: ControllerLayout) -> list[str]:
+def _name_elements(quantity: Quantity, plan: ControllerPlan) -> list[str]:
     """Return the names of a quantity's elements, in the policy's order; empty if they have none."""
-    joints, axes = layout.env.joints, re.findall(r"\b[xyzw]\b", quantity.unit)
+    joints, axes = plan.env.joints, re.findall(r"\b[xyzw]\b", quantity.unit)
     if "quaternion" in quantity.unit and len(axes) == quantity.size:
         return axes
     is_of_joints = joints is not None and (quantity.name == joints.measured or quantity.name.startswith("joint"))

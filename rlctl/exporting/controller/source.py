@@ -9,8 +9,8 @@ import numpy as np
 from rlctl.exporting import c_source
 from rlctl.exporting.c_network import list_functions, write_action, write_network
 from rlctl.exporting.c_source import CFunction, CSource
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget, Observed, Quantity
 from rlctl.exporting.controller.limits_source import LimitsSource
+from rlctl.exporting.controller.plan import ControllerPlan, JointTarget, Observed, Quantity
 from rlctl.exporting.controller.program_mapping import NO_MAPPING, ElementMap, ProgramMapping
 from rlctl.exporting.controller.symbols import CSymbol
 from rlctl.limits.fitting import fit_limits
@@ -47,16 +47,21 @@ class ControllerSource:
     """
 
     def __init__(
-        self, policy: PolicyFile, file_name: str, limits: Limits | None, mapping: ProgramMapping = NO_MAPPING
+        self,
+        policy: PolicyFile,
+        plan: ControllerPlan,
+        file_name: str,
+        limits: Limits | None,
+        mapping: ProgramMapping = NO_MAPPING,
     ) -> None:
         c_source.check_can_be_written(policy)
-        self.layout = layout = ControllerLayout(policy.info.env, policy.info.spec.frame_stack)
+        self.plan = plan
         self._mapping = mapping
-        fitted = fit_limits(limits or NO_LIMITS, layout.inputs_info)
+        fitted = fit_limits(limits or NO_LIMITS, plan.inputs_info)
         self.limits = fitted.limits
         assert fitted.bounds is not None  # the actions are in a Box
         self._limits_source = LimitsSource(self.limits, fitted, fitted.bounds)
-        self.target = layout.find_target(None if limits is None else fitted)
+        self.target = plan.find_target(None if limits is None else fitted)
         self.name = c_source.make_identifier(file_name)
         self._values = self._describe(policy)
 
@@ -72,11 +77,11 @@ class ControllerSource:
         return CSource(self.name, header, source, prototype, harness)
 
     def _describe(self, policy: PolicyFile) -> dict[str, Any]:
-        layout, network, writer = self.layout, Network(policy), CWriter()
+        plan, network, writer = self.plan, Network(policy), CWriter()
         described = CFunction(self.name, policy.info)
-        sizes = {key: part.shape[0] for key, part in layout.parts.items()}  # type: ignore[index]  # vectors
+        sizes = {key: part.shape[0] for key, part in plan.parts.items()}  # type: ignore[index]  # vectors
         value = write_network(writer, network, sizes, "state->observation")
-        write_action(writer, network, value, layout.action_space, described.action_type)
+        write_action(writer, network, value, plan.action_space, described.action_type)
         lstm = network.lstm
         hidden = 0 if lstm is None else len(lstm.layers) * lstm.hidden_size
         values: dict[str, Any] = {
@@ -84,20 +89,20 @@ class ControllerSource:
             "upper": self.name.upper(),
             "version": __version__,
             "info": policy.info,
-            "layout": _WithActions(layout, described),
+            "plan": _WithActions(plan, described),
             "limits": self._limits_source,
             "kind": described.type,
             "type": described.action_type,
-            "stacks": layout.stacks,
+            "stacks": plan.stacks,
             "lstm_size": hidden,
             "arrays": self._list_arrays(described),
             "target": None if self.target is None else self._describe_target(self.target),
-            "read_lines": [line for quantity in layout.quantities for line in self._write_reading(quantity)],
+            "read_lines": [line for quantity in plan.quantities for line in self._write_reading(quantity)],
             "mapped": [f"{name}: {text}" for name, text in self._mapping.describe().items()],
-            "members": {part.name: self._describe_input(part) for part in layout.quantities},
+            "members": {part.name: self._describe_input(part) for part in plan.quantities},
             "program_target": self._mapping.targets,
             "target_lines": [] if (one := self._mapping.targets) is None else self._write_targets(one),
-            "term_lines": [line for part in layout.observed for line in self._write_term(part, described.type)],
+            "term_lines": [line for part in plan.observed for line in self._write_term(part, described.type)],
             "constants": writer.constants,
             "functions": list_functions(writer),
             "statements": writer.statements,
@@ -141,7 +146,7 @@ class ControllerSource:
 
     def _write_term(self, part: Observed, kind: str) -> list[str]:
         """Return statements that compute the newest values of a part of the observation."""
-        quantities = {quantity.name: quantity for quantity in self.layout.quantities}
+        quantities = {quantity.name: quantity for quantity in self.plan.quantities}
         if part.term is None:
             start = quantities[part.name].start
             loop = f"for (int i = 0; i < {part.size}; ++i) {{"
@@ -150,7 +155,7 @@ class ControllerSource:
         if part.term.internal == "last_action":
             symbols = [CSymbol([f"(double)state->last_action[{index}]" for index in range(part.size)])]
         elif part.term.internal == "time":
-            symbols = [CSymbol([f"((double)state->steps * {self.layout.env.control_dt!r})"])]
+            symbols = [CSymbol([f"((double)state->steps * {self.plan.env.control_dt!r})"])]
         parts: list[CSymbol] = part.term.compute(*symbols)
         expressions = [element for symbol in parts for element in symbol.elements]
         return [f"newest[{part.newest + i}] = ({kind}){text};" for i, text in enumerate(expressions)]
@@ -174,8 +179,8 @@ class ControllerSource:
 
     def _list_arrays(self, described: CFunction) -> list[tuple[str, str, str, list[str]]]:
         """Return the header's constant arrays: type, name, the macro of the length, and the values as C."""
-        quote, target, env = c_source.quote, self.target, self.layout.env
-        quantities = self.layout.quantities
+        quote, target, env = c_source.quote, self.target, self.plan.env
+        quantities = self.plan.quantities
         arrays: list[tuple[str, str, str, list[str]]] = [
             ("char *const", "input_names", "INPUTS", [quote(quantity.name) for quantity in quantities]),
             (
@@ -209,10 +214,10 @@ class ControllerSource:
 
 
 class _WithActions:
-    """The layout as the templates read it: of the controller and, for the action, of the policy."""
+    """The plan as the templates read it: of the controller and, for the action, of the policy."""
 
-    def __init__(self, layout: ControllerLayout, described: CFunction) -> None:
-        self._layout, self.describe_action = layout, described.describe_action
+    def __init__(self, plan: ControllerPlan, described: CFunction) -> None:
+        self._plan, self.describe_action = plan, described.describe_action
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._layout, name)
+        return getattr(self._plan, name)

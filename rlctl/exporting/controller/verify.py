@@ -13,7 +13,7 @@ from rlctl.environments.dict_spaces import take_row
 from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError
-from rlctl.exporting.controller.layout import ControllerLayout, JointTarget
+from rlctl.exporting.controller.plan import ControllerPlan, JointTarget
 from rlctl.exporting.controller.players import CController, Controller, Inputs
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, compare_episodes
 from rlctl.limits.limited import Limited
@@ -42,16 +42,16 @@ class Recorded:
 class TaskPlayer:
     """Plays episodes of the task in this process."""
 
-    def __init__(self, layout: ControllerLayout, env: gymnasium.Env[Any, Any], task: str) -> None:
-        self._layout, self._env, self._task = layout, env, task
+    def __init__(self, plan: ControllerPlan, env: gymnasium.Env[Any, Any], task: str) -> None:
+        self._plan, self._env, self._task = plan, env, task
         self._inputs: Inputs = {}
 
     def limit(self, actor: Actor, limits: Limits) -> Limited:
         """Return an actor within limits, whose filter observes what the robot measures."""
-        return Limited(actor, self._layout.inputs_info, limits, measure=self._measure)
+        return Limited(actor, self._plan.inputs_info, limits, measure=self._measure)
 
     def _measure(self, row: int) -> NDArray[Any]:
-        return np.concatenate([np.ravel(value) for value in self._inputs.values()]).astype(self._layout.dtype)
+        return np.concatenate([np.ravel(value) for value in self._inputs.values()]).astype(self._plan.dtype)
 
     def play(self, seed: int, actor: Actor, watch: Callable[[], None] = lambda: None) -> Recorded:
         """Play an episode; raises `TaskError` if the environment fails or the episode does not end.
@@ -72,7 +72,7 @@ class TaskPlayer:
 
     def measure(self, observation: Any) -> Inputs:
         """Return what the robot measures now."""
-        self._inputs = self._layout.measure(observation, getattr(self._env.unwrapped, "measured", {}))
+        self._inputs = self._plan.measure(observation, getattr(self._env.unwrapped, "measured", {}))
         return self._inputs
 
 

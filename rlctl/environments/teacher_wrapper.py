@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from gymnasium import spaces
 
 
-class TeacherView(gymnasium.Wrapper[Any, Any, Any, Any]):
+class TeacherWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Observes for a teacher too: `seen` is its observation of the present step, of the space `teacher_space`.
 
     It is the innermost wrapper; those around it change the observations of the student only.
@@ -73,14 +73,14 @@ class _Source(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._read(), 0.0, False, False, {}
 
 
-def find_teacher_view(env: gymnasium.Env[Any, Any]) -> TeacherView:
-    """Return the `TeacherView` of an environment that was made with a teacher."""
-    while not isinstance(env, TeacherView):
+def find_teacher_wrapper(env: gymnasium.Env[Any, Any]) -> TeacherWrapper:
+    """Return the `TeacherWrapper` of an environment that was made with a teacher."""
+    while not isinstance(env, TeacherWrapper):
         assert isinstance(env, gymnasium.Wrapper)
         env = env.env
     return env
 
 
-def strip_teacher_view(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
-    """Return an environment without a `TeacherView` that is its outermost wrapper."""
-    return env.env if isinstance(env, TeacherView) else env
+def strip_teacher_wrapper(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+    """Return an environment without a `TeacherWrapper` that is its outermost wrapper."""
+    return env.env if isinstance(env, TeacherWrapper) else env

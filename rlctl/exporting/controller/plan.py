@@ -16,6 +16,7 @@ from rlctl.errors import RecipeError, UsageError
 from rlctl.limits.fitting import FittedLimits
 from rlctl.policy.c_policy import observation_type
 from rlctl.task.joints import Command
+from rlctl.task.layout import Layout, Part
 from rlctl.task.terms import Gravity, Internal, Scaled
 
 _UNITS = {"position": "rad or m", "step": "rad or m", "speed": "rad/s or m/s", "torque": "N m or N"}
@@ -43,26 +44,11 @@ class Quantity:
 
 
 @dataclasses.dataclass(frozen=True)
-class Observed:
+class Observed(Part):
     """A named part of the policy's observation."""
 
-    name: str
     key: str  # of the part of a Dict space
-    size: int  # elements of one step
-    frames: int
-    newest: int  # place among the newest values of all
-    start: int  # place in the observation
     term: AnyTerm | None
-
-
-@dataclasses.dataclass(frozen=True)
-class Stack:
-    """Newest values that are appended to the last ones."""
-
-    newest: int
-    size: int
-    start: int
-    frames: int
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -121,8 +107,8 @@ class JointTarget:
         return f"joint {kind} [{self.unit}] = {base}target_factor * action{clipped}"
 
 
-class ControllerLayout:
-    """The interface of a controller for an environment; `frames` are the stacked observations of its policy.
+class ControllerPlan:
+    """What a controller takes, computes and returns; `frames` are the stacked observations of its policy.
 
     Raises `UsageError` for an environment that cannot have one.
     """
@@ -154,12 +140,10 @@ class ControllerLayout:
         total = sum(math.prod(part.shape or ()) for part in self.parts.values()) // self.frames
         if sum(sizes.values()) != total:
             sizes = {"observation": total}
-        observed, newest, start = [], 0, 0
-        for name, size in sizes.items():
-            frames, term = env.observation_history.get(name, 1), env.observation_terms.get(name)
-            key = name if name in self.parts else SINGLE
-            observed.append(Observed(name, key, size // frames, frames, newest, start, term))
-            newest, start = newest + size // frames, start + size
+        observed = []
+        for part in Layout(sizes, env.observation_history).parts:
+            key = part.name if part.name in self.parts else SINGLE
+            observed.append(Observed(**vars(part), key=key, term=env.observation_terms.get(part.name)))
         return observed
 
     def _list_quantities(self) -> list[Quantity]:
@@ -181,13 +165,13 @@ class ControllerLayout:
         return quantities
 
     @property
-    def stacks(self) -> list[Stack]:
+    def stacks(self) -> list[Part]:
         """The histories and the other parts of the observation, in its order; empty if it has no history."""
         if self.frames > 1:
-            return [Stack(0, self.newest_size, 0, self.frames)]
+            return [Part("", self.newest_size, self.frames, start=0, newest=0)]
         if all(part.frames == 1 for part in self.observed):
             return []
-        return [Stack(part.newest, part.size, part.start, part.frames) for part in self.observed]
+        return [*self.observed]
 
     @property
     def internal(self) -> set[Internal]:
