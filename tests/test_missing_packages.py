@@ -70,6 +70,7 @@ def test_an_import_of_an_environment(write_module):
         EnvSpec("skimage:E").make()
 
 
+@pytest.mark.slow
 def test_an_import_inside_of_reset(rlctl, write_module):
     write_module("late.py", ENV.format(top="import sys; sys.modules['cv2'] = None", inside="import cv2"))
     done = rlctl("train", "late.py:E", "-n", "100", "--no-check")

@@ -77,6 +77,7 @@ def test_the_demo_learns_in_mujoco(rlctl_without):
         assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_a_gymnasium_environment_is_recorded(rlctl_without):
     done = rlctl_without("replay", "Pendulum-v1", "--policy", "zero")
     assert done.returncode == 0, done.stderr

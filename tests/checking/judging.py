@@ -37,6 +37,8 @@ class Case:
     twin: str = "broken_envs.py:Clean"
     pybullet: bool = False
     """Whether one of them needs PyBullet."""
+    slow: bool = False
+    """Whether it takes seconds."""
 
     @property
     def needs_pybullet(self) -> bool:
@@ -52,8 +54,8 @@ def case(broken: str, *expected: tuple[str, str], **settings: Any) -> Case:
 
 
 def mark_slow(cases: Sequence[Case]) -> list[Any]:
-    """Return the cases as parameters; all but the first one that expects the same findings are slow."""
-    quick = {case.expected: case for case in reversed(cases)}.values()
+    """Return the cases as parameters; all but the first quick one that expects the same findings are slow."""
+    quick = {case.expected: case for case in reversed(cases) if not case.slow}.values()
     return [case if case in quick else pytest.param(case, marks=pytest.mark.slow) for case in cases]
 
 

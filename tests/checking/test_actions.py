@@ -6,7 +6,7 @@ from gymnasium import spaces
 
 from rlctl.checking.action_trials import find_dimensions
 from rlctl.environments.leaves import find_leaves
-from tests.checking.judging import case, check_case, findings, found, rules_of, verdict_of
+from tests.checking.judging import case, check_case, findings, found, mark_slow, rules_of, verdict_of
 
 FILE = "broken_actions.py"
 CASES = [
@@ -25,7 +25,7 @@ CASES = [
 CLEAN = [f"{FILE}:Switch"]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 

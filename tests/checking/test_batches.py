@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rlctl.checking.families.batches import describe_difference
-from tests.checking.judging import case, check_case, findings, found
+from tests.checking.judging import case, check_case, findings, found, mark_slow
 
 pytest.importorskip("mujoco")
 
@@ -24,7 +24,7 @@ CASES = [
 CLEAN = [SOUND, f"{FILE}:ScalesByEach", f"{FILE}:ResetsItsGoal", f"{FILE}:MovesItsBase", f"{FILE}:CountsStepsOfEach"]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 

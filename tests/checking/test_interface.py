@@ -7,7 +7,7 @@ import pytest
 from rlctl.checking.check import check
 from rlctl.checking.rules import RULES
 from rlctl.environments.spec import EnvSpec
-from tests.checking.judging import case, check_case, findings, verdict_of
+from tests.checking.judging import case, check_case, findings, mark_slow, verdict_of
 
 FILE = "broken_interface.py"
 CASES = [
@@ -21,7 +21,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 

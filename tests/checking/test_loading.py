@@ -11,7 +11,7 @@ import pytest
 from rlctl.environments.info import space_to_json
 from rlctl.errors import OldGymError
 from rlctl.task.pybullet.library import pybullet_data
-from tests.checking.judging import case, check_case, findings
+from tests.checking.judging import case, check_case, findings, mark_slow
 
 ERROR = "error"
 CASES = [
@@ -32,7 +32,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 

@@ -18,18 +18,18 @@ from tests.checking.judging import case, check_case, findings, mark_slow, shared
 MEANING, REACH = "broken_meaning.py", "broken_reach.py"
 
 
-def broken(name, *expected, twin, file=MEANING):
-    return case(f"{file}:{name}", *expected, twin=f"{file}:{twin}")
+def broken(name, *expected, twin, file=MEANING, **settings):
+    return case(f"{file}:{name}", *expected, twin=f"{file}:{twin}", **settings)
 
 
 CASES = [
-    broken("RoverLateReward", ("RL616", "warning"), twin="Rover"),
+    broken("RoverLateReward", ("RL616", "warning"), twin="Rover", slow=True),
     broken("DroneLateReward", ("RL616", "warning"), twin="Drone"),
     broken("RoverLateSuccess", ("RL617", "warning"), twin="Rover"),
     broken("DroneLeavesLate", ("RL617", "warning"), twin="DroneLeaves"),
-    broken("RoverLooksRound", ("RL618", "warning"), twin="RoverLooks"),
+    broken("RoverLooksRound", ("RL618", "warning"), twin="RoverLooks", slow=True),
     broken("DroneTurnsBack", ("RL618", "warning"), twin="DroneTurns"),
-    broken("RoverBehindTheShore", ("RL619", "warning"), twin="RoverInPond"),
+    broken("RoverBehindTheShore", ("RL619", "warning"), twin="RoverInPond", slow=True),
     broken("ArmFarGoals", ("RL619", "warning"), twin="Arm", file=REACH),
     case(
         "broken_reach_bullet.py:ReacherFarGoals",
@@ -37,7 +37,7 @@ CASES = [
         twin="broken_reach_bullet.py:Reacher",
         pybullet=True,
     ),
-    broken("RoverMillimetres", ("RL118", "info"), ("RL119", "warning"), twin="Rover"),
+    broken("RoverMillimetres", ("RL118", "info"), ("RL119", "warning"), twin="Rover", slow=True),
     broken("DroneDegrees", ("RL119", "warning"), twin="DroneRadians"),
 ]
 

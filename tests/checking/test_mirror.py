@@ -6,7 +6,7 @@ from rlctl.engine import MUJOCO
 from rlctl.errors import TaskError
 from rlctl.task.env import TaskEnv
 from rlctl_locomotion.walk import Walk
-from tests.checking.judging import case, check_case, findings, found, verdict_of
+from tests.checking.judging import case, check_case, findings, found, mark_slow, verdict_of
 
 pytest.importorskip("mujoco")
 
@@ -19,7 +19,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 

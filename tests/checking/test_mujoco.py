@@ -7,23 +7,25 @@ from tests.checking.judging import case, check_case, findings, found, mark_slow,
 pytest.importorskip("mujoco")
 
 
-def broken(name, rule, severity="warning", twin=None):
+def broken(name, rule, severity="warning", twin=None, **settings):
     base = "mujoco_robots.py:MujocoArm" if name.startswith("Arm") else "mujoco_robots.py:MujocoHopper"
-    return case(f"broken_mujoco.py:{name}", (rule, severity), twin=f"broken_mujoco.py:{twin}" if twin else base)
+    return case(
+        f"broken_mujoco.py:{name}", (rule, severity), twin=f"broken_mujoco.py:{twin}" if twin else base, **settings
+    )
 
 
-def broken_joints(name, rule, twin, severity="warning"):
-    return case(f"broken_mujoco_joints.py:{name}", (rule, severity), twin=f"broken_mujoco_joints.py:{twin}")
+def broken_joints(name, rule, twin, severity="warning", **settings):
+    return case(f"broken_mujoco_joints.py:{name}", (rule, severity), twin=f"broken_mujoco_joints.py:{twin}", **settings)
 
 
 CASES = [
-    broken("ArmQuaternion", "RL116", "error", "ArmRightQuaternion"),
+    broken("ArmQuaternion", "RL116", "error", "ArmRightQuaternion", slow=True),
     broken("HopperQuaternion", "RL116", "error"),
     broken("HopperVelocity", "RL116", "error", "HopperRightVelocity"),
     broken("HopperHeading", "RL116", "error", "HopperRightHeading"),
     broken("ArmBeyondLimits", "RL804"),
-    broken("HopperExplodes", "RL805"),
-    broken("HopperInTheGround", "RL807"),
+    broken("HopperExplodes", "RL805", slow=True),
+    broken("HopperInTheGround", "RL807", slow=True),
     broken("ArmLongSteps", "RL813"),
     broken("ArmWeakMotors", "RL814"),
     broken("ArmDegrees", "RL810", "error"),
@@ -34,7 +36,7 @@ CASES = [
     broken("ArmOrder", "RL811", "error"),
     broken("ArmOrderOfRanges", "RL811", "error", "ArmRange"),
     broken("HopperOrder", "RL811", "error"),
-    broken("ArmTouchesWithPalm", "RL812", twin="ArmTouchesWithFinger"),
+    broken("ArmTouchesWithPalm", "RL812", twin="ArmTouchesWithFinger", slow=True),
     broken("HopperOtherSoles", "RL812", twin="HopperThighs"),
     broken("ArmOldTip", "RL815"),
     broken("ArmOldSensor", "RL815", twin="ArmRightSensor"),
@@ -46,16 +48,16 @@ CASES = [
     broken("ArmGrowsHeavy", "RL817", "error", "ArmNominalMass"),
     broken("HopperSlips", "RL817", "error", "HopperFriction"),
     broken("ArmKeepsActivation", "RL302", "error", "ArmResets"),
-    broken("HopperKeepsTime", "RL301", "error", "HopperResets"),
-    broken("ArmInverse", "RL818", twin="ArmActuator"),
+    broken("HopperKeepsTime", "RL301", "error", "HopperResets", slow=True),
+    broken("ArmInverse", "RL818", twin="ArmActuator", slow=True),
     broken("HopperForces", "RL818", twin="HopperRightForces"),
     case("broken_mujoco_joints.py:ArmLimitsInRadians", ("RL804", "warning"), twin="mujoco_robots.py:MujocoArm"),
     broken_joints("ArmIncrementsInOtherOrder", "RL811", "ArmIncrements", "error"),
     broken_joints("HopperIncrementsInOtherOrder", "RL811", "HopperIncrements", "error"),
     broken_joints("ArmIncrementsTooFar", "RL816", "ArmIncrements"),
     broken_joints("HopperInDegrees", "RL119", "HopperObserves"),
-    broken_joints("HopperSpeedsInOtherOrder", "RL819", "HopperObserves"),
-    broken_joints("ArmVelocityOfSubsteps", "RL820", "ArmVelocity"),
+    broken_joints("HopperSpeedsInOtherOrder", "RL819", "HopperObserves", slow=True),
+    broken_joints("ArmVelocityOfSubsteps", "RL820", "ArmVelocity", slow=True),
 ]
 CLEAN = [f"broken_mujoco_joints.py:{name}" for name in ("ArmFollowsMeasured", "ArmResolvesMotion")]
 IN_DEGREES = "broken_mujoco_joints.py:HopperAllInDegrees"  # RL118 says that such numbers are large

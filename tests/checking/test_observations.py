@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.checking.judging import case, check_case, findings, found, rules_of
+from tests.checking.judging import case, check_case, findings, found, mark_slow, rules_of
 
 BROKEN = "broken_observations.py"
 CASES = [
@@ -14,7 +14,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
@@ -22,11 +22,13 @@ def test_finds_the_mistake_and_only_that(case):
 CLEAN = [f"{BROKEN}:{name}" for name in ("Wide", "Counter", "SomeFlags", "SeenGoal", "NoisyReward", "ShownChance")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", CLEAN)
 def test_clean_is_clean(task):
     assert found(task, *rules_of("RL1")) == set()
 
 
+@pytest.mark.slow
 def test_a_bandit_shows_nothing():
     assert found(f"{BROKEN}:Bandit", "RL110", "RL114") == {("RL110", "info")}
 

@@ -6,13 +6,13 @@ import pytest
 
 from rlctl.environments.bullet_calls import record_calls
 from rlctl.task.pybullet.library import pybullet
-from tests.checking.judging import case, check_case, findings, found, rules_of
+from tests.checking.judging import case, check_case, findings, found, mark_slow, rules_of
 
 RULES = set(rules_of("RL8"))
 CART = "broken_physics.py:Cart"
 CASES = [
     case("broken_physics.py:NoGravity", ("RL801", "warning"), twin="broken_physics.py:Flat"),
-    case("broken_physics.py:InTheFloor", ("RL803", "warning"), twin=CART),
+    case("broken_physics.py:InTheFloor", ("RL803", "warning"), twin=CART, slow=True),
     case("broken_physics.py:BeyondLimits", ("RL804", "warning"), twin="broken_physics.py:TurnsWithoutEnd"),
     case("broken_physics.py:Explodes", ("RL805", "warning"), twin=CART),
     case("broken_physics.py:LongPhysicsSteps", ("RL813", "warning"), twin=CART),
@@ -22,7 +22,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
@@ -60,6 +60,7 @@ def test_penetration_is_measured():
     assert "for 30 steps in a row" in finding.message
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_explosion_is_measured():
     finding = the_finding("Explodes")

@@ -105,6 +105,7 @@ class Env(gymnasium.Env):
 """
 
 
+@pytest.mark.slow
 def test_what_hangs_for_nan_is_not_called_a_hang(tmp_path):
     (tmp_path / "nan_hangs.py").write_text(NAN)
     rules = choose_rules(["RL209", "RL704"])
@@ -115,6 +116,7 @@ def test_what_hangs_for_nan_is_not_called_a_hang(tmp_path):
     assert report.exit_code == 0
 
 
+@pytest.mark.slow
 def test_printing_is_worth_knowing_and_does_not_reach_the_result(in_root):
     run = rlctl(f"{BROKEN}:Prints", "--select", "RL211", "--json", "-")
     content = json.loads(run.stdout)
@@ -158,6 +160,7 @@ def test_a_rule_that_crashes_is_no_pass(monkeypatch):
     assert verdict.judged == []
 
 
+@pytest.mark.slow
 def test_command_of_a_clean_environment(tmp_path):
     run = rlctl("reach")
     assert (run.returncode, run.stderr) == (0, "")

@@ -9,7 +9,7 @@ from rlctl.checking.instance import Context
 from rlctl.checking.progress import read_clock
 from rlctl.checking.rules import NotJudged
 from rlctl.environments.spec import EnvSpec
-from tests.checking.judging import case, check_case, findings, records_of
+from tests.checking.judging import case, check_case, findings, mark_slow, records_of
 
 FILE = "broken_resources.py"
 CASES = [
@@ -22,7 +22,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
@@ -77,6 +77,7 @@ def test_too_few_resets_are_not_judged():
         found_in(4, [1, 2, 3, 4])
 
 
+@pytest.mark.slow
 def test_a_task_without_generators_plays_its_episodes_once():
     context = Context(EnvSpec("reach"))
     context.budget.deadline = read_clock() + 60

@@ -9,13 +9,13 @@ from gymnasium import spaces
 from rlctl.checking.episode import action_at
 from rlctl.checking.families.rewards import discounted_steps, discounted_sum
 from rlctl.checking.families.search import compare_returns
-from tests.checking.judging import case, check_case, findings, found, rules_of, shared_records_of
+from tests.checking.judging import case, check_case, findings, found, mark_slow, rules_of, shared_records_of
 
 BROKEN = "broken_rewards.py"
 
 
-def broken(name, *expected, twin=None):
-    return case(f"{BROKEN}:{name}", *expected, twin=f"{BROKEN}:{twin}" if twin else "broken_envs.py:Clean")
+def broken(name, *expected, twin=None, **settings):
+    return case(f"{BROKEN}:{name}", *expected, twin=f"{BROKEN}:{twin}" if twin else "broken_envs.py:Clean", **settings)
 
 
 CASES = [
@@ -34,11 +34,11 @@ CASES = [
     broken("SuccessIsAShare", ("RL609", "info")),
     broken("SuccessAtStart", ("RL610", "warning")),
     broken("SuccessNever", ("RL611", "info")),
-    broken("WrongSlice", ("RL612", "warning"), twin="TimePenalty"),
+    broken("WrongSlice", ("RL612", "warning"), twin="TimePenalty", slow=True),
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
@@ -52,6 +52,7 @@ CLEAN = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", CLEAN)
 def test_clean_is_clean(task):
     assert found(task, *rules_of("RL6")) == set()
@@ -136,6 +137,7 @@ def test_numbers_become_actions_of_every_kind():
         assert tuple(part.tolist() for part in action["more"]) == more
 
 
+@pytest.mark.slow
 def test_search_finds_what_chance_does_not():
     lives = shared_records_of("reach", "search").role("search")
     assert any(life.infos["is_success"].values.any() for life in lives if life.actions == "searched")

@@ -2,12 +2,12 @@
 
 import pytest
 
-from tests.checking.judging import case, check_case, findings
+from tests.checking.judging import case, check_case, findings, mark_slow
 
 
-def broken(name, rule, severity, twin):
+def broken(name, rule, severity, twin, **settings):
     file = "robots.py" if twin in ("Arm", "Boat", "Crawler", "Tank") else "broken_robots.py"
-    return case(f"broken_robots.py:{name}", (rule, severity), twin=f"{file}:{twin}")
+    return case(f"broken_robots.py:{name}", (rule, severity), twin=f"{file}:{twin}", **settings)
 
 
 CASES = [
@@ -15,8 +15,8 @@ CASES = [
     broken("TankHiddenWish", "RL114", "warning", "Tank"),
     broken("BoatOldObservation", "RL115", "error", "Boat"),
     broken("ArmOldObservation", "RL115", "error", "Arm"),
-    broken("ArmQuaternion", "RL116", "error", "ArmRightQuaternion"),
-    broken("BoatWraps", "RL117", "info", "Boat"),
+    broken("ArmQuaternion", "RL116", "error", "ArmRightQuaternion", slow=True),
+    broken("BoatWraps", "RL117", "info", "Boat", slow=True),
     broken("CrawlerWraps", "RL117", "info", "Crawler"),
     case(
         "broken_robots.py:CrawlerQuaternion", ("RL116", "error"), ("RL117", "info"), twin="robots.py:Crawler"
@@ -29,9 +29,9 @@ CASES = [
     broken("TankSpills", "RL311", "error", "TankSeededSpills"),
     broken("TankFailsAsTruncated", "RL507", "warning", "Tank"),
     broken("CrawlerFallsAsTruncated", "RL507", "warning", "CrawlerFalls"),
-    broken("BoatTermsOff", "RL607", "warning", "BoatTerms"),
+    broken("BoatTermsOff", "RL607", "warning", "BoatTerms", slow=True),
     broken("CrawlerTermsOff", "RL607", "warning", "CrawlerTerms"),
-    broken("BoatMovingBuoy", "RL615", "warning", "BoatFixedBuoy"),
+    broken("BoatMovingBuoy", "RL615", "warning", "BoatFixedBuoy", slow=True),
     broken("TankOtherWish", "RL615", "warning", "TankOneWish"),
     broken("BoatLateReward", "RL616", "warning", "Boat"),
     broken("ArmLateReward", "RL616", "warning", "Arm"),
@@ -50,7 +50,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 

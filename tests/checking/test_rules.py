@@ -10,7 +10,17 @@ import pytest
 
 from rlctl.checking.rules import RULES
 from rlctl.checking.values import find_numbers
-from tests.checking.judging import FOLDER, IN_PROCESSES, case, check_case, findings, found, records_of, verdict_of
+from tests.checking.judging import (
+    FOLDER,
+    IN_PROCESSES,
+    case,
+    check_case,
+    findings,
+    found,
+    mark_slow,
+    records_of,
+    verdict_of,
+)
 
 CASES = [
     case("broken_envs.py:OldGym", ("RL003", "error"), ("RL201", "error"), ("RL202", "error")),
@@ -69,7 +79,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 

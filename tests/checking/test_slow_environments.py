@@ -57,6 +57,7 @@ def test_the_time_of_a_slow_environment_grows_while_it_is_played(slow):
     assert 9.0 < finished.needed_s < 30.0
 
 
+@pytest.mark.slow
 def test_fewer_episodes_are_enough_for_a_slow_environment(slow):
     records = play(slow, ["episodes", "search"], 1.1, 1.0)  # half a second for 16 episodes of 0.05 s
     episodes = len(records.role("episodes"))

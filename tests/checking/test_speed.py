@@ -12,7 +12,7 @@ from rlctl.checking.families.speed import Speed, format_speed, typical
 from rlctl.checking.profiling import Profile, Stopwatch, TimedCall
 from rlctl.checking.records import Records
 from rlctl.checking.rules import choose_rules
-from tests.checking.judging import case, check_case, shared_records_of
+from tests.checking.judging import case, check_case, mark_slow, shared_records_of
 
 CASES = [
     case("broken_speed.py:SlowStep", ("RL901", "warning")),
@@ -42,7 +42,7 @@ def findings(evidence):
     return verdict.findings
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
@@ -138,6 +138,7 @@ def test_rebuilding_is_named_with_its_calls():
     assert "pybullet.resetSimulation (broken_speed.py:" in finding.message
 
 
+@pytest.mark.slow
 def test_waiting_in_reset_is_said_once():
     (finding,) = findings(measured("broken_speed.py:SleepsInReset"))
     assert (finding.rule, finding.evidence["value"]) == ("RL903", "time.sleep")

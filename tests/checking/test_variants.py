@@ -2,12 +2,12 @@
 
 import pytest
 
-from tests.checking.judging import FOLDER, case, check_case, findings, records_of
+from tests.checking.judging import FOLDER, case, check_case, findings, mark_slow, records_of
 
 ERROR = "error"
 SOUND = "broken_variants.py:Sound"
 CASES = [
-    case("broken_variants.py:WrongBody", ("RL011", ERROR), twin=SOUND),
+    case("broken_variants.py:WrongBody", ("RL011", ERROR), twin=SOUND, slow=True),
     case("broken_variants.py:OwnChance", ("RL011", ERROR), twin=SOUND),
     case("broken_variants.py:BreaksDown", ("RL011", ERROR), twin="broken_variants.py:NeedsItsEvents"),
     case("broken_variants.py:Misspelled", ("RL013", "warning"), twin=SOUND),
@@ -18,7 +18,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 

@@ -131,6 +131,7 @@ def with_path(site, more):
     return {**os.environ, **more, "PYTHONPATH": os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])}
 
 
+@pytest.mark.slow
 def test_the_shell_completes_names_and_options(site, tmp_path):
     assert complete(["rlctl", "gre"], site, tmp_path) == (["greet"], "")
     assert complete(["rlctl", "greet", "--lo"], site, tmp_path) == (["imported", "--loud"], "")

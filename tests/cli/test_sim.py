@@ -46,6 +46,7 @@ def test_a_policy_contains_the_engine_of_its_training(rlctl, tmp_path):
     assert "2 episodes, seed 0, PyBullet" in other.stdout, other.stderr
 
 
+@pytest.mark.slow
 def test_a_batch_has_no_worlds_in_pybullet(rlctl):
     done = rlctl("eval", "walk", "--policy", "zero", "--episodes", "1", "--sim", "pybullet")
     assert done.returncode == 2
@@ -85,6 +86,7 @@ def test_a_look_in_mujoco(rlctl):
     assert json.loads(done.stdout)["episodes"][0]["length"] == 120
 
 
+@pytest.mark.slow
 def test_the_engine_leaves_the_events_as_they_are(rlctl):
     """`--sim` is the engine and nothing else: not whether the world is randomised."""
     done = rlctl("eval", "walk", "--policy", "zero", "--episodes", "1", "--sim", "mujoco", "--set", "randomize=true")

@@ -105,6 +105,7 @@ def test_a_group_goes_on_without_its_driver_which_finds_it_again(train, slurm, t
     assert read_group(folder).is_done(0)
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_not_shared_is_named_and_not_tried_again(train, slurm, tmp_path, capsys):
     (tmp_path / "cluster.yaml").write_text(f"setup: ['rm {tmp_path}/runs/Line/*_seeds/.jobs/driver']\n")
     result = train("0")

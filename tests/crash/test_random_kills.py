@@ -27,6 +27,7 @@ def test_killed_at_any_moment(trials, whole, folders, part):
         assert_nothing_lost(trials, ARGUMENTS[name], ended, only_run(before.folder))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "how", [*(pytest.param(how, marks=pytest.mark.crash) for how in ("asleep", "busy")), "in a library"]
 )

@@ -74,6 +74,7 @@ def test_ids_of_gymnasium_itself():
     assert describe_registrations(task, "train").endswith("max_episode_steps=200: rlctl train Pendulum-v1")
 
 
+@pytest.mark.slow
 def test_where_the_missing_limit_and_arguments_matter(rlctl, walkers):
     done = rlctl("check-env", "there/walkers/envs/fall.py:Walk", "--select", "RL506")
     assert (

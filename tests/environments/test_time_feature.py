@@ -114,6 +114,7 @@ def test_the_zoos_agents_play_as_they_did(zoo_agent):
         assert episode.result.total_reward == pytest.approx(total, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_export_and_replay_honour_it(zoo_agent, tmp_path):
     _, _, imported = zoo_agent

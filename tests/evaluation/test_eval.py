@@ -218,6 +218,7 @@ def test_a_run_without_a_best_policy(rlctl, reach_run, tmp_path):
     assert "no best policy yet; train longer, or use --checkpoint last" in done.stderr
 
 
+@pytest.mark.slow
 def test_an_exported_policy_is_evaluated_alike_and_without_torch(reach_run, evaluation, tmp_path):
     from rlctl.exporting.export import export_policy
     from rlctl.exporting.request import ExportRequest

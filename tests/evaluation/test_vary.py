@@ -295,6 +295,7 @@ def test_contacts_from_soft_to_stiff(rlctl):
     assert [cell["success_rate"] for cell in engine["cells"]] == [1.0, 1.0, 1.0]
 
 
+@pytest.mark.slow
 def test_the_worst_contacts_are_gated(rlctl):
     pytest.importorskip("mujoco")
     options = ("--episodes", "2", "--vary", "sim=0.01:0.02:2", "--min-success", "0.9")
@@ -312,6 +313,7 @@ def test_what_mujoco_has_not_is_said_before_an_episode_is_played(rlctl):
     assert done.stderr.endswith("kuka_with_gripper2.sdf: MuJoCo reads URDF and MJCF (.xml) files\n")
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_cell_that_fails_is_a_failed_cell(rlctl, tmp_path):
     run = write_run(tmp_path / "run", f"{ENVS}:Brittle")

@@ -137,6 +137,7 @@ def test_an_environment_that_magnifies_rounding_is_verified_by_its_actions(small
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [{"noise": 0.1}, {"keeps": True}])
 @pytest.mark.parametrize("algo", ["ppo", "recurrent_ppo"])
 def test_an_environment_that_does_not_repeat_its_episodes_is_verified_by_actions(algo, parameters, small, train, write):

@@ -125,6 +125,7 @@ def rows(env, seed, steps=150):
     return np.array(observations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("biped", BIPEDS.values(), ids=BIPEDS)
 @pytest.mark.parametrize("roughness", [0.0, 0.04])
 def test_episodes_repeat_with_contacts_pushes_and_all_randomisation(biped, roughness):

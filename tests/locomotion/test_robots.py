@@ -27,6 +27,7 @@ def live(env, seed, actions):
     return np.array(rows), contacts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_an_episode_after_others_is_as_in_a_fresh_world(robot):
     class Endless(robot):  # most would fall and end in a second
@@ -46,6 +47,7 @@ def test_an_episode_after_others_is_as_in_a_fresh_world(robot):
     dirty.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_joints_start_within_a_tenth_of_a_radian(robot):
     env = TaskEnv(robot())
@@ -145,6 +147,7 @@ def test_motors_in_another_order_than_the_model():
         TaskEnv(Mixed())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_randomized_episodes_repeat_too(robot):
     class Endless(robot):

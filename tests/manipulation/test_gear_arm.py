@@ -248,6 +248,7 @@ def test_end_stops():
     assert stop_torque(3.0, 0.5, 2.9) == pytest.approx(-6.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stage", "randomize"), [("reach", True), slow("lift", False), slow("lift", True)])
 def test_episodes_repeat_bit_for_bit(stage, randomize):
     def make():

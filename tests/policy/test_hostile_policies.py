@@ -165,6 +165,7 @@ def test_a_tensor_of_no_network(changed):
     assert load_policy(path).predict(np.zeros(5)).shape == (2,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [None, -1, "x", [], {}, 10**30])
 def test_any_value_at_any_place(value, changed, described):
     """Refused in a line, or of no consequence; whatever it is, no other exception."""

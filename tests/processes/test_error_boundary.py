@@ -52,6 +52,7 @@ def test_progress_in_ascii(monkeypatch, capsys):
     assert sparkline([0.0, 0.5, 1.0]).isascii()
 
 
+@pytest.mark.slow
 def test_stderr_is_closed(tmp_path):
     done = shell(f"cd {tmp_path}; {RLCTL} eval 2>&-; echo $?")
     assert done.stdout == b"5\n"

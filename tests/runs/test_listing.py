@@ -138,6 +138,7 @@ def on_terminal(*arguments, columns):
     return re.sub(r"\x1b\[[0-9;]*m", "", shown.decode()).replace("\r\n", "\n")
 
 
+@pytest.mark.slow
 def test_a_narrow_terminal_has_fewer_columns_and_no_broken_names(write_run):
     name = "half-cheetah/2026-01-01_00-00-00_s0"
     changes = {"algo_kwargs.gamma": 0.9, "total_timesteps": 1000}

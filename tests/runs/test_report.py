@@ -114,6 +114,7 @@ def write_recipes(group, **recipes):
         RunDirectory(folder).write_recipe(resolve("reach", None, {"algo_kwargs": settings}))
 
 
+@pytest.mark.slow
 def test_a_band_per_recipe(group):
     write_recipes(group, a={"learning_rate": 0.001}, b={"learning_rate": 0.001}, c={"learning_rate": 0.002})
     report = content.collect([str(run) for run in group])
@@ -157,6 +158,7 @@ def test_curves_of_seeds_are_averaged_at_common_steps():
     assert curve["high"].tolist() == [6, 6]
 
 
+@pytest.mark.slow
 def test_robustness_is_in_it_where_it_was_measured(group):
     outcome = {"success_interval": (0.1, 0.9), "mean_return": 1.0, "return_interval": (0.0, 2.0)}
     axis = Axis(name="mass", setting="events.mass.factor", values=[0.6, 1.0], nominal=1.0)

@@ -217,6 +217,7 @@ def test_offsets_stay_inside_the_joint_limits(make):
     np.testing.assert_allclose(env.task.arm.joint_positions, env.task.arm.joint_high)
 
 
+@pytest.mark.slow
 def test_reach_with_all_of_its_events_repeats(make):
     def episode(env, seed):
         observation, info = env.reset(seed=seed)

@@ -48,6 +48,7 @@ def test_begins_where_a_policy_ended(source, train, capfd):
     assert "its actor, critic and normalisation" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_shipped_actor_gets_a_fresh_critic(train, capfd):
     network = {"n_envs": 2, "total_timesteps": 32, "eval": {"episodes": 2, "every_steps": 1_000_000}}
     kwargs = {"algo_kwargs": {"n_steps": 16, "batch_size": 32, "n_epochs": 1}}

@@ -237,6 +237,7 @@ def test_nothing_is_removed_in_a_run_that_another_process_holds(played, tmp_path
     assert run.checkpoints()
 
 
+@pytest.mark.slow
 def test_tuners_share_a_storage_and_nothing_is_lost_on_resume(played, tmp_path):
     url = f"sqlite:///{tmp_path}/tune.db"
     one = begin(tmp_path, RATES, trials=3, storage=url)

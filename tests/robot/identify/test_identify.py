@@ -116,6 +116,7 @@ def test_values_that_the_log_cannot_tell_apart_are_named(real):
     assert found.events() == {"late": {"steps": [1, 1]}}
 
 
+@pytest.mark.slow
 def test_a_log_without_information_is_an_error(real, tmp_path):
     # Nothing is touched, so friction leaves no trace.
     with pytest.raises(

@@ -88,6 +88,7 @@ def test_the_trajectory_of_the_task_itself_has_its_own_values(env, folder):
     assert found.position_error[1] < 1e-6
 
 
+@pytest.mark.slow
 def test_targets_begin_where_the_robot_is_if_the_log_has_none(env, folder, log):
     path, expected = folder / "no_targets.csv", describe_expected(env, SPEC.task)
     write_log(path, dataclasses.replace(log, targets=None), expected)
