@@ -145,8 +145,8 @@ def evaluate(
     environment: `reward_weights`, `randomize`, `events`. `pandas.DataFrame(result.episodes)` is a table of them.
     """
     from rlctl.errors import UsageError
+    from rlctl.evaluation.eval_request import EvalRequest
     from rlctl.evaluation.evaluate import run_evaluation
-    from rlctl.evaluation.request import EvalRequest
     from rlctl.recipe.sources import check_changes
 
     if task is not None and not isinstance(task, str):

@@ -7,10 +7,10 @@ import rlctl as package
 from rlctl.environments import installed
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError, RlctlError, UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import measure_score
-from rlctl.evaluation.request import EvalRequest
+from rlctl.exporting.export_request import ExportRequest
 from rlctl.exporting.policy_file import export_actor
-from rlctl.exporting.request import ExportRequest
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.shipped import MeasuredScore, Provenance, find_shipped_policy, list_shipped
 from rlctl.recipe.sources import resolve_with_stages

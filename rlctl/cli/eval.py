@@ -12,9 +12,9 @@ from typer.core import TyperCommand
 
 from rlctl.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.errors import UsageError
-from rlctl.evaluation.request import EvalOptions, EvalRequest, Gates, MinReturn, MinSuccess, MinSuccessLower
+from rlctl.evaluation.eval_request import EvalOptions, EvalRequest, Gates, MinReturn, MinSuccess, MinSuccessLower
 from rlctl.options import Cluster, Json, Junit, On, Option, PictureFile, Pretrained, Settings, Sim, Yes
-from rlctl.replaying.request import ReplayRequest
+from rlctl.replaying.replay_request import ReplayRequest
 
 
 @command_in_panels(

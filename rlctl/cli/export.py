@@ -5,7 +5,7 @@ from typing import Annotated
 
 from rlctl.arguments import choose_checkpoint, command
 from rlctl.errors import UsageError
-from rlctl.exporting.request import DatasetFormat, ExportRequest, Format
+from rlctl.exporting.export_request import DatasetFormat, ExportRequest, Format
 from rlctl.options import Argument, Checkpoint, Json, Option, Pretrained, RunName, Sim
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from rlctl.arguments import choose_checkpoint, command_in_panels, parse_changes
-from rlctl.evaluation.request import MinReturn, MinSuccess, MinSuccessLower
+from rlctl.evaluation.eval_request import MinReturn, MinSuccess, MinSuccessLower
 from rlctl.options import Checkpoint, EpisodeSeed, Json, Junit, Option, Pretrained, RunName, Settings, Sim
 
 
@@ -52,7 +52,7 @@ def gate(
     ] = None,
 ) -> None:
     """Check, evaluate, compare with the policy in use, and export: one report and one exit code, for CI."""
-    from rlctl.evaluation.request import EvalRequest, Gates
+    from rlctl.evaluation.eval_request import EvalRequest, Gates
     from rlctl.gating.gate import GateRequest, run_gate
     from rlctl.gating.report import show, show_step
 

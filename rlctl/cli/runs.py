@@ -24,7 +24,7 @@ from rlctl.options import (
 )
 
 if TYPE_CHECKING:
-    from rlctl.evaluation.request import EvalRequest
+    from rlctl.evaluation.eval_request import EvalRequest
 
 
 class _RunsGroup(TyperGroup):
@@ -130,7 +130,7 @@ def compare_runs(
     junit: Junit = None,
 ) -> None:
     """Test whether a policy, or a recipe trained with several seeds, is better than another."""
-    from rlctl.evaluation.request import EvalRequest
+    from rlctl.evaluation.eval_request import EvalRequest
     from rlctl.runs.compare.comparison import compare
     from rlctl.runs.compare.report import make_suite, show
     from rlctl.storage.junit import write as write_junit

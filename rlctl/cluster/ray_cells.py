@@ -16,8 +16,8 @@ from rlctl.cluster.ray_trainings import Pulse, connect, describe_slots, is_copie
 from rlctl.cluster.work import ClusterSettings, compare_versions, describe_driver
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.players import LoadedPolicy, load_player
-from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.vary import CellPlayer, Scores, order_cells
 
 _POLL_S = 5.0

@@ -12,9 +12,9 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation import episode_statistics
 from rlctl.evaluation.episode_statistics import Spread
+from rlctl.evaluation.eval_request import NO_GATES, EvalRequest, Gates
 from rlctl.evaluation.failures import FailurePattern, find_patterns
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, find_player, load_baseline
-from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.evaluation.sequential import EarlyGate, find_interval
 from rlctl.play.collect import Episode, play_episodes
 from rlctl.play.episode import save_episode

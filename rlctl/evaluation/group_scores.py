@@ -10,8 +10,8 @@ from pydantic_core import to_jsonable_python
 from rlctl import output
 from rlctl.errors import AnswerIsNo, ArtifactError, RlctlError
 from rlctl.evaluation.episode_statistics import Spread
+from rlctl.evaluation.eval_request import EvalRequest, Gates
 from rlctl.evaluation.evaluate import measure_score
-from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.policy.shipped import MeasuredScore
 from rlctl.runs.group import Group
 

@@ -1,8 +1,8 @@
 """Evaluations as JUnit XML: a gate is a test case, of a group for each seed, of a robustness map of the worst cell."""
 
+from rlctl.evaluation.eval_request import Gates, Scores
 from rlctl.evaluation.evaluate import Evaluation
 from rlctl.evaluation.group_scores import GroupScore
-from rlctl.evaluation.request import Gates, Scores
 from rlctl.evaluation.robustness import Robustness
 from rlctl.storage.junit import Case, CaseEntry, Suite, make_gate_case
 

@@ -8,7 +8,7 @@ from typing import Any
 from rlctl import output
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, explain_missing_package
-from rlctl.evaluation.request import EvalRequest
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.play.workers import Workers
 from rlctl.policy.actor import Actor
 from rlctl.policy.file import PolicyFile, PolicyInfo

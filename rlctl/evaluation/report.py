@@ -10,9 +10,9 @@ from rich.text import Text
 from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.evaluation.episode_statistics import Spread
+from rlctl.evaluation.eval_request import NO_GATES, Gates, judge
 from rlctl.evaluation.evaluate import Evaluation
 from rlctl.evaluation.group_scores import GroupScore, SeedScore
-from rlctl.evaluation.request import NO_GATES, Gates, judge
 from rlctl.evaluation.robustness import Cell, FailedCell, Outcome, PushTest, Robustness, RobustnessMap
 from rlctl.evaluation.sequential import EarlyGate
 from rlctl.evaluation.vary import format_command

@@ -20,10 +20,10 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.evaluation import robustness
 from rlctl.evaluation.episode_statistics import summarize
+from rlctl.evaluation.eval_request import NO_GATES, EvalRequest, Gates
 from rlctl.evaluation.evaluate import start_workers
 from rlctl.evaluation.players import LoadedPolicy, find_player
 from rlctl.evaluation.push import measure_push
-from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.evaluation.robustness import Axis, Cell, FailedCell, Failure, Outcome, Robustness, RobustnessMap
 from rlctl.play.collect import play_episodes
 from rlctl.play.messages import EpisodeResult

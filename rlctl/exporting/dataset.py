@@ -15,10 +15,10 @@ from rlctl.environments.info import EnvInfo
 from rlctl.environments.registry import make_slug
 from rlctl.environments.spec import EnvChanges
 from rlctl.errors import UsageError, explain_missing_package
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import start_workers
 from rlctl.evaluation.players import find_player
-from rlctl.evaluation.request import EvalRequest
-from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.export_request import ExportRequest
 from rlctl.play.collect import Episode, play_episodes
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.storage import files

@@ -15,7 +15,7 @@ from rlctl import output
 from rlctl.engine import Engine
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
-from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.export_request import ExportRequest
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, Latency, measure_latency, verify
 from rlctl.hub import store
 from rlctl.play.workers import Workers, count_envs

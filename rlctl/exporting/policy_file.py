@@ -8,10 +8,10 @@ from rich.filesize import decimal as format_bytes
 from rlctl import output
 from rlctl.environments.registry import identify_task
 from rlctl.errors import ArtifactError, UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import measure_score
 from rlctl.evaluation.report import describe_score
-from rlctl.evaluation.request import EvalRequest
-from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.export_request import ExportRequest
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.named_actors import BASELINES
 from rlctl.policy.shipped import Provenance

@@ -12,11 +12,11 @@ from rlctl.checking.rules import choose_rules
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError, UsageError
 from rlctl.evaluation import junit as evaluation_junit
+from rlctl.evaluation.eval_request import NO_GATES, EvalRequest, Gates
 from rlctl.evaluation.evaluate import Evaluation, run_evaluation
 from rlctl.evaluation.players import find_player
-from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
 from rlctl.exporting.export import ExportReport, export_policy
-from rlctl.exporting.request import ExportRequest, Format
+from rlctl.exporting.export_request import ExportRequest, Format
 from rlctl.runs import lookup
 from rlctl.runs.compare.comparison import RunComparison, compare
 from rlctl.runs.compare.significance import Verdict

@@ -7,8 +7,8 @@ from rlctl import output
 from rlctl.checking import formats, tool_formats
 from rlctl.checking.check import CheckReport
 from rlctl.evaluation import report as evaluation_report
+from rlctl.evaluation.eval_request import NO_GATES
 from rlctl.evaluation.evaluate import Evaluation
-from rlctl.evaluation.request import NO_GATES
 from rlctl.exporting import export
 from rlctl.gating.gate import GateReport, Result
 from rlctl.runs.compare import report as comparison_report

@@ -10,8 +10,8 @@ from pathlib import Path
 from rlctl import output
 from rlctl.environments import named_task
 from rlctl.errors import RlctlError, UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.group_scores import GroupScore, evaluate_group
-from rlctl.evaluation.request import EvalRequest
 from rlctl.launching.trainings import MakeTrainings, make_local_trainings
 from rlctl.runs.directory import RunLock
 from rlctl.runs.group import Group, create_group, parse_seeds, read_group

@@ -177,7 +177,7 @@ class _Sender:
 def _present(run: RunDirectory, folder: Path) -> Iterator[Path]:
     """Write the report, and a film of the best policy unless that takes too long or cannot be done."""
     from rlctl.replaying.replay import run_replay
-    from rlctl.replaying.request import ReplayRequest
+    from rlctl.replaying.replay_request import ReplayRequest
     from rlctl.runs.report.write import write_report
 
     yield write_report([str(run.path)], target=(report := folder / "report.html"), pictures=False) or report

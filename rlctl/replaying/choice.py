@@ -10,7 +10,7 @@ from rlctl.play.collect import play_episodes
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers, count_envs
-from rlctl.replaying.request import Choice
+from rlctl.replaying.replay_request import Choice
 
 
 def choose_episodes(

@@ -10,9 +10,9 @@ from rlctl.errors import UsageError
 from rlctl.replaying.camera import read_viewpoint
 from rlctl.replaying.pictures import check_file, film_episodes
 from rlctl.replaying.recorder import Rollout
+from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.report import ReplayResult
 from rlctl.replaying.reproduce import verify_episode
-from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.sources import PolicySource, RecordedSource, TaskSource, load_located, summarize
 from rlctl.replaying.views import make_filmable
 from rlctl.replaying.window import open_window, show_episodes

@@ -9,9 +9,9 @@ from typing import Any
 from rlctl import output
 from rlctl.environments.info import describe_randomization
 from rlctl.errors import AnswerIsNo
+from rlctl.replaying.look import WorldSummary
+from rlctl.replaying.look_table import show_world
 from rlctl.replaying.reproduce import Verification
-from rlctl.replaying.world import WorldSummary
-from rlctl.replaying.world_table import show_world
 from rlctl.version import collect_versions
 
 

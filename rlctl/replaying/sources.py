@@ -20,6 +20,8 @@ from rlctl.policy.named_actors import SERVER
 from rlctl.recipe.sources import parse_changes
 from rlctl.replaying.choice import choose_episodes
 from rlctl.replaying.drawable import make_drawable
+from rlctl.replaying.look import WorldWatch
+from rlctl.replaying.look_readers import make_world_reader
 from rlctl.replaying.recorder import (
     Choose,
     Rollout,
@@ -27,12 +29,10 @@ from rlctl.replaying.recorder import (
     play_episode,
     recorded_actions,
 )
+from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.report import ReplayedEpisode, ReplayResult
 from rlctl.replaying.reproduce import print_warning, record_episode
-from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.scene import Env
-from rlctl.replaying.world import WorldWatch
-from rlctl.replaying.world_readers import make_world_reader
 from rlctl.runs.directory import RunDirectory, refuse_links_out
 from rlctl.runs.lookup import find_owner, find_policy, locate_task
 

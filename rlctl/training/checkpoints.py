@@ -14,9 +14,9 @@ from rlctl.policy.torch_policy import describe_network
 from rlctl.runs.directory import RunDirectory
 from rlctl.storage import files
 from rlctl.storage.table import Table
-from rlctl.training import checkpoint, snapshot
+from rlctl.training import checkpoint_file, snapshot
 from rlctl.training.callbacks import Callbacks
-from rlctl.training.checkpoint import Checkpoint, ReplaySegments
+from rlctl.training.checkpoint_file import Checkpoint, ReplaySegments
 from rlctl.training.learner import Learner, begin_next_episodes
 from rlctl.training.snapshot import check_finite
 
@@ -117,21 +117,21 @@ class Checkpoints:
         tensors, plain = snapshot.take(learner.model)
         of_callbacks, plain_of_callbacks = self.callbacks.take()
         of_rollouts, plain["rollouts"] = learner.rollouts.take()
-        tensors |= of_callbacks | of_rollouts | checkpoint.environment_tensors(learner.env)
+        tensors |= of_callbacks | of_rollouts | checkpoint_file.environment_tensors(learner.env)
         segments = []
         if self._replay is not None:
             segments = self._replay.save(self._added)
-            tensors |= checkpoint.hindsight_tensors(self._replay.buffer)
-        state = checkpoint.State(
+            tensors |= checkpoint_file.hindsight_tensors(self._replay.buffer)
+        state = checkpoint_file.State(
             run=self.run.id(),
             step=learner.steps,
             model=plain,
             progress=learner.progress,
             callbacks=plain_of_callbacks,
             segments=segments,
-            computed_with=checkpoint.describe_computation(learner.model.device),
+            computed_with=checkpoint_file.describe_computation(learner.model.device),
         )
-        checkpoint.write(self.run.checkpoint(state.step), state, policy, tensors)
+        checkpoint_file.write(self.run.checkpoint(state.step), state, policy, tensors)
 
     @property
     def _added(self) -> int:
@@ -143,7 +143,7 @@ class Checkpoints:
         for old in self.run.checkpoints()[: -self._learner.recipe.checkpoint.keep]:
             files.remove_tree(old)
         if self._replay is not None:
-            self._replay.remove_others(checkpoint.list_segments(self.run))
+            self._replay.remove_others(checkpoint_file.list_segments(self.run))
 
     def restore(self, saved: Checkpoint, changed: Sequence[str]) -> str:
         """Restore a checkpoint; return a message with the reasons, `changed` and others, why it is not exact."""
@@ -157,14 +157,14 @@ class Checkpoints:
             learner.rollouts.restore(saved.tensors, saved.state.model.get("rollouts"))
             if self._replay is not None:
                 self._replay.load(saved.state.segments, self._added)
-                checkpoint.restore_hindsight(self._replay.buffer, saved.tensors)
-            mismatch = checkpoint.restore_environments(learner.env, saved.tensors)
+                checkpoint_file.restore_hindsight(self._replay.buffer, saved.tensors)
+            mismatch = checkpoint_file.restore_environments(learner.env, saved.tensors)
         except (ArtifactError, KeyError) as error:
             raise ArtifactError(f"{saved.folder}: {error}") from None
         # SB3 resets the environments if this is None; it has no other use here.
         learner.model._last_obs = learner.env.observations()
-        now = checkpoint.describe_computation(learner.model.device)
-        inexact = [*changed, *checkpoint.find_differences(saved.state.computed_with, now)]
+        now = checkpoint_file.describe_computation(learner.model.device)
+        inexact = [*changed, *checkpoint_file.find_differences(saved.state.computed_with, now)]
         if mismatch is not None:
             inexact.append(mismatch)
             begin_next_episodes(learner.model)

@@ -33,7 +33,7 @@ from rlctl.training.distilling.teacher import Teacher
 from rlctl.training.warm_start import find_source
 
 if TYPE_CHECKING:
-    from rlctl.training.checkpoint import Checkpoint
+    from rlctl.training.checkpoint_file import Checkpoint
 
 _NO_CALLBACK = "neither a rlctl.Callback nor a BaseCallback of Stable-Baselines3"
 _DEMONSTRATIONS = (".npz", ".parquet", ".hdf5", ".arrow", ".json")  # suffixes of files
@@ -124,7 +124,7 @@ def _find_new(request: TrainRequest, task: str) -> Start:
 
 
 def _find_checkpoint(request: TrainRequest) -> Start:
-    from rlctl.training import checkpoint
+    from rlctl.training import checkpoint_file
 
     run = lookup.find_run(request.resume, request.root, to_train=True)
     before = run.recipe()
@@ -140,7 +140,7 @@ def _find_checkpoint(request: TrainRequest) -> Start:
         if changes and not request.force:
             raise UsageError(f"{run.path}: {'; '.join(changes)}. The policy may no longer fit; --force resumes anyway")
         run.recover()
-        newest, damage = checkpoint.read_newest(run)
+        newest, damage = checkpoint_file.read_newest(run)
         if newest is None and status.get("status") == "finished":
             command = shlex.join(["rlctl", "train", task, "--from", str(run.path)])
             raise ArtifactError(f"{run.path}: finished, and its checkpoints were removed; train from it: {command}")

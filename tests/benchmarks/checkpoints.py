@@ -151,7 +151,7 @@ def _saved() -> tuple[float, float, float]:
     from gymnasium import spaces
     from stable_baselines3.common.buffers import ReplayBuffer
 
-    from rlctl.training.checkpoint import ReplaySegments
+    from rlctl.training.checkpoint_file import ReplaySegments
 
     box = spaces.Box(-1, 1, (_SIZE,), np.float32)
     buffer = ReplayBuffer(_TRANSITIONS, box, spaces.Box(-1, 1, (8,), np.float32))

@@ -20,8 +20,8 @@ from typing import Any
 
 from rlctl.entry_points import OURS
 from rlctl.environments import installed, registry
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.group_scores import evaluate_group
-from rlctl.evaluation.request import EvalRequest
 from rlctl.runs.directory import GROUP_FILE
 from rlctl.runs.group import Group, parse_seeds, read_group
 from rlctl.runs.train_request import TrainRequest

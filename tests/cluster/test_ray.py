@@ -16,7 +16,7 @@ import pytest
 
 from rlctl.cluster.executors import choose_cell_player, choose_executor
 from rlctl.cluster.ray_trainings import connect
-from rlctl.evaluation.request import EvalRequest
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.vary import measure_robustness
 from rlctl.launching.seeds import train_seeds
 from rlctl.launching.train import run_training

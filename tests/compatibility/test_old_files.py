@@ -9,7 +9,7 @@ import rlctl
 from rlctl.play.episode import load_episode
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.tables import read_table
-from rlctl.training import checkpoint
+from rlctl.training import checkpoint_file
 
 VERSIONS = sorted(path for path in Path(__file__).parent.iterdir() if path.name[0].isdigit())
 
@@ -41,7 +41,7 @@ def test_a_run_is_read(files):
 
 def test_a_checkpoint_is_read(files):
     (folder,) = (files / "run" / "checkpoints").iterdir()
-    assert checkpoint.read(folder).state.format == 1
+    assert checkpoint_file.read(folder).state.format == 1
 
 
 def test_an_episode_is_read(files):

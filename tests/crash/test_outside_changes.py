@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from rlctl.training import checkpoint
+from rlctl.training import checkpoint_file
 from tests.crash.contract import assert_quiet, assert_same_end
 from tests.crash.outside_changes import CLOCKS
 from tests.crash.trials import ARGUMENTS, only_run, resume
@@ -36,7 +36,7 @@ def steps(file):
 
 def assert_same_learnt(run, whole):
     """Hold that the last checkpoints are the same; of tables and files there may be less."""
-    (ours, damage), (theirs, _) = checkpoint.read_newest(run), checkpoint.read_newest(whole)
+    (ours, damage), (theirs, _) = checkpoint_file.read_newest(run), checkpoint_file.read_newest(whole)
     assert damage == []
     assert ours.state.step == theirs.state.step
     for name, values in ours.tensors.items():
@@ -73,7 +73,7 @@ def test_the_next_checkpoint_is_whole(trials, whole, change, name, what, after):
     assert_same_end(run, only_run(whole(name).folder))
     again = trials.run([*resume(run), "-n", "96"], ended.folder)
     assert again.code == 0, again.stderr
-    saved, _ = checkpoint.read_newest(only_run(whole(name).folder))
+    saved, _ = checkpoint_file.read_newest(only_run(whole(name).folder))
     assert f"resuming at step {saved.state.step}, bit-exact" in again.stderr
 
 

@@ -10,8 +10,8 @@ from safetensors.numpy import load_file, save
 from rlctl.environments import named_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import run_evaluation
-from rlctl.evaluation.request import EvalRequest
 from rlctl.launching.train import run_training
 from rlctl.play.episode import EpisodeInfo, RecordedEpisode, load_episode, save_episode
 from rlctl.policy.file import PolicyFile, compute_digest

@@ -10,15 +10,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import run_evaluation
-from rlctl.evaluation.request import EvalRequest
 from rlctl.exporting.export import export_policy
-from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.export_request import ExportRequest
 from rlctl.importing.import_model import import_model
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.recipe import recipe
 from rlctl.replaying.replay import run_replay
-from rlctl.replaying.request import ReplayRequest
+from rlctl.replaying.replay_request import ReplayRequest
 from tests.evaluation.conftest import ENVS
 
 BLOCK = f"{ENVS}:Block"

@@ -9,11 +9,11 @@ import pytest
 from rlctl.environments.spec import EnvChanges
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.episode_statistics import Spread, mean_terms, success_interval, success_rate
+from rlctl.evaluation.eval_request import EvalRequest, Gates
 from rlctl.evaluation.evaluate import measure_score, run_evaluation
 from rlctl.evaluation.group_scores import GroupScore, SeedScore
 from rlctl.evaluation.junit import make_group_suite, make_suite
 from rlctl.evaluation.report import as_json
-from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.launching.train import run_training
 from rlctl.play.messages import EpisodeResult
 from rlctl.runs.tables import read_table
@@ -221,7 +221,7 @@ def test_a_run_without_a_best_policy(rlctl, reach_run, tmp_path):
 @pytest.mark.slow
 def test_an_exported_policy_is_evaluated_alike_and_without_torch(reach_run, evaluation, tmp_path):
     from rlctl.exporting.export import export_policy
-    from rlctl.exporting.request import ExportRequest
+    from rlctl.exporting.export_request import ExportRequest
 
     exported = tmp_path / "policy.onnx"
     export_policy(ExportRequest(str(reach_run.path), ("onnx",), "best", exported))

@@ -7,8 +7,8 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.push import find_pushed, find_threshold
-from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.robustness import read
 from rlctl.evaluation.vary import measure_robustness
 from tests.evaluation.conftest import ENVS, write_run

@@ -11,8 +11,8 @@ from rlctl.engine import Engine
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.episode_statistics import mean_interval
+from rlctl.evaluation.eval_request import EvalRequest, Gates
 from rlctl.evaluation.evaluate import run_evaluation
-from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.evaluation.robustness import apply_axes, read, read_axes
 from rlctl.evaluation.vary import check_gates, format_command, measure_robustness
 from rlctl.output import format_duration

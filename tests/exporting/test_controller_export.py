@@ -11,7 +11,7 @@ from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.exporting.actor import build
 from rlctl.exporting.c_source import find_compiler, write_c
 from rlctl.exporting.controller.export import export_controller
-from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.export_request import ExportRequest
 from rlctl.policy.file import PolicyFile
 from tests.exporting import controlled
 from tests.exporting.controllers import make_policy

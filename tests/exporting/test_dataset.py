@@ -12,7 +12,7 @@ from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.exporting.dataset import export_dataset
-from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.export_request import ExportRequest
 from rlctl.training.demonstrations import read_demonstrations
 from tests.evaluation.conftest import write_run
 from tests.training.conftest import ENVS

@@ -12,7 +12,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.exporting.c_source import FLAGS, build_library, find_compiler, write_c
 from rlctl.exporting.export import export_policy
-from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.export_request import ExportRequest
 from rlctl.policy.c_policy import CActor
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.policy import Policy

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import pytest
 
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.evaluation.request import NO_GATES, EvalRequest, Gates
+from rlctl.evaluation.eval_request import NO_GATES, EvalRequest, Gates
 from rlctl.gating.gate import GateReport, GateRequest, GateStep, Result
 from rlctl.gating.report import as_json, to_markdown
 from rlctl.storage import junit

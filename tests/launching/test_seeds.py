@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from rlctl.errors import ArtifactError, Interrupted, RecipeError, UsageError
+from rlctl.evaluation.eval_request import EvalRequest, Gates
 from rlctl.evaluation.group_scores import evaluate_group
-from rlctl.evaluation.request import EvalRequest, Gates
 from rlctl.launching.seeds import train_seeds
 from rlctl.runs.compare.comparison import find_runs_of
 from rlctl.runs.directory import RunLock, is_being_written

@@ -5,9 +5,9 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.errors import PolicyError, UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.report import as_json
-from rlctl.evaluation.request import EvalRequest
 from rlctl.policy.actor import Rows
 from rlctl.policy.named_actors import load_function, make_actor
 

@@ -17,8 +17,8 @@ from rlctl.replaying.mjcf import ShapeKind, read_shapes
 from rlctl.replaying.pictures import take_pictures
 from rlctl.replaying.recorder import Rollout, play_episode
 from rlctl.replaying.replay import run_replay
+from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.reproduce import verify_episode
-from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.rrd import write_rrd
 
 p = pytest.importorskip("pybullet", reason="PyBullet is not installed")

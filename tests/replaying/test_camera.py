@@ -8,7 +8,7 @@ import pytest
 from rlctl.errors import UsageError
 from rlctl.replaying.camera import FIELD_OF_VIEW, FilmCamera, Viewpoint, read_viewpoint
 from rlctl.replaying.replay import run_replay
-from rlctl.replaying.request import ReplayRequest
+from rlctl.replaying.replay_request import ReplayRequest
 
 SIZE = (400, 300)
 LOW, HIGH = np.array([-0.2, -0.2, 0.0]), np.array([0.2, 0.2, 0.5])

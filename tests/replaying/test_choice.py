@@ -7,13 +7,13 @@ import typer
 
 from rlctl.cli import build_app
 from rlctl.errors import UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import run_evaluation
-from rlctl.evaluation.request import EvalRequest
 from rlctl.play.messages import EpisodeResult
 from rlctl.replaying import sources
 from rlctl.replaying.choice import choose_episodes, select
 from rlctl.replaying.replay import run_replay
-from rlctl.replaying.request import Choice, ReplayRequest
+from rlctl.replaying.replay_request import Choice, ReplayRequest
 
 
 def results(*outcomes):

@@ -10,7 +10,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import PolicyError, UsageError
 from rlctl.play.episode import load_episode
 from rlctl.replaying.replay import run_replay
-from rlctl.replaying.request import ReplayRequest
+from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.sources import TaskSource
 from rlctl.replaying.window import open_window, show_episodes
 from tests.replaying.conftest import ENVS, as_json

@@ -12,8 +12,8 @@ from rlctl.errors import UsageError
 from rlctl.play.episode import save_episode
 from rlctl.replaying.camera import find_distance
 from rlctl.replaying.replay import run_replay
+from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.report import ReplayResult, show
-from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.window import show_episodes
 from rlctl.task.pybullet.library import pybullet
 from tests.replaying.conftest import play

@@ -8,9 +8,9 @@ import pytest
 from rlctl.errors import ArtifactError
 from rlctl.play.episode import load_episode, save_episode
 from rlctl.replaying.replay import run_replay
+from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.report import as_json
 from rlctl.replaying.reproduce import record_episode
-from rlctl.replaying.request import ReplayRequest
 from tests.replaying.conftest import ENVS, play
 from tests.replaying.reading import column, layout, properties
 

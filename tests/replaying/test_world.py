@@ -10,10 +10,10 @@ import pytest
 from rlctl.engine import MUJOCO
 from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.spec import EnvSpec
+from rlctl.replaying.look import BodySummary, Contact, JointSummary, Motion, Pose, Touch, WorldSummary, WorldWatch
+from rlctl.replaying.look_readers import make_world_reader
+from rlctl.replaying.look_table import list_findings
 from rlctl.replaying.recorder import play_episode
-from rlctl.replaying.world import BodySummary, Contact, JointSummary, Motion, Pose, Touch, WorldSummary, WorldWatch
-from rlctl.replaying.world_readers import make_world_reader
-from rlctl.replaying.world_table import list_findings
 from tests.replaying.conftest import ENVS
 
 BULLET_ENVS = Path(__file__).with_name("bullet_envs.py")

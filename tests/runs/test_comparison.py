@@ -10,8 +10,8 @@ import pytest
 
 from rlctl.environments.spec import EnvSpec, merge
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.players import choose_spec, load_player
-from rlctl.evaluation.request import EvalRequest
 from rlctl.launching.train import run_training
 from rlctl.recipe.sources import resolve
 from rlctl.runs.compare.comparison import Candidate, RunComparison, Side, compare, find_recipe_changes

@@ -7,7 +7,7 @@ import numpy as np
 from safetensors.numpy import load_file
 
 from rlctl.runs.directory import RunDirectory
-from rlctl.training import checkpoint
+from rlctl.training import checkpoint_file
 
 OF_TIME = ("seconds", "fps", "playing", "acting")
 
@@ -35,7 +35,7 @@ def assert_same_run(one: RunDirectory, other: RunDirectory) -> None:
     """Compare tables, the newest checkpoints bit by bit, and what was evaluated."""
     assert rows(one.metrics_file) == rows(other.metrics_file)
     assert rows(one.evals_file) == rows(other.evals_file)
-    (ours, _), (theirs, _) = checkpoint.read_newest(one), checkpoint.read_newest(other)
+    (ours, _), (theirs, _) = checkpoint_file.read_newest(one), checkpoint_file.read_newest(other)
     assert ours.state.step == theirs.state.step
     assert ours.tensors.keys() == theirs.tensors.keys()
     different = [name for name, values in ours.tensors.items() if values.tobytes() != theirs.tensors[name].tobytes()]

@@ -10,7 +10,7 @@ import pytest
 
 from rlctl.errors import ArtifactError, Interrupted, TaskError, UsageError
 from rlctl.runs import lookup
-from rlctl.training import checkpoint
+from rlctl.training import checkpoint_file
 from tests.training.comparing import Killed, assert_same_run, replay_buffer, rows
 from tests.training.conftest import ENVS, TINY
 
@@ -133,9 +133,9 @@ def test_other_spaces(plugin, resume):
 
 
 def test_other_libraries_are_named(killed, resume, monkeypatch, capfd):
-    versions = checkpoint.collect_versions
+    versions = checkpoint_file.collect_versions
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "collect_versions", lambda: {**versions(), "torch": "1.0", "numpy": "1.26.4"})
+        patch.setattr(checkpoint_file, "collect_versions", lambda: {**versions(), "torch": "1.0", "numpy": "1.26.4"})
         run = killed("Line")
     resume(run)
     now = versions()
@@ -158,14 +158,14 @@ SAC = {
 @pytest.mark.parametrize("settings", [pytest.param(TINY, marks=pytest.mark.slow), SAC], ids=["ppo", "sac"])
 def test_an_environment_that_no_seed_reaches_begins_new_episodes(killed, resume, capfd, settings):
     run = killed("Unseeded", settings)
-    before, _ = checkpoint.read_newest(run)
+    before, _ = checkpoint_file.read_newest(run)
     resume(run)
     printed = capfd.readouterr().err
     assert (
         "resuming at step 64, not bit-exact: environment 0 did not reach its saved state from its seed "
         "and actions, so all environments start new episodes"
     ) in printed
-    after, damage = checkpoint.read_newest(run)
+    after, damage = checkpoint_file.read_newest(run)
     assert damage == []
     assert after.state.step == 128
     if settings is SAC:

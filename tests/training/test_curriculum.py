@@ -8,15 +8,15 @@ from rich.console import Console
 
 from rlctl import load_policy
 from rlctl.errors import RecipeError, UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import run_evaluation
-from rlctl.evaluation.request import EvalRequest
 from rlctl.launching.train import run_training
 from rlctl.play.episode import load_episode
 from rlctl.play.workers import available_cores
 from rlctl.policy.file import PolicyFile
 from rlctl.replaying.reproduce import verify_episode
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training import checkpoint
+from rlctl.training import checkpoint_file
 from rlctl.training.display import LiveDisplay
 from tests.training.comparing import replay_buffer
 from tests.training.conftest import ENVS, SMALL, SMALL_PPO
@@ -37,7 +37,7 @@ def column(path, name, kind=int):
 
 
 def saved(run):
-    return checkpoint.read_newest(run)[0]
+    return checkpoint_file.read_newest(run)[0]
 
 
 @pytest.fixture(scope="module")

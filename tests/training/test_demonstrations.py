@@ -10,8 +10,8 @@ import pytest
 import rlctl
 from rlctl.environments.dict_spaces import take_row
 from rlctl.errors import ArtifactError, UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import run_evaluation
-from rlctl.evaluation.request import EvalRequest
 from rlctl.launching.seeds import train_seeds
 from rlctl.play.episode import load_episode
 from rlctl.policy.file import PolicyFile

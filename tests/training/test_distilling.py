@@ -12,7 +12,7 @@ from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError
 from rlctl.exporting.export import export_policy
-from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.export_request import ExportRequest
 from rlctl.launching import distill as distilling
 from rlctl.launching.distill import distill, make_settings
 from rlctl.launching.distill_request import DistillRequest

@@ -5,7 +5,7 @@ import pytest
 from rlctl.errors import TaskError, UsageError
 from rlctl.play.episode import load_episode
 from rlctl.replaying.replay import run_replay
-from rlctl.replaying.request import ReplayRequest
+from rlctl.replaying.replay_request import ReplayRequest
 from tests.training.conftest import FAULTY, FAULTY_SEED, TINY
 
 pytestmark = pytest.mark.usefixtures("every_boundary", "no_child_left")

@@ -6,7 +6,7 @@ from rlctl.errors import ArtifactError, TaskError, UsageError
 from rlctl.play.episode import load_episode
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.replaying.replay import run_replay
-from rlctl.replaying.request import ReplayRequest
+from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.runs import lookup
 from tests.training.comparing import Killed, rows
 from tests.training.conftest import FAULTY, TINY

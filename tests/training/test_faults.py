@@ -9,7 +9,7 @@ import pytest
 
 from rlctl.errors import TaskError
 from rlctl.play import workers
-from rlctl.training import checkpoint, checkpoints
+from rlctl.training import checkpoint_file, checkpoints
 from tests.training import faulty_envs
 from tests.training.comparing import assert_same_run
 from tests.training.conftest import FAULTY as ENVS
@@ -132,7 +132,7 @@ def test_one_kind_of_bad_behaviour_alone(train, whole, misbehaviour):
 
 
 def assert_same_weights(one, other):
-    (ours, _), (theirs, _) = checkpoint.read_newest(one), checkpoint.read_newest(other)
+    (ours, _), (theirs, _) = checkpoint_file.read_newest(one), checkpoint_file.read_newest(other)
     different = [name for name, values in ours.tensors.items() if values.tobytes() != theirs.tensors[name].tobytes()]
     assert different == []
 

@@ -15,7 +15,7 @@ from rlctl.play.workers import Workers
 from rlctl.recipe import recipe as recipes
 from rlctl.recipe import sources
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training import checkpoint
+from rlctl.training import checkpoint_file
 from rlctl.training.algorithms import build_model
 from rlctl.training.learner import begin_next_episodes
 from rlctl.training.off_policy import OffPolicyRollouts, replay_arguments
@@ -187,7 +187,7 @@ def goals(max_steps=None) -> EnvInfo:
 def test_a_task_that_computes_rewards(tmp_path):
     settings = {**SMALL_HER, "n_envs": 2, "total_timesteps": 110, "algo_kwargs": {"batch_size": 16}, "task": {}}
     run = run_training(TrainRequest(f"{tasks.__file__}:Place", settings=settings, root=tmp_path, check=False)).run
-    found, _ = checkpoint.read_newest(run)
+    found, _ = checkpoint_file.read_newest(run)
     assert found.state.model["counters"]["_n_updates"] == 5 * 2  # after 102, 104, ..., 110 steps
     assert load_policy(run.best_policy).info.env.has_compute_reward
 

@@ -3,8 +3,8 @@
 import pytest
 
 from rlctl.environments.spec import EnvChanges
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import run_evaluation
-from rlctl.evaluation.request import EvalRequest
 from rlctl.launching.train import run_training
 from rlctl.runs.train_request import TrainRequest
 from tests.training.conftest import ENVS

@@ -9,7 +9,7 @@ from rlctl.errors import RecipeError, TaskError
 from rlctl.play.episode import load_episode
 from rlctl.play.messages import LevelRule
 from rlctl.runs.directory import RunDirectory
-from rlctl.training import checkpoint
+from rlctl.training import checkpoint_file
 
 pytest.importorskip("mujoco")
 
@@ -46,7 +46,7 @@ def test_what_is_mastered_gets_harder(train, task):
         rows = list(csv.DictReader(file))
     # After 16 steps three episodes have ended, after 32 steps six.
     assert [float(row["level"]) for row in rows] == [0.75, 0.8]
-    saved, _ = checkpoint.read_newest(run)
+    saved, _ = checkpoint_file.read_newest(run)
     assert saved.tensors["environments/level"].tolist() == [0.8] * 4
     (first, *_) = [load_episode(file) for file in sorted(run.episodes.glob("*.npz"))]
     assert first.info.spec.level == 1.0  # evaluations

@@ -9,7 +9,7 @@ import pytest
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RecipeError, TaskError, UsageError
 from rlctl.exporting.export import export_policy
-from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.export_request import ExportRequest
 from rlctl.play.messages import Play
 from rlctl.play.shared_arrays import CRITIC
 from rlctl.play.workers import Workers

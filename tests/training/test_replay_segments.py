@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from rlctl.storage import files
-from rlctl.training.checkpoint import ReplaySegments
+from rlctl.training.checkpoint_file import ReplaySegments
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 

@@ -12,7 +12,7 @@ from rlctl.play.workers import Workers
 from rlctl.policy.actor import Exploration
 from rlctl.runs.directory import RunDirectory
 from rlctl.training import display
-from rlctl.training.checkpoint import environment_tensors
+from rlctl.training.checkpoint_file import environment_tensors
 from rlctl.training.display import Display
 from rlctl.training.loop import _SEGMENT_MAY_TAKE_S
 from rlctl.training.rollouts import WorkerVecEnv

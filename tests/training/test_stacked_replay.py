@@ -12,7 +12,7 @@ from rlctl.recipe.recipe import merge
 from rlctl.task.history import TermHistory
 from rlctl.task.layout import Layout
 from rlctl.training import algorithms
-from rlctl.training.checkpoint import ReplaySegments
+from rlctl.training.checkpoint_file import ReplaySegments
 from rlctl.training.stacked_replay import StackedRows, Stacking, store_once
 from tests.training.envs import Image, Line
 

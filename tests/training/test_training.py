@@ -18,7 +18,7 @@ from rlctl.recipe import sources
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.summary import summarize
 from rlctl.runs.train_request import TrainRequest
-from rlctl.training import checkpoint
+from rlctl.training import checkpoint_file
 from tests import fork_server
 from tests.training.conftest import ENVS, SMALL, SMALL_PPO
 
@@ -141,12 +141,12 @@ def test_every_algorithm_trains_resumes_and_loads(train, resume, algo, env):
 
 def test_resume_goes_on_with_weights_optimiser_normalisation_and_counters(train, resume, small_ppo):
     first = train("Line", small_ppo)
-    before, _ = checkpoint.read_newest(first.run)
+    before, _ = checkpoint_file.read_newest(first.run)
     count = float(before.tensors["normalize//count"])
     # VecNormalize starts at 1e-4 and counts every observation once, resets included: 256 + 4.
     assert count == pytest.approx(260, abs=0.01)
     resume(first, total_timesteps=320)
-    after, _ = checkpoint.read_newest(first.run)
+    after, _ = checkpoint_file.read_newest(first.run)
     counters = after.state.model["counters"]
     assert counters["num_timesteps"] == after.state.step == 320
     assert counters["_n_updates"] == 2 * 5  # epochs x rollouts

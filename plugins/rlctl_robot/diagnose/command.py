@@ -5,7 +5,7 @@ from typing import Annotated
 
 from rlctl.arguments import choose_checkpoint, command
 from rlctl.options import Argument, Json, Sim
-from rlctl_robot.diagnose.request import DiagnoseRequest
+from rlctl_robot.diagnose.diagnose_request import DiagnoseRequest
 
 
 @command

@@ -4,7 +4,7 @@ import dataclasses
 
 from rlctl.arguments import choose_checkpoint, command_in_panels
 from rlctl.options import Json, Pretrained
-from rlctl_robot.play.request import PlayRequest
+from rlctl_robot.play.play_request import PlayRequest
 
 
 @command_in_panels(

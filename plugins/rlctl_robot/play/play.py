@@ -20,13 +20,13 @@ from rlctl.errors import UsageError, explain_missing_package
 from rlctl.play.seeds import Stream, episode_seed
 from rlctl.replaying.drawable import make_drawable
 from rlctl.replaying.recorder import DEFAULT_DT, Choose, LogEntry, Rollout, find_dt, make_reader, play_episode
+from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.reproduce import print_warning
-from rlctl.replaying.request import ReplayRequest
 from rlctl.replaying.scene import Env
 from rlctl.replaying.sources import PolicySource
 from rlctl_robot.play.controls import Controls, PageMessage
 from rlctl_robot.play.drawing import describe_shapes, list_poses
-from rlctl_robot.play.request import PlayRequest
+from rlctl_robot.play.play_request import PlayRequest
 from rlctl_robot.play.robot_world import RobotWorld
 
 if TYPE_CHECKING:

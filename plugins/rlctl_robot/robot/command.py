@@ -1,9 +1,9 @@
 """`rlctl robot`."""
 
 from rlctl.arguments import command_in_panels, parse_changes
-from rlctl.evaluation.request import Gates, MinReturn, MinSuccess, MinSuccessLower
+from rlctl.evaluation.eval_request import Gates, MinReturn, MinSuccess, MinSuccessLower
 from rlctl.options import Json, Pretrained, Settings, Sim
-from rlctl_robot.robot.request import RobotRequest
+from rlctl_robot.robot.robot_request import RobotRequest
 
 
 @command_in_panels(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl_robot.robot.packets import Kind
 from rlctl_robot.robot.program import ControlProgram, UdpController
-from rlctl_robot.robot.request import RobotRequest
+from rlctl_robot.robot.robot_request import RobotRequest
 
 if TYPE_CHECKING:
     from rlctl_robot.robot.websocket import Door

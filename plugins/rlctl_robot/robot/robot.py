@@ -17,8 +17,8 @@ from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError, explain_missing_package
 from rlctl.evaluation.episode_statistics import summarize
+from rlctl.evaluation.eval_request import Gates
 from rlctl.evaluation.players import resolve_task
-from rlctl.evaluation.request import Gates
 from rlctl.evaluation.robustness import Outcome
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.seeds import Stream, episode_seeds
@@ -34,7 +34,7 @@ from rlctl_robot.robot.faults import Faults, parse_faults, set_stuck_joints
 from rlctl_robot.robot.interface import ControllerInterface, Interface, PolicyInterface
 from rlctl_robot.robot.listener import wait_for_controller
 from rlctl_robot.robot.player import RobotPlayer
-from rlctl_robot.robot.request import RobotRequest
+from rlctl_robot.robot.robot_request import RobotRequest
 from rlctl_robot.serve.access import find_key
 
 if TYPE_CHECKING:

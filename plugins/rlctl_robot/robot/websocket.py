@@ -10,9 +10,9 @@ from aiohttp import web
 from rlctl.errors import short_repr
 from rlctl.play import remote_messages as messages
 from rlctl_robot.robot.program import ControlProgram, SentObservation
-from rlctl_robot.robot.request import RobotRequest
+from rlctl_robot.robot.robot_request import RobotRequest
 from rlctl_robot.serve.access import find_problem, is_websocket
-from rlctl_robot.serve.request import LOOPBACK
+from rlctl_robot.serve.serve_request import LOOPBACK
 
 _LARGEST_COMMAND = 2**20  # [bytes]
 _MOST_WAITING = 64

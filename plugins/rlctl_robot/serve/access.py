@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.options import KEY_VARIABLE
 from rlctl.storage import untrusted
-from rlctl_robot.serve.request import LOOPBACK
+from rlctl_robot.serve.serve_request import LOOPBACK
 
 if TYPE_CHECKING:
     from aiohttp import web

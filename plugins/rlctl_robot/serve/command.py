@@ -5,7 +5,7 @@ from typing import Annotated
 
 from rlctl.arguments import choose_checkpoint, command, parse_changes
 from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName, Sim
-from rlctl_robot.serve.request import ServeRequest
+from rlctl_robot.serve.serve_request import ServeRequest
 
 
 @command
@@ -36,7 +36,7 @@ def serve(
     if self_test:
         # First: it explains a missing package, which the self-test imports.
         server = make_server(policy.file, dataclasses.replace(request, port=0, watchdog=False))
-        from rlctl.evaluation.request import EvalRequest
+        from rlctl.evaluation.eval_request import EvalRequest
         from rlctl_robot.serve import self_test as test
 
         result = test.run_self_test(

@@ -16,7 +16,7 @@ from aiohttp import web
 from rlctl.errors import RlctlError, UsageError, did_you_mean
 from rlctl.play import remote_messages as messages
 from rlctl_robot.serve.access import find_problem, is_websocket
-from rlctl_robot.serve.request import LOOPBACK
+from rlctl_robot.serve.serve_request import LOOPBACK
 from rlctl_robot.serve.server import PolicyServer
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]

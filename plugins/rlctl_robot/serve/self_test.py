@@ -12,8 +12,8 @@ import numpy as np
 from rlctl import output
 from rlctl.errors import AnswerIsNo
 from rlctl.evaluation import report
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import Evaluation, run_evaluation
-from rlctl.evaluation.request import EvalRequest
 from rlctl.play.workers import available_cores
 from rlctl_robot.serve.serve import make_loop, serve_until
 from rlctl_robot.serve.server import PolicyServer

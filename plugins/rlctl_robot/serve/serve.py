@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from rlctl.errors import RlctlError, UsageError, explain_missing_package
 from rlctl.limits.limits import NO_LIMITS, read_limits
-from rlctl_robot.serve.request import ServeRequest
+from rlctl_robot.serve.serve_request import ServeRequest
 from rlctl_robot.serve.session import load_served_policy
 
 if TYPE_CHECKING:

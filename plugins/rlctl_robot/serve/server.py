@@ -21,7 +21,7 @@ from rlctl.limits.observation import ObservationReader
 from rlctl.play import remote_messages as messages
 from rlctl.version import __version__
 from rlctl_robot.serve.records import EventLog, Measurements, RerunLog
-from rlctl_robot.serve.request import ServeRequest
+from rlctl_robot.serve.serve_request import ServeRequest
 from rlctl_robot.serve.session import ServedPolicy, Session, load_served_policy
 
 _HEARTBEAT_S = 30.0

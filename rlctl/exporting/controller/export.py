@@ -38,7 +38,7 @@ from rlctl.exporting.export import (
     explain_unverifiable,
     find_source,
 )
-from rlctl.exporting.request import ExportRequest
+from rlctl.exporting.export_request import ExportRequest
 from rlctl.exporting.verify import Latency, change_last_bits, measure_sb3
 from rlctl.limits.doubts import list_doubts
 from rlctl.limits.limits import Limits, read_limits

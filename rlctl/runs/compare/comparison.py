@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import Evaluation, run_evaluation
-from rlctl.evaluation.request import EvalRequest
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference, find_mixed
 from rlctl.runs.compare.margin import check_margin

@@ -6,8 +6,8 @@ from typing import Any
 
 from rlctl import output
 from rlctl.errors import UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.players import find_player
-from rlctl.evaluation.request import EvalRequest
 from rlctl.evaluation.robustness import Axis, Cell, Robustness
 from rlctl.evaluation.vary import measure_robustness
 from rlctl.runs.listing import find_runs_of

@@ -6,7 +6,7 @@ from rich.text import Text
 
 from rlctl import output
 from rlctl.evaluation.episode_statistics import Spread
-from rlctl.evaluation.request import judge
+from rlctl.evaluation.eval_request import judge
 from rlctl.recipe.stages import format_value
 from rlctl.runs.compare import significance
 from rlctl.runs.compare.comparison import Candidate, EvaluatedRun, RunComparison, Side

@@ -9,7 +9,7 @@ import jinja2
 
 from rlctl import output
 from rlctl.errors import RlctlError
-from rlctl.evaluation.request import EvalRequest
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.runs.compare.comparison import compare_runs
 from rlctl.runs.compare.report import describe_candidate, describe_seeds, describe_tests
 from rlctl.runs.report import content

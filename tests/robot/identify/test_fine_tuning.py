@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rlctl.environments.spec import EnvChanges, EnvSpec
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import measure_score
-from rlctl.evaluation.request import EvalRequest
 from rlctl.launching.train import run_training
 from rlctl.runs.train_request import TrainRequest
 from rlctl_robot.identify.excite import write_excitation

@@ -9,7 +9,7 @@ import time
 import aiohttp
 
 from rlctl.replaying.drawable import make_drawable
-from rlctl.replaying.request import ReplayRequest
+from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.sources import PolicySource
 from rlctl_robot.play.controls import Controls
 from rlctl_robot.play.page_server import PageServer

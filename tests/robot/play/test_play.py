@@ -13,7 +13,7 @@ from rlctl.engine import MUJOCO
 from rlctl.errors import TaskError, UsageError
 from rlctl.play.episode import load_episode
 from rlctl.replaying.drawable import make_drawable
-from rlctl.replaying.request import ReplayRequest
+from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.sources import PolicySource, load_located
 from rlctl_robot.play.controls import Controls
 from rlctl_robot.play.page_server import PageServer

@@ -12,13 +12,13 @@ import pytest
 from rlctl.environments.info import describe
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, EpisodeFailed, UsageError
-from rlctl.evaluation.request import NO_GATES, Gates
+from rlctl.evaluation.eval_request import NO_GATES, Gates
 from rlctl.limits.limits import Limits
 from rlctl_robot.robot import packets
 from rlctl_robot.robot.packets import Kind, Packet
 from rlctl_robot.robot.report import as_json
-from rlctl_robot.robot.request import RobotRequest
 from rlctl_robot.robot.robot import run_robot
+from rlctl_robot.robot.robot_request import RobotRequest
 from rlctl_robot.serve.session import Session, load_served_policy
 from tests.exporting import controlled
 from tests.play.policies import linear

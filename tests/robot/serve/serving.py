@@ -14,8 +14,8 @@ from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.play.remote import PolicyClient
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl_robot.serve.request import ServeRequest
 from rlctl_robot.serve.serve import make_loop, make_server, serve_until
+from rlctl_robot.serve.serve_request import ServeRequest
 from tests.play.policies import linear
 
 OBSERVATION = {"positions": [0.1, 0.2], "goal": [1.0, 2.0, 3.0]}

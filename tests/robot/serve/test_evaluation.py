@@ -13,9 +13,9 @@ from gymnasium import spaces
 
 from rlctl import output
 from rlctl.errors import PolicyError, RecipeError, UsageError
+from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.report import as_json, count_interventions, show
-from rlctl.evaluation.request import EvalRequest
 from rlctl.play import remote_messages as messages
 from rlctl.play.remote import PolicyClient, RemoteActor
 from rlctl.policy.actor import Rows
@@ -152,8 +152,8 @@ def serve_answer(metadata, answer):
 @pytest.mark.pybullet
 def test_self_test(tmp_path):
     from rlctl.runs.lookup import find_policy
-    from rlctl_robot.serve.request import ServeRequest
     from rlctl_robot.serve.serve import make_server
+    from rlctl_robot.serve.serve_request import ServeRequest
 
     server = make_server(find_policy("reach", PRETRAINED).file, ServeRequest(port=0, watchdog=False))
     result = run_self_test(server, EvalRequest("reach", checkpoint=PRETRAINED, episodes=2, n_envs=1))

@@ -11,8 +11,8 @@ import urllib.request
 import pytest
 
 from rlctl.errors import RlctlError
-from rlctl_robot.serve.request import ServeRequest
 from rlctl_robot.serve.serve import make_server
+from rlctl_robot.serve.serve_request import ServeRequest
 from tests.robot.serve.serving import write_policy
 
 
@@ -84,7 +84,7 @@ def test_starts_without_what_takes_long_to_import(tmp_path):
     file = write_policy(tmp_path / "policy.safetensors")
     code = (
         "import pathlib, sys\n"
-        "from rlctl_robot.serve.request import ServeRequest\n"
+        "from rlctl_robot.serve.serve_request import ServeRequest\n"
         "from rlctl_robot.serve.serve import make_server\n"
         "from rlctl_robot.serve.routes import Routes\n"
         "from rlctl_robot.serve.routes import Connections\n"

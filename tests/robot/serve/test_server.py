@@ -12,8 +12,8 @@ import pytest
 from rlctl.errors import ArtifactError, PolicyError, UsageError
 from rlctl.play.remote import PolicyClient
 from rlctl.policy.numpy_actor import NumpyActor
-from rlctl_robot.serve.request import ServeRequest
 from rlctl_robot.serve.serve import make_server
+from rlctl_robot.serve.serve_request import ServeRequest
 from tests.robot.serve.serving import (
     FLAT,
     OBSERVATION,

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from rlctl import output
-from rlctl.replaying.world import TIPPED, Contact, JointSummary, Motion, WorldSummary
+from rlctl.replaying.look import TIPPED, Contact, JointSummary, Motion, WorldSummary
 
 _SHOWN_CONTACTS = 16
 _DEEP = 1e-4  # [m]; smaller overlaps are those of any contact

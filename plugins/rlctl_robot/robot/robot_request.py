@@ -4,7 +4,7 @@ import dataclasses
 from typing import Annotated
 
 from rlctl.options import EpisodeSeed, Option, TaskName
-from rlctl_robot.serve.request import Host, KeyFile, Port
+from rlctl_robot.serve.serve_request import Host, KeyFile, Port
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,9 +13,9 @@ from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.driven_joints import joint_name
 from rlctl.environments.info import find_mujoco
 from rlctl.replaying.bullet_bodies import BulletBody, name_bodies, read_bodies, read_body, read_pose, read_state
+from rlctl.replaying.look import BodySummary, JointSummary, Pose, Touch, WorldReader
 from rlctl.replaying.mujoco_scene import find_trunk_joint
 from rlctl.replaying.scene import Env
-from rlctl.replaying.world import BodySummary, JointSummary, Pose, Touch, WorldReader
 from rlctl.task.body import Body
 from rlctl.task.env import TaskEnv
 from rlctl.task.joints import WIDEST_RANGE
