@@ -54,6 +54,7 @@ def test_its_controller_is_verified_in_mujoco(rlctl_without, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_pybullet_that_was_asked_for_is_an_error_that_says_how_to_install_it(rlctl_without):
     done = rlctl_without("eval", "reach", "--pretrained", "--set", "sim=pybullet")
     assert done.returncode == 2

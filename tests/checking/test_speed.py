@@ -47,10 +47,11 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "task",
     [
-        pytest.param("reach", marks=pytest.mark.slow),
+        "reach",
         "CartPole-v1",
         "broken_envs.py:Clean",
         "broken_speed.py:Sees",

@@ -23,6 +23,7 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "rule", "message"),
     [

@@ -226,6 +226,7 @@ def test_a_closed_stdout_ends_quietly(rlctl, arguments):
     assert (result.returncode, result.stderr) == (141, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("variable", "coloured"), [({}, True), ({"NO_COLOR": "1"}, False)])
 def test_colours_are_for_terminals_and_can_be_refused(install, tmp_path, variable, coloured):
     site = install("some-robots", {"absent": "some_robots.absent:Task"})  # a problem, shown in red

@@ -82,7 +82,8 @@ def test_a_policy_that_chatters_within_limits_of_acceleration(policy_of, tmp_pat
     assert report.closed_loop.agrees or not report.closed_loop.is_conclusive
 
 
-@pytest.mark.parametrize("name", ["onnx", pytest.param("c", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["onnx", "c"])
 def test_a_wrong_declaration_is_not_written(name, policy_of, tmp_path):
     path = policy_of(fault="last action")
     request = ExportRequest(str(path), (name,), controller=True, output=tmp_path / f"wrong.{name}")

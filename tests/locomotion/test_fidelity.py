@@ -34,9 +34,8 @@ def pair(request):
     theirs.close()
 
 
-@pytest.mark.parametrize(
-    ("seed", "steps"), [(0, FEWER), *(pytest.param(seed, STEPS, marks=pytest.mark.slow) for seed in range(3))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "steps"), [(0, FEWER), *((seed, STEPS) for seed in range(3))])
 def test_many_steps_and_the_episodes_in_them(pair, seed, steps):
     ours, theirs = pair
     actions = np.random.default_rng(seed).uniform(-1, 1, (steps, *ours.action_space.shape)).astype(np.float32)
@@ -51,7 +50,8 @@ def test_many_steps_and_the_episodes_in_them(pair, seed, steps):
             np.testing.assert_array_equal(ours.reset()[0], theirs.reset()[0])
 
 
-@pytest.mark.parametrize("robot", [Hopper, Walker2D, pytest.param(Humanoid, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", [Hopper, Walker2D, Humanoid])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_thousand_steps_without_a_new_start(robot, seed):
     """With random actions they fall in a second; what happens on the floor is long and full of contacts."""

@@ -200,6 +200,7 @@ def test_the_time_limit_is_a_parameter():
     assert Ant().max_steps == 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_an_episode_in_mujoco_stays_finite(robot):
     class Endless(robot):

@@ -38,6 +38,7 @@ def env():
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_block_can_be_lifted_and_held(env, seed):
     _, info = play(env, seed, steer)

@@ -126,7 +126,8 @@ def test_a_head_start_is_on_the_way_or_in_the_socket():
     env.close()
 
 
-@pytest.mark.parametrize("randomize", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("randomize", [False, True])
 def test_episodes_repeat_bit_for_bit(randomize):
     assert_episodes_repeat(ScrewDrive, drive, STEPS, randomize)
 

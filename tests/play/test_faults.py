@@ -115,9 +115,8 @@ PARENT = textwrap.dedent(
 )
 
 
-@pytest.mark.parametrize(
-    "first_seed", [pytest.param(5, id="stuck in a step", marks=pytest.mark.slow), pytest.param(100, id="at work")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("first_seed", [pytest.param(5, id="stuck in a step"), pytest.param(100, id="at work")])
 def test_workers_end_with_a_killed_parent(first_seed):
     command = [sys.executable, "-c", PARENT, f"{ENVS}:Walk", str(first_seed)]
     parent = subprocess.Popen(command, stdout=subprocess.PIPE)

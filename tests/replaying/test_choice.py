@@ -36,6 +36,7 @@ def test_without_success_the_return_counts():
         select(played, Choice("failures", 3))
 
 
+@pytest.mark.slow
 def test_they_are_episodes_of_the_evaluation_bit_for_bit(run, tmp_path, capsys):
     request = ReplayRequest(str(run.run.path), episodes=5, output=tmp_path, worst=2)
     result = run_replay(request)

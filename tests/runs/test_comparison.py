@@ -64,6 +64,7 @@ def test_all_play_in_the_world_of_the_first(root):
     assert result.world_differences == ["task.goal", "randomize"]
 
 
+@pytest.mark.slow
 def test_settings_change_that_world(root, rlctl):
     runs = map(str, sorted((root / "0.9/Line").iterdir()))
     result = rlctl("runs", "compare", *runs, "--set", "task.goal=0.3")

@@ -40,6 +40,7 @@ def push_into_the_plane(env, seed):
     return seen
 
 
+@pytest.mark.slow
 def test_reach_after_many_contacts():
     actions = np.random.default_rng(0).uniform(-1, 1, (TaskEnv(Reach()).max_steps, 7))
     # Half of the seeds run into the plane themselves.
@@ -65,11 +66,12 @@ def test_contacts_of_the_last_episode_are_gone():
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "task",
     [
         Cubes,  # exact by the parameter deterministicOverlappingPairs alone
-        pytest.param(PileAnew, marks=pytest.mark.slow),
+        pytest.param(PileAnew),
         # Why there is `fast_reset = False`. The day this passes, a fast reset does for every task.
         pytest.param(Pile, marks=pytest.mark.xfail(strict=True, reason="restored contacts come in another order")),
     ],

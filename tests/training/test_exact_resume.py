@@ -145,6 +145,7 @@ def kill_and_resume(train, resume, kill_after, case, device):
     assert_same_run(whole, run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "steps"), [("ppo", 37), ("ppo, blocks", 37), ("tqc, blocks", 13)])
 @pytest.mark.usefixtures("every_boundary")
 def test_on_one_core_and_resumed_on_all(train, resume, kill_after, use_cores, case, steps):
