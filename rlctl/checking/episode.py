@@ -87,8 +87,10 @@ class EpisodePlayer:
         terminated, truncated = moment.flags
         if not moment.is_readable:
             self.ended = "raised"
+        elif terminated and truncated:
+            self.ended = "both"
         elif terminated or truncated:
-            self.ended = "both" if terminated and truncated else "terminated" if terminated else "truncated"
+            self.ended = "terminated" if terminated else "truncated"
         elif self.steps >= self.max_steps:
             self.ended = "steps"
         elif self._is_late():

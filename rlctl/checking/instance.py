@@ -220,7 +220,9 @@ class Budget:
         """Return which resource is used up; empty if none is."""
         if self.failures >= MOST_FAILURES:
             return f"{self.failures} of them raised"
-        return "memory was used up" if self.bytes_left <= 0 else "time ran out" if self.is_over() else ""
+        if self.bytes_left <= 0:
+            return "memory was used up"
+        return "time ran out" if self.is_over() else ""
 
 
 class Instance:

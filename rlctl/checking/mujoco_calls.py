@@ -92,7 +92,9 @@ def _join(calls: MujocoCalls, name: str, function: Any) -> Any:
 
     if name == FORCES:
         return compute
-    return step if name in STEPS else find if name == "mj_name2id" else forward
+    if name in STEPS:
+        return step
+    return find if name == "mj_name2id" else forward
 
 
 def _read_arguments(arguments: tuple[Any, ...], keywords: dict[str, Any]) -> tuple[Any, Any]:

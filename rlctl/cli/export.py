@@ -57,7 +57,9 @@ def export(
     if policy is not None and sim is not None:
         raise UsageError("--policy FILE contains the score in the engine of the training: leave out --sim")
     both = onnx == c if controller else onnx and c
-    formats: tuple[Format, ...] = ("onnx", "c") if both else ("c",) if c else ("onnx",)
+    formats: tuple[Format, ...] = ("c",) if c else ("onnx",)
+    if both:
+        formats = ("onnx", "c")
     request = ExportRequest(
         run, formats, checkpoint, output, policy, episodes, dataset, controller, limits, sim, mapping
     )

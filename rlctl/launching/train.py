@@ -57,7 +57,9 @@ def run_training(request: TrainRequest, find: Callable[[TrainRequest], Start] = 
             return _report_finished(start, start.run, start.checkpoint.state.progress)
         engine = start.recipe.env_specs(start.task, named_by=RUN if start.run else "")[-1].engine
         how = ", ".join(filter(None, [start.recipe.algo, engine]))
-        verb = "resume" if start.run is not None else "train" if start.teacher is None else "distill"
+        verb = "train" if start.teacher is None else "distill"
+        if start.run is not None:
+            verb = "resume"
         title = f"{verb} {start.task} ({how})"
         display = make_display(title, start.recipe.total_timesteps)
         observers = [WarnOfFindings(), SendToTracker()]

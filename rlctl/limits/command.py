@@ -130,7 +130,8 @@ class Command:
         present = self._present(None)
         home = self._home if go_home else None
         if self._bounds.is_value:
-            return self._move(self._safe if not self._is_position else present if home is None else home)
+            goal = present if home is None else home
+            return self._move(goal if self._is_position else self._safe)
         return self._move(self._zeros if home is None or self.position is None else home - self.position)
 
     def stand_still(self) -> NDArray[Any]:
@@ -181,7 +182,9 @@ class Command:
         action = self._as_action(command)
         if self._space.dtype.kind != "f" and not self._keeps_limits(action):
             # The nearest whole action may be beyond a limit; the next one towards the present command is not.
-            present = self._zeros if not bounds.is_value else self._safe if reference is None else reference
+            present = self._safe if reference is None else reference
+            if not bounds.is_value:
+                present = self._zeros
             action = self._as_action(command, np.where(command > present, -1, 1))
         if self._steps is not None:
             is_safe = bounds.keeps_limits(command, before, reference)

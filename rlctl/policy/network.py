@@ -35,7 +35,9 @@ class Network:
     def __init__(self, policy: PolicyFile) -> None:
         info = policy.info
         algo, read = info.algo, _Reader(policy)
-        owner = "actor." if algo in ACTOR_CRITIC else "q_net." if algo == "dqn" else "pi_"
+        owner = "q_net." if algo == "dqn" else "pi_"
+        if algo in ACTOR_CRITIC:
+            owner = "actor."
         extractor = f"{owner}features_extractor"
         self.own = read.own_graph()
         """A user's own network. It replaces `parts`, and without an LSTM also `trunk`; None for SB3's networks."""

@@ -56,8 +56,9 @@ def pin_threads() -> None:
 
 def policy_name(algo: str, observation_space: spaces.Space[Any]) -> str:
     """Return SB3's name of the policy for an observation space."""
-    is_dict = isinstance(observation_space, spaces.Dict)
-    kind = "MultiInput" if is_dict else "Cnn" if is_image_space(observation_space) else "Mlp"
+    kind = "Cnn" if is_image_space(observation_space) else "Mlp"
+    if isinstance(observation_space, spaces.Dict):
+        kind = "MultiInput"
     return f"{kind}{'Lstm' if algo == 'recurrent_ppo' else ''}Policy"
 
 

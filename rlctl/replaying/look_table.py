@@ -55,7 +55,8 @@ def _format_contact(contact: Contact) -> list[str]:
 
 def _format_joint(joint: JointSummary) -> list[str]:
     limits = [_format_limit(limit) for limit in (joint.low, joint.high)]
-    force = "" if joint.max_force is None else f"{joint.max_force:.4g} {'N m' if joint.unit == 'rad' else 'N'}"
+    unit = "N m" if joint.unit == "rad" else "N"
+    force = "" if joint.max_force is None else f"{joint.max_force:.4g} {unit}"
     speed = "" if joint.max_speed is None else f"{joint.max_speed:.4g} {joint.unit}/s"
     return [*limits, joint.unit, f"{joint.start:.3f}", force, speed]
 

@@ -86,7 +86,9 @@ def show(result: ReplayResult, json: str | None) -> None:
 
 def _format_episode(episode: ReplayedEpisode) -> str:
     file = f"{episode.recording}: " if episode.recording else ""
-    success = "" if episode.success is None else ", success" if episode.success else ", no success"
+    success = ""
+    if episode.success is not None:
+        success = ", success" if episode.success else ", no success"
     return f"{file}seed {episode.seed}, {episode.length} steps, return {episode.total_reward:.4g}{success}"
 
 

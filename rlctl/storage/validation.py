@@ -211,12 +211,12 @@ def _describe(root: Schema, node: Schema) -> str:
 def _describe_range(node: Schema) -> str:
     low, above = node.get("minimum", node.get("ge")), node.get("exclusiveMinimum", node.get("gt"))
     high, below = node.get("maximum", node.get("le")), node.get("exclusiveMaximum", node.get("lt"))
-    left = f"[{_format_number(low)}" if low is not None else f"({_format_number(above)}" if above is not None else ""
-    right = f"{_format_number(high)}]" if high is not None else f"{_format_number(below)})" if below is not None else ""
-    if left and right:
-        return f" in {left}, {right}"
-    if left:
-        return f" {'>=' if low is not None else '>'} {left[1:]}"
+    opening, least = ("(", above) if low is None else ("[", low)
+    closing, most = (")", below) if high is None else ("]", high)
+    if least is not None and most is not None:
+        return f" in {opening}{_format_number(least)}, {_format_number(most)}{closing}"
+    if least is not None:
+        return f" {'>=' if low is not None else '>'} {_format_number(least)}"
     return ""
 
 

@@ -148,7 +148,9 @@ def _format_event(event: Json) -> Row:
     if "every_s" in parameters:
         when = f"every {_format_value(parameters.pop('every_s'))} s"
     arguments = ", ".join(f"{name} {_format_range(value)}" for name, value in parameters.items())
-    acts = "always" if event["enabled"] else "with this recipe" if event["acts"] else "with randomize=true"
+    acts = "with this recipe" if event["acts"] else "with randomize=true"
+    if event["enabled"]:
+        acts = "always"
     return event["name"], when, event["function"], arguments, acts
 
 

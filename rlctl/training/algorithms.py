@@ -142,7 +142,9 @@ def keep_compiler_out() -> None:
 
 def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """Raise `RecipeError` for spaces that SB3 refuses with an unclear message, or only during training."""
-    needed = spaces.Discrete if algo == "dqn" else spaces.Box if algo in _CONTINUOUS else spaces.Space
+    needed: type[spaces.Space[Any]] = spaces.Box if algo in _CONTINUOUS else spaces.Space
+    if algo == "dqn":
+        needed = spaces.Discrete
     if not isinstance(action_space, needed):
         others = {spaces.Box: "ppo or sac", spaces.Discrete: "ppo or dqn"}.get(type(action_space), "ppo")
         kind, actions = needed.__name__, short_repr(action_space)

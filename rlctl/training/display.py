@@ -36,7 +36,9 @@ def sparkline(values: list[float], low: float | None = None, high: float | None 
 
 def percent(rate: float | None) -> str:
     """Return a rate as text: `98.5%`, `-` for none."""
-    return "-" if rate is None else f"{rate:.0%}" if rate in (0, 1) else f"{rate:.1%}"
+    if rate is None:
+        return "-"
+    return f"{rate:.0%}" if rate in (0, 1) else f"{rate:.1%}"
 
 
 def duration(seconds: float) -> str:

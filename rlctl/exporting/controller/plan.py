@@ -149,10 +149,11 @@ class ControllerPlan:
     def _list_quantities(self) -> list[Quantity]:
         env, sizes = self.env, dict[str, int]()
         for part in self.observed:
-            term = part.term
-            names = [part.name] if term is None else [] if term.internal else term.inputs
-            for name in names:
-                size = part.size if term is None else env.quantity_sizes[name]
+            measured = {part.name: part.size}
+            if part.term is not None:
+                names = () if part.term.internal else part.term.inputs
+                measured = {name: env.quantity_sizes[name] for name in names}
+            for name, size in measured.items():
                 if sizes.setdefault(name, size) != size:
                     raise UsageError(f"--controller: two quantities are named {name!r}, of different sizes")
         quaternions = {part.term.orientation for part in self.observed if isinstance(part.term, Gravity)}
@@ -236,9 +237,9 @@ class ControllerPlan:
                 raise RecipeError(f"limits: scale and offset differ from the task's {factor.tolist()}; leave them out")
         source = self.find_quantity(joints.measured) if kind == "step" else None
         measured, name = (0, "") if source is None else (source.start, source.identifier)
-        clips: Clips = (
-            "" if not joints.clips_target else "towards" if fitted is not None and kind == "step" else "exact"
-        )
+        clips: Clips = ""
+        if joints.clips_target:
+            clips = "towards" if fitted is not None and kind == "step" else "exact"
         low, high = (np.array(ends or [0.0] * count) for ends in (joints.low, joints.high))
         return JointTarget(kind, factor, default, measured, name, clips, low, high, tracks=steps is not None)
 

@@ -212,17 +212,11 @@ def compare_runs(
         check_margin(margin, request.episodes, of_success=first.evaluation.success_rate is not None)
     # All play in the same environment: an easier tolerance does not make a policy better.
     request = dataclasses.replace(request, spec=first.evaluation.spec)
-    sides = [
-        Side(
-            name=name,
-            runs=[
-                first if run is groups[0][0] else _evaluate(run, request, threshold, first.evaluation if twin else None)
-                for run in group
-            ],
-            mixed=find_mixed(own),
-        )
-        for name, group, own, twin in zip(names, groups, recipes, same, strict=True)
-    ]
+    sides = []
+    for name, group, own, twin in zip(names, groups, recipes, same, strict=True):
+        known = first.evaluation if twin else None
+        evaluated = [first if run is groups[0][0] else _evaluate(run, request, threshold, known) for run in group]
+        sides.append(Side(name=name, runs=evaluated, mixed=find_mixed(own)))
     baseline, *others = sides
     return RunComparison(
         of_recipes=of_recipes,

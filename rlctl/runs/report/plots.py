@@ -123,9 +123,9 @@ def _draw_learning(axes: Axes, report: RunReport, column: str, *, for_paper: boo
         if training is not None and not alone:
             _draw_smoothed(axes, training, name or "training", color)
         if evaluated is not None:
-            line = {"linestyle": "-" if alone else "none", **color} if recipe.name else {}
-            label = "evaluations" if not name else name if alone else ""
-            _draw_curve(axes, evaluated, label, {"marker": "o", "ms": 3, **line})
+            label, style = (name, "-") if alone else ("", "none")
+            line = {"linestyle": style, **color} if recipe.name else {}
+            _draw_curve(axes, evaluated, label if name else "evaluations", {"marker": "o", "ms": 3, **line})
     if column == "success":
         _scale_rates(axes)
     axes.legend(loc="best", **_LEGEND) if axes.lines else None
