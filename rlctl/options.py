@@ -49,7 +49,7 @@ Pretrained = Annotated[bool, Option("The policy that ships with the task.", ("--
 Settings = Annotated[
     list[str], Option("Set a key, e.g. task.tolerance=0.02, randomize=true.", ("--set",), metavar="KEY=VALUE")
 ]
-Sim = Annotated[
+SimOption = Annotated[
     Engine | None,
     Option(
         "Physics engine of a task; default: that of the policy or recipe, else PyBullet if it is installed.",

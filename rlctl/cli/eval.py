@@ -13,7 +13,7 @@ from typer.core import TyperCommand
 from rlctl.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.eval_request import EvalOptions, EvalRequest, Gates, MinReturn, MinSuccess, MinSuccessLower
-from rlctl.options import Cluster, Json, Junit, On, Option, PictureFile, Pretrained, Settings, Sim, Yes
+from rlctl.options import Cluster, Json, Junit, On, Option, PictureFile, Pretrained, Settings, SimOption, Yes
 from rlctl.replaying.replay_request import ReplayRequest
 
 
@@ -43,7 +43,7 @@ def evaluate(
         ),
     ] = [],
     push: Annotated[bool, Option("Find the smallest push at which the policy fails.", ("--push",))] = False,
-    sim: Sim = None,
+    sim: SimOption = None,
     yes: Yes = False,
     on: On = None,
     cluster: Cluster = None,

@@ -6,7 +6,7 @@ from typing import Annotated
 from rlctl.arguments import choose_checkpoint, command
 from rlctl.errors import UsageError
 from rlctl.exporting.export_request import DatasetFormat, ExportRequest, Format
-from rlctl.options import Argument, Checkpoint, Json, Option, Pretrained, RunName, Sim
+from rlctl.options import Argument, Checkpoint, Json, Option, Pretrained, RunName, SimOption
 
 
 @command
@@ -41,7 +41,7 @@ def export(
     episodes: Annotated[int, Option("Episodes of the dataset.", min=1)] = 100,
     checkpoint: Checkpoint = "best",
     pretrained: Pretrained = False,
-    sim: Sim = None,
+    sim: SimOption = None,
     output: Annotated[
         Path | None,
         Option(

@@ -7,7 +7,7 @@ import typer
 
 from rlctl.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.evaluation.eval_request import MinReturn, MinSuccess, MinSuccessLower
-from rlctl.options import Checkpoint, EpisodeSeed, Json, Junit, Option, Pretrained, RunName, Settings, Sim
+from rlctl.options import Checkpoint, EpisodeSeed, Json, Junit, Option, Pretrained, RunName, Settings, SimOption
 
 
 @command_in_panels(
@@ -27,7 +27,7 @@ def gate(
     episodes: Annotated[int, Option("Episodes, each with its own seed.", min=2, max=1_000_000)] = 100,
     seed: EpisodeSeed = 0,
     settings: Settings = [],
-    sim: Sim = None,
+    sim: SimOption = None,
     strict: Annotated[bool, Option("Warnings of the check fail too.", ("--strict",))] = False,
     budget: Annotated[float, Option("Computing time of the check in seconds.", min=1)] = 18.0,
     min_success: MinSuccess = None,

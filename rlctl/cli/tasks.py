@@ -10,7 +10,7 @@ from typer.core import TyperCommand
 
 from rlctl.arguments import command, command_in_panels, parse_changes
 from rlctl.errors import UsageError
-from rlctl.options import Argument, Config, EnvTimeout, Json, Option, OptionalTask, Settings, Sim, TaskName
+from rlctl.options import Argument, Config, EnvTimeout, Json, Option, OptionalTask, Settings, SimOption, TaskName
 
 ReportFormat = enum.StrEnum("ReportFormat", ["text", "json", "sarif", "junit", "github"])
 
@@ -46,7 +46,7 @@ def _fill_targets(arguments: Iterable[str]) -> Iterator[str]:
 def check_env(
     task: OptionalTask = None,
     settings: Settings = [],
-    sim: Sim = None,
+    sim: SimOption = None,
     select: Annotated[list[str], Option("Check only these rules: RL3,RL501.", metavar="RULES")] = [],
     ignore: Annotated[list[str], Option("Skip these rules: RL106.", metavar="RULES")] = [],
     strict: Annotated[

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from rlctl.arguments import choose_checkpoint, command_in_panels
 from rlctl.errors import UsageError
 from rlctl.launching.distill_request import DistillRequest
-from rlctl.options import Cluster, Jobs, Json, On, Option, Pretrained, Settings, Sim
+from rlctl.options import Cluster, Jobs, Json, On, Option, Pretrained, Settings, SimOption
 from rlctl.runs.train_request import TrainRequest
 from rlctl.tuning.tune_request import TuneRequest
 
@@ -24,7 +24,7 @@ class RecipeFlags:
         str | None, Option("Environment steps; 1e6 is fine.", ("--total-timesteps", "-n"), metavar="STEPS")
     ] = None
     n_envs: Annotated[int | None, Option("Environments stepped in parallel.", min=1)] = None
-    sim: Sim = None
+    sim: SimOption = None
     track: Annotated[str | None, Option("Also send the run to wandb, mlflow or trackio.", metavar="TRACKER")] = None
 
     def merge(self) -> dict[str, Any]:

@@ -178,8 +178,8 @@ def _export(source: FoundPolicy, targets: list[Path], sim: Engine | None) -> lis
     with contextlib.suppress(UsageError, TaskError):  # `_check_environment` says what does not build
         n_envs = count_envs(spec, EPISODES)
     with Workers(spec, n_envs) as workers:
-        from rlctl.exporting.actor import build
         from rlctl.exporting.c_source import write_c
+        from rlctl.exporting.onnx_source import build
         from rlctl.policy.torch_policy import TorchActor, pin_threads
 
         pin_threads()

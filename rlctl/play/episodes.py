@@ -226,7 +226,7 @@ class _Segment(Actor):
             self._row = row + 1
             if self._row == asked.steps:
                 running = self.index if self._seeds else np.setdiff1d(self.index, played.ended)
-                self._write_current(running)
+                self._keep_last(running)
                 break
             began = perf_counter()
         self._note_times()
@@ -234,7 +234,7 @@ class _Segment(Actor):
         # In the order of environments that play one after the other.
         return sorted(self._ended, key=lambda ended: ended.env)
 
-    def _write_current(self, index: Index) -> None:
+    def _keep_last(self, index: Index) -> None:
         for key, part in self._segment.observation.items():
             self._arrays.observation[key][self._first + index] = part[self._row, index]
 

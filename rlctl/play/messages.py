@@ -107,7 +107,7 @@ class LevelRule:
 
 @dataclasses.dataclass(frozen=True)
 class Play:
-    """Play a segment in some environments, one after the other."""
+    """Play a segment in some environments: the worlds of a `BatchTask` together, others one after the other."""
 
     steps: int  # at most so many steps in each environment
     begin: dict[int, int]  # per environment the seed of the episode to begin; negative: the running episode continues

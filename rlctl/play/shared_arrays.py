@@ -15,7 +15,7 @@ from rlctl.play.messages import EpisodeResult
 from rlctl.policy.file import PolicyFile
 from rlctl.processes.child_process import grow_anonymous_file
 
-Layout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]  # shape and dtype per name
+ArrayLayout = Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]  # shape and dtype per name
 
 CRITIC = "critic"
 """Key of what only the critic sees, beside the keys of the observation."""
@@ -24,7 +24,7 @@ _ROWS = ("stored", "action", "label", "reward", "terminated", "truncated", "term
 """The arrays of a segment that have a row for each step."""
 
 
-def observation_fields(space: spaces.Space[Any]) -> Layout:
+def observation_fields(space: spaces.Space[Any]) -> ArrayLayout:
     """Return shape and dtype per observation key; see `rlctl.environments.dict_spaces`."""
     return {key: _leaf(part) for key, part in split_space(space).items()}
 
@@ -35,7 +35,7 @@ def _leaf(space: spaces.Space[Any]) -> tuple[tuple[int, ...], np.dtype[Any]]:
     return space.shape, np.dtype(space.dtype)
 
 
-def map_arrays(descriptor: int, layout: Layout) -> dict[str, NDArray[Any]]:
+def map_arrays(descriptor: int, layout: ArrayLayout) -> dict[str, NDArray[Any]]:
     """Map named arrays to a file, which grows if needed; each array begins at its own cache line."""
     size = 0
     offsets = {}
@@ -63,7 +63,7 @@ class SharedArrays:
         if privileged:
             observation[CRITIC] = (privileged,), np.dtype(np.float32)
         stored = np.dtype(np.float32 if isinstance(action_space, spaces.Box) else np.int64)
-        of_segment: Layout = {
+        of_segment: ArrayLayout = {
             "stored": ((max(1, int(np.prod(action[0]))),), stored),
             "action": action,
             "label": action,

@@ -1,4 +1,4 @@
-"""Many environments on few processes: each worker plays several environments, one after the other.
+"""Many environments on few processes: each worker plays several environments.
 
 Observations, actions, rewards, flags and a policy's parameters are in shared memory; messages tell workers what to do,
 and answers list the episodes that ended. Workers are new interpreters, never forks, with one thread each.
@@ -31,7 +31,7 @@ BUILD_TIMEOUT_S = 300.0
 DEFAULT_TIMEOUT_S = 60.0
 _WORLDS = 64  # worlds of a `BatchTask` per core, that play whole episodes
 
-RecordedActions = tuple[int, NDArray[Any]]  # seed and actions so far of an episode
+EpisodeSoFar = tuple[int, NDArray[Any]]  # seed and actions so far of an episode
 
 
 class Workers(contextlib.AbstractContextManager["Workers"]):
@@ -186,10 +186,10 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
     def reset(self, seeds: Mapping[int, int]) -> None:
         """Begin an episode in some environments: environment index -> seed."""
         nothing = self.arrays.segment.action[0, :0]
-        self.replay_actions({env: (seed, nothing) for env, seed in seeds.items()}, doing="resetting")
+        self.begin_episodes({env: (seed, nothing) for env, seed in seeds.items()}, doing="resetting")
 
-    def replay_actions(
-        self, episodes: Mapping[int, RecordedActions], *, doing: str = "stepping", may_fail: bool = False
+    def begin_episodes(
+        self, episodes: Mapping[int, EpisodeSoFar], *, doing: str = "stepping", may_fail: bool = False
     ) -> set[int]:
         """Begin episodes, environment index -> (seed, actions so far), and replay their actions.
 

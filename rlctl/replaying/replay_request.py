@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
-from rlctl.options import Argument, Checkpoint, EpisodeSeed, Option, Settings, Sim
+from rlctl.options import Argument, Checkpoint, EpisodeSeed, Option, Settings, SimOption
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,7 @@ class ReplayRequest:
     settings: Settings = dataclasses.field(default_factory=list)
     verify: Annotated[Path | None, Option("Replay an episode; exit 1 if any bit differs.", metavar="EPISODE")] = None
     gui: Annotated[bool, Option("Show it in a window, live, instead of writing a recording.", ("--gui",))] = False
-    sim: Sim = None
+    sim: SimOption = None
     output: Annotated[
         Path | None,
         Option(

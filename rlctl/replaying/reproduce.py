@@ -81,7 +81,7 @@ def _replay_failed(episode: RecordedEpisode) -> None:
     """Replay a failed episode in a worker, because it may hang or end its process; raises `TaskError` as it does."""
     with Workers(episode.info.spec, 1) as workers:
         recorded_actions(episode, workers.info.spaces()[1])
-        workers.replay_actions({0: (episode.info.seed, episode.actions)})
+        workers.begin_episodes({0: (episode.info.seed, episode.actions)})
 
 
 def verify_episode(episode: RecordedEpisode, path: Path) -> tuple[Rollout, Verification]:

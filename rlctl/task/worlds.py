@@ -246,10 +246,10 @@ class TaskWorlds:
             self.drawn[world] = {}
             if self.events:
                 self._streams[world] = seed_streams(self.events, int(seed))
-                self._act("reset", world)
+                self._run_events("reset", world)
         self.calls.reset(generators, worlds)
         for world in listed if self.events else ():
-            self._act("start", world)
+            self._run_events("start", world)
             self._signals.begin(world, self._streams[world], float(self._levels[world]))
         self.view.begin(worlds)
         if self.teacher is not None:
@@ -261,7 +261,7 @@ class TaskWorlds:
             self._note(world, self._signals.drawn[world])
         return observation
 
-    def _act(self, when: Literal["reset", "start"], world: int) -> None:
+    def _run_events(self, when: Literal["reset", "start"], world: int) -> None:
         with in_world(world):
             drawn = self._acting.run(when, self.sim_of(world), self._streams[world], float(self._levels[world]))
         self._note(world, drawn)

@@ -195,7 +195,7 @@ def restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
         raise ArtifactError(f"it was saved with {len(steps)} environments, not {env.num_envs}")
     env.levels = tensors["environments/level"]
     started = tensors["environments/episodes_started"].tolist()
-    mismatch = set(env.replay_actions(started, np.split(tensors["environments/actions"], np.cumsum(steps)[:-1])))
+    mismatch = set(env.begin_episodes(started, np.split(tensors["environments/actions"], np.cumsum(steps)[:-1])))
     for key, observation in env.workers.arrays.observation.items():
         before = tensors[f"environments/observation/{key}"]
         mismatch.update(index for index in range(env.num_envs) if not np.array_equal(before[index], observation[index]))

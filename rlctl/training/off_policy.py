@@ -84,7 +84,7 @@ class OffPolicyRollouts(Rollouts):
         if steps and model.num_timesteps > model.learning_starts and has_whole_episode(model.replay_buffer):
             updates = model.gradient_steps if model.gradient_steps >= 0 else steps
             if updates > 0:
-                self._learner.train(batch_size=model.batch_size, gradient_steps=updates)
+                self._update.train(batch_size=model.batch_size, gradient_steps=updates)
                 self.rehearse(updates)
 
 

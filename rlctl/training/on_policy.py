@@ -52,7 +52,7 @@ class OnPolicyRollouts(Rollouts):
 
     def learn(self) -> None:
         """Run the updates of this segment."""
-        self._learner.train()
+        self._update.train()
 
     @torch.no_grad()
     def _fill_buffer(self, segment: SegmentArrays) -> None:
@@ -104,8 +104,8 @@ class OnPolicyRollouts(Rollouts):
 
     def _evaluate_actions(self, observations: Arrays, actions: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the values of observations and the log-probabilities of actions, shape (rows,)."""
-        if isinstance(self._learner, PpoUpdate):
-            return self._learner.evaluate(self._to_tensor(observations, slice(None)), actions)
+        if isinstance(self._update, PpoUpdate):
+            return self._update.evaluate(self._to_tensor(observations, slice(None)), actions)
         policy, chosen = self.model.policy, self._to_actions(actions)
         parts_of_batches = [
             policy.evaluate_actions(self._to_tensor(observations, rows), chosen[rows])[:2]

@@ -28,7 +28,7 @@ from rlctl.training.own_networks import write_graph
 from rlctl.training.privileged import name_as_sb3, widen, widen_space
 from rlctl.training.progress import Progress
 from rlctl.training.snapshot import Tensors, observation_statistics, pack, select_actor
-from rlctl.training.updates.choice import choose_learner
+from rlctl.training.updates.choice import choose_update
 
 
 class WorkerVecEnv(VecEnv):
@@ -89,12 +89,12 @@ class WorkerVecEnv(VecEnv):
         """Return the actions of an environment's running episode so far, shape (steps, ...)."""
         return np.concatenate(self._actions[env])
 
-    def replay_actions(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
+    def begin_episodes(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
         """Restore running episodes by replaying their actions; return the environments whose episode ended early."""
         self.episodes_started = list(episodes_started)
         seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
         episodes = dict(enumerate(zip(seeds, actions, strict=True)))
-        ended = self.workers.replay_actions(episodes, doing="replaying episodes", may_fail=True)
+        ended = self.workers.begin_episodes(episodes, doing="replaying episodes", may_fail=True)
         self._actions = [[actions_of_episode] for actions_of_episode in actions]
         return ended
 
@@ -208,7 +208,7 @@ class Rollouts(abc.ABC):
         self.env = env
         self._algo = recipe.algo
         self._progress = progress
-        self._learner = choose_learner(model)
+        self._update = choose_update(model)
         self._policy_info: PolicyInfo | None = None
         self._mirror = Mirror(model.mirror[0]) if hasattr(model, "mirror") else None  # of observations
         self.rehearse: Callable[[int], None] = lambda updates: None  # called after so many off-policy updates
@@ -229,8 +229,8 @@ class Rollouts(abc.ABC):
 
     def close(self) -> None:
         """End the learner's processes."""
-        if self._learner is not self.model:
-            self._learner.close()
+        if self._update is not self.model:
+            self._update.close()
 
     @abc.abstractmethod
     def start(self) -> None:

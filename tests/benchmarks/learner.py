@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from rlctl.play.workers import available_cores
 from rlctl.policy.torch_policy import pin_threads
 from rlctl.training.updates.blocks import MAX_BLOCKS, OFF_POLICY_BLOCKS
-from rlctl.training.updates.choice import choose_learner
+from rlctl.training.updates.choice import choose_update
 from tests.benchmarks.row import Row, side_by_side
 
 N_ENVS, STEPS, UPDATES = 256, 24, 64
@@ -82,7 +82,7 @@ def _compare(
         model = make()
         model.set_logger(Logger(None, []))
         with _limit_cores(cores):
-            pairs.append((choose_learner(model), model))
+            pairs.append((choose_update(model), model))
     shared = _measure_blocks(pairs[1][0])
 
     def measure(learner: Any, model: Any) -> float:

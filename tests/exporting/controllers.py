@@ -6,8 +6,8 @@ from gymnasium import spaces
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.exporting.c_source import find_compiler
+from rlctl.exporting.controller.controllers import CController, compile_controller
 from rlctl.exporting.controller.plan import ControllerPlan
-from rlctl.exporting.controller.players import CController, compile_controller
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.file import PolicyFile, PolicyInfo
 

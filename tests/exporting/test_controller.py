@@ -10,9 +10,9 @@ from rlctl.deploy import Limits
 from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.exporting.c_source import find_compiler
+from rlctl.exporting.controller.controllers import OnnxController
 from rlctl.exporting.controller.graph import build_graph
 from rlctl.exporting.controller.plan import ControllerPlan
-from rlctl.exporting.controller.players import OnnxController
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.onnx_policy import OnnxActor, encode

@@ -8,10 +8,10 @@ import pytest
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
-from rlctl.exporting.actor import build
 from rlctl.exporting.c_source import find_compiler, write_c
 from rlctl.exporting.controller.export import export_controller
 from rlctl.exporting.export_request import ExportRequest
+from rlctl.exporting.onnx_source import build
 from rlctl.policy.file import PolicyFile
 from tests.exporting import controlled
 from tests.exporting.controllers import make_policy

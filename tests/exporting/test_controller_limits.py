@@ -9,7 +9,7 @@ import pytest
 
 from rlctl.deploy import Limits, SafetyFilter
 from rlctl.exporting.c_source import find_compiler
-from rlctl.exporting.controller.players import STATUS
+from rlctl.exporting.controller.controllers import STATUS
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.task import terms
 from tests.exporting.controllers import build_controller, make_arm, make_policy, plan_of

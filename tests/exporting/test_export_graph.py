@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from rlctl.environments.info import describe
 from rlctl.errors import UsageError
-from rlctl.exporting.actor import build
+from rlctl.exporting.onnx_source import build
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.onnx_policy import OnnxActor, encode
 from rlctl.policy.torch_policy import ACTIVATIONS

@@ -5,9 +5,9 @@ import pytest
 
 from rlctl.errors import RecipeError, RlctlError, UsageError
 from rlctl.exporting.c_source import find_compiler
+from rlctl.exporting.controller.controllers import CController, MappedController, OnnxController, compile_controller
 from rlctl.exporting.controller.graph import build_graph
 from rlctl.exporting.controller.plan import ControllerPlan
-from rlctl.exporting.controller.players import CController, MappedController, OnnxController, compile_controller
 from rlctl.exporting.controller.program_mapping import read_mapping
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.numpy_actor import NumpyActor

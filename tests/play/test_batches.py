@@ -195,7 +195,7 @@ def test_actions_are_replayed(spec, start):
     first, again = start(spec, 4, n_workers=1), start(spec, 4, n_workers=2)
     played, _ = play(first, 1, 10)
     lengths = [3, 9, 0, 6]
-    left = again.replay_actions(
+    left = again.begin_episodes(
         {env: (seed(env, 0), played["action"][env, :count]) for env, count in enumerate(lengths)}
     )
     assert left == set()
@@ -213,7 +213,7 @@ def test_actions_are_replayed(spec, start):
 def test_a_world_that_fails_when_it_is_replayed_is_left_out(start, capfd):
     workers = start(EnvSpec(STOOL, {"fault": "reward", "faulty_start": 0.2}), 3, n_workers=1)
     still = np.zeros((5, 2), np.float32)
-    left = workers.replay_actions({0: (4, still[:2]), 1: (5, still), 2: (6, still[:1])}, may_fail=True)
+    left = workers.begin_episodes({0: (4, still[:2]), 1: (5, still), 2: (6, still[:1])}, may_fail=True)
     assert left == {1}
 
 

@@ -101,7 +101,7 @@ def test_every_kind_of_space(spec, start, kind):
 def test_what_environments_print_is_forwarded_at_once(spec, start, capfd):
     lines = []
     workers = start(spec("Walk", fault="print"), 1, printed=PrintedLines(lines.append))
-    workers.replay_actions({0: still(7, 3)})
+    workers.begin_episodes({0: still(7, 3)})
     deadline = time.monotonic() + 60
     while len(lines) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -111,7 +111,7 @@ def test_what_environments_print_is_forwarded_at_once(spec, start, capfd):
 
 def test_without_a_listener_prints_go_to_stderr(spec, start, capfd):
     workers = start(spec("Walk", fault="print"), 1)
-    workers.replay_actions({0: still(7, 3)})
+    workers.begin_episodes({0: still(7, 3)})
     workers.close()
     out, err = capfd.readouterr()
     assert out == ""
@@ -144,7 +144,7 @@ def test_nothing_is_left_open(spec):
     process = psutil.Process()
     files, threads = process.num_fds(), threading.active_count()
     with Workers(spec("Walk"), 2, n_workers=1) as workers:
-        workers.replay_actions({0: still(0, 1), 1: still(1, 1)})
+        workers.begin_episodes({0: still(0, 1), 1: still(1, 1)})
     del workers
     workers = Workers(spec("Walk"), 1)
     workers.close()  # before it was used
@@ -207,7 +207,7 @@ def test_episodes_end_in_the_order_of_the_environments(spec, start):
 def test_actions_are_replayed_up_to_where_the_episode_was(spec, start):
     workers, env = start(spec("Walk"), 3, n_workers=2), spec("Walk").make()
     actions = np.random.default_rng(0).uniform(-1, 1, (4, 2)).astype(np.float32)
-    assert workers.replay_actions({0: (3, actions), 2: (5, actions[:0]), 1: still(8, 30)}) == {1}
+    assert workers.begin_episodes({0: (3, actions), 2: (5, actions[:0]), 1: still(8, 30)}) == {1}
     env.reset(seed=3)
     for action in actions:
         observation, *_ = env.step(action)

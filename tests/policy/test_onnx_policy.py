@@ -14,7 +14,7 @@ from rlctl import load_policy
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.exporting.actor import build
+from rlctl.exporting.onnx_source import build
 from rlctl.policy.onnx_policy import OnnxActor, encode
 from rlctl.policy.torch_policy import ALGORITHMS, policy_name
 from rlctl.training.snapshot import pack

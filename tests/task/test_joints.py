@@ -8,7 +8,7 @@ import pytest
 from rlctl.environments.info import EnvInfo, describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
-from rlctl.exporting.actor import make_metadata
+from rlctl.exporting.onnx_source import make_metadata
 from rlctl.policy.file import PolicyInfo
 from rlctl.task.joints import Joints
 

@@ -12,10 +12,10 @@ from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.evaluation.evaluate import EvalRequest, run_evaluation
-from rlctl.exporting.actor import build
 from rlctl.exporting.c_source import write_c
 from rlctl.exporting.export import export_policy
 from rlctl.exporting.export_request import ExportRequest
+from rlctl.exporting.onnx_source import build
 from rlctl.policy import own_modules
 from rlctl.policy.file import GRAPH, PolicyFile
 from rlctl.policy.load import load_policy

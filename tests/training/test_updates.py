@@ -15,7 +15,7 @@ from rlctl.environments.dict_spaces import map_parts, split
 from rlctl.errors import RecipeError
 from rlctl.task.mirror import Mirror
 from rlctl.training.privileged import POLICIES
-from rlctl.training.updates.choice import choose_learner
+from rlctl.training.updates.choice import choose_update
 from rlctl.training.updates.crossq import CrossQUpdate
 from rlctl.training.updates.ppo import PpoUpdate
 from rlctl.training.updates.q_learning import DqnUpdate, Td3Update
@@ -275,7 +275,7 @@ def test_wide_networks_are_updated_on_all_cores_to_the_same_bit(algorithm, use_c
         set_random_seed(1)
         settings = {**WIDE, **({"n_steps": 100} if algorithm is PPO else {})}
         model = make_ppo(**settings) if algorithm is PPO else make_off_policy(algorithm, **settings)
-        learner, arguments = choose_learner(model), {} if algorithm is PPO else {"gradient_steps": 3, "batch_size": 128}
+        learner, arguments = choose_update(model), {} if algorithm is PPO else {"gradient_steps": 3, "batch_size": 128}
         learner.train(**arguments)
         learner.close()
         return weights(model)
@@ -293,15 +293,15 @@ def test_what_sb3_updates_itself():
     sac = [make_off_policy(network=elu), make_off_policy(network={"net_arch": []}), make_off_policy(TQC)]
     sac += [make_off_policy(observations=image, policy="CnnPolicy")]
     sac += [make_off_policy(use_sde=True, network={"use_expln": True})]
-    assert [choose_learner(model) for model in ppo] == ppo
+    assert [choose_update(model) for model in ppo] == ppo
     assert not SacUpdate.supports(sac.pop(2))
-    assert [choose_learner(model) for model in sac] == sac
+    assert [choose_update(model) for model in sac] == sac
 
 
 def test_a_delayed_actor_learns_at_every_other_update():
     model = make_off_policy()
     model.policy_delay = 2
-    learner = choose_learner(model)
+    learner = choose_update(model)
     actors = []
     for _ in range(4):
         before = weights(model)
@@ -316,4 +316,4 @@ def test_sb3_cannot_delay_the_actor():
     model = make_off_policy(network={"activation_fn": torch.nn.ELU})
     model.policy_delay = 2
     with pytest.raises(RecipeError, match="policy_delay: supported only for multi-layer perceptrons"):
-        choose_learner(model)
+        choose_update(model)

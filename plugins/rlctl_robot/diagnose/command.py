@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from rlctl.arguments import choose_checkpoint, command
-from rlctl.options import Argument, Json, Sim
+from rlctl.options import Argument, Json, SimOption
 from rlctl_robot.diagnose.diagnose_request import DiagnoseRequest
 
 
@@ -19,7 +19,7 @@ def diagnose(
         ),
     ],
     request: DiagnoseRequest,
-    sim: Sim = None,
+    sim: SimOption = None,
     json: Json = None,
 ) -> None:
     """Find what is wrong between a robot and a policy: order, sign, unit, offset, delay, frozen sensors."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from rlctl.arguments import command, parse_changes
 from rlctl.errors import UsageError
-from rlctl.options import Json, Option, Settings, Sim, TaskName
+from rlctl.options import Json, Option, Settings, SimOption, TaskName
 
 
 @command
@@ -26,7 +26,7 @@ def identify(
     ] = [],
     seconds: Annotated[float, Option("Length of the trajectory of --excite, in seconds.", min=1.0, max=3600.0)] = 10.0,
     settings: Settings = [],
-    sim: Sim = None,
+    sim: SimOption = None,
     seed: Annotated[int, Option("Seed of the search, or of the trajectory.", min=0)] = 0,
     json: Json = None,
 ) -> None:

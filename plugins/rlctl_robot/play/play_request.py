@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated
 
-from rlctl.options import Checkpoint, EpisodeSeed, Option, RunName, Settings, Sim
+from rlctl.options import Checkpoint, EpisodeSeed, Option, RunName, Settings, SimOption
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,7 +15,7 @@ class PlayRequest:
     task: Annotated[str | None, Option("Play on this task instead of the one it was trained on.")] = None
     checkpoint: Checkpoint = "best"
     settings: Settings = dataclasses.field(default_factory=list)
-    sim: Sim = None
+    sim: SimOption = None
     seed: EpisodeSeed = 0
     record: Annotated[bool, Option("Record from the start; the page has a button for it, too.", ("--record",))] = False
     output: Annotated[

@@ -2,7 +2,7 @@
 
 from rlctl.arguments import command_in_panels, parse_changes
 from rlctl.evaluation.eval_request import Gates, MinReturn, MinSuccess, MinSuccessLower
-from rlctl.options import Json, Pretrained, Settings, Sim
+from rlctl.options import Json, Pretrained, Settings, SimOption
 from rlctl_robot.robot.robot_request import RobotRequest
 
 
@@ -18,7 +18,7 @@ def robot(
     request: RobotRequest,
     pretrained: Pretrained = False,
     settings: Settings = [],
-    sim: Sim = None,
+    sim: SimOption = None,
     min_success: MinSuccess = None,
     min_success_lower: MinSuccessLower = None,
     min_return: MinReturn = None,

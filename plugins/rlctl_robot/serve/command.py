@@ -4,7 +4,7 @@ import dataclasses
 from typing import Annotated
 
 from rlctl.arguments import choose_checkpoint, command, parse_changes
-from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName, Sim
+from rlctl.options import Checkpoint, Json, Option, Pretrained, RunName, SimOption
 from rlctl_robot.serve.serve_request import ServeRequest
 
 
@@ -18,7 +18,7 @@ def serve(
         bool, Option("Play the task through the server in simulation, and print the scores.", ("--self-test",))
     ] = False,
     episodes: Annotated[int, Option("Episodes of the self-test.", min=1, max=1_000_000)] = 100,
-    sim: Sim = None,
+    sim: SimOption = None,
     json: Json = None,
 ) -> None:
     """Serve a policy to robots: WebSocket and HTTP, with limits, watchdog, log and a live page."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rlctl.exporting.controller.players import Controller, Inputs
+from rlctl.exporting.controller.controllers import Controller, Inputs
 
 ROWS = 100
 

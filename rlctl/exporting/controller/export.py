@@ -18,16 +18,16 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError, UsageError
 from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
-from rlctl.exporting.controller.example import ROWS, write_example
-from rlctl.exporting.controller.graph import build_graph
-from rlctl.exporting.controller.plan import ControllerPlan, JointTarget
-from rlctl.exporting.controller.players import (
+from rlctl.exporting.controller.controllers import (
     CController,
     Controller,
     MappedController,
     OnnxController,
     compile_controller,
 )
+from rlctl.exporting.controller.example import ROWS, write_example
+from rlctl.exporting.controller.graph import build_graph
+from rlctl.exporting.controller.plan import ControllerPlan, JointTarget
 from rlctl.exporting.controller.program_mapping import NO_MAPPING, ProgramMapping, read_mapping
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.exporting.export import (

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import onnx
 
-from rlctl.exporting.actor import emit_actor, make_metadata
 from rlctl.exporting.controller.plan import ControllerPlan, JointTarget, Observed, Quantity
 from rlctl.exporting.controller.program_mapping import NO_MAPPING, ElementMap, ProgramMapping
 from rlctl.exporting.controller.symbols import GraphSymbol
+from rlctl.exporting.onnx_source import emit_policy, make_metadata
 from rlctl.policy import onnx_policy
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.onnx_graph import BATCH, Graph
@@ -69,7 +69,7 @@ class _Writer:
             self._last_action = graph.input(LAST_ACTION, action_type, shape, f"last action; {_ZEROS}")
         newest = [self._compute(part) for part in plan.observed]
         observation = self._stack(newest) if plan.stacks else graph.concatenate(newest)
-        emit_actor(graph, self._policy, self._split(observation))
+        emit_policy(graph, self._policy, self._split(observation))
         action = onnx_policy.ACTION
         if self._target is not None:
             self._emit_target(action, self._target)

@@ -13,8 +13,8 @@ from rlctl.environments.dict_spaces import take_row
 from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError
+from rlctl.exporting.controller.controllers import CController, Controller, Inputs
 from rlctl.exporting.controller.plan import ControllerPlan, JointTarget
-from rlctl.exporting.controller.players import CController, Controller, Inputs
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, compare_episodes
 from rlctl.limits.limited import Limited
 from rlctl.limits.limits import Limits

@@ -172,7 +172,7 @@ def noise(rng: Rng, first: Parts, *, std: NotNegative) -> tuple[Drawn, Signal]:
 
 @acts_at("observation", "action", steps=0.0)
 def delay(rng: Rng, first: Parts, *, steps: Steps) -> tuple[Drawn, Signal]:
-    """WorldDelay all values by some control steps; the number is drawn once per episode, both ends included.
+    """Delay all values by some control steps; the number is drawn once per episode, both ends included.
 
     In these first steps the observation is the first of the episode, and the action is 0 or the nearest to 0.
     """

@@ -33,19 +33,19 @@ class Signals:
         self.bounds = {**pictures, **bounds}
         self._space = action_space
         self._zero: Array = np.zeros(0)  # the action before the first one
-        self.on_observation: list[_Acting] = []
-        self.on_action: list[_Acting] = []
+        self.on_observation: list[_SignalEvent] = []
+        self.on_action: list[_SignalEvent] = []
         for event in events.values():
             if event.event.when == "observation":
                 observed = {name: np.asarray(first[name]) for name in _find_observed(event, first)}
-                self.on_observation.append(_Acting(event, worlds, observed))
+                self.on_observation.append(_SignalEvent(event, worlds, observed))
             elif event.event.when == "action":
                 if not isinstance(action_space, spaces.Box):
                     raise event.error(
                         f"events.{event.name}: only actions in a Box can have noise or delay, not {action_space}."
                     )
                 self._zero = np.clip(np.zeros(action_space.shape), action_space.low, action_space.high)
-                self.on_action.append(_Acting(event, worlds, {_ACTION: self._zero}))
+                self.on_action.append(_SignalEvent(event, worlds, {_ACTION: self._zero}))
         self._streams: list[Streams] = [{} for _ in range(worlds)]
         self._levels, self._is_new = np.ones(worlds), np.zeros(worlds, bool)
         self._worlds = np.arange(worlds)
@@ -64,7 +64,7 @@ class Signals:
         for acting in self.on_action:
             self._start(acting, world, self._zero.ravel())
 
-    def _start(self, acting: "_Acting", world: int, first: Array) -> None:
+    def _start(self, acting: "_SignalEvent", world: int, first: Array) -> None:
         name, level = acting.event.name, float(self._levels[world])
         with in_world(world):
             self.drawn[world][name] = acting.begin(world, self._streams[world][name], first, level)
@@ -107,7 +107,7 @@ class Signals:
         return self.drawn[0]
 
 
-class _Acting:
+class _SignalEvent:
     """An event on observations or actions; a user's own function knows one world only and is called per world."""
 
     def __init__(self, event: BoundEvent, worlds: int, first: Parts) -> None:

@@ -1,4 +1,4 @@
-"""WorldNoise and delay of n worlds; each world has the numbers of its own generator, whatever the other worlds are."""
+"""Noise and delay of n worlds; each world has the numbers of its own generator, whatever the other worlds are."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol

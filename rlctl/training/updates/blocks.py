@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.play.shared_arrays import Layout, map_arrays
+from rlctl.play.shared_arrays import ArrayLayout, map_arrays
 from rlctl.play.workers import available_cores
 from rlctl.printed_lines import print_line
 from rlctl.processes.child_process import ChildProcess, anonymous_file
@@ -52,7 +52,7 @@ class BlockSettings(Protocol):
     def list_shapes(self) -> Shapes:
         """Return the shapes of all trained parameters."""
 
-    def make_layout(self) -> Layout:
+    def make_layout(self) -> ArrayLayout:
         """Return the arrays that all processes share besides the parameters and their gradients."""
 
 
@@ -164,7 +164,7 @@ def _close(processes: list[ChildProcess], ends: Sequence[socket.socket]) -> None
 
 
 def main(
-    connection: Connection, *, kind: str, settings: Any, layout: Layout, memory: int, taken: int, reported: int
+    connection: Connection, *, kind: str, settings: Any, layout: ArrayLayout, memory: int, taken: int, reported: int
 ) -> None:
     """In a child: compute tasks until the parent ends."""
     module, _, name = kind.partition(":")

@@ -13,7 +13,7 @@ from rlctl.training.updates.q_learning import DqnUpdate, Td3Update
 from rlctl.training.updates.sac import SacUpdate, TqcUpdate
 
 
-def choose_learner(model: Any) -> Any:
+def choose_update(model: Any) -> Any:
     """Return the object whose `train` updates a model: a class of this package, or the SB3 model itself."""
     updates: tuple[Any, ...] = (PpoUpdate, SacUpdate, TqcUpdate, CrossQUpdate, Td3Update, DqnUpdate)
     extracts = any("features_extractor" in name for name, _ in model.policy.named_parameters())  # not all are linear

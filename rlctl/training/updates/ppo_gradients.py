@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 
-from rlctl.play.shared_arrays import Layout
+from rlctl.play.shared_arrays import ArrayLayout
 from rlctl.task.mirror import Mirror
 from rlctl.training.updates.blocks import MAX_BLOCKS, Arrays, BlockWork, select_block
 from rlctl.training.updates.perceptrons import LOG_SQRT_TAU, Floats, MlpStack, Shapes, list_shapes, split_vector
@@ -38,7 +38,7 @@ class PpoSettings:
         """Return the shapes of the parameters: of the actor, of the critic, of the deviation."""
         return [*list_shapes(self.actor), *list_shapes(self.critic), self.log_std]
 
-    def make_layout(self) -> Layout:
+    def make_layout(self) -> ArrayLayout:
         """Return the arrays that all processes share besides the parameters and their gradients."""
         floats, numbers = np.dtype(np.float32), np.dtype(np.float64)
         return {

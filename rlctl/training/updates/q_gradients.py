@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from rlctl.play.shared_arrays import Layout
+from rlctl.play.shared_arrays import ArrayLayout
 from rlctl.training.updates.blocks import MAX_BLOCKS, Arrays, BlockWork, select_block
 from rlctl.training.updates.perceptrons import Floats, MlpStack, Shapes, count_floats, list_shapes, split_vector
 
@@ -33,7 +33,7 @@ class QSettings:
         """Return the shapes of all trained parameters."""
         return [*self.list_critic_shapes(), *list_shapes(self.actor)]
 
-    def make_layout(self) -> Layout:
+    def make_layout(self) -> ArrayLayout:
         """Return the arrays that all processes share besides the parameters and their gradients."""
         floats = np.dtype(np.float32)
         return {

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from rlctl.play.shared_arrays import Layout
+from rlctl.play.shared_arrays import ArrayLayout
 from rlctl.training.updates.blocks import MAX_BLOCKS, Arrays, BlockWork, select_block
 from rlctl.training.updates.perceptrons import Floats, MlpStack, Shapes, count_floats, list_shapes, split_vector
 from rlctl.training.updates.squashed_gaussian import SquashedGaussian
@@ -45,7 +45,7 @@ class SacSettings:
         """Return the shapes of all trained parameters."""
         return [*self.list_critic_shapes(), *self.list_actor_shapes()]
 
-    def make_layout(self) -> Layout:
+    def make_layout(self) -> ArrayLayout:
         """Return the arrays that all processes share besides the parameters and their gradients."""
         floats = np.dtype(np.float32)
         normal = (self.rows, self.actions) if self.log_std is None else self.log_std

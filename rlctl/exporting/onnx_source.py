@@ -29,7 +29,7 @@ def build(policy: PolicyFile) -> onnx.ModelProto:
     info, graph = policy.info, Graph()
     parts = split_space(info.env.spaces()[0])
     inputs = {key: _add_input(graph, info, key, part) for key, part in parts.items()}
-    emit_actor(graph, policy, inputs)
+    emit_policy(graph, policy, inputs)
     description = (
         f"{info.algo} policy for {info.spec.task} after {info.training_steps} steps: raw observations in, "
         "deterministic action out; normalisation and the action's bounds are inside"
@@ -37,7 +37,7 @@ def build(policy: PolicyFile) -> onnx.ModelProto:
     return graph.model(make_metadata(info), description)
 
 
-def emit_actor(graph: Graph, policy: PolicyFile, inputs: Mapping[str, tuple[str, Any]]) -> None:
+def emit_policy(graph: Graph, policy: PolicyFile, inputs: Mapping[str, tuple[str, Any]]) -> None:
     """Add a policy, from the parts of a raw observation, each a value and its dtype, to the output `action`.
 
     The state of an LSTM becomes inputs and outputs of the graph.
