@@ -107,6 +107,7 @@ def as_json(result: Evaluation) -> dict[str, Any]:
         policy = {"file": result.name, **info.model_dump(include={"algo", "training_steps", "versions"})}
     content = {
         "task": {"name": result.spec.task, "parameters": result.spec.parameters},
+        "sim": str(result.spec.resolve().sim),
         "policy": policy,
         "versions": collect_versions(),
         "randomized": any(result.events.values()),

@@ -18,6 +18,7 @@ from rlctl.launching.train import run_training
 from rlctl.play.messages import EpisodeResult
 from rlctl.runs.tables import read_table
 from rlctl.runs.train_request import TrainRequest
+from rlctl.task.pybullet.library import is_installed
 from tests import fork_server
 from tests.training.conftest import ENVS, SMALL_PPO
 
@@ -102,6 +103,7 @@ def test_terms_add_up_to_the_return(evaluation):
 
 def test_json_has_what_ci_needs(evaluation):
     content = as_json(evaluation)
+    assert content["sim"] == ("pybullet" if is_installed() else "mujoco")
     assert {"success_rate", "success_interval", "return", "episodes", "task", "policy", "versions"} <= content.keys()
     assert content["return"].keys() == {"mean", "iqm", "std", "min", "max"}
     assert content["episodes"][2].keys() >= {"index", "seed", "success", "return", "length", "terms"}
