@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, short_repr
 from rlctl.task.batch import BatchTask, WorldRngs, read_rows
-from rlctl.task.returned import not_a_number, not_by_name, term_mismatch
+from rlctl.task.returned import not_a_number, not_by_name, reward_not_finite, term_mismatch
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task
 
@@ -58,7 +59,7 @@ class TaskCalls(Protocol):
         """Return the reward and the raw terms in the order of `weights`, shape (n, 1 + terms).
 
         Weighted terms are added in order, so that the last bits do not depend on the number of worlds. A term that is
-        not a number raises `WrongRow`.
+        not a number raises `WrongRow`; a reward of a `Task` that is not finite does too.
         """
 
     def is_terminated(self) -> Flags:
@@ -127,7 +128,7 @@ class OneWorldCalls:
         rows: dict[str, Any] = {}
         for name, value in observed.items():
             if name not in terms:
-                rows[name] = np.asarray(value)[None]
+                rows[name] = value[None] if value.__class__ is np.ndarray else np.asarray(value)[None]
             elif isinstance(value, tuple):
                 rows[name] = tuple([_quantity_row(quantity) for quantity in value])
             else:
@@ -149,6 +150,9 @@ class OneWorldCalls:
                 reward += weight * term
         except (TypeError, ValueError):
             raise not_a_number(raw) from None
+        if not math.isfinite(reward):
+            weighted = {name: weights[name] * term for name, term in zip(weights, row[1:], strict=True)}
+            raise reward_not_finite(weighted, reward)
         row[0] = reward
         return np.array([row])
 

@@ -1,5 +1,6 @@
 """Errors about what the methods of a task returned."""
 
+import math
 import numbers
 from collections.abc import Mapping
 from typing import Any
@@ -24,6 +25,12 @@ def not_a_number(raw: Mapping[str, Any]) -> WrongRow:
     """Return the error for a reward term that is not a number."""
     name = next((name for name, value in raw.items() if not isinstance(value, numbers.Real)), "sum")
     return WrongRow(f"reward term {name!r} is {short_repr(raw.get(name))} at step {{}}, not a number")
+
+
+def reward_not_finite(weighted: Mapping[str, float], reward: float, row: int = 0) -> WrongRow:
+    """Return the error for a reward that is not finite, with the first of its weighted terms that is not."""
+    name = next((name for name, term in weighted.items() if not math.isfinite(term)), "sum")
+    return WrongRow(f"reward term {name!r} is {weighted.get(name, reward)} at step {{}}", row)
 
 
 def term_mismatch(task: str, raw: Mapping[str, float], weights: Mapping[str, float]) -> TaskError:

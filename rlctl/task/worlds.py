@@ -33,7 +33,7 @@ from rlctl.task.observation import (
 from rlctl.task.privileged import CriticSight
 from rlctl.task.pybullet.library import is_installed
 from rlctl.task.pybullet.sim import PybulletSim
-from rlctl.task.returned import WrongRow
+from rlctl.task.returned import WrongRow, reward_not_finite
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_definition, check_parameters
 
@@ -85,6 +85,7 @@ class TaskWorlds:
         check_definition(task)
         self.task, self.count = task, count
         self.name = type(task).__name__
+        self._is_batch = isinstance(task, BatchTask)
         self.calls: TaskCalls
         if isinstance(task, BatchTask):
             self.calls = ManyWorldCalls(task, count)
@@ -320,7 +321,7 @@ class TaskWorlds:
             self._gained[worlds] += gained
         reward, terms = gained[:, 0], gained[:, 1:]
         truncated = self._find_truncated(terminated, worlds)
-        if reward.dot(self._zeros[: len(reward)]) != 0:  # one is not finite
+        if self._is_batch and reward.dot(self._zeros[: len(reward)]) != 0:  # one is not finite
             self._check_reward(reward, terms, worlds)
         if self._acting.periods:
             self._run_due(worlds)
@@ -343,7 +344,7 @@ class TaskWorlds:
     def _find_truncated(self, terminated: Flags, worlds: Worlds) -> Flags:
         self._steps_left -= 1
         if self._steps_left > 0:  # no world can be at the time limit
-            return self._no_flags[: len(worlds)]
+            return self._no_flags if len(worlds) == self.count else self._no_flags[: len(worlds)]
         steps = self.step_of[worlds]
         self._steps_left = self.max_steps - int(self.step_of.max())
         return (steps >= self.max_steps) & ~terminated
@@ -381,8 +382,7 @@ class TaskWorlds:
         if bad.any():
             row = int(bad.argmax())
             weighted = dict(zip(self.weights, (terms[row] * self._weight_values).tolist(), strict=True))
-            name = next((name for name, term in weighted.items() if not math.isfinite(term)), "sum")
-            self._fail(worlds[row], f"reward term {name!r} is {weighted.get(name, reward[row])} at step {{}}")
+            self._fail(worlds[row], str(reward_not_finite(weighted, float(reward[row]))))
 
     def totals(self, world: int) -> EpisodeTotals:
         """Return what the running episode of a world has added up to."""
