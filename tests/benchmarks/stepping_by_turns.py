@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from rlctl.play.workers import Workers
-
-EnvSpec: Any = importlib.import_module("rlctl.env_spec").EnvSpec  # where it was in that commit
+# Where they were in that commit.
+EnvSpec: Any = importlib.import_module("rlctl.env_spec").EnvSpec
+Workers: Any = importlib.import_module("rlctl.rollout.workers").Workers
 
 
 def main(task: str, n_envs: int, steps: int, hidden: int) -> None:
