@@ -105,9 +105,9 @@ def as_json(result: Evaluation) -> dict[str, Any]:
     info, policy = result.policy, {"baseline": result.name}
     if info is not None:
         policy = {"file": result.name, **info.model_dump(include={"algo", "training_steps", "versions"})}
-    content = {
+    content: dict[str, Any] = {
         "task": {"name": result.spec.task, "parameters": result.spec.parameters},
-        "sim": str(result.spec.resolve().sim),
+        "sim": str(result.spec.resolve().sim) or None,
         "policy": policy,
         "versions": collect_versions(),
         "randomized": any(result.events.values()),

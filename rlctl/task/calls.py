@@ -58,8 +58,8 @@ class TaskCalls(Protocol):
     def rewards(self, action: Any, weights: Mapping[str, float]) -> Array:
         """Return the reward and the raw terms in the order of `weights`, shape (n, 1 + terms).
 
-        Weighted terms are added in order, so that the last bits do not depend on the number of worlds. A term that is
-        not a number raises `WrongRow`; a reward of a `Task` that is not finite does too.
+        Weighted terms are added in order, so that the last bits do not depend on the number of worlds. A `Task`'s
+        term that is not a number, or its reward that is not finite, raises `WrongRow`.
         """
 
     def is_terminated(self) -> Flags:

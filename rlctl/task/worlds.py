@@ -288,6 +288,7 @@ class TaskWorlds:
 
     def step(self, action: Any, worlds: Worlds | None = None) -> WorldsStep:
         """Advance all worlds, or some, by a control step; `action` has a row for each of them, shape (k, ...)."""
+        self._steps_left -= 1  # here, so that it is right after a step that fails
         if worlds is None or self.count == 1 or self._is_all(worlds):
             np.add(self.step_of, self._ones, out=self.step_of)
             return self._step(self._check_action(action, self._all), self._all)
@@ -310,10 +311,7 @@ class TaskWorlds:
             self.sim.step(worlds)
             chosen = self._spread(chosen, worlds)
         terminated = calls.is_terminated()
-        try:
-            gained = calls.rewards(chosen, self.weights)
-        except WrongRow as wrong:
-            self._fail(worlds[wrong.row], str(wrong))
+        gained = self.rewards(chosen)
         if is_all:
             np.add(self._gained, gained, out=self._gained)
         else:
@@ -341,8 +339,14 @@ class TaskWorlds:
             self._last_terms[worlds] = terms
         return WorldsStep(observation, reward, terminated, truncated, terms, success)
 
+    def rewards(self, action: Any) -> Array:
+        """Return the reward and the raw terms of all worlds, shape (n, 1 + terms); see `TaskCalls.rewards`."""
+        try:
+            return self.calls.rewards(action, self.weights)
+        except WrongRow as wrong:
+            self._fail(wrong.row, str(wrong))
+
     def _find_truncated(self, terminated: Flags, worlds: Worlds) -> Flags:
-        self._steps_left -= 1
         if self._steps_left > 0:  # no world can be at the time limit
             return self._no_flags if len(worlds) == self.count else self._no_flags[: len(worlds)]
         steps = self.step_of[worlds]
@@ -374,7 +378,8 @@ class TaskWorlds:
         return clipped
 
     def _fail(self, world: Any, message: str) -> NoReturn:
-        before, _, after = message.rpartition("{}")
+        before, place, after = message.rpartition("{}")  # of the step; a value before it may be an empty dict
+        assert place
         raise WorldFailed(f"{self.name}: {before}{self.step_of[world]}{after}", int(world))
 
     def _check_reward(self, reward: Array, terms: Array, worlds: Worlds) -> None:

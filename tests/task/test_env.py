@@ -140,6 +140,20 @@ def test_a_fault_of_the_task_names_the_offender(make, fault, message):
     assert str(caught.value) == message
 
 
+def test_a_step_that_fails_counts_for_the_time_limit(make):
+    env = make(Slider(fault="nan term"))
+    env.reset(seed=0)
+    for _ in range(2):
+        env.step(np.zeros(2))
+    with pytest.raises(TaskError):
+        env.step(np.zeros(2))
+    env.unwrapped.task.fault = ""
+    steps = 3
+    while not env.step(np.zeros(2))[3]:
+        steps += 1
+    assert steps + 1 == env.unwrapped.max_steps
+
+
 def test_a_changed_shape_in_a_dict_layout(make):
     env = make(ByName(fault="shape"))
     env.reset(seed=0)

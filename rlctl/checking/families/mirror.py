@@ -83,7 +83,7 @@ class _Trial:
         self._call("act", worlds.calls.act, rows, step=step)
         self._call("step", self.sim.step, step=step)
         self._call("is_terminated", worlds.calls.is_terminated, step=step)
-        terms = self._call("rewards", worlds.calls.rewards, rows, worlds.weights, step=step)[0, 1:]
+        terms = self._call("rewards", worlds.rewards, rows, step=step)[0, 1:]
         observed = self._call("observe", self.env.observe_exactly, step=step)
         named = zip(worlds.weights, terms.tolist(), strict=True)
         return {**observed, **{f"reward term {name}": np.array([value]) for name, value in named}}

@@ -63,7 +63,8 @@ class IdealMotors:
     @property
     def is_used(self) -> bool:
         """Whether a motor is ideal."""
-        return self._may_act and bool(self._world.extra["ideal motors"][:, _DAMPING].any())
+        values = self._world.extra.get("ideal motors") if self._may_act else None
+        return values is not None and bool(values[:, _DAMPING].any())
 
     def step(self, substeps: int) -> None:
         """Take the physics steps of a control step; what depends on positions and velocities is up to date."""

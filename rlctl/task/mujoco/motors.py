@@ -2,7 +2,8 @@
 
 Each joint has an actuator with the force `ctrl + b1 * position + b2 * velocity`, within a range. `drive_to` makes it a
 spring and a damper (b1 = -stiffness, b2 = -damping), `drive_at` a damper, `set_torques` a force. Without `set_drives`
-those of the wheels of a single world are `IdealMotors`; all others are springs and dampers which come close.
+those of a single world are `IdealMotors` in a command whose joints all turn without limits, as wheels do; all others
+are springs and dampers which come close.
 """
 
 from __future__ import annotations
