@@ -48,6 +48,19 @@ def library() -> Any:
     return sys.modules["mujoco"]
 
 
+def copy_data(target: Any, model: Any, source: Any) -> None:
+    """Make one MjData equal to another of the same model."""
+    mujoco = library()
+    if hasattr(mujoco, "mj_copyData"):
+        mujoco.mj_copyData(target, model, source)
+        return
+    # Older versions cannot copy into an MjData that exists; what is derived is computed anew.
+    state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION))
+    mujoco.mj_getState(model, source, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    mujoco.mj_setState(model, target, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    mujoco.mj_forward(model, target)
+
+
 def read_kept_fields(env: Any) -> dict[str, Attribute]:
     """Return copies of the fields of `KEPT` of an environment that MuJoCo simulates; empty for any other."""
     if (simulation := find_mujoco(env)) is None:
@@ -129,7 +142,7 @@ class MujocoStateReader:
 
     def update(self) -> None:
         """See `StateReader`."""
-        library().mj_copyData(self._now, self.model, self.data)
+        copy_data(self._now, self.model, self.data)
         refresh(self.model, self._now)
         contacts = self._now.contact
         self.touched.append(set(contacts.geom[(contacts.dist <= 0) & (contacts.exclude == 0)].ravel().tolist()))
@@ -175,7 +188,7 @@ class MujocoStateReader:
         if self._before is None or self._calls < 2:
             return None
         mujoco, before, (qpos, qvel) = library(), self._other, self._before
-        mujoco.mj_copyData(before, self.model, self._now)
+        copy_data(before, self.model, self._now)
         before.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, before)
         mujoco.mj_comPos(self.model, before)
@@ -226,8 +239,8 @@ class MujocoStateReader:
 
     def read_weights(self) -> dict[JointKey, float]:
         """See `StateReader`; empty for robots that stand on something, or are bound by an equality."""
-        mujoco, model, still = library(), self.model, self._other
-        mujoco.mj_copyData(still, model, self._now)
+        model, still = self.model, self._other
+        copy_data(still, model, self._now)
         still.qvel[:] = 0
         refresh(model, still)
         forces = np.abs(still.qfrc_bias - still.qfrc_passive)
@@ -262,7 +275,7 @@ class MujocoStateReader:
     def find_jumps(self, seed: int) -> list[Jump]:
         """See `StateReader`; the environment's data are not changed."""
         mujoco, model, alone = library(), self.model, self._other
-        mujoco.mj_copyData(alone, model, self.data)
+        copy_data(alone, model, self.data)
         gravity, dt = float(np.linalg.norm(model.opt.gravity)), float(model.opt.timestep)
         free = {b.name: int(model.jnt_dofadr[model.body_jntadr[b.id]]) for b in self.world.bodies if b.is_free}
         speeds = [_free_speeds(alone, free)]

@@ -18,7 +18,7 @@ from rlctl.checking.families.motor_trials import find_wrong_answers
 from rlctl.checking.instance import EnvironmentRaised, Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_trials import STEPS, Look, are_equal, name_columns, pair_rows, play
-from rlctl.checking.mujoco_worlds import MujocoStateReader, library, refresh
+from rlctl.checking.mujoco_worlds import MujocoStateReader, copy_data, library, refresh
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rules import RuleFinding, Severity, list_names
 from rlctl.checking.values import flatten
@@ -200,7 +200,7 @@ def _find_stale_fields(instance: Instance) -> dict[str, NDArray[np.bool_]]:
         return {}
     model, data = simulation
     fresh = library().MjData(model)
-    library().mj_copyData(fresh, model, data)
+    copy_data(fresh, model, data)
     refresh(model, fresh)
     differ = {name: ~np.isclose(getattr(data, name), getattr(fresh, name), 1e-6, 1e-6) for name in DERIVED}
     for number in range(model.nsensor):  # those that only a step computes
