@@ -54,7 +54,7 @@ def copy_data(target: Any, model: Any, source: Any) -> None:
     if hasattr(mujoco, "mj_copyData"):
         mujoco.mj_copyData(target, model, source)
         return
-    # Older versions cannot copy into an MjData that exists; what is derived is computed anew.
+    # Older versions cannot copy into an MjData that exists; so what is derived is computed again.
     state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION))
     mujoco.mj_getState(model, source, state, mujoco.mjtState.mjSTATE_INTEGRATION)
     mujoco.mj_setState(model, target, state, mujoco.mjtState.mjSTATE_INTEGRATION)

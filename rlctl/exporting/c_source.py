@@ -7,7 +7,7 @@ import re
 import shlex
 import shutil
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -232,16 +232,28 @@ def find_compiler() -> list[str] | None:
 
 def build_library(code: CSource, info: PolicyInfo, folder: Path, compiler: list[str]) -> Path:
     """Compile a policy in `folder` and return the library; raises `AnswerIsNo` if the compiler fails."""
-    (folder / f"{code.name}.h").write_text(code.header)
-    (folder / f"{code.name}.c").write_text(code.source)
-    (folder / "harness.c").write_text(code.harness)
-    library = folder / f"{code.name}{LIBRARY_SUFFIX}"
+    library = compile_code(code, "policy", [f"{code.name}.c", "harness.c"], folder, compiler)
     library.with_suffix(".json").write_text(info.model_dump_json())
-    command = [*compiler, *FLAGS, "-fPIC", "-shared", "-o", str(library), f"{code.name}.c", "harness.c", "-lm"]
+    return library
+
+
+def compile_code(code: CSource, what: str, sources: Sequence[str], folder: Path, compiler: list[str]) -> Path:
+    """Write code into `folder`, compile the files `sources` of it, and return the library.
+
+    Raises `AnswerIsNo`, which names `what` it is, if the compiler fails.
+    """
+    for name, content in (
+        (f"{code.name}.h", code.header),
+        (f"{code.name}.c", code.source),
+        ("harness.c", code.harness),
+    ):
+        (folder / name).write_text(content, encoding="utf-8")
+    library = folder / f"{code.name}{LIBRARY_SUFFIX}"
+    command = [*compiler, *FLAGS, "-fPIC", "-shared", "-o", str(library), *sources, "-lm"]
     try:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     except OSError as error:
         raise AnswerIsNo(f"{compiler[0]} cannot be started: {error.strerror or error}") from None
     if done.returncode != 0:
-        raise AnswerIsNo(f"{compiler[0]} cannot compile the policy: {short_repr(done.stderr, 300)}")
+        raise AnswerIsNo(f"{compiler[0]} cannot compile the {what}: {short_repr(done.stderr, 300)}")
     return library

@@ -158,15 +158,15 @@ class OneWorldCalls:
 
     def is_terminated(self) -> Flags:
         """Return whether the episode ends, shape (1,)."""
-        flag = self.task.is_terminated()
-        return ONE_FLAG[flag] if flag is False or flag is True else self._read_flag("is_terminated", flag)
+        return self._read_flag("is_terminated", self.task.is_terminated())
 
     def is_success(self) -> Flags:
         """Return whether the goal is reached, shape (1,)."""
-        flag = self.task.is_success()
-        return ONE_FLAG[flag] if flag is False or flag is True else self._read_flag("is_success", flag)
+        return self._read_flag("is_success", self.task.is_success())
 
     def _read_flag(self, method: str, flag: Any) -> Flags:
+        if flag is False or flag is True:
+            return ONE_FLAG[flag]
         try:
             is_flag = flag in (False, True)
         except ValueError:  # an array

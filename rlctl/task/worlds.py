@@ -289,7 +289,7 @@ class TaskWorlds:
     def step(self, action: Any, worlds: Worlds | None = None) -> WorldsStep:
         """Advance all worlds, or some, by a control step; `action` has a row for each of them, shape (k, ...)."""
         self._steps_left -= 1  # here, so that it is right after a step that fails
-        if worlds is None or self.count == 1 or self._is_all(worlds):
+        if worlds is None or self._is_all(worlds):
             np.add(self.step_of, self._ones, out=self.step_of)
             return self._step(self._check_action(action, self._all), self._all)
         self.step_of[worlds] += 1
@@ -319,7 +319,7 @@ class TaskWorlds:
             self._gained[worlds] += gained
         reward, terms = gained[:, 0], gained[:, 1:]
         truncated = self._find_truncated(terminated, worlds)
-        if self._is_batch and reward.dot(self._zeros[: len(reward)]) != 0:  # one is not finite
+        if self._is_batch and not is_finite(reward, self._zeros):
             self._check_reward(reward, terms, worlds)
         if self._acting.periods:
             self._run_due(worlds)

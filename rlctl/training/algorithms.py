@@ -27,7 +27,7 @@ from rlctl.training.own_networks import check_policy_class, write_graph
 from rlctl.training.privileged import POLICIES, has_privileged_critic
 from rlctl.training.rollouts import WorkerVecEnv
 from rlctl.training.snapshot import pack
-from rlctl.training.stack_layout import find_layout
+from rlctl.training.stack_layout import find_stacking
 from rlctl.training.stacked_replay import store_once
 from rlctl.training.updates.ppo import PpoUpdate
 
@@ -95,7 +95,7 @@ def build_model(recipe: Recipe, env: WorkerVecEnv, device: str) -> BaseAlgorithm
             model.policy_delay = recipe.algo_kwargs.get("policy_delay", 1)  # type: ignore[attr-defined]
         if isinstance(model, OffPolicyAlgorithm):
             start = env.workers.info.history_start if env.workers.info.observation_history else "first"
-            store_once(model.replay_buffer, find_layout(env.workers, model.observation_space), start)
+            store_once(model.replay_buffer, find_stacking(env.workers, model.observation_space), start)
         if recipe.mirror or recipe.mirror_loss:
             add_mirror(model, env.workers, images=recipe.mirror, loss=recipe.mirror_loss)
         write_graph(model, recipe.algo, env.workers.info.spaces()[0])  # reports faults of a user's network
@@ -211,7 +211,7 @@ def _check_memory(recipe: Recipe, env: WorkerVecEnv) -> None:
         row = sum(elements for elements, _ in parts) * _FLOAT32 + action + 6 * _FLOAT32
     else:  # observations before and after, in the space's dtype, action, reward and two flags
         key, rows = "buffer_size", int(recipe.algo_kwargs["buffer_size"])
-        if (layout := find_layout(env.workers, env.observation_space)) is not None:
+        if (layout := find_stacking(env.workers, env.observation_space)) is not None:
             parts = [(layout.size, env.observation_space.dtype)]
         observation = sum(elements * np.dtype(dtype or np.float32).itemsize for elements, dtype in parts)
         row = 2 * observation + action + 3 * _FLOAT32

@@ -11,8 +11,8 @@ from rlctl.training.rollouts import to_network_layout
 from rlctl.training.stacked_replay import Stacking
 
 
-def find_layout(workers: Workers, space: spaces.Space[Any]) -> Stacking | None:
-    """Return the layout of a network's observations; None without histories and for dictionaries."""
+def find_stacking(workers: Workers, space: spaces.Space[Any]) -> Stacking | None:
+    """Return how the observations of a network are stacked; None without histories and for dictionaries."""
     info, stacked = workers.info, workers.spec.frame_stack
     shape = info.spaces()[0].shape
     if not isinstance(space, spaces.Box) or not shape:

@@ -18,7 +18,7 @@ from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact, 
 from rlctl.checking.regression import action_terms, fit_terms
 from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.transitions import Transitions, collect_transitions, find_float_leaves
-from rlctl.checking.values import Attribute, Generator, read_attributes
+from rlctl.checking.values import Attribute, read_attributes
 from rlctl.checking.workspaces import Reach, find_chains, find_reach, measure_reach
 from rlctl.environments.leaves import pick
 
@@ -83,7 +83,7 @@ def _read_after_reset(instance: Instance, seed: int) -> dict[str, Attribute]:
 
 
 def _is_place(one: Attribute, two: Attribute) -> bool:
-    if isinstance(one.value, Generator) or np.asarray(one.value).dtype.kind != "f":
+    if np.asarray(one.value).dtype.kind != "f":
         return False  # whole numbers are states and cells: an environment looks them up in tables
     sizes = one.numbers.size, two.numbers.size
     return sizes[0] == sizes[1] and sizes[0] in SIZES and int((one.numbers != two.numbers).sum()) >= min(2, sizes[0])

@@ -2,7 +2,6 @@
 
 import abc
 import ctypes
-import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import AnswerIsNo, short_repr
-from rlctl.exporting.c_source import FLAGS, CSource
+from rlctl.exporting.c_source import CSource, compile_code
 from rlctl.exporting.controller.graph import LAST_ACTION, TARGET, name_input
 from rlctl.exporting.controller.plan import ControllerPlan
 from rlctl.exporting.controller.program_mapping import ProgramMapping
 from rlctl.policy.actor import Actor, Array, Rows, act_one_by_one
 from rlctl.policy.c_policy import action_type
-from rlctl.policy.load import LIBRARY_SUFFIX
 from rlctl.policy.onnx_policy import ACTION, open_session
 
 Inputs = Mapping[str, NDArray[Any]]
@@ -198,18 +195,4 @@ _DTYPES: dict[str, np.dtype[Any]] = {
 
 def compile_controller(code: CSource, folder: Path, compiler: list[str]) -> Path:
     """Compile a controller in `folder` and return the library; raises `AnswerIsNo` if the compiler fails."""
-    for name, content in (
-        (f"{code.name}.h", code.header),
-        (f"{code.name}.c", code.source),
-        ("harness.c", code.harness),
-    ):
-        (folder / name).write_text(content, encoding="utf-8")
-    library = folder / f"{code.name}{LIBRARY_SUFFIX}"
-    command = [*compiler, *FLAGS, "-fPIC", "-shared", "-o", str(library), "harness.c", "-lm"]
-    try:
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    except OSError as error:
-        raise AnswerIsNo(f"{compiler[0]} cannot be started: {error.strerror or error}") from None
-    if done.returncode != 0:
-        raise AnswerIsNo(f"{compiler[0]} cannot compile the controller: {short_repr(done.stderr, 300)}")
-    return library
+    return compile_code(code, "controller", ["harness.c"], folder, compiler)  # which includes the other file

@@ -125,26 +125,25 @@ class ControllerPlan:
         self.action_size = math.prod(action_space.shape)
         self.repeats_first = env.history_start == "first"
         self.frames = frames
-        self.observed = self._list_observed()
-        self.newest_size = sum(part.size for part in self.observed)
-        self.size = sum(part.size * part.frames for part in self.observed) * self.frames
+        layout = Layout(self._find_sizes(), env.observation_history)
+        self.newest_size, self.size = layout.newest_size, layout.size * frames
+        self.observed = [self._describe(part) for part in layout.parts]
         self.quantities = self._list_quantities()
         self.input_size = sum(quantity.size for quantity in self.quantities)
         if not self.quantities:
             raise UsageError("--controller: the policy observes nothing that a robot measures")
 
-    def _list_observed(self) -> list[Observed]:
-        env, sizes = self.env, self.env.observation_sizes
+    def _find_sizes(self) -> dict[str, int]:
+        """Return the elements of each name of a single observation, without a stack of them."""
+        sizes = self.env.observation_sizes
         if SINGLE not in self.parts:
             sizes = {key: math.prod(part.shape or ()) for key, part in self.parts.items()}
         total = sum(math.prod(part.shape or ()) for part in self.parts.values()) // self.frames
-        if sum(sizes.values()) != total:
-            sizes = {"observation": total}
-        observed = []
-        for part in Layout(sizes, env.observation_history).parts:
-            key = part.name if part.name in self.parts else SINGLE
-            observed.append(Observed(**vars(part), key=key, term=env.observation_terms.get(part.name)))
-        return observed
+        return sizes if sum(sizes.values()) == total else {"observation": total}
+
+    def _describe(self, part: Part) -> Observed:
+        key = part.name if part.name in self.parts else SINGLE
+        return Observed(**vars(part), key=key, term=self.env.observation_terms.get(part.name))
 
     def _list_quantities(self) -> list[Quantity]:
         env, sizes = self.env, dict[str, int]()
