@@ -286,7 +286,6 @@ class SensorChecks:
         return fault
 
     def _name(self, index: int) -> str:
-        for name, part in self._layout.columns.items():
-            if part.start <= index < part.stop:
-                return name if part.stop - part.start == 1 else f"{name}[{index - part.start}]"
-        return str(index)
+        name = self._layout.find_name(index)
+        part = self._layout.columns[name]
+        return name if part.stop - part.start == 1 else f"{name}[{index - part.start}]"
