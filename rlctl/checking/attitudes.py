@@ -26,6 +26,13 @@ OF_VECTOR = (
 """Of the columns of `rotate`, to be followed by the vector."""
 
 
+def find_vector(column: int) -> int:
+    """Return a number that the columns of `rotate` have in common which are components of one vector; several blocks of
+    such columns may follow each other."""
+    block, place = divmod(column, len(OF_VECTOR))
+    return 3 * block + place // 3
+
+
 def compute_matrices(quaternions: Array) -> Array:
     """Return the rotation matrices, shape (n, 3, 3), of quaternions x, y, z, w, shape (n, 4)."""
     x, y, z, w = quaternions.T

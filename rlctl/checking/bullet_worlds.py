@@ -5,6 +5,7 @@ It does not call `getCollisionShapeData`, which crashes on some models.
 
 import contextlib
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -31,6 +32,7 @@ from rlctl.environments.bullet_calls import BulletCalls
 from rlctl.environments.bullet_clients import ClientCalls, bullet
 
 GRAVITY, WEIGHT_STEPS = -9.81, 20  # [m/s^2]
+CREATED = "link0"  # PyBullet's name for the base of each body that createMultiBody makes
 UNMOVED = 1e-6  # smaller differences are no effect of gravity [m, rad, m/s, rad/s]; stiff motors leave little
 
 
@@ -51,6 +53,8 @@ def read_world(client: int) -> World:
 def _body(client: int, body: int) -> WorldBody:
     p = ClientCalls(client)
     base, name = (text.decode(errors="replace") for text in p.getBodyInfo(body))
+    if not name and base == CREATED:
+        base = ""
     infos = [p.getJointInfo(body, i) for i in range(p.getNumJoints(body))]
     moving = [info for info in infos if info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)]
     joints = [Joint(i[0], i[1].decode(errors="replace"), i[2] == p.JOINT_REVOLUTE, i[8], i[9]) for i in moving]
@@ -99,6 +103,19 @@ def read_contacts(client: int) -> dict[Pair, float]:
     for contact in ClientCalls(client).getContactPoints() or ():
         pair = (contact[1], contact[3]), (contact[2], contact[4])
         deepest[pair] = min(deepest.get(pair, math.inf), contact[8])
+    return deepest
+
+
+def read_overlaps(world: World) -> dict[Pair, float]:
+    """Return the deepest distance per pair of links that are inside each other, of each free body and what else moves;
+    the engine may not have looked for contacts since the bodies were placed."""
+    p = ClientCalls(world.client)
+    moving = [body for body in world.bodies if body.is_free or body.joints]
+    deepest: dict[Pair, float] = {}
+    for one, two in itertools.combinations(moving, 2):
+        for point in p.getClosestPoints(one.id, two.id, 0.0) if one.is_free or two.is_free else ():
+            pair = (one.id, point[3]), (two.id, point[4])
+            deepest[pair] = min(deepest.get(pair, 0.0), point[8])
     return deepest
 
 
@@ -180,6 +197,10 @@ class BulletStateReader:
     def read_contacts(self) -> dict[Pair, float]:
         """See `StateReader`."""
         return read_contacts(self.world.client)
+
+    def read_overlaps(self) -> dict[Pair, float]:
+        """See `StateReader`."""
+        return read_overlaps(self.world)
 
     def find_thickness(self, pair: Pair) -> float:
         """See `StateReader`."""

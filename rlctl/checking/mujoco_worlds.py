@@ -211,6 +211,14 @@ class MujocoStateReader:
         body = int(self.model.geom_bodyid[geom])
         return self._link_of.get(body, (int(self.model.body_rootid[body]), -1))
 
+    def read_overlaps(self) -> dict[Pair, float]:
+        """See `StateReader`."""
+        free = {body.id for body in self.world.bodies if body.is_free}
+        moving = free | {body.id for body in self.world.bodies if body.joints}
+        overlaps = {pair: distance for pair, distance in self.read_contacts().items() if distance < 0.0}
+        bodies = {pair: {root for root, _ in pair} for pair in overlaps}
+        return {pair: overlaps[pair] for pair in overlaps if bodies[pair] <= moving and bodies[pair] & free}
+
     def find_thickness(self, pair: Pair) -> float:
         """See `StateReader`."""
         bodies = [self._links[root][number + 1] if root in self._links else root for root, number in pair]

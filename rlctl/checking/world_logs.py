@@ -52,6 +52,8 @@ class WorldLog:
     times: list[float] = dataclasses.field(default_factory=list)  # simulated [s]; NaN in PyBullet
     states: list[list[Array]] = dataclasses.field(default_factory=list)  # by look and body
     deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)  # depth and limit [m]
+    overlaps: dict[Pair, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    """Depth and limit [m] of free bodies that a reset puts into what moves."""
     touching: list[set[Pair]] = dataclasses.field(default_factory=list)  # Links that touch
     poses: list[Poses] = dataclasses.field(default_factory=list)
     observed: list[Array] = dataclasses.field(default_factory=list)  # flat observations
@@ -70,9 +72,10 @@ class WorldLog:
             reader.update()
             states, contacts = reader.read_states(), reader.read_contacts()
             poses, targets = reader.read_poses(), reader.read_targets()
-            deep = {pair: (-d, self._limit(pair)) for pair, d in contacts.items() if d < -LEAST_LIMIT}
+            deep = self._find_deep(contacts)
             if not self.places:
                 self.weights = reader.read_weights()
+                self.overlaps = self._find_deep(reader.read_overlaps())
         except reader.errors:
             return False
         self.places.append(place)
@@ -85,9 +88,14 @@ class WorldLog:
         self.before.append(reader.read_before())
         self.targets.append(targets)
         self.commands.append(reader.read_command())
-        self.deep.append({pair: depth for pair, depth in deep.items() if depth[0] > depth[1]})
+        self.deep.append(deep)
         self.failure = self.failure or reader.read_failure()
         return True
+
+    def _find_deep(self, distances: dict[Pair, float]) -> dict[Pair, tuple[float, float]]:
+        """Return depth and limit of the pairs that are too deep inside each other [m]."""
+        inside = {pair: (-d, self._limit(pair)) for pair, d in distances.items() if d < -LEAST_LIMIT}
+        return {pair: depth for pair, depth in inside.items() if depth[0] > depth[1]}
 
     def _limit(self, pair: Pair) -> float:
         return min(DEEPEST_FINE, max(LEAST_LIMIT, PART_OF_LINK * self.reader.find_thickness(pair)))

@@ -149,3 +149,17 @@ class Logs(Point):
     def rewards(self, action):
         self.mean_error = float(np.abs(self.error()).mean())
         return super().rewards(action)
+
+
+class CachesAndForgetsTheSeed(Point):
+    """The error is computed anew in each step, and the goals are not drawn from the seed."""
+
+    rlctl_ignore = {"RL301": "it is what the test is about", "RL308": "a consequence"}
+
+    def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
+        super().reset(rng, worlds)
+        self.goal[worlds] += np.random.default_rng().uniform(-0.1, 0.1, len(worlds))
+
+    def act(self, action: np.ndarray) -> None:
+        super().act(action)
+        self.cached_error = self.error()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pybullet as p
-from robots import Arm, Boat, Crawler, Tank
+from robots import Arm, Boat, Crawler, Pusher, Tank
 
 
 class BoatHiddenBuoy(Boat):
@@ -340,3 +340,13 @@ class ArmPullsOnly(Arm):
 class BoatForwardOnly(Boat):
     def move(self, action):
         super().move(np.maximum(action, 0.0))
+
+
+class PusherInsideItsCube(Pusher):
+    rlctl_ignore = {**Pusher.rlctl_ignore, "RL302": "a consequence"}
+
+    def put_cube(self, place):
+        super().put_cube(place)
+        if self.np_random.random() < 0.5:
+            place = [0.26, 0.035, 0.03]
+            p.resetBasePositionAndOrientation(self.cube, place, [0, 0, 0, 1], physicsClientId=self.client)

@@ -214,3 +214,44 @@ class Crawler(Simulated):
 
     def info(self, success):
         return {"is_success": self.forward() > 0.0 and not self.has_failed()}
+
+
+class Pusher(Arm):
+    """A crank that turns about the vertical pushes a cube; how fast the cube slides is observed in the world's frame,
+    as is where its crank is."""
+
+    home = np.array([0.0, 0.0, 0.0])
+    placed = (0.25, 0.09, 0.03)  # of the cube, beside the crank [m]
+
+    def size(self):
+        return 2 * self.joints + 6
+
+    def load(self):
+        p.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=self.client)
+        self.robot = p.loadURDF(str(HERE / "crank.urdf"), useFixedBase=True, physicsClientId=self.client)
+        shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.03] * 3, physicsClientId=self.client)
+        self.cube = p.createMultiBody(0.1, shape, basePosition=self.placed, physicsClientId=self.client)
+
+    def hand(self):
+        return p.getLinkState(self.robot, 2, computeForwardKinematics=True, physicsClientId=self.client)
+
+    def start(self):
+        super().start()
+        self.put_cube(np.add(self.placed, [*self.np_random.uniform(-0.02, 0.02, 2), 0.0]))
+
+    def put_cube(self, place):
+        for z in (9.0, place[2]):  # far away first, which forgets the contacts of the last episode
+            p.resetBasePositionAndOrientation(self.cube, [*place[:2], z], [0, 0, 0, 1], physicsClientId=self.client)
+            p.performCollisionDetection(physicsClientId=self.client)
+
+    def observe(self):
+        place, _ = p.getBasePositionAndOrientation(self.cube, physicsClientId=self.client)
+        velocity, _ = p.getBaseVelocity(self.cube, physicsClientId=self.client)
+        return np.concatenate([super().observe(), place, velocity]).astype(np.float32)
+
+    def reward(self):
+        velocity, _ = p.getBaseVelocity(self.cube, physicsClientId=self.client)
+        return velocity[1] - 0.1
+
+    def info(self, success):
+        return {"is_success": p.getBasePositionAndOrientation(self.cube, physicsClientId=self.client)[0][1] > 0.14}

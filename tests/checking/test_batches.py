@@ -62,6 +62,13 @@ def test_the_message_names_what_is_wrong(name, rule, message):
     assert finding.message.startswith(message)
 
 
+def test_kept_values_are_not_judged_where_the_seed_does_not_determine_an_episode():
+    from tests.checking.judging import verdict_of
+
+    verdict = verdict_of(f"{FILE}:CachesAndForgetsTheSeed", "RL409")
+    assert "differs from its repetition" in verdict.not_judged["RL409"]
+
+
 def test_a_difference_by_rounding_is_named():
     assert describe_difference(0.5, 0.25) == "is 0.5, then 0.25"
     rounded = describe_difference(0.5, float(np.nextafter(0.5, 1.0)))

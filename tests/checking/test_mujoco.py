@@ -95,6 +95,7 @@ def test_clean_is_clean(task):
         ("HopperStateInTheLoop", "RL815", ("observation[0] (position of body)",)),
         ("ArmBeyondRange", "RL816", ("only", "of the action's range")),
         ("ArmGrowsHeavy", "RL817", ("body_mass[1] (upper)",)),
+        ("HopperSlips", "RL817", ("geom_friction[", ", 0]")),
         ("ArmKeepsActivation", "RL302", ("reset keeps state (data.act",)),
         ("HopperForces", "RL818", ("data.cfrc_ext", "mj_rnePostConstraint")),
     ],

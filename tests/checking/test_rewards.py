@@ -32,7 +32,7 @@ CASES = [
     broken("SuccessUntold", ("RL609", "info"), twin="SuccessArray"),
     broken("SuccessMisnamed", ("RL609", "info"), twin="SuccessOtherwiseNamed"),
     broken("SuccessIsAShare", ("RL609", "info")),
-    broken("SuccessAtStart", ("RL610", "warning")),
+    broken("SuccessAtStart", ("RL610", "warning"), twin="SuccessOnAverage"),
     broken("SuccessNever", ("RL611", "info")),
     broken("WrongSlice", ("RL612", "warning"), twin="TimePenalty", slow=True),
 ]

@@ -6,7 +6,7 @@ from tests.checking.judging import case, check_case, findings, mark_slow
 
 
 def broken(name, rule, severity, twin, **settings):
-    file = "robots.py" if twin in ("Arm", "Boat", "Crawler", "Tank") else "broken_robots.py"
+    file = "robots.py" if twin in ("Arm", "Boat", "Crawler", "Pusher", "Tank") else "broken_robots.py"
     return case(f"broken_robots.py:{name}", (rule, severity), twin=f"{file}:{twin}", **settings)
 
 
@@ -37,6 +37,7 @@ CASES = [
     broken("ArmLateReward", "RL616", "warning", "Arm"),
     broken("BoatNan", "RL704", "info", "Boat"),
     broken("TankNan", "RL704", "info", "Tank"),
+    broken("PusherInsideItsCube", "RL803", "warning", "Pusher"),
     broken("ArmDegrees", "RL810", "error", "Arm"),
     broken("CrawlerStartsInDegrees", "RL810", "error", "Crawler"),
     broken("ArmOrder", "RL811", "error", "Arm"),

@@ -149,6 +149,11 @@ def describe_difference(value: float, expected: float) -> str:
     return f"is {value:.9g}, then {difference}: a @ b rounds as the number of rows says, a * b does not"
 
 
+def _are_equal(one: PlayedWorlds, two: PlayedWorlds) -> bool:
+    pairs = zip(one.rows, two.rows, strict=False)
+    return len(one.rows) == len(two.rows) and all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
+
+
 def _find_influence(worlds: _Worlds, alone: Rows) -> Iterator[ChildMessage]:
     first, again, other = (worlds.play(others=others) for others in (0, 0, 100))
     ours, repeated, changed = ([rows[COMPARED] for rows in play.rows] for play in (first, again, other))
@@ -182,7 +187,10 @@ def _find_reset_of_others(worlds: _Worlds) -> Iterator[ChildMessage]:
 
 
 def _find_kept_values(worlds: _Worlds) -> Iterator[ChildMessage]:
-    reference = worlds.play()
+    reference, again = worlds.play(), worlds.play()
+    if not _are_equal(reference, again):
+        yield Skipped("RL409", "an episode already differs from its repetition (RL301 to RL303)")
+        return
     if len(reference.rows) <= LATER + 1:
         yield Skipped("RL409", f"episodes ended within {len(reference.rows) - 1} steps")
         return
@@ -190,10 +198,7 @@ def _find_kept_values(worlds: _Worlds) -> Iterator[ChildMessage]:
     found: dict[Severity, list[str]] = {Severity.ERROR: [], Severity.WARNING: []}
     for name in [name for name in later if name in earlier and not np.array_equal(earlier[name], later[name])]:
         replayed = worlds.play(replaced={name: earlier[name]})
-        differs = any(
-            not np.array_equal(*pair, equal_nan=True) for pair in zip(reference.rows, replayed.rows, strict=False)
-        )
-        if differs or len(reference.rows) != len(replayed.rows):
+        if not _are_equal(reference, replayed):
             found[Severity.ERROR].append(f"self.{name}")
         elif np.shape(later[name])[:1] != (WORLDS,):  # one with a row per world is computed in each step
             found[Severity.WARNING].append(f"self.{name}")

@@ -21,6 +21,9 @@ FEWEST_COMPARED, SHORTEST_COMPARED = 10, 10  # Episodes; steps of each
 MOST_OF = 0.5
 STARTS, FEWEST_STARTS = 30, 10
 START_STEPS = 3  # More than one, to tell what belongs to the episode from chance in each step
+WHOLE, ENOUGH_WHOLE = "whole starts", 5
+"""Starts that succeed at once and go on are played on: an episode succeeds if it does at its end, and `is_success` may
+be about a mean of the episode so far."""
 FIRST = FIRST_SEED + 100  # The first of their seeds; none of the whole episodes has them
 MANY_AT_START = 0.2  # part of the starts: a goal may be near the robot by chance
 FEWEST_EPISODES = 20  # Fewer episodes say little about whether one can succeed
@@ -105,12 +108,27 @@ def _bonus(idle: Sequence[CheckedEpisode]) -> tuple[str | None, float]:
 @experiment("starts", share=1.0)
 def record_starts(context: Context) -> Iterator[ChildMessage]:
     """Reset with many seeds, and take the same few steps with the zero action after each."""
+    whole = 0
     for number in range(STARTS):
         if why := context.budget.why_spent():
             yield Skipped("starts", f"only {number} of {STARTS} starts were made: {why}")
             return
         episode = EpisodePlayer(context.instance, FIRST + number, "zero", number=number, max_steps=START_STEPS)
-        yield from Recording("starts", episode).run()
+        recorded = Recording("starts", episode).run()
+        yield from recorded
+        if whole < ENOUGH_WHOLE and isinstance(recorded[0], CheckedEpisode) and _succeeds_and_goes_on(recorded[0]):
+            whole += 1
+            again = EpisodePlayer(context.instance, FIRST + number, "zero", number=number, max_steps=COMPARED_STEPS)
+            yield from Recording(WHOLE, again).run()
+
+
+def _succeeds_at_once(start: CheckedEpisode) -> bool:
+    success = start.infos.get(SUCCESS)
+    return success is not None and bool((success.values[success.steps <= 1] > 0).any())
+
+
+def _succeeds_and_goes_on(start: CheckedEpisode) -> bool:
+    return _succeeds_at_once(start) and not (start.terminated[:1] | start.truncated[:1]).any()
 
 
 @check("RL609", *rewards.WITH_SEARCH, of_absence=True)
@@ -131,13 +149,20 @@ def _find_success_at_start(records: Records) -> Iterator[RuleFinding]:
     starts = [episode for episode in records.role("starts") if episode.steps]
     if len(starts) < FEWEST_STARTS:
         raise NotJudged("no step could be taken" if records.role("starts") else records.why_missing("starts"))
-    reported = [(start, start.infos[SUCCESS]) for start in starts if SUCCESS in start.infos]
-    if not reported:
+    if not any(SUCCESS in start.infos for start in starts):
         raise NotApplicable("is_success is not reported at the first step")
-    at_once = [episode for episode, success in reported if (success.values[success.steps <= 1] > 0).any()]
-    share = len(at_once) / len(starts)
+    at_once = [start for start in starts if _succeeds_at_once(start)]
+    going_on = sum(map(_succeeds_and_goes_on, at_once))
+    whole = records.role(WHOLE)
+    if whole:  # of those that go on, so many in the end
+        kept = sum(map(rewards.ends_in_success, whole)) / len(whole)
+        share = (len(at_once) - going_on * (1.0 - kept)) / len(starts)
+    else:
+        share = len(at_once) / len(starts)
     if share > MANY_AT_START:
         message = f"{len(at_once)} of {len(starts)} episodes are a success after one step with the zero action"
+        if going_on and whole:
+            message += f", and {100 * kept:.0f} % of those that go on are one in the end"
         yield RuleFinding("RL610", message, at_once[0].at(1, value=share, expected=f"up to {MANY_AT_START}"))
 
 

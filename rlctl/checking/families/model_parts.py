@@ -62,11 +62,11 @@ def find_drift(instance: Instance) -> Iterator[RuleFinding]:
         _write_property(model, name, drawn[0][name])
         grown = (scaled != first) & (first != before)
         if np.array_equal(first, again) and grown.any():
-            row = int(np.argwhere(grown)[0][0])
-            kind = PROPERTIES[name]
-            of = f" ({getattr(model, kind)(row).name or row})" if kind else ""
-            series = ", ".join(f"{float(np.ravel(each[name][row])[-1]):.4g}" for each in drawn)
-            message = f"every reset changes model.{name} as the last one left it: {name}[{row}]{of} was {series}"
+            place = tuple(np.argwhere(grown)[0].tolist())
+            kind, shown = PROPERTIES[name], f"{name}[{', '.join(map(str, place))}]"
+            of = f" ({getattr(model, kind)(place[0]).name or place[0]})" if kind else ""
+            series = ", ".join(f"{each[name][place]:.4g}" for each in drawn)
+            message = f"every reset changes model.{name} as the last one left it: {shown}{of} was {series}"
             evidence = {"element": f"model.{name}", "call": "reset", "seed": FIRST_SEED}
             yield RuleFinding("RL817", message, evidence)
 

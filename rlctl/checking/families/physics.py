@@ -4,7 +4,7 @@ import contextlib
 import itertools
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("ran
 """Actions and logged steps. The last ones are for what resets draw."""
 ENOUGH_EPISODES, PART_FOR_THE_REST = 5, 0.3  # of a slow environment; of the experiment's time
 LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved yet
+FEWEST_OVERLAPS = 2  # resets that put something into something else
 LASTING_SOFT = 10  # the same for contacts of MuJoCo, which are soft by design, if they begin after a reset
 PART_OF_RANGE, LEAST_ANGLE, LEAST_LENGTH = 0.1, 0.05, 0.01
 """How far outside its limits a joint may be: part of the range, and at least so much [rad], [m]."""
@@ -144,6 +145,31 @@ def _penetration(world: LoggedWorld) -> Iterator[RuleFinding]:
         lasts = f"deeper than {100 * limit:.1f} cm for {len(row)} steps in a row{more}"
         message = f"{names[0]} is {100 * depth:.1f} cm inside {names[1]} {_when(place)}, and {lasts}"
         yield RuleFinding("RL803", message, {**place, "value": depth, "expected": limit, "links": names})
+    if not worst:
+        yield from _overlap_at_reset(world, thrown)
+
+
+def _overlap_at_reset(world: LoggedWorld, thrown: Collection[str]) -> Iterator[RuleFinding]:
+    """Yield what resets put into each other, if the two ever touch: the engine may have been told to let them pass."""
+    touching = {frozenset(pair) for log in world.logs for pairs in log.touching for pair in pairs}
+    starts: dict[Pair, list[WorldLog]] = {}
+    for log in world.logs:
+        for pair in log.overlaps:
+            is_thrown = any(body in log.world.link_name(link) for body in thrown for link in pair)  # RL807 says it
+            if frozenset(pair) in touching and not is_thrown:
+                starts.setdefault(pair, []).append(log)
+    often = [pair for pair in starts if len(starts[pair]) >= FEWEST_OVERLAPS]
+    if not often:
+        return
+    pair = max(often, key=lambda pair: len(starts[pair]))
+    log = max(starts[pair], key=lambda log: log.overlaps[pair][0])
+    (depth, limit), place = log.overlaps[pair], log.places[0]
+    names = [log.world.link_name(link) for link in sorted(pair, reverse=True)]
+    how_often = f"in {len(starts[pair])} of {len(world.logs)} episodes"
+    message = (
+        f"{names[0]} is {100 * depth:.1f} cm inside {names[1]} at reset, {how_often} more than {100 * limit:.1f} cm"
+    )
+    yield RuleFinding("RL803", message, {**place, "value": depth, "expected": limit, "links": names})
 
 
 def _longest_row(is_deep: Sequence[bool]) -> list[int]:

@@ -34,6 +34,8 @@ ORDERS = {
 }
 AXIS_NAMES = (*(f"the world's {axis} axis in the frame" for axis in "xyz"), *(f"the {axis} axis" for axis in "xyz"))
 EXACT = 2e-6  # relative; the last bits of float32 and of sums
+Match = tuple[int, Link, str, int, int]
+"""Element, link, order, feature and sign."""
 OLD = 1e-4  # An old value differs from the present one by more, in most looks [m], [rad], [m/s]
 
 
@@ -56,7 +58,7 @@ def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
     links = sorted(set.intersection(*(set(poses) for poses in looks)))
     quaternions = {link: np.array([poses[link][ORIENTATION] for poses in looks]) for link in links}
     velocities = _find_velocities(logs)
-    wrong: list[tuple[int, Link, str, int, int]] = []  # element, link, order, feature and sign
+    wrong: list[Match] = []
     orders = ORDERS[world.world.engine]
     for (link, values), (places, order) in itertools.product(quaternions.items(), orders.items()):
         names, features = _compute_all(values[:, places], velocities)
@@ -65,8 +67,9 @@ def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
         wrong += [(int(moving[column]), link, order, feature, sign) for column, feature, sign in equal]
     if not wrong:
         return
+    wrong = _drop_lonely_components(wrong)
     computed = [_compute_all(values, velocities)[1] for values in quaternions.values()]
-    right = np.hstack([*computed, *_read_joints(logs)])
+    right = np.hstack([*computed, *velocities.values(), *_read_joints(logs)])
     equal = _find_equal(observed, right)
     signs = {(column, sign) for column, _, sign in equal}
     known = {column for column, _ in signs} | _find_turned(observed, {entry[0] for entry in wrong}, quaternions, logs)
@@ -85,6 +88,22 @@ def find_misread_quaternions(world: LoggedWorld) -> Iterator[RuleFinding]:
     columns = sorted({column for column, *_ in wrong})
     rows = [column for column in range(observed.shape[1] - 2) if sum(column + i in columns for i in range(3)) >= 2]
     yield from _find_misread_axes(world.world, observed, rows, quaternions)
+
+
+def _drop_lonely_components(matches: Sequence[Match]) -> list[Match]:
+    """Drop a component of a vector that is the only one of its vector: where a link turns about one axis, a wrong order
+    turns any vector of the world by half a turn, so that one component is equal to itself up to its sign."""
+    count = len(attitudes.NAMES)
+
+    def vector_of(match: Match) -> tuple[Link, str, int]:
+        _, link, order, feature, _ = match
+        return link, order, attitudes.find_vector(feature - count)
+
+    found: dict[tuple[Link, str, int], set[int]] = {}
+    for match in matches:
+        if match[3] >= count:
+            found.setdefault(vector_of(match), set()).add(match[3])
+    return [match for match in matches if match[3] < count or len(found[vector_of(match)]) > 1]
 
 
 def _read_joints(logs: Sequence[WorldLog]) -> list[Array]:
