@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.records import CheckedEpisode, Records
-from rlctl.checking.rules import NotJudged
+from rlctl.checking.rule import NotJudged
 from rlctl.environments.leaves import Leaf
 from rlctl.environments.success import SUCCESS
 

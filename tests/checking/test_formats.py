@@ -16,11 +16,12 @@ import typer
 from gymnasium import spaces
 
 from rlctl import cli
-from rlctl.checking import families, tool_formats
+from rlctl.checking import tool_formats
 from rlctl.checking.check import CheckReport, CheckVerdict, judge
 from rlctl.checking.formats import FORMATS, pair_targets, show_notes, to_text
 from rlctl.checking.records import Built, Finished, Records
-from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, choose_rules, find_rule
+from rlctl.checking.rule import RuleFinding, Severity
+from rlctl.checking.rules import FAMILIES, PROCESSES, RULES, choose_rules, find_needs, find_rule
 from rlctl.environments.leaves import find_leaves
 from rlctl.errors import UsageError
 from tests import fork_server
@@ -30,11 +31,11 @@ ROOT = Path(__file__).parent.parent.parent
 HERE = "tests/checking"
 
 
-PROBE = families.PROCESSES["probe"]
+PROBE = PROCESSES["probe"]
 
 
 def report_of(task, rules=tuple(RULES), experiments=None):
-    records = records_of(task, *(experiments or {"build", *families.find_needs(rules)}))
+    records = records_of(task, *(experiments or {"build", *find_needs(rules)}))
     return CheckReport(task, judge(records, rules), records, 1.0, 20.0)
 
 

@@ -7,7 +7,7 @@ from rlctl.checking.families import isolation
 from rlctl.checking.families.episodes import find_unseeded, record_episodes
 from rlctl.checking.instance import Context
 from rlctl.checking.progress import read_clock
-from rlctl.checking.rules import NotJudged
+from rlctl.checking.rule import NotJudged
 from rlctl.environments.spec import EnvSpec
 from tests.checking.judging import case, check_case, findings, mark_slow, records_of
 

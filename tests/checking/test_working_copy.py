@@ -9,7 +9,7 @@ from rlctl.checking import tool_formats
 from rlctl.checking.check import CheckReport, CheckVerdict
 from rlctl.checking.formats import show_notes
 from rlctl.checking.records import Built, Records
-from rlctl.checking.rules import RuleFinding
+from rlctl.checking.rule import RuleFinding
 from rlctl.checking.working_copy import find_outdated, find_working_copy, prefer_working_copy
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rlctl.checking.records import Fact, Series
-from rlctl.checking.rules import RuleFinding, Severity
+from rlctl.checking.rule import RuleFinding, Severity
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.play import messages

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from rlctl.checking import action_trials
 from rlctl.checking.action_trials import REWARD, ActionNumber, Frame, Trials
-from rlctl.checking.experiments import check, experiment
+from rlctl.checking.experiment import INSTANCES, experiment, judges_records
 from rlctl.checking.instance import Context, EnvironmentRaised
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact, Records
-from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFinding, Severity, list_names
+from rlctl.checking.rule import NotApplicable, NotJudged, OutOfTime, RuleFinding, Severity, list_names
 
 MOST_DIMENSIONS = 64
 STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows
@@ -25,7 +25,7 @@ Effect = Literal["lasting", "reward", "cost", "copy", "none"]
 in the observation; or nothing."""
 
 
-@experiment("action effects", "RL701", "RL115", share=4.0)
+@experiment("action effects", INSTANCES, 60, "RL701", "RL115", share=4.0)
 def compare_actions(context: Context) -> Iterator[ChildMessage]:
     """Play the same episode with each number of the action at other values."""
     with context.fresh() as instance:
@@ -56,7 +56,7 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
         yield _finding(halves, message, Severity.INFO)
 
 
-@experiment("nan action", "RL704", share=0.2)
+@experiment("nan action", INSTANCES, 80, "RL704", share=0.2)
 def give_nan(context: Context) -> Iterator[ChildMessage]:
     """Take an action of NaN, and then begin another episode."""
     with context.fresh() as instance:
@@ -73,7 +73,7 @@ def give_nan(context: Context) -> Iterator[ChildMessage]:
                 yield RuleFinding("RL704", message, evidence, Severity.WARNING if lasts else None)
 
 
-@check("RL704", "nan action")
+@judges_records("RL704", "nan action")
 def _find_end_after_nan(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
         if failure.phase == "nan action" and failure.kind in ("died", "hung"):
@@ -82,7 +82,7 @@ def _find_end_after_nan(records: Records) -> Iterator[RuleFinding]:
             return
 
 
-@check("RL705")
+@judges_records("RL705")
 def _find_changed_actions(records: Records) -> Iterator[RuleFinding]:
     for episode, form in records.forms("action")[:1]:
         message = (

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiments import check
+from rlctl.checking.experiment import judges_records
 from rlctl.checking.families import rewards
 from rlctl.checking.records import Records
-from rlctl.checking.rules import NotApplicable, RuleFinding
+from rlctl.checking.rule import NotApplicable, RuleFinding
 from rlctl.checking.transitions import Transitions, collect_transitions, find_unit_pairs
 
 NEAR_TURN = 1.0  # an angle that passes pi changes by 2 pi +- NEAR_TURN [rad]
@@ -23,7 +23,7 @@ SAME_FACTOR, MOST_FIT = 0.15, 0.7  # how equal factors are, and what part of all
 RARE = 0.05  # the same of all other steps, relative to that of the passes
 
 
-@check("RL618", *rewards.WITH_SEARCH)
+@judges_records("RL618", *rewards.WITH_SEARCH)
 def _find_jumps_of_angles(records: Records) -> Iterator[RuleFinding]:
     rewards.require_rewarded(records)
     steps = collect_transitions(records)

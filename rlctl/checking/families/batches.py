@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiments import experiment
+from rlctl.checking.experiment import INSTANCES, experiment
 from rlctl.checking.families.determinism import NEARLY
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance, describe
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, list_names
+from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.values import NUMBERS, find_batch
 from rlctl.environments.places import find_line
 from rlctl.errors import WorldFailed
@@ -34,7 +34,7 @@ class PlayedWorlds:
     attributes: list[dict[str, Any]]  # numbers that the task holds after each of them, by name
 
 
-@experiment("batches", "RL406", "RL407", "RL408", "RL409")
+@experiment("batches", INSTANCES, 30, "RL406", "RL407", "RL408", "RL409")
 def compare_worlds(context: Context) -> Iterator[ChildMessage]:
     """Play a few steps with one world and with several, whose seeds and actions change."""
     with context.fresh() as instance:

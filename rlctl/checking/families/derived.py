@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.families.model_parts import find_drift, find_untouched_parts
 from rlctl.checking.families.motor_trials import find_wrong_answers
-from rlctl.checking.instance import EnvironmentRaised, Instance
+from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
-from rlctl.checking.mujoco_trials import STEPS, Look, are_equal, name_columns, pair_rows, play
+from rlctl.checking.mujoco_trials import STEPS, Look, name_columns, pair_rows, play
 from rlctl.checking.mujoco_worlds import MujocoStateReader, copy_data, library, refresh
 from rlctl.checking.records import FIRST_SEED
-from rlctl.checking.rules import RuleFinding, Severity, list_names
+from rlctl.checking.rule import RuleFinding, Severity, list_names
 from rlctl.checking.values import flatten
-from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import Array
 from rlctl.environments.info import find_mujoco
 
@@ -44,25 +43,21 @@ FEWEST_LOOKS, LEAST_MOTION = 4, 1e-4
 EXACT = 2e-6  # relative; the last bits of float32
 
 
+def find_wrong_resets(instance: Instance) -> Iterator[RuleFinding]:
+    """Yield what is wrong with how an environment changes its model."""
+    yield from find_drift(instance)
+
+
 def find_wrong_reads(
-    instance: Instance, calls: MujocoCalls, worlds: Sequence[LoggedWorld], known: Collection[str]
+    instance: Instance, calls: MujocoCalls, reader: MujocoStateReader, plain: Sequence[Look], known: Collection[str]
 ) -> Iterator[RuleFinding]:
-    """Yield what is wrong with how an environment reads MuJoCo's data, changes its model, and moves its motors; `known`
-    are the rules that have findings about the motors."""
-    readers = [world.reader for world in worlds if isinstance(world.reader, MujocoStateReader)]
-    if not readers or not instance.accepts_seed or instance.context.budget.is_over():
-        return
-    with contextlib.suppress(EnvironmentRaised):  # an episode that was logged raised it too
-        yield from find_drift(instance)
-        plain = play(instance, calls)
-        plain = play(instance, calls)  # an instance's first episode may differ from all others
-        if not are_equal(plain, play(instance, calls)):
-            return
-        yield from _find_stale(instance, calls, plain)
-        yield from _find_unforwarded(instance, calls, plain)
-        yield from _find_never_computed(instance, calls, plain)
-        yield from find_untouched_parts(instance, calls, readers[0])
-        yield from find_wrong_answers(instance, calls, readers[0], known)
+    """Yield what is wrong with how an environment reads MuJoCo's data, and moves its motors; `known` are the rules that
+    have findings about the motors."""
+    yield from _find_stale(instance, calls, plain)
+    yield from _find_unforwarded(instance, calls, plain)
+    yield from _find_never_computed(instance, calls, plain)
+    yield from find_untouched_parts(instance, calls, reader)
+    yield from find_wrong_answers(instance, calls, reader, known)
 
 
 class _Refresh:

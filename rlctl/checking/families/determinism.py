@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import Check, check, experiment
+from rlctl.checking.experiment import PROBE, RecordsJudge, experiment, judges_records
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.mujoco_worlds import FIELDS, read_kept_fields
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, CheckedEpisode, ChildMessage, Fact, Records, Series
-from rlctl.checking.rules import NotJudged, RuleFinding, Severity, list_names
+from rlctl.checking.rule import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.values import find_unequal, read_attributes
 from rlctl.environments.success import SUCCESS
 
@@ -54,7 +54,7 @@ class FirstDifference:
         return {**place, "value": self.second, "expected": self.first, **sizes}
 
 
-@experiment("comparisons", share=4.0)
+@experiment("comparisons", PROBE, 20, share=4.0)
 def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
     """Play the first episode again: at once, after an unfinished other one, and with another seed."""
     instance, budget = context.instance, context.budget
@@ -128,8 +128,8 @@ def _find_cause(records: Records) -> tuple[str, str]:
     return f"; a new process repeats it, so reset keeps state{shown}", f"Set back in reset: {what}."
 
 
-def _compare_itself(rule: str, what: str, *, at_reset: bool) -> Check:
-    @check(rule, "comparisons", "instances")
+def _compare_itself(rule: str, what: str, *, at_reset: bool) -> RecordsJudge:
+    @judges_records(rule, "comparisons", "instances")
     def compare_itself(records: Records) -> Iterator[RuleFinding]:
         difference = compare(records, "alone", "reused")
         if difference is not None and (difference.step == 0) is at_reset:
@@ -138,8 +138,8 @@ def _compare_itself(rule: str, what: str, *, at_reset: bool) -> Check:
     return compare_itself
 
 
-def _compare_other(rule: str, first: str, second: str, what: str, *needs: str) -> Check:
-    @check(rule, "comparisons", *needs)
+def _compare_other(rule: str, first: str, second: str, what: str, *needs: str) -> RecordsJudge:
+    @judges_records(rule, "comparisons", *needs)
     def compare_other(records: Records) -> Iterator[RuleFinding]:
         if (difference := compare(records, first, second)) is not None:
             if compare(records, "alone", "reused") is not None:

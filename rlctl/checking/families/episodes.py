@@ -4,11 +4,11 @@ import contextlib
 from collections.abc import Iterator
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
+from rlctl.checking.experiment import PROBE, experiment, judges_records
 from rlctl.checking.instance import Context
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import ENDS, FIRST_SEED, CheckedEpisode, ChildMessage, Records, Shortened
-from rlctl.checking.rules import NotJudged, RuleFinding, Severity
+from rlctl.checking.rule import NotJudged, RuleFinding, Severity
 from rlctl.checking.values import find_assignment, read_generators, watch_unseeded
 
 EPISODES = (
@@ -28,7 +28,7 @@ SHORTEST_TIE = 20  # The same, where only some episodes end together [steps]
 ENOUGH_STEPS = 1_000  # shorter episodes without an end are too short to judge
 
 
-@experiment("episodes", share=6.0)
+@experiment("episodes", PROBE, 50, share=6.0)
 def record_episodes(context: Context) -> Iterator[ChildMessage]:
     """Play whole episodes with actions of every kind."""
     instance, budget, steps, longest = context.instance, context.budget, 0, ENDLESS_STEPS
@@ -51,7 +51,7 @@ def record_episodes(context: Context) -> Iterator[ChildMessage]:
                 return
 
 
-@experiment("unseeded generators", "RL311", share=0.1)
+@experiment("unseeded generators", PROBE, 80, "RL311", share=0.1)
 def find_unseeded(context: Context) -> Iterator[ChildMessage]:
     """Reset with the first seed, and compare the states of all generators with those after the first reset."""
     instance = context.instance
@@ -84,7 +84,7 @@ def _require_two_flags(records: Records) -> None:
         raise NotJudged("step returns one flag for both (RL201)")
 
 
-@check("RL501", "episodes", "search")  # of absence too, but for the counter
+@judges_records("RL501", "episodes", "search")  # of absence too, but for the counter
 def _find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
     episodes = _require_episodes(records)
     _require_two_flags(records)
@@ -122,7 +122,7 @@ def _ends_with_odd_reward(episode: CheckedEpisode) -> bool:
     return bool(before.size and (last < before.min() or last > before.max()))
 
 
-@check("RL502", "episodes", of_absence=True)
+@judges_records("RL502", "episodes", of_absence=True)
 def _find_both_flags(records: Records) -> Iterator[RuleFinding]:
     episodes = _require_episodes(records)
     both = [episode for episode in episodes if episode.ended == "both"]
@@ -131,7 +131,7 @@ def _find_both_flags(records: Records) -> Iterator[RuleFinding]:
         yield RuleFinding("RL502", message, both[0].at(both[0].steps, value=len(both), expected=0))
 
 
-@check("RL507", "episodes", of_absence=True)
+@judges_records("RL507", "episodes", of_absence=True)
 def _find_failure_as_truncated(records: Records) -> Iterator[RuleFinding]:
     episodes = _require_episodes(records)
     lengths = [episode.steps for episode in episodes if episode.ended == "truncated"]
@@ -144,7 +144,7 @@ def _find_failure_as_truncated(records: Records) -> Iterator[RuleFinding]:
     yield RuleFinding("RL507", f"{message}steps, and none is terminated", {"value": steps, "expected": limit})
 
 
-@check("RL503", "episodes", of_absence=True)
+@judges_records("RL503", "episodes", of_absence=True)
 def _find_endless(records: Records) -> Iterator[RuleFinding]:
     limit, episodes = records.require_built().max_steps, _require_episodes(records)
     if any(episode.ended == "truncated" for episode in episodes):
@@ -163,7 +163,7 @@ def _find_endless(records: Records) -> Iterator[RuleFinding]:
     yield RuleFinding("RL503", message, {"steps": longest, "expected": limit}, fix=_use_registration(records))
 
 
-@check("RL504", "episodes")
+@judges_records("RL504", "episodes")
 def _find_end_at_once(records: Records) -> Iterator[RuleFinding]:
     episodes = _require_episodes(records)
     built, longest = records.require_built(), max(episode.steps for episode in episodes)
@@ -174,7 +174,7 @@ def _find_end_at_once(records: Records) -> Iterator[RuleFinding]:
         yield RuleFinding("RL504", message, {"step": longest, "episodes": len(episodes)})
 
 
-@check("RL506", "episodes", "search", of_absence=True)
+@judges_records("RL506", "episodes", "search", of_absence=True)
 def _find_no_time_limit(records: Records) -> Iterator[RuleFinding]:
     built, episodes = records.require_built(), _require_episodes(records)
     if built.max_steps is not None or any(episode.ended != "terminated" for episode in episodes):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, Moment
-from rlctl.checking.experiments import check, experiment
+from rlctl.checking.experiment import PROBE, experiment, judges_records
 from rlctl.checking.families import rewards
 from rlctl.checking.families.episodes import EPISODES
 from rlctl.checking.families.incentives import FIRST, STARTS
@@ -16,7 +16,7 @@ from rlctl.checking.families.lateness import sample_ordinary_steps
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact, Records
 from rlctl.checking.regression import action_terms, fit_terms
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
+from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.transitions import Transitions, collect_transitions, find_float_leaves
 from rlctl.checking.values import Attribute, read_attributes
 from rlctl.checking.workspaces import Reach, find_chains, find_reach, measure_reach
@@ -38,7 +38,7 @@ Source = tuple[int, int]
 """The element of an observation from which on it has a place, and the sign with which the goal is in it, or 0."""
 
 
-@experiment("goals", share=0.5)
+@experiment("goals", PROBE, 110, share=0.5)
 def find_goals(context: Context) -> Iterator[ChildMessage]:
     """Find an attribute that is drawn at reset and stays, and the parts of the observation that follow it."""
     instance = context.instance
@@ -159,7 +159,7 @@ class DrawnGoal:
     reaches: Mapping[Source, Reach]  # of links of a fixed robot, by where the observation has their places
 
 
-@check("RL619", *rewards.WITH_SEARCH, "goals")
+@judges_records("RL619", *rewards.WITH_SEARCH, "goals")
 def _find_goals_out_of_reach(records: Records) -> Iterator[RuleFinding]:
     rewards.require_rewarded(records)
     if "goals" in records.not_applicable:

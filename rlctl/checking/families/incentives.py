@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
+from rlctl.checking.experiment import PROBE, experiment, judges_records
 from rlctl.checking.families import rewards
 from rlctl.checking.instance import Context
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Records, Skipped
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
+from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.environments.success import SUCCESS
 
 LIKE_A_GOAL, LIKE_ANY = 0.9, 0.5  # of all rewards up to the last one: like a goal, like any; less: a failure
@@ -28,7 +28,7 @@ FEWEST_STEPS = 500  # Steps of them: less is what raises, or ends, at once
 OTHER_NAMES = ("success", "succeeded", "goal_reached", "is_goal")
 
 
-@check("RL604", *rewards.WITH_SEARCH, of_absence=True)
+@judges_records("RL604", *rewards.WITH_SEARCH, of_absence=True)
 def _find_paid_ends(records: Records) -> Iterator[RuleFinding]:
     episodes = rewards.require_rewarded(records)
     if not any(episode.terminated.any() for episode in episodes):
@@ -66,7 +66,7 @@ def _severity_of_end(
     return Severity.INFO if as_good_as >= LIKE_ANY else Severity.WARNING
 
 
-@check("RL606", *rewards.WITH_SEARCH, of_absence=True)
+@judges_records("RL606", *rewards.WITH_SEARCH, of_absence=True)
 def _find_paid_idleness(records: Records) -> Iterator[RuleFinding]:
     compared = [episode for episode in rewards.require_rewarded(records) if episode.role in ("episodes", "search")]
     idle = [episode for episode in compared if episode.actions == "zero"]
@@ -102,7 +102,7 @@ def _bonus(idle: Sequence[CheckedEpisode]) -> tuple[str | None, float]:
     return (largest, shares[largest]) if largest is not None and shares[largest] >= MOST_OF else (None, 0.0)
 
 
-@experiment("starts", share=1.0)
+@experiment("starts", PROBE, 60, share=1.0)
 def record_starts(context: Context) -> Iterator[ChildMessage]:
     """Reset with many seeds, and take the same few steps with the zero action after each."""
     for number in range(STARTS):
@@ -113,7 +113,7 @@ def record_starts(context: Context) -> Iterator[ChildMessage]:
         yield from Recording("starts", episode).run()
 
 
-@check("RL609", *rewards.WITH_SEARCH, of_absence=True)
+@judges_records("RL609", *rewards.WITH_SEARCH, of_absence=True)
 def _find_unreported_success(records: Records) -> Iterator[RuleFinding]:
     episodes = rewards.require_readable(records)
     if rewards.reports_success(episodes):
@@ -126,7 +126,7 @@ def _find_unreported_success(records: Records) -> Iterator[RuleFinding]:
     yield RuleFinding("RL609", message, {"value": list(names), "expected": SUCCESS})
 
 
-@check("RL610", "starts")
+@judges_records("RL610", "starts")
 def _find_success_at_start(records: Records) -> Iterator[RuleFinding]:
     starts = [episode for episode in records.role("starts") if episode.steps]
     if len(starts) < FEWEST_STARTS:
@@ -141,7 +141,7 @@ def _find_success_at_start(records: Records) -> Iterator[RuleFinding]:
         yield RuleFinding("RL610", message, at_once[0].at(1, value=share, expected=f"up to {MANY_AT_START}"))
 
 
-@check("RL611", *rewards.WITH_SEARCH, of_absence=True)
+@judges_records("RL611", *rewards.WITH_SEARCH, of_absence=True)
 def _find_no_success(records: Records) -> Iterator[RuleFinding]:
     episodes = rewards.require_readable(records)
     if not rewards.reports_success(episodes):

@@ -1,49 +1,44 @@
 """RL2, the interface: what reset, step and render take and return, that they come back, and unasked windows."""
 
 import itertools
-import re
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
-from rlctl.checking.experiments import RECORDING, check, experiment
-from rlctl.checking.instance import Context, EnvironmentRaised, display_error, find_missing_file, get_causes
-from rlctl.checking.records import FIRST_SEED, CallFailure, CheckedEpisode, ChildMessage, Form, Records
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
+from rlctl.checking.experiment import RECORDING, judges_records
+from rlctl.checking.instance import display_error
+from rlctl.checking.records import CallFailure, CheckedEpisode, Form, Records
+from rlctl.checking.rule import RuleFinding, Severity
 from rlctl.environments.graphics import opengl_fix
 from rlctl.environments.success import SUCCESS
-from rlctl.errors import RecipeError, UsageError
 
 NUMBERS = ("float", "int", "numpy.float64")  # Reward types that both libraries accept
 MANY_LINES, FEWEST_STEPS = 0.5, 20  # lines per step; with fewer steps most lines come from the start
 OF_OTHER_RULES = ("interleaved", "after close", "rendering", "nan action")
 """Failures there are those of RL401, RL402, RL215 and RL704."""
-PICTURE = "a uint8 array of shape (height, width, 3)"  # What `render` returns in the mode rgb_array
-NO_GRAPHICS = re.compile(r"OpenGL|\bEGL\b|OSMesa|GLFW|X11|display", re.IGNORECASE)  # raised without graphics
 
 
-@check("RL201")
+@judges_records("RL201")
 def _find_other_number_of_values(records: Records) -> Iterator[RuleFinding]:
     for what, expected in (("reset", "tuple of 2"), ("step", "tuple of 5")):
         for trajectory, form in _first_forms(records, what):
             yield _of_form("RL201", f"{what} returns {_a(form.type)}", trajectory, form, expected)
 
 
-@check("RL202", "build")
+@judges_records("RL202", "build")
 def _find_reset_without_seed(records: Records) -> Iterator[RuleFinding]:
     if not records.require_built().accepts_seed:
         yield RuleFinding("RL202", "reset has no parameter `seed`")
 
 
-@check("RL203", "build")
+@judges_records("RL203", "build")
 def _find_reset_without_options(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     if built.accepts_seed and not built.accepts_options:  # without `seed`, RL202 says what reset has to look like
         yield RuleFinding("RL203", "reset has no parameter `options`")
 
 
-@check("RL204")
+@judges_records("RL204")
 def _find_wrong_types(records: Records) -> Iterator[RuleFinding]:
     for what in ("terminated", "truncated"):
         for trajectory, form in _first_forms(records, what, "bool"):
@@ -97,14 +92,14 @@ def select_failures(records: Records, kind: str) -> Iterator[CallFailure]:
             yield failure
 
 
-@check("RL207")
+@judges_records("RL207")
 def _find_exceptions(records: Records) -> Iterator[RuleFinding]:
     raised = (failure for failure in select_failures(records, "raised") if failure.file is None)  # the others: RL007
     for failure in itertools.islice(raised, 3):
         yield RuleFinding("RL207", failure.message, failure.place, fix=failure.fix, where=failure.where)
 
 
-@check("RL208")
+@judges_records("RL208")
 def _find_ends_of_process(records: Records) -> Iterator[RuleFinding]:
     without_opengl = any(opengl_fix(failure.error) for failure in select_failures(records, "raised"))
     # Of a process that ends at once, the last line that says so may be lost: another process has it.
@@ -114,13 +109,13 @@ def _find_ends_of_process(records: Records) -> Iterator[RuleFinding]:
             yield RuleFinding("RL208", failure.message, failure.place)
 
 
-@check("RL209")
+@judges_records("RL209")
 def _find_hangs(records: Records) -> Iterator[RuleFinding]:
     for failure in itertools.islice(select_failures(records, "hung"), 1):
         yield RuleFinding("RL209", failure.message, failure.place)
 
 
-@check("RL211", *RECORDING)
+@judges_records("RL211", *RECORDING)
 def _find_prints(records: Records) -> Iterator[RuleFinding]:
     if lines := records.printed_lines:
         steps = max(1, sum(trajectory.steps for trajectory in records.trajectories))
@@ -129,57 +124,7 @@ def _find_prints(records: Records) -> Iterator[RuleFinding]:
         yield RuleFinding("RL211", message, {"value": lines, "expected": 0}, severity)
 
 
-@experiment("rendering", "RL215")
-def render(context: Context) -> Iterator[ChildMessage]:
-    """Try the mode rgb_array, which opens no window, on an instance of its own, where it is promised."""
-    with context.fresh() as instance:
-        metadata = getattr(instance.env, "metadata", None)
-    modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
-    if not isinstance(modes, (list, tuple, set)) or "rgb_array" not in modes:
-        raise NotApplicable(f"metadata does not list the render mode rgb_array (render_modes: {modes})")
-    try:
-        with context.fresh("rgb_array") as instance:
-            instance.reset(FIRST_SEED)
-            picture = instance.call("render", instance.env.render)
-    except EnvironmentRaised as error:
-        if find_missing_file(error.cause) is not None:
-            raise NotJudged("a file that the environment loads is missing (RL007)") from None
-        raised = str(error)
-        causes = get_causes(error.cause)
-        if any(isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in causes):
-            raise NotJudged(f"a library that rendering needs is not installed: {raised}") from None
-        if isinstance(error.cause, UsageError) and not isinstance(error.cause, RecipeError):
-            raise NotJudged(
-                str(error.cause).splitlines()[0]
-            ) from None  # rlctl draws the world of a task, not its author
-        call = "the constructor" if error.call == "build" else error.call
-        message = f"with render_mode='rgb_array' {call} raises {raised}"
-        if isinstance(error.cause, RecipeError):  # the constructor was not even called
-            message = f"metadata lists the render mode rgb_array, but {error.cause}"
-        severity = Severity.INFO if NO_GRAPHICS.search(raised) else None
-        yield RuleFinding("RL215", message, {"value": raised, "expected": PICTURE}, severity)
-        return
-    if wrong := _describe_wrong_picture(picture):
-        message = f"with render_mode='rgb_array' render returns {wrong}, not {PICTURE}"
-        is_rgba = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.shape[2:] == (4,)
-        yield RuleFinding("RL215", message, {"value": wrong, "expected": PICTURE}, Severity.INFO if is_rgba else None)
-
-
-def _describe_wrong_picture(picture: Any) -> str:
-    if not isinstance(picture, np.ndarray):
-        return f"a {type(picture).__name__}"
-    fine = picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3
-    return "" if fine else f"an array of {picture.dtype} and shape {picture.shape}"
-
-
-@check("RL215", "rendering")
-def _find_end_in_rendering(records: Records) -> Iterator[RuleFinding]:
-    for failure in records.failures:
-        if failure.phase == "rendering" and failure.kind in ("died", "hung"):
-            yield RuleFinding("RL215", f"rendering without a window: {failure.message}", failure.place, Severity.ERROR)
-
-
-@check("RL216", *RECORDING)
+@judges_records("RL216", *RECORDING)
 def _find_lost_display(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
         if line := display_error(failure):

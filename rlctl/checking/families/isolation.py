@@ -13,13 +13,13 @@ from typing import Any
 import gymnasium
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
+from rlctl.checking.experiment import INSTANCES, PROBE, experiment, judges_records
 from rlctl.checking.families.determinism import COMPARED_STEPS, compare, report, require_independent
 from rlctl.checking.families.interface import select_failures
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance, describe_failure
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Records, Skipped
-from rlctl.checking.rules import RULES, NotJudged, RuleFinding, Severity, list_names
+from rlctl.checking.rule import UNMOVED, NotJudged, RuleFinding, Severity, list_names
 from rlctl.environments import registry
 from rlctl.environments.bullet_calls import BulletCall, record_calls
 from rlctl.environments.bullet_clients import find_clients
@@ -41,7 +41,7 @@ LEAKS = {
 _PROCESS = Path("/proc/self")
 
 
-@experiment("instances", "RL404", "RL808", share=10.0)
+@experiment("instances", INSTANCES, 10, "RL404", "RL808", share=10.0)
 def compare_instances(context: Context) -> Iterator[ChildMessage]:
     """Play on three instances: one alone, one after it, and two side by side of which one is closed."""
     progress, budget = context.progress, context.budget
@@ -120,7 +120,7 @@ def _failure(records: Records, rule: str, phase: str, doing: str) -> RuleFinding
     return None
 
 
-@check("RL401", "comparisons", "global random", "instances")
+@judges_records("RL401", "comparisons", "global random", "instances")
 def _find_shared_world(records: Records) -> Iterator[RuleFinding]:
     _require_same_alone(records)
     if finding := _failure(records, "RL401", "interleaved", IN_TURNS):
@@ -129,12 +129,12 @@ def _find_shared_world(records: Records) -> Iterator[RuleFinding]:
     for alone, beside in (("fresh process", "interleaved"), ("second alone", "interleaved second")):
         if (difference := compare(records, alone, beside)) is not None:
             draws = any(finding.rule == "RL309" for finding in records.findings)
-            because = ("; both draw from a global random generator (RL309)", RULES["RL309"].fix) if draws else ()
+            because = ("; both draw from a global random generator (RL309)", UNMOVED["RL309"].fix) if draws else ()
             yield report("RL401", records, difference, f"{IN_TURNS}, compared with one alone", *because)
             return
 
 
-@check("RL402", "comparisons", "instances")
+@judges_records("RL402", "comparisons", "instances")
 def _find_effect_of_closing(records: Records) -> Iterator[RuleFinding]:
     _require_same_alone(records)
     if finding := _failure(records, "RL402", "after close", AFTER_CLOSE):
@@ -146,7 +146,7 @@ def _find_effect_of_closing(records: Records) -> Iterator[RuleFinding]:
         yield report("RL402", records, difference, f"{AFTER_CLOSE}, compared with one alone")
 
 
-@check("RL403", "instances")
+@judges_records("RL403", "instances")
 def _find_single_instance(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
         if failure.call in ("load", "build") and failure.process != "probe":
@@ -200,7 +200,7 @@ class Counts:
         self.memory.append(int((_PROCESS / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
 
 
-@experiment("leaks", "RL405", share=3.0)
+@experiment("leaks", PROBE, 100, "RL405", share=3.0)
 def count_after_resets(context: Context) -> Iterator[ChildMessage]:
     """Reset the process's instance many times, with one step each, and count what it holds."""
     counts = Counts()

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking.families.readings import MOST_ELEMENTS, join_logs, name_features, read_features
-from rlctl.checking.rules import RuleFinding, list_names
+from rlctl.checking.rule import RuleFinding, list_names
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import JOINTS, Array, Joint, JointKey
 

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiments import check
+from rlctl.checking.experiment import judges_records
 from rlctl.checking.families import rewards
 from rlctl.checking.families.units import find_rates
 from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.regression import EXACT, RewardFit, action_terms, fit_observation, fit_terms
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
+from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.transitions import Quantities, Transitions, collect_transitions, find_differences, find_simple
 
 MOST_ROWS = 1_200  # steps that rewards are fitted to
@@ -25,7 +25,7 @@ JUMP = 1.5  # times nearly all other changes
 ACTS = "action effects"  # The experiment that knows when the first action changes what
 
 
-@check("RL616", *rewards.WITH_SEARCH, ACTS)
+@judges_records("RL616", *rewards.WITH_SEARCH, ACTS)
 def _find_late_reward(records: Records) -> Iterator[RuleFinding]:
     rewards.require_rewarded(records)
     if not rewards.reports_success(records.alone):
@@ -88,7 +88,7 @@ def _fit_before(steps: Transitions) -> RewardFit | None:
     return None if any(fit_terms(columns, steps.rewards).is_exact for columns in others) else before
 
 
-@check("RL617", *rewards.WITH_SEARCH)
+@judges_records("RL617", *rewards.WITH_SEARCH)
 def _find_late_success(records: Records) -> Iterator[RuleFinding]:
     rewards.require_readable(records)
     steps = collect_transitions(records)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlctl import missing_packages
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import RECORDING, check, experiment
+from rlctl.checking.experiment import INSTANCES, PROBE, RECORDING, experiment, judges_records
 from rlctl.checking.instance import (
     Context,
     EnvironmentRaised,
@@ -29,7 +29,7 @@ from rlctl.checking.instance import (
     raised_by_environment,
 )
 from rlctl.checking.records import FIRST_SEED, Built, ChildMessage, Records, Skipped
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding
+from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.step_source import read_flags
 from rlctl.checking.values import find_assignment, find_author, flatten, is_task
 from rlctl.environments import registry
@@ -55,7 +55,7 @@ from rlctl.errors import (
 WAIVERS = "rlctl_ignore"  # The class attribute that waives rules: rule id -> reason
 
 
-@experiment("build", "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", "RL013", "RL216", share=0.0)
+@experiment("build", PROBE, 10, "RL001", "RL002", "RL003", "RL005", "RL006", "RL008", "RL013", "RL216", share=0.0)
 def build(context: Context) -> Iterator[ChildMessage]:
     """Build the first instance, which the process keeps. Raises `UsageError` for a name that does not exist."""
     try:
@@ -162,7 +162,7 @@ def _find_misspelled(author: type) -> Iterator[RuleFinding]:
                 yield RuleFinding("RL013", message, {"value": name, "expected": close[0]})
 
 
-@check("RL004", "build")
+@judges_records("RL004", "build")
 def _find_end_while_loading(records: Records) -> Iterator[RuleFinding]:
     if records.built is None:
         for failure in records.failures:
@@ -171,7 +171,7 @@ def _find_end_while_loading(records: Records) -> Iterator[RuleFinding]:
                 yield RuleFinding("RL004", failure.message, evidence)
 
 
-@check("RL007", "build", *RECORDING)
+@judges_records("RL007", "build", *RECORDING)
 def _find_missing_files(records: Records) -> Iterator[RuleFinding]:
     files = set()
     for failure in records.failures if records.built is not None else ():
@@ -237,7 +237,7 @@ def _find_places(env: Any, author: type, file: str | None) -> dict[str, tuple[st
 STEPS = 60  # Of each variant: an event at an interval of a second acts in them
 
 
-@experiment("variants", "RL011", "RL012", share=2.0)
+@experiment("variants", INSTANCES, 90, "RL011", "RL012", share=2.0)
 def play_variants(context: Context) -> Iterator[ChildMessage]:
     """Play the task with all of its events and with none, and each of its stages, and compare equal seeds."""
     task: Any = getattr(getattr(context.instance.env, "unwrapped", None), "task", None)

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiments import experiment
+from rlctl.checking.experiment import INSTANCES, experiment
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding
+from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.values import is_task
 from rlctl.task.mirror import ACTION, Mirror
 
@@ -36,7 +36,7 @@ class _Pose:
     joints: Array  # positions, then velocities; shape (2, joints)
 
 
-@experiment("mirror", "RL120")
+@experiment("mirror", INSTANCES, 40, "RL120")
 def compare_mirror_images(context: Context) -> Iterator[ChildMessage]:
     """Take steps from random states in flight, and the mirrored steps from their mirror images."""
     instance = context.instance

@@ -10,7 +10,7 @@ from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_trials import Look, name_columns, pair_rows, play
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
-from rlctl.checking.rules import RuleFinding, list_names
+from rlctl.checking.rule import RuleFinding, list_names
 from rlctl.checking.worlds import Array
 from rlctl.environments.info import find_mujoco
 

@@ -13,7 +13,7 @@ from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_worlds import MujocoStateReader, library
 from rlctl.checking.records import FIRST_SEED
-from rlctl.checking.rules import RuleFinding, list_names
+from rlctl.checking.rule import RuleFinding, list_names
 from rlctl.checking.worlds import Array, Joint, Motor
 from rlctl.environments.info import find_mujoco
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking.motor_commands import CommandSpan, MotorCommands
-from rlctl.checking.rules import RuleFinding, Severity, list_names
+from rlctl.checking.rule import RuleFinding, Severity, list_names
 from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import JOINTS, Array, JointKey, Motor, MotorTarget
 from rlctl.environments.bullet_calls import FULL_TURN, BulletCalls

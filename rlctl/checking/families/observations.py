@@ -5,10 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiments import RECORDING, check
+from rlctl.checking.experiment import RECORDING, judges_records
 from rlctl.checking.families.rewards import WITH_SEARCH
+from rlctl.checking.observations import name_moment
 from rlctl.checking.records import CheckedEpisode, Form, Records, Series
-from rlctl.checking.rules import NotJudged, RuleFinding, Severity, list_names
+from rlctl.checking.rule import NotJudged, RuleFinding, Severity, list_names
 from rlctl.environments.leaves import Leaf, name_leaf
 
 ROUNDING = 1e-6  # Excess over a bound, relative to the bound, up to which it is float rounding
@@ -28,18 +29,14 @@ def _forms(records: Records) -> Iterator[tuple[int, Leaf, CheckedEpisode, Form]]
             yield index, leaves[index], episode, form
 
 
-def _when(step: int) -> str:
-    return "from reset" if step == 0 else f"at step {step}"
-
-
-@check("RL101")
+@judges_records("RL101")
 def _find_wrong_shape(records: Records) -> Iterator[RuleFinding]:
     reported = set()
     for index, leaf, trajectory, form in _forms(records):
         if index not in reported and (what := _wrong_shape(leaf, form)):
             reported.add(index)
             shape = None if form.shape is None else list(form.shape)
-            message = f"{name_leaf(leaf)} {_when(form.step)} {what}"
+            message = f"{name_leaf(leaf)} {name_moment(form.step)} {what}"
             evidence = trajectory.at(form.step, type=form.type, shape=shape, expected=list(leaf.shape))
             yield RuleFinding("RL101", message, evidence)
     for trajectory, form in records.forms("keys")[:1]:
@@ -56,13 +53,13 @@ def _wrong_shape(leaf: Leaf, form: Form) -> str:
     return f"is a {form.type}, not a numpy array" if form.type in ("list", "tuple") else ""
 
 
-@check("RL102")
+@judges_records("RL102")
 def _find_wrong_dtype(records: Records) -> Iterator[RuleFinding]:
     wrong = [record for record in _forms(records) if _has_wrong_dtype(record[1], record[3])]
     parts = len({index for index, *_ in wrong})
     for _, leaf, trajectory, form in wrong[:1]:
         more = f"; {parts - 1} other parts differ too" if parts > 1 else ""
-        message = f"{name_leaf(leaf)} {_when(form.step)} is {form.dtype}; the space is {leaf.dtype}{more}"
+        message = f"{name_leaf(leaf)} {name_moment(form.step)} is {form.dtype}; the space is {leaf.dtype}{more}"
         evidence = trajectory.at(form.step, dtype=form.dtype, expected=leaf.dtype)
         is_number = np.dtype(form.dtype).kind in "biuf"
         yield RuleFinding("RL102", message, evidence, Severity.WARNING if is_number else Severity.ERROR)
@@ -77,7 +74,7 @@ def _has_wrong_dtype(leaf: Leaf, form: Form) -> bool:
     return dtype != declared and not (form.type in ("float", "int") and leaf.shape == ())
 
 
-@check("RL103")
+@judges_records("RL103")
 def _find_out_of_range(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     for index, leaf in enumerate(built.leaves):
@@ -98,7 +95,7 @@ def _find_out_of_range(records: Records) -> Iterator[RuleFinding]:
         more = f"; so are {list_names(others)}" if others else ""
         allowed = f"the space allows [{low:.9g}, {high:.9g}]{' (float rounding)' if is_rounding else ''}"
         share = f"{count} of {total} observations are outside{more}"
-        message = f"{element} is {value:.9g} {_when(step)}; {allowed}; {share}"
+        message = f"{element} is {value:.9g} {name_moment(step)}; {allowed}; {share}"
         counts = {"observations_outside": count, "observations": total}
         evidence = trajectory.at(step, element=element, value=value, expected=[low, high], **counts)
         severity = Severity.WARNING if is_rounding else _severity_of_outside(recorded, outside)
@@ -123,20 +120,7 @@ def _excess(leaf: Leaf, series: Series) -> NDArray[np.float64]:
         return np.where(np.isfinite(rows), np.maximum(np.maximum(low - rows, rows - high), 0.0), 0.0)
 
 
-@check("RL104")
-def _find_not_finite(records: Records) -> Iterator[RuleFinding]:
-    built = records.require_built()
-    for index, _ in enumerate(built.leaves):
-        first = next((pair for pair in records.series(index) if not np.isfinite(pair[1].rows).all()), None)
-        if first is not None:
-            trajectory, series = first
-            row, flat = np.argwhere(~np.isfinite(series.rows))[0].tolist()
-            step, element, value = int(series.steps[row]), built.element(index, flat), str(series.rows[row, flat])
-            evidence = trajectory.at(step, element=element, value=value, expected="finite")
-            yield RuleFinding("RL104", f"{element} is {value} {_when(step)}", evidence)
-
-
-@check("RL105")
+@judges_records("RL105")
 def _find_shared_memory(records: Records) -> Iterator[RuleFinding]:
     for trajectory, form in records.forms("memory")[:1]:
         name = name_leaf(records.require_built().leaves[form.leaf or 0])
@@ -144,7 +128,7 @@ def _find_shared_memory(records: Records) -> Iterator[RuleFinding]:
         yield RuleFinding("RL105", message, trajectory.at(form.step, steps=form.count))
 
 
-@check("RL106", "build")
+@judges_records("RL106", "build")
 def _find_unusual_actions(records: Records) -> Iterator[RuleFinding]:
     for leaf in records.require_built().action_leaves:
         if leaf.kind == "Box":
@@ -174,7 +158,7 @@ def _unusual_actions(leaf: Leaf) -> Iterator[RuleFinding]:
         yield RuleFinding("RL106", f"actions are {leaf.dtype}", evidence, Severity.INFO)
 
 
-@check("RL108", "build", *RECORDING)
+@judges_records("RL108", "build", *RECORDING)
 def _find_unusual_images(records: Records) -> Iterator[RuleFinding]:
     for index, leaf in enumerate(records.require_built().leaves):
         name, shape = name_leaf(leaf), list(leaf.shape)
@@ -201,7 +185,7 @@ def _image_problem(leaf: Leaf) -> str:
     return ""
 
 
-@check("RL109", "build")
+@judges_records("RL109", "build")
 def _find_unsupported_spaces(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     for what, leaves, depth in (("observation", built.leaves, 1), ("action", built.action_leaves, 0)):
@@ -246,7 +230,7 @@ def _leaves(records: Records, kinds: str = "f") -> Iterator[tuple[int, Leaf]]:
             yield index, leaf
 
 
-@check("RL110", *WITH_SEARCH, of_absence=True)
+@judges_records("RL110", *WITH_SEARCH, of_absence=True)
 def _find_constant_elements(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     names: list[str] = []
@@ -273,7 +257,7 @@ def _constant(rows: NDArray[np.float64], leaf: Leaf) -> NDArray[np.intp]:
     return np.flatnonzero(still & (low < high))
 
 
-@check("RL117", *WITH_SEARCH)
+@judges_records("RL117", *WITH_SEARCH)
 def _find_wrapped_angles(records: Records) -> Iterator[RuleFinding]:
     for index, _ in _leaves(records):
         rows = _rows(records, index)
@@ -286,7 +270,7 @@ def _find_wrapped_angles(records: Records) -> Iterator[RuleFinding]:
             yield RuleFinding("RL117", message, {"element": name, "expected": "sin and cos"})
 
 
-@check("RL118", *WITH_SEARCH)
+@judges_records("RL118", *WITH_SEARCH)
 def _find_large_elements(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     large: dict[str, float] = {}

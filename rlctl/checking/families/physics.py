@@ -1,31 +1,19 @@
 """RL8: the physics, as PyBullet has it while the environment runs."""
 
-import contextlib
 import itertools
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from rlctl.checking.experiments import experiment
-from rlctl.checking.families.derived import find_wrong_reads
-from rlctl.checking.families.robots import find_misuses
-from rlctl.checking.instance import Context, EnvironmentRaised, describe_failure
-from rlctl.checking.mujoco_calls import MujocoCalls, join_calls
-from rlctl.checking.records import FIRST_SEED, ChildMessage, Shortened, Skipped
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity, list_names
+from rlctl.checking.records import ChildMessage, Skipped
+from rlctl.checking.rule import RuleFinding, Severity, list_names
 from rlctl.checking.values import is_task
-from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog, WorldLogger
+from rlctl.checking.world_logs import LoggedWorld, Place, WorldLog
 from rlctl.checking.worlds import ANGULAR, JOINTS, VELOCITY, Array, Joint, Jump, Pair, WorldBody
-from rlctl.environments.bullet_calls import FULL_TURN, record_calls
-from rlctl.environments.bullet_clients import find_clients
+from rlctl.environments.bullet_calls import FULL_TURN
 
-ENGINES = {"pybullet", "mujoco"}
-EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60)) + (("random", 2),) * 16
-"""Actions and logged steps. The last ones are for what resets draw."""
-ENOUGH_EPISODES, PART_FOR_THE_REST = 5, 0.3  # of a slow environment; of the experiment's time
 LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved yet
 LASTING_SOFT = 10  # the same for contacts of MuJoCo, which are soft by design, if they begin after a reset
 PART_OF_RANGE, LEAST_ANGLE, LEAST_LENGTH = 0.1, 0.05, 0.01
@@ -38,52 +26,8 @@ RADIANS = 'Write <compiler angle="radian"/> into the model file: angles in MJCF 
 LONGEST_TIME_STEP = 0.02  # PyBullet's own is 1/240 [s]
 
 
-@experiment("worlds", "RL116", *(f"RL8{i:02}" for i in (1, 3, 4, 5, 7, *range(9, 21))), share=4.0)
-def watch_worlds(context: Context) -> Iterator[ChildMessage]:
-    """Log the worlds of an instance through a few episodes, then let them fall alone, which may change them."""
-    if not ENGINES & sys.modules.keys():
-        with context.fresh():
-            pass  # what it imports is imported now
-    if not ENGINES & sys.modules.keys():
-        raise NotApplicable("no world of PyBullet or MuJoCo")
-    older, mujoco_calls = set(find_clients()), MujocoCalls()
-    with _join(mujoco_calls), record_calls() as calls, context.fresh() as instance:
-        with contextlib.suppress(EnvironmentRaised):  # the first episode raises it again
-            instance.reset(FIRST_SEED)
-        yield from _model_faults(instance.env)
-        logger = WorldLogger(instance, older, calls, mujoco_calls)
-        whole_s = context.budget.seconds_left
-        for number, (kind, steps) in enumerate(EPISODES):
-            if number and (not logger.worlds or context.budget.is_over()):
-                break
-            if number >= ENOUGH_EPISODES and context.budget.seconds_left < PART_FOR_THE_REST * whole_s:
-                yield Shortened("worlds", f"{number} of {len(EPISODES)} logged episodes")
-                break
-            try:
-                logger.play(number, kind, steps)
-            except EnvironmentRaised as error:
-                yield describe_failure(error, context.progress)
-        bounds = [leaf.flat_bounds for leaf in instance.action_leaves if leaf.supported]
-        low, high = (np.concatenate([pair[end] for pair in bounds] or [np.zeros(0)]) for end in (0, 1))
-        misuses = list(find_misuses(logger.worlds, calls, low, high))
-        yield from misuses
-        yield from find_wrong_reads(instance, mujoco_calls, logger.worlds, {finding.rule for finding in misuses})
-        if logger.worlds and not context.budget.is_over():
-            with contextlib.suppress(EnvironmentRaised):  # its resets were logged by now
-                logger.simulate_alone(len(EPISODES))
-    if not logger.resets:
-        raise NotJudged("no episode could be logged")
-    if not logger.worlds:
-        raise NotApplicable("no world of PyBullet or MuJoCo")
-    for world in logger.worlds:
-        yield from _judge(world)
-
-
-def _join(calls: MujocoCalls) -> contextlib.AbstractContextManager[None]:
-    return join_calls(calls) if "mujoco" in sys.modules else contextlib.nullcontext()
-
-
-def _model_faults(env: Any) -> Iterator[ChildMessage]:
+def find_model_faults(env: Any) -> Iterator[ChildMessage]:
+    """Yield what is wrong with the model files of a task."""
     if not is_task(env):
         yield Skipped("RL809", "only the model files of tasks of rlctl are known", applies=False)
         return
@@ -96,8 +40,8 @@ def _model_faults(env: Any) -> Iterator[ChildMessage]:
             yield RuleFinding("RL809", frames, severity=Severity.INFO)
 
 
-def _judge(world: LoggedWorld) -> Iterator[ChildMessage]:
-    yield from _gravity(world)
+def judge_logs(world: LoggedWorld) -> Iterator[ChildMessage]:
+    """Yield what is wrong with the physics of a world."""
     if world.time_step > LONGEST_TIME_STEP:
         evidence = {"value": world.time_step, "expected": f"up to {LONGEST_TIME_STEP:g}"}
         yield RuleFinding("RL813", f"a step of the physics takes {world.time_step:.4g} s", evidence)
@@ -114,13 +58,6 @@ def _judge(world: LoggedWorld) -> Iterator[ChildMessage]:
 
 def _when(place: Place) -> str:
     return f"at step {place['step']}" if place["step"] else "at reset"
-
-
-def _gravity(world: LoggedWorld) -> Iterator[RuleFinding]:
-    heavy = [body.name for body in world.world.bodies if body.is_free or body.has_heavy_links]
-    if heavy and not any(world.gravity) and world.weight_matters is not False:
-        evidence = {"value": world.gravity, "expected": [0.0, 0.0, -9.81], "bodies": heavy}
-        yield RuleFinding("RL801", f"gravity is (0, 0, 0), and {list_names(heavy)} can move", evidence)
 
 
 def _penetration(world: LoggedWorld) -> Iterator[RuleFinding]:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking import attitudes
-from rlctl.checking.rules import RuleFinding, Severity
+from rlctl.checking.rule import RuleFinding, Severity
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import ANGULAR, JOINTS, ORIENTATION, VELOCITY, Array, Link, Poses, World, WorldBody
 

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from rlctl.checking.action_trials import REWARD, Frame, Trials, find_differences
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
+from rlctl.checking.experiment import INSTANCES, PROBE, experiment, judges_records
 from rlctl.checking.families.determinism import COMPARED_STEPS, LATE, compare, find_difference, report
 from rlctl.checking.families.rewards import has_succeeded
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Records
-from rlctl.checking.rules import NotApplicable, NotJudged, OutOfTime, RuleFinding
+from rlctl.checking.rule import NotApplicable, NotJudged, OutOfTime, RuleFinding
 from rlctl.checking.values import Attribute, find_assignment, find_unequal, flatten, read_attributes, read_generators
 
 HIDDEN_STEPS, FEWEST_COMPARED = 20, 5  # How many steps are compared with an attribute changed
@@ -28,7 +28,7 @@ MOST_SECOND_STEPS = 1_000  # most time limits are shorter
 FAINT = 0.01  # smaller late differences are a residue, no counter or flag
 
 
-@experiment("hidden state", "RL114", share=1.5)
+@experiment("hidden state", INSTANCES, 70, "RL114", share=1.5)
 def change_attributes(context: Context) -> Iterator[ChildMessage]:
     """Play one episode again and again, each time with one attribute as reset drew it for another seed."""
     with context.fresh() as instance:
@@ -132,7 +132,7 @@ def play_after_ends(context: Context, success: Sequence[Any] | None) -> Iterator
             yield from repeat(role)
 
 
-@check("RL310", "search")
+@judges_records("RL310", "search")
 def _compare_after_ends(records: Records) -> Iterator[RuleFinding]:
     first, again = records.require_role("before ends"), records.require_role("before ends again")
     if not records.require_built().accepts_seed or find_difference(records, first, again) is not None:
@@ -153,7 +153,7 @@ UNSEEDED_RESETS, UNSEEDED_STEPS = 2, 20  # Of two discrete starts one may be the
 FEWEST_SEEDS = 4
 
 
-@check("RL306", "comparisons", "episodes", of_absence=True)
+@judges_records("RL306", "comparisons", "episodes", of_absence=True)
 def _compare_seeds(records: Records) -> Iterator[RuleFinding]:
     if compare(records, "alone", "seeds") is not None:
         return
@@ -169,7 +169,7 @@ def _compare_seeds(records: Records) -> Iterator[RuleFinding]:
     yield RuleFinding("RL306", message, {"seeds": seeds, "value": 1, "expected": seeds})
 
 
-@experiment("unseeded", "RL308", share=0.5)
+@experiment("unseeded", INSTANCES, 50, "RL308", share=0.5)
 def compare_unseeded(context: Context) -> Iterator[ChildMessage]:
     """Play in two new instances after the same resets: first all with a seed, then the last ones without."""
     with context.fresh() as first, context.fresh() as second:
@@ -204,7 +204,7 @@ def _differing(one: NDArray[np.float64], two: NDArray[np.float64]) -> list[float
     return [float(numbers[unequal[0]]) for numbers in (one, two)] if unequal.size else []
 
 
-@experiment("global random", "RL309", share=0.5)
+@experiment("global random", PROBE, 30, "RL309", share=0.5)
 def compare_generators(context: Context) -> Iterator[ChildMessage]:
     """Play the beginning of an episode, and say which generators of the whole process it moves, and where first."""
     moved: set[str] = set()

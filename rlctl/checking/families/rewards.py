@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
+from rlctl.checking.experiment import PROBE, experiment, judges_records
 from rlctl.checking.instance import Context, EnvironmentRaised
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Records
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding, Severity
+from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.environments.success import SUCCESS
 
 WITH_SEARCH = ("comparisons", "episodes", "starts", "search")  # they play the first process's instance
@@ -122,7 +122,7 @@ def summarize(episodes: Sequence[CheckedEpisode]) -> str:
     return f"{len(episodes)} episodes with {kinds_text} actions ({sum(episode.steps for episode in episodes):,} steps)"
 
 
-@check("RL601")
+@judges_records("RL601")
 def _find_not_finite(records: Records) -> Iterator[RuleFinding]:
     for episode in records.require_alone():
         wrong = np.flatnonzero(~np.isfinite(episode.rewards) & episode.reward_is_number)
@@ -133,7 +133,7 @@ def _find_not_finite(records: Records) -> Iterator[RuleFinding]:
             return
 
 
-@check("RL602", *WITH_SEARCH, of_absence=True)
+@judges_records("RL602", *WITH_SEARCH, of_absence=True)
 def _find_constant_reward(records: Records) -> Iterator[RuleFinding]:
     episodes = require_rewarded(records)
     constant = float(episodes[0].rewards[0])
@@ -147,7 +147,7 @@ def _find_constant_reward(records: Records) -> Iterator[RuleFinding]:
     yield RuleFinding("RL602", message, evidence, severity)
 
 
-@check("RL603")
+@judges_records("RL603")
 def _find_badly_scaled(records: Records) -> Iterator[RuleFinding]:
     require_rewarded(records)
     episodes = [episode for episode in records.role("episodes") if episode.steps]
@@ -168,7 +168,7 @@ def _find_badly_scaled(records: Records) -> Iterator[RuleFinding]:
     yield RuleFinding("RL603", message, evidence, Severity.INFO if records.normalizes("reward") else Severity.WARNING)
 
 
-@check("RL612", *WITH_SEARCH, of_absence=True)
+@judges_records("RL612", *WITH_SEARCH, of_absence=True)
 def _find_constant_penalty(records: Records) -> Iterator[RuleFinding]:
     episodes = _require_enough(_require_terms(records))
     for name, value in find_constant_terms(episodes).items():
@@ -177,7 +177,7 @@ def _find_constant_penalty(records: Records) -> Iterator[RuleFinding]:
             yield RuleFinding("RL612", message, {"term": name, "value": value, "episodes": len(episodes)})
 
 
-@check("RL607", *WITH_SEARCH)
+@judges_records("RL607", *WITH_SEARCH)
 def _find_wrong_sum(records: Records) -> Iterator[RuleFinding]:
     episodes = _require_terms(records)
     totals = [np.sum(list(find_terms(episode).values()), axis=0) for episode in episodes]
@@ -193,7 +193,7 @@ def _find_wrong_sum(records: Records) -> Iterator[RuleFinding]:
         yield RuleFinding("RL607", message, episode.at(step, value=total, expected=reward))
 
 
-@check("RL615", "episodes", "search")
+@judges_records("RL615", "episodes", "search")
 def _find_jump_at_rest(records: Records) -> Iterator[RuleFinding]:
     require_rewarded(records)
     for episode in records.role("episodes") + records.role("search"):
@@ -217,7 +217,7 @@ def _find_jump_at_rest(records: Records) -> Iterator[RuleFinding]:
                 return
 
 
-@experiment("hindsight", "RL614", share=0.3)
+@experiment("hindsight", PROBE, 90, "RL614", share=0.3)
 def recompute_rewards(context: Context) -> Iterator[ChildMessage]:
     """Ask for the rewards of steps that have just been rewarded, all at once, as hindsight replay does."""
     instance = context.instance

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from rlctl.checking.families.joint_readings import find_misread_joints
 from rlctl.checking.families.motors import find_wrong_motors
 from rlctl.checking.families.readings import find_misread_quaternions, find_old_elements
-from rlctl.checking.rules import RuleFinding, Severity, list_names
+from rlctl.checking.rule import RuleFinding, Severity, list_names
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import Array
 from rlctl.environments.bullet_calls import BulletCalls, ContactQuery

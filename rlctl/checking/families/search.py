@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, action_at, zero_action
-from rlctl.checking.experiments import experiment
+from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.families import rewards
 from rlctl.checking.families.reset import play_after_ends
 from rlctl.checking.instance import Context
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Shortened, Skipped
-from rlctl.checking.rules import NotJudged, RuleFinding
+from rlctl.checking.rule import NotJudged, RuleFinding
 
 MOST_STEPS, MOST_EPISODES = 4_500, 60  # in all: they find the goal of the bundled `reach` from most seeds
 ENOUGH_EPISODES, STEPS_AFTER = 11, 2_000  # Of a slow environment; of the episodes after the search
@@ -49,7 +49,7 @@ class _Attempt:
         return float(rewards.sum() / LONGEST + rewards.max()) if rewards.size else -np.inf
 
 
-@experiment("search", "RL605", share=6.0)
+@experiment("search", PROBE, 70, "RL605", share=6.0)
 def search(context: Context) -> Iterator[ChildMessage]:
     """Look for action sequences with a high return, and stop one that finished shortly before its end."""
     leaves = context.instance.action_leaves

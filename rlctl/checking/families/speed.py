@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments import check, experiment
+from rlctl.checking.experiment import PROBE, experiment, judges_records
 from rlctl.checking.instance import Context, Instance, Timer
 from rlctl.checking.profiling import Profile, Stopwatch, TimedCall, find_own_code
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import ChildMessage, Fact, Records
-from rlctl.checking.rules import NotJudged, RuleFinding, Severity, list_names
+from rlctl.checking.rule import NotJudged, RuleFinding, Severity, list_names
 from rlctl.checking.values import find_author, find_batch, is_task
 from rlctl.environments.bullet_calls import visible_to_profilers
 from rlctl.output import format_duration
@@ -50,7 +50,7 @@ class Speed:
     is_batch: bool = False  # a `BatchTask`: one of its worlds was timed
 
 
-@experiment("speed", share=1.5)
+@experiment("speed", PROBE, 40, share=1.5)
 def measure_speed(context: Context) -> Iterator[ChildMessage]:
     """Play random episodes: first with nothing but a clock, then under a profiler."""
     instance, seconds = context.instance, min(LONGEST_S, context.budget.seconds_left)
@@ -107,7 +107,7 @@ def typical(seconds: Sequence[float], batch: int) -> float | None:
     return float(np.median(whole.mean(axis=1)))
 
 
-@check("RL901", "speed")
+@judges_records("RL901", "speed")
 def _find_slow_step(records: Records) -> Iterator[RuleFinding]:
     speed: Speed = records.require_fact("speed")
     if speed.step_s is None:
@@ -125,7 +125,7 @@ def _find_slow_step(records: Records) -> Iterator[RuleFinding]:
     yield RuleFinding("RL901", f"{per_s:,.3g} steps/s: {time}; slowest: {slowest}", evidence, severity)
 
 
-@check("RL903", "speed")
+@judges_records("RL903", "speed")
 def _find_drawing_and_waiting(records: Records) -> Iterator[RuleFinding]:
     speed: Speed = records.require_fact("speed")
     for call, seconds in (("step", speed.step_s), ("reset", speed.reset_s)):
@@ -136,7 +136,7 @@ def _find_drawing_and_waiting(records: Records) -> Iterator[RuleFinding]:
             yield RuleFinding("RL903", message, evidence)
 
 
-@check("RL904", "speed", "episodes")
+@judges_records("RL904", "speed", "episodes")
 def _find_loading(records: Records) -> Iterator[RuleFinding]:
     speed, step_s, reset_s, steps = _require_times(records)
     for call, call_s, part, whole_s in (

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiments import check
+from rlctl.checking.experiment import judges_records
 from rlctl.checking.families import rewards
 from rlctl.checking.records import Records
-from rlctl.checking.rules import NotApplicable, RuleFinding
+from rlctl.checking.rule import NotApplicable, RuleFinding
 from rlctl.checking.transitions import Quantities, Transitions, collect_transitions, find_lengths, find_unit_pairs
 
 MOST_ROWS = 2_000
@@ -33,7 +33,7 @@ class Rate:
     size: float  # of the quantity, root mean square
 
 
-@check("RL119", *rewards.WITH_SEARCH, "worlds")  # which compares joints with those of the engine
+@judges_records("RL119", *rewards.WITH_SEARCH, "worlds")  # which compares joints with those of the engine
 def _find_mixed_units(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     steps = collect_transitions(records)
