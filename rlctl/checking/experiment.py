@@ -83,24 +83,20 @@ class JudgeHook(Generic[Shown]):
 
 
 def experiment(
-    name: str, process: str, place: int, *rules: Rule | str, share: float = 1.0, hooks: tuple[JudgeHook[Any], ...] = ()
+    name: str, process: str, place: int, *rules: Rule, share: float = 1.0, hooks: tuple[JudgeHook[Any], ...] = ()
 ) -> Callable[[RunExperiment], Experiment]:
     """Make an experiment of a function. If it completes it decides `rules`, and those that register with its hooks."""
 
     def make(run: RunExperiment) -> Experiment:
-        return Experiment(name, process, place, share, run, tuple(map(_id_of, rules)), hooks)
+        return Experiment(name, process, place, share, run, tuple(rule.id for rule in rules), hooks)
 
     return make
 
 
-def judges_records(rule: Rule | str, *needs: str, of_absence: bool = False) -> Callable[[JudgeRecords], RecordsJudge]:
+def judges_records(rule: Rule, *needs: str, of_absence: bool = False) -> Callable[[JudgeRecords], RecordsJudge]:
     """Make the judge of a rule of a function; by default it reads the recorded episodes."""
 
     def make(run: JudgeRecords) -> RecordsJudge:
-        return RecordsJudge(_id_of(rule), needs or RECORDING, of_absence, run)
+        return RecordsJudge(rule.id, needs or RECORDING, of_absence, run)
 
     return make
-
-
-def _id_of(rule: Rule | str) -> str:
-    return rule if isinstance(rule, str) else rule.id

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
-
-import yaml
 
 
 class Severity(enum.StrEnum):
@@ -48,32 +44,6 @@ class Rule:
             object.__setattr__(self, name, " ".join(text.split()))
 
 
-OF_SPACES = ("RL103", "RL106", "RL108", "RL109")  # rules about what a space declares
-OF_OLD_GYM = ("RL106", "RL109", "RL207")  # which today's libraries cannot read or call: not faults of their own
-OF_AN_EXAMPLE = ("RL3", "RL120", "RL406", "RL407", "RL409", "RL810", "RL811", "RL814", "RL815", "RL816", "RL820")
-LOADING = ("RL0", "RL216")  # judged even if no instance could be built
-
-
-def _load() -> dict[str, Rule]:
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where PyYAML has it
-    content = yaml.load(Path(__file__).with_name("rules.yaml").read_text(encoding="utf-8"), loader)  # noqa: S506
-    rules = {}
-    for key, text in content["rules"].items():
-        (rule_id, severity), name = key.partition(": ")[0].split(), key.partition(": ")[2]
-        meaning, fix, *task = re.split(r"\n(?:fix|task): ", text)
-        more = {
-            "is_about_space": rule_id in OF_SPACES,
-            "shows_one": rule_id.startswith(OF_AN_EXAMPLE),
-            "needs_instance": not rule_id.startswith(LOADING),
-            "allows_old_gym": rule_id in OF_OLD_GYM,
-        }
-        rules[rule_id] = Rule(rule_id, name, Severity(severity), meaning, fix, *task, **more)  # type: ignore[arg-type]
-    return rules
-
-
-UNMOVED = _load()  # Rules that have no file yet, by id
-
-
 @dataclasses.dataclass(init=False)
 class RuleFinding:
     """Something that is wrong, or may be, with one environment."""
@@ -88,7 +58,7 @@ class RuleFinding:
 
     def __init__(
         self,
-        rule: Rule | str,
+        rule: Rule,
         message: str,
         evidence: Mapping[str, Any] | None = None,
         severity: Severity | None = None,
@@ -96,7 +66,6 @@ class RuleFinding:
         where: tuple[str, int] | None = None,
     ) -> None:
         """Severity and fix are the rule's where left out."""
-        rule = UNMOVED[rule] if isinstance(rule, str) else rule
         self.rule, self.name, self.message, self.evidence = rule.id, rule.name, message, evidence or {}
         self.severity, self.fix = Severity(severity or rule.severity), fix or rule.fix
         self.where = where

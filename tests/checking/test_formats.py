@@ -1,5 +1,6 @@
 """What comes out: text, JSON, SARIF and annotations, and what can be chosen: rules, waivers, strictness."""
 
+import copy
 import dataclasses
 import json
 import os
@@ -358,7 +359,8 @@ def test_junit_names_the_task_and_what_the_baseline_knows(broken):
 
 
 def test_in_junit_warnings_fail_with_strict_only(broken):
-    warning = dataclasses.replace(broken.verdict.findings[0], severity=Severity.WARNING)
+    warning = copy.copy(broken.verdict.findings[0])
+    warning.severity = Severity.WARNING
     for strict, failures in ((False, "0"), (True, "1")):
         verdict = CheckVerdict(findings=[warning], judged=[warning.rule])
         text = FORMATS["junit"](dataclasses.replace(broken, verdict=verdict, strict=strict))

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -9,14 +10,16 @@ from typing import Any
 import numpy as np
 
 from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
-from rlctl.checking.families import derived, physics, robots
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance, describe_failure
+from rlctl.checking.joint_copies import JointCopy, find_copies
+from rlctl.checking.motor_commands import CommandSpan, MotorCommands
 from rlctl.checking.mujoco_calls import MujocoCalls, join_calls
 from rlctl.checking.mujoco_trials import Look, are_equal, play
 from rlctl.checking.mujoco_worlds import MujocoStateReader
+from rlctl.checking.readings import join_logs
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Shortened
 from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding
-from rlctl.checking.world_logs import LoggedWorld, WorldLogger
+from rlctl.checking.world_logs import LoggedWorld, WorldLog, WorldLogger
 from rlctl.checking.worlds import Array
 from rlctl.environments.bullet_calls import BulletCalls, record_calls
 from rlctl.environments.bullet_clients import find_clients
@@ -28,6 +31,20 @@ ENOUGH_EPISODES, PART_FOR_THE_REST = 5, 0.3  # of a slow environment; of the exp
 
 
 @dataclasses.dataclass(frozen=True)
+class ObservedWorld:
+    """A world, and what the environment observed of it."""
+
+    world: LoggedWorld
+    logs: list[WorldLog]
+    observed: Array  # In all looks. Shape (looks, elements)
+
+    @functools.cached_property
+    def copies(self) -> list[JointCopy]:
+        """The elements of the observation that are a copy of one value of one joint."""
+        return find_copies(self.logs, self.observed)
+
+
+@dataclasses.dataclass(frozen=True)
 class WatchedWorlds:
     """The worlds of an instance that were logged and are there still, and what was called in them."""
 
@@ -36,6 +53,19 @@ class WatchedWorlds:
     calls: BulletCalls
     low: Array  # Of the action. Shape (n,)
     high: Array
+
+    @functools.cached_property
+    def driven(self) -> list[tuple[LoggedWorld, list[CommandSpan]]]:
+        """The worlds, and between what its actions drive the motors of each, where that is known."""
+        commands = [MotorCommands.read(world, self.low, self.high) for world in self.worlds]
+        spans = [[] if one is None else one.find_spans() for one in commands]
+        return list(zip(self.worlds, spans, strict=True))
+
+    @functools.cached_property
+    def observed(self) -> list[ObservedWorld]:
+        """The worlds with enough observations to compare with what the engine has."""
+        joined = [(world, join_logs(world)) for world in self.worlds]
+        return [ObservedWorld(world, *both) for world, both in joined if both is not None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,15 +92,7 @@ judges_logs = JudgeHook[LoggedWorld]()
 _HOOKS = (judges_models, judges_worlds, judges_resets, judges_trials, judges_logs)
 
 
-@experiment(
-    "worlds",
-    INSTANCES,
-    20,
-    "RL116",
-    *(f"RL8{i:02}" for i in (3, 4, 5, 7, *range(9, 21))),
-    share=4.0,
-    hooks=_HOOKS,
-)
+@experiment("worlds", INSTANCES, 20, share=4.0, hooks=_HOOKS)
 def watch_worlds(context: Context) -> Iterator[ChildMessage]:
     """Log the worlds of an instance through a few episodes, then let them fall alone, which may change them."""
     if not ENGINES & sys.modules.keys():
@@ -83,15 +105,13 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
     with _join(mujoco_calls), record_calls() as calls, context.fresh() as instance:
         with contextlib.suppress(EnvironmentRaised):  # the first episode raises it again
             instance.reset(FIRST_SEED)
-        yield from physics.find_model_faults(instance.env)
         yield from judges_models.judge(instance.env)
         logger = WorldLogger(instance, older, calls, mujoco_calls)
         yield from _log_episodes(logger, context)
         bounds = [leaf.flat_bounds for leaf in instance.action_leaves if leaf.supported]
         low, high = (np.concatenate([pair[end] for pair in bounds] or [np.zeros(0)]) for end in (0, 1))
         watched = WatchedWorlds(instance, logger.worlds, calls, low, high)
-        misuses = list(robots.find_misuses(logger.worlds, calls, low, high))
-        for message in [*misuses, *judges_worlds.judge(watched)]:
+        for message in list(judges_worlds.judge(watched)):
             if isinstance(message, RuleFinding):
                 found.append(message.rule)
             yield message
@@ -105,7 +125,6 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
         raise NotApplicable("no world of PyBullet or MuJoCo")
     for world in logger.worlds:
         yield from judges_logs.judge(world)
-        yield from physics.judge_logs(world)
 
 
 def _join(calls: MujocoCalls) -> contextlib.AbstractContextManager[None]:
@@ -134,13 +153,11 @@ def _try_mujoco(
         return
     with contextlib.suppress(EnvironmentRaised):  # an episode that was logged raised it too
         yield from judges_resets.judge(instance)
-        yield from derived.find_wrong_resets(instance)
         plain = play(instance, calls)
         plain = play(instance, calls)  # an instance's first episode may differ from all others
         if not are_equal(plain, play(instance, calls)):
             return
         trials = MujocoTrials(instance, calls, readers[0], plain, found)
-        yield from derived.find_wrong_reads(instance, calls, readers[0], plain, set(found))
         for message in judges_trials.judge(trials):
             if isinstance(message, RuleFinding):
                 found.append(message.rule)

@@ -31,9 +31,9 @@ import pkgutil
 from collections.abc import Collection, Sequence
 from types import ModuleType
 
-from rlctl.checking import experiments, families
+from rlctl.checking import experiments
 from rlctl.checking.experiment import HASH_SEEDS, Experiment, RecordsJudge
-from rlctl.checking.rule import UNMOVED, Rule
+from rlctl.checking.rule import Rule
 from rlctl.errors import UsageError, did_you_mean
 
 PROCESS_S = 18.0  # for the experiments of one process [s], besides importing and building
@@ -63,13 +63,12 @@ _RULE_MODULES = _import_modules(__name__, __path__)
 _MODULES = [
     *_RULE_MODULES,
     *_import_modules(experiments.__name__, experiments.__path__),
-    *_import_modules(families.__name__, families.__path__),
 ]
 _MEMBERS = [value for module in _MODULES for value in vars(module).values()]
 _EXPERIMENTS = {value.name: value for value in _MEMBERS if isinstance(value, Experiment)}
 
 _RULES: list[Rule] = [module.RULE for module in _RULE_MODULES]
-RULES = {rule.id: rule for rule in sorted([*_RULES, *UNMOVED.values()], key=lambda rule: rule.id)}
+RULES = {rule.id: rule for rule in sorted(_RULES, key=lambda rule: rule.id)}
 JUDGES = {value.rule: value for value in _MEMBERS if isinstance(value, RecordsJudge)}
 EXPERIMENTS = {one.name: one for one in sorted(_EXPERIMENTS.values(), key=lambda one: one.place)}
 DECIDED_BY = {rule: one for one in EXPERIMENTS.values() for rule in one.rules}
