@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.checking.check import check
-from rlctl.checking.rules import FAMILIES, RULES, Rule
+from rlctl.checking.rule import Rule
+from rlctl.checking.rules import FAMILIES, RULES
 from rlctl.environments.spec import EnvSpec
 
 ROOT = Path(__file__).parent.parent

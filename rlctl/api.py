@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 if TYPE_CHECKING:
     import gymnasium
 
-    from rlctl.checking.rules import RuleFinding
+    from rlctl.checking.rule import RuleFinding
     from rlctl.environments.spec import EnvSpec
     from rlctl.evaluation.evaluate import Evaluation
     from rlctl.launching.train import TrainResult

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_actions, zero_action
 from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED
-from rlctl.checking.rules import NotJudged, OutOfTime
+from rlctl.checking.rule import NotJudged, OutOfTime
 from rlctl.checking.values import flatten, flatten_action
 from rlctl.environments.leaves import Leaf, name_element, pick
 

@@ -9,10 +9,18 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from rlctl import output
-from rlctl.checking import families
 from rlctl.checking.children import Supervisor
 from rlctl.checking.records import Records
-from rlctl.checking.rules import RULES, NotApplicable, NotJudged, RuleFinding, Severity
+from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding, Severity
+from rlctl.checking.rules import (
+    DECIDED_BY,
+    JUDGES,
+    MOST_GROWTH,
+    PROCESS_S,
+    PROCESSES,
+    RULES,
+    find_needs,
+)
 from rlctl.checking.working_copy import find_outdated, find_root, prefer_working_copy
 from rlctl.environments import registry
 from rlctl.environments.leaves import name_leaf
@@ -22,12 +30,7 @@ from rlctl.recipe import sources
 
 METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6": "step", "RL7": "step"}
 """The method that the findings of a family are about, where nothing more is known."""
-OF_SPACES = ("RL103", "RL106", "RL108", "RL109")  # rules about what a space declares
-OF_OLD_GYM = ("RL106", "RL109", "RL207")  # which today's libraries cannot read or call: not faults of their own
-OF_AN_EXAMPLE = ("RL3", "RL120", "RL406", "RL407", "RL409", "RL810", "RL811", "RL814", "RL815", "RL816", "RL820")
-"""Rules whose finding shows one element of all that are wrong: without a seed, another one in another run."""
 BUDGET_STEP_S = 10
-LOADING = ("RL0", "RL216")  # judged even if no instance could be built
 
 
 @dataclasses.dataclass
@@ -59,7 +62,7 @@ class CheckReport:
     def out_of_time(self) -> list[str]:
         """Rules that were not judged because the time of an experiment ended."""
         cut = {name for name, end in self.records.finished.items() if end.is_cut}
-        return [rule for rule in self.verdict.not_judged if rule in RULES and families.find_needs([rule]) & cut]
+        return [rule for rule in self.verdict.not_judged if rule in RULES and find_needs([rule]) & cut]
 
     @property
     def advice(self) -> str:
@@ -102,7 +105,7 @@ class CheckReport:
             file = registry.find_source_file(self.task)
             return (file, 1) if file else None
         method = finding.evidence.get("call") or METHODS.get(finding.rule[:3], "")
-        if finding.rule in OF_SPACES:
+        if RULES[finding.rule].is_about_space:
             kind = "action" if str(finding.evidence.get("element")).startswith("action") else "observation"
             method = f"{kind}_space" if f"{kind}_space" in built.places else method
         file_name, line = built.places.get(method) or (built.file, built.line or 1)
@@ -123,7 +126,7 @@ class CheckReport:
 
     def fingerprint(self, finding: RuleFinding) -> str:
         """Return what identifies a finding in every run: no number of a message, which differ from run to run."""
-        element = "" if finding.rule.startswith(OF_AN_EXAMPLE) else finding.evidence.get("element", "")
+        element = "" if RULES[finding.rule].shows_one else finding.evidence.get("element", "")
         return f"{self.task} {finding.rule} {element}".strip()
 
     def summarize(self) -> str:
@@ -175,13 +178,13 @@ def check(
     itself, also crashes, and calls that take more than `env_timeout_s` seconds. `budget_s` is the computing time of
     each process [s]; without it this is `PROCESS_S`, and up to `MOST_GROWTH` times as much where the steps are slow.
     """
-    most_growth = families.MOST_GROWTH if budget_s is None else 1.0
-    budget_s = budget_s or families.PROCESS_S
+    most_growth = MOST_GROWTH if budget_s is None else 1.0
+    budget_s = budget_s or PROCESS_S
     started = time.monotonic()
     records = Records(spec.task, normalizes=lambda what: _normalizes(spec.task, what))
 
-    needed = {"build"} | {name for name in families.find_needs(rules) if only is None or name in only}
-    wanted = {process: [n for n in names if n in needed] for process, names in families.PROCESSES.items()}
+    needed = {"build"} | {name for name in find_needs(rules) if only is None or name in only}
+    wanted = {process: [n for n in names if n in needed] for process, names in PROCESSES.items()}
     supervisor = Supervisor(spec, budget_s, env_timeout_s, records.add, most_growth)
     with _status(spec.task, show_progress) as say:
         supervisor.run({process: names for process, names in wanted.items() if names}, say)
@@ -210,7 +213,7 @@ def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> CheckVerdi
     for rule in rules:
         _apply(rule, records, verdict)
     if any(finding.rule == "RL008" for finding in verdict.findings):
-        for finding in [finding for finding in verdict.findings if finding.rule in OF_OLD_GYM]:
+        for finding in [finding for finding in verdict.findings if RULES[finding.rule].allows_old_gym]:
             verdict.findings.remove(finding)
             verdict.not_judged[finding.rule] = "the environment is written for the old gym (RL008)"
     if records.built is not None:
@@ -242,14 +245,14 @@ def _apply(rule: str, records: Records, verdict: CheckVerdict) -> None:
 
 
 def _findings(rule: str, records: Records) -> list[RuleFinding]:
-    check, experiment = families.CHECKS.get(rule), families.DECIDED_BY.get(rule)
+    judge_records, experiment = JUDGES.get(rule), DECIDED_BY.get(rule)
     findings = [finding for finding in records.findings if finding.rule == rule]
     if records.built is None and findings:
         return findings
-    if not rule.startswith(LOADING):
+    if RULES[rule].needs_instance:
         records.require_built()
-    if check is not None and not findings:
-        findings += check.run(records)
+    if judge_records is not None and not findings:
+        findings += judge_records.run(records)
     if experiment is not None and not findings:
         if rule in records.skipped:
             raise NotJudged(records.skipped[rule])
@@ -259,8 +262,8 @@ def _findings(rule: str, records: Records) -> list[RuleFinding]:
         is_failed_build = records.built is None and experiment.name == "build"
         if not is_failed_build and (finished is None or not finished.is_complete):
             raise NotJudged(records.why_missing(experiment.name))
-    if not findings or (check is not None and check.of_absence):
-        records.require_whole(*families.find_needs([rule]))
+    if not findings or (judge_records is not None and judge_records.of_absence):
+        records.require_whole(*find_needs([rule]))
     return findings
 
 

@@ -14,12 +14,14 @@ from multiprocessing.connection import Connection, wait
 
 from gymnasium import spaces
 
-from rlctl.checking import families
-from rlctl.checking.experiments import Experiment
+from rlctl.checking.experiment import HASH_SEEDS, Experiment
 from rlctl.checking.instance import Budget, Context, EnvironmentRaised, describe_failure, raised_by_environment
 from rlctl.checking.progress import CallProgress, Position, read_clock, read_clock_of
 from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finished, Mistake, Skipped
-from rlctl.checking.rules import NotApplicable, NotJudged, RuleFinding
+from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding
+from rlctl.checking.rules import (
+    EXPERIMENTS,
+)
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.printed_lines import LineReader, clean
@@ -57,7 +59,7 @@ def run(
     context = Context(spec, progress)
     context.seconds, context.most_growth = seconds, most_growth
     try:
-        for message in _run_all(context, [families.EXPERIMENTS[name] for name in experiments], seconds):
+        for message in _run_all(context, [EXPERIMENTS[name] for name in experiments], seconds):
             yield dataclasses.replace(message, process=process) if isinstance(message, CallFailure) else message
     except UsageError as error:
         yield Mistake(str(error))
@@ -152,7 +154,7 @@ class Child:
             stdout=self._readers[0].descriptor,
             stderr=self._readers[1].descriptor,
             pass_fds=[self._memory],
-            env={"PYTHONHASHSEED": str(families.HASH_SEEDS[name])},
+            env={"PYTHONHASHSEED": str(HASH_SEEDS[name])},
         )
         for reader in self._readers:
             reader.close_descriptor()

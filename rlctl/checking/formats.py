@@ -14,9 +14,10 @@ from rich.text import Text
 
 from rlctl import output
 from rlctl.checking.check import CheckReport
-from rlctl.checking.families.speed import format_speed
 from rlctl.checking.junit import to_junit
-from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, find_rule
+from rlctl.checking.rule import RuleFinding, Severity
+from rlctl.checking.rules import FAMILIES, RULES, find_rule
+from rlctl.checking.speed import format_speed
 from rlctl.checking.tool_formats import Row, action_rows, observation_rows, to_annotations, to_json, to_sarif
 from rlctl.checking.working_copy import is_own
 from rlctl.environments import registry

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from rlctl.checking.progress import CallProgress, read_clock
 from rlctl.checking.records import CallFailure
-from rlctl.checking.rules import NotJudged
+from rlctl.checking.rule import NotJudged
 from rlctl.checking.values import is_task
 from rlctl.environments import registry
 from rlctl.environments.graphics import opengl_fix

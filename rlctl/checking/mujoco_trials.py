@@ -11,7 +11,7 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.records import FIRST_SEED
-from rlctl.checking.rules import list_names
+from rlctl.checking.rule import list_names
 from rlctl.checking.values import flatten
 from rlctl.checking.worlds import Array
 from rlctl.environments.info import find_mujoco

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.rules import NotJudged, RuleFinding
+from rlctl.checking.rule import NotJudged, RuleFinding
 from rlctl.environments.leaves import Leaf, name_element
 from rlctl.errors import UsageError
 

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.check import CheckReport
-from rlctl.checking.families.speed import Speed
 from rlctl.checking.records import Built, Records
-from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity
+from rlctl.checking.rule import RuleFinding, Severity
+from rlctl.checking.rules import FAMILIES, RULES
+from rlctl.checking.speed import Speed
 from rlctl.environments.leaves import Leaf, name_leaf
 from rlctl.errors import ArtifactError
 from rlctl.storage import files

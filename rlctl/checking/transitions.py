@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.records import CheckedEpisode, Records
-from rlctl.checking.rules import NotJudged
+from rlctl.checking.records import FIRST_SEED, CheckedEpisode, Records
+from rlctl.checking.rule import NotJudged
 from rlctl.environments.leaves import Leaf
 from rlctl.environments.success import SUCCESS
 
@@ -183,3 +183,13 @@ def find_functions(rows: Numbers, names: Sequence[str]) -> Quantities:
 
 def _span(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"({names[0]} to {names[-1]})"
+
+
+MOST_ROWS = 1_200  # steps that rewards are fitted to
+
+
+def sample_ordinary_steps(steps: Transitions) -> Transitions:
+    """Return some steps in random order, without those whose reward may have a bonus or a penalty for the end."""
+    steps = steps.select(~(steps.success | steps.terminated | steps.is_last))
+    order = np.random.default_rng(FIRST_SEED).permutation(len(steps.rewards))
+    return steps.select(order[:MOST_ROWS])

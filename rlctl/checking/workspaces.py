@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.bullet_worlds import read_world
 from rlctl.checking.records import FIRST_SEED
-from rlctl.checking.rules import NotJudged
+from rlctl.checking.rule import NotJudged
 from rlctl.checking.worlds import WorldBody
 from rlctl.environments.bullet_clients import ClientCalls, find_clients
 from rlctl.task.env import TaskEnv

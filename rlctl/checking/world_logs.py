@@ -247,3 +247,11 @@ class WorldLogger:
                 if not any(logged.gravity):
                     logged.weight_matters = logged.reader.weight_matters()
                 logged.jumps += logged.reader.find_jumps(FIRST_SEED + number)
+
+
+LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved yet
+
+
+def name_place(place: Place) -> str:
+    """Return when something was logged, in words."""
+    return f"at step {place['step']}" if place["step"] else "at reset"

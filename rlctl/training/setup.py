@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.check import CheckReport, check
-from rlctl.checking.families import find_rules
-from rlctl.checking.rules import Severity
+from rlctl.checking.rule import Severity
+from rlctl.checking.rules import find_rules
 from rlctl.environments import registry
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.named_task import RUN

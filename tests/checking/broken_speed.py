@@ -9,7 +9,7 @@ import numpy as np
 from broken_envs import Clean
 from gymnasium import spaces
 
-from rlctl.checking.families.speed import FIRST_SPEED_SEED
+from rlctl.checking.experiments.speed import FIRST_SPEED_SEED
 from rlctl_manipulation.reach import Reach
 
 with contextlib.suppress(ModuleNotFoundError):  # whatever needs it is skipped without it

@@ -4,7 +4,8 @@ import sys
 
 import pytest
 
-from rlctl.checking.families import episodes
+from rlctl.checking.experiments import episodes
+from rlctl.checking.rules.rl503_episodes_never_end import ENOUGH_STEPS
 
 pytest.register_assert_rewrite("tests.checking.judging")
 
@@ -28,7 +29,7 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(autouse=True)
 def _cut_endless_episodes(monkeypatch):
     """Cut episodes that do not end as soon as that is judged, by steps: how many there is time for differs."""
-    monkeypatch.setattr(episodes, "ENDLESS_STEPS", episodes.ENOUGH_STEPS)
+    monkeypatch.setattr(episodes, "ENDLESS_STEPS", ENOUGH_STEPS)
     monkeypatch.setattr(episodes, "LATER_ENDLESS_STEPS", 100)
 
 

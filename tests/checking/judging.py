@@ -10,16 +10,16 @@ from typing import Any
 
 import pytest
 
-from rlctl.checking import children, families
+from rlctl.checking import children
 from rlctl.checking.check import judge
 from rlctl.checking.records import Records
-from rlctl.checking.rules import RULES
+from rlctl.checking.rules import PROCESS_S, PROCESSES, RULES, find_needs
 from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.spec import EnvSpec
 from rlctl.task.pybullet.library import pybullet
 
 FOLDER = Path(__file__).parent
-SECONDS = 10 * families.PROCESS_S
+SECONDS = 10 * PROCESS_S
 """For the experiments of a process: a slow machine judges as a fast one does."""
 PYBULLET_FILES = ("broken_models.py", "broken_physics.py", "broken_robots.py")
 """All of their environments need PyBullet."""
@@ -73,7 +73,7 @@ IN_PROCESSES = [
 def records_of(task, *experiments):
     """What some experiments find out, or all."""
     records = Records(_path(task))
-    for process, names in families.PROCESSES.items():
+    for process, names in PROCESSES.items():
         for message in _run(task, process, [name for name in names if not experiments or name in experiments]):
             records.add(message)
     return records
@@ -82,7 +82,7 @@ def records_of(task, *experiments):
 def shared_records_of(task, *experiments):
     """What some experiments find out, each in a process of its own, and once for all tests: many have one twin."""
     records = Records(_path(task))
-    for experiment in itertools.chain(*families.PROCESSES.values()):
+    for experiment in itertools.chain(*PROCESSES.values()):
         if experiment == "build" or (experiment in experiments and records.built):
             for message in _play(task, experiment):
                 records.add(message)
@@ -91,7 +91,7 @@ def shared_records_of(task, *experiments):
 
 @functools.cache
 def _play(task, experiment):
-    (process,) = [process for process, names in families.PROCESSES.items() if experiment in names]
+    (process,) = [process for process, names in PROCESSES.items() if experiment in names]
     return _run(task, process, [experiment])
 
 
@@ -110,7 +110,7 @@ def _path(task):
 
 def verdict_of(task, *rules):
     """The verdict by some rules, from the experiments that they need; or by all, from one process after the other."""
-    records = shared_records_of(task, *families.find_needs(rules)) if rules else _whole(task)
+    records = shared_records_of(task, *find_needs(rules)) if rules else _whole(task)
     verdict = judge(records, rules or tuple(RULES))
     assert verdict.crashed == {}
     return verdict

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rlctl.checking.families.batches import describe_difference
+from rlctl.checking.rules.rl406_worlds_affect_each_other import describe_difference
 from tests.checking.judging import case, check_case, findings, found, mark_slow
 
 pytest.importorskip("mujoco")

@@ -1,5 +1,6 @@
 """What comes out: text, JSON, SARIF and annotations, and what can be chosen: rules, waivers, strictness."""
 
+import copy
 import dataclasses
 import json
 import os
@@ -16,11 +17,12 @@ import typer
 from gymnasium import spaces
 
 from rlctl import cli
-from rlctl.checking import families, tool_formats
+from rlctl.checking import tool_formats
 from rlctl.checking.check import CheckReport, CheckVerdict, judge
 from rlctl.checking.formats import FORMATS, pair_targets, show_notes, to_text
 from rlctl.checking.records import Built, Finished, Records
-from rlctl.checking.rules import FAMILIES, RULES, RuleFinding, Severity, choose_rules, find_rule
+from rlctl.checking.rule import RuleFinding, Severity
+from rlctl.checking.rules import FAMILIES, PROCESSES, RULES, choose_rules, find_needs, find_rule
 from rlctl.environments.leaves import find_leaves
 from rlctl.errors import UsageError
 from tests import fork_server
@@ -30,11 +32,11 @@ ROOT = Path(__file__).parent.parent.parent
 HERE = "tests/checking"
 
 
-PROBE = families.PROCESSES["probe"]
+PROBE = PROCESSES["probe"]
 
 
 def report_of(task, rules=tuple(RULES), experiments=None):
-    records = records_of(task, *(experiments or {"build", *families.find_needs(rules)}))
+    records = records_of(task, *(experiments or {"build", *find_needs(rules)}))
     return CheckReport(task, judge(records, rules), records, 1.0, 20.0)
 
 
@@ -357,7 +359,8 @@ def test_junit_names_the_task_and_what_the_baseline_knows(broken):
 
 
 def test_in_junit_warnings_fail_with_strict_only(broken):
-    warning = dataclasses.replace(broken.verdict.findings[0], severity=Severity.WARNING)
+    warning = copy.copy(broken.verdict.findings[0])
+    warning.severity = Severity.WARNING
     for strict, failures in ((False, "0"), (True, "1")):
         verdict = CheckVerdict(findings=[warning], judged=[warning.rule])
         text = FORMATS["junit"](dataclasses.replace(broken, verdict=verdict, strict=strict))

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rlctl.checking.families.units import find_rates
-from rlctl.checking.rules import NotJudged
+from rlctl.checking.rates import find_rates
+from rlctl.checking.rule import NotJudged
 from rlctl.checking.transitions import Transitions
 from rlctl.checking.values import read_attributes
 from rlctl.checking.workspaces import find_chains, find_reach, measure_reach

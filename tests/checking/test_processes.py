@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from rlctl.checking import families
 from rlctl.checking.check import check, judge
-from rlctl.checking.experiments import Check
+from rlctl.checking.experiment import RecordsJudge
 from rlctl.checking.records import Records
-from rlctl.checking.rules import choose_rules
+from rlctl.checking.rules import JUDGES, choose_rules
 from rlctl.checking.tool_formats import read_baseline
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError
@@ -153,7 +152,7 @@ def test_the_tools_own_process_loads_neither_learner_nor_simulator(in_root):
 
 def test_a_rule_that_crashes_is_no_pass(monkeypatch):
     for rule in ("RL004", "RL306"):
-        monkeypatch.setitem(families.CHECKS, rule, Check(rule, (), False, lambda records: [1 / 0]))
+        monkeypatch.setitem(JUDGES, rule, RecordsJudge(rule, (), False, lambda records: [1 / 0]))
     verdict = judge(Records("any"), ["RL004", "RL306"])
     assert verdict.not_judged["RL306"] == "no instance could be built"
     assert "ZeroDivisionError" in verdict.crashed["RL004"]

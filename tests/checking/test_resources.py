@@ -3,11 +3,12 @@
 import pytest
 
 from rlctl.checking.check import judge
-from rlctl.checking.families import isolation
-from rlctl.checking.families.episodes import find_unseeded, record_episodes
+from rlctl.checking.experiments.episodes import record_episodes
 from rlctl.checking.instance import Context
 from rlctl.checking.progress import read_clock
-from rlctl.checking.rules import NotJudged
+from rlctl.checking.rule import NotJudged
+from rlctl.checking.rules import rl405_leaks_on_reset as leaks
+from rlctl.checking.rules.rl311_random_generator_without_a_seed import find_unseeded
 from rlctl.environments.spec import EnvSpec
 from tests.checking.judging import case, check_case, findings, mark_slow, records_of
 
@@ -34,7 +35,7 @@ def the_finding(name, rule):
 
 @pytest.mark.pybullet
 def test_each_reset_leaves_a_client(monkeypatch):
-    monkeypatch.setattr(isolation, "MOST_RESETS", 12)  # each is slow: PyBullet connects anew
+    monkeypatch.setattr(leaks, "MOST_RESETS", 12)  # each is slow: PyBullet connects anew
     (finding,) = judge(records_of(f"{FILE}:Reconnects", "build", "leaks"), ["RL405"]).findings
     assert finding.severity == "error"
     assert finding.evidence["per_reset"] == 1.0
@@ -52,7 +53,7 @@ def test_memory_is_counted():
 
 def found_in(resets, bodies=None, **memory):
     series = {"bodies in the PyBullet world": bodies} if bodies else {}
-    return [finding.message for finding in isolation.find_growth(isolation.Counts(resets, series, **memory))]
+    return [finding.message for finding in leaks.find_growth(leaks.Counts(resets, series, **memory))]
 
 
 def test_what_changes_or_fills_once_is_no_leak():

@@ -7,8 +7,8 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.checking.episode import action_at
-from rlctl.checking.families.rewards import discounted_steps, discounted_sum
-from rlctl.checking.families.search import compare_returns
+from rlctl.checking.rewards import discounted_steps, discounted_sum
+from rlctl.checking.rules.rl605_hovering_pays_more_than_finishing import compare_returns
 from tests.checking.judging import case, check_case, findings, found, mark_slow, rules_of, shared_records_of
 
 BROKEN = "broken_rewards.py"

@@ -2,10 +2,11 @@
 
 import pytest
 
-from rlctl.checking import children, families
+from rlctl.checking import children
 from rlctl.checking.check import CheckReport, judge
 from rlctl.checking.formats import to_text
 from rlctl.checking.records import Finished, Records, Shortened
+from rlctl.checking.rules import PROCESS_S
 from rlctl.environments.spec import EnvSpec
 
 SLOW = """
@@ -69,16 +70,16 @@ def test_fewer_episodes_are_enough_for_a_slow_environment(slow):
 def test_the_last_line_says_what_more_time_would_do(slow):
     records = play(slow, ["comparisons"], 0.15, 1.0)
     rules = ["RL301", "RL302"]
-    report = CheckReport(slow, judge(records, rules), records, seconds=1.0, budget_s=families.PROCESS_S)
+    report = CheckReport(slow, judge(records, rules), records, seconds=1.0, budget_s=PROCESS_S)
     lines = to_text(report).splitlines()
     assert lines[-1].startswith("2 rules not judged for lack of time: --budget ")
     assert lines[-1].endswith("0 should judge them")
-    assert int(lines[-1].split()[-4]) >= 2 * families.PROCESS_S
+    assert int(lines[-1].split()[-4]) >= 2 * PROCESS_S
 
 
 def test_what_was_shortened_is_named(slow):
     records = play(slow, [], 1.0, 1.0)
     records.add(Shortened("episodes", "12 of 16 episodes"))
     records.add(Finished("episodes", 1.0, is_complete=True))
-    report = CheckReport(slow, judge(records, []), records, seconds=1.0, budget_s=families.PROCESS_S)
+    report = CheckReport(slow, judge(records, []), records, seconds=1.0, budget_s=PROCESS_S)
     assert "slow environment: judged on 12 of 16 episodes" in to_text(report).splitlines()

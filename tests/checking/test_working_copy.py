@@ -9,7 +9,8 @@ from rlctl.checking import tool_formats
 from rlctl.checking.check import CheckReport, CheckVerdict
 from rlctl.checking.formats import show_notes
 from rlctl.checking.records import Built, Records
-from rlctl.checking.rules import RuleFinding
+from rlctl.checking.rule import RuleFinding
+from rlctl.checking.rules import RULES
 from rlctl.checking.working_copy import find_outdated, find_working_copy, prefer_working_copy
 
 
@@ -28,7 +29,7 @@ def copies(request, tmp_path, monkeypatch):
 
 def report_on(file):
     built = Built([], [], "", "", file=str(file), line=1)
-    verdict = CheckVerdict(findings=[RuleFinding("RL705", "a message", {})])
+    verdict = CheckVerdict(findings=[RuleFinding(RULES["RL705"], "a message", {})])
     return CheckReport("team:Dock-v0", verdict, Records("team:Dock-v0", built), 1.0, 20.0)
 
 

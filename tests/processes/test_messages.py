@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from rlctl.checking.records import Fact, Series
-from rlctl.checking.rules import RuleFinding, Severity
+from rlctl.checking.rule import RuleFinding, Severity
+from rlctl.checking.rules import RULES
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.play import messages
@@ -34,7 +35,7 @@ SPEC = EnvSpec("reach", {"limit": math.inf, "range": (0.5, 1)}, named_by="run")
         ),
         messages.Play(40, {0: -1, 3: 7}, {0: 5}, run_seed=3),
         messages.Answer(ended=[messages.EpisodeResult(1, 2, -math.inf, 3, None, {"x": 1.0}, None, 4, {"calls": 2})]),
-        RuleFinding("RL001", "message", severity=Severity.INFO),
+        RuleFinding(RULES["RL001"], "message", severity=Severity.INFO),
         WorkerException("caf\udce9", "TaskError", "Traceback", (1, 2, 3)),
     ],
     ids=lambda message: type(message).__name__,

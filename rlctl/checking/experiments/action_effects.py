@@ -1,0 +1,95 @@
+"""The experiment `action effects`: changes numbers of the action, for rules about what they do."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking import action_trials
+from rlctl.checking.action_trials import REWARD, ActionNumber, Frame, Trials
+from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
+from rlctl.checking.instance import Context
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact
+from rlctl.checking.rule import NotJudged
+
+DELAY_STEPS = 4  # Of episodes whose first action is changed
+ROUNDING = 1e-9  # up to which rewards may differ where a robot mirrors itself
+Changes = Mapping[int, NDArray[np.intp]]
+"""The columns of observation and reward that differ, by step."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionTrials:
+    """Episodes of one instance that repeat exactly, in which single numbers of the action can be changed."""
+
+    trials: Trials
+    dimensions: Sequence[ActionNumber]  # All numbers of the action that can be varied
+    earliest: set[int]  # The first steps at which anything of the observation follows the first action
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the observation never follows the first action before the second step."""
+        return self.earliest == {2}
+
+
+judges_actions = JudgeHook[ActionTrials]()
+"""Shows trials, with which the parts play episodes."""
+
+
+@experiment("action effects", INSTANCES, 60, share=4.0, hooks=(judges_actions,))
+def compare_actions(context: Context) -> Iterator[ChildMessage]:
+    """Play the same episode with each number of the action at other values."""
+    with context.fresh() as instance:
+        dimensions = action_trials.find_dimensions(instance.action_leaves)
+        if not dimensions:
+            raise NotJudged("no element of the action can be varied")
+        trials = Trials(instance)
+        trials.require_repeatable()
+        pairs, opposites = _play_first_actions(trials, dimensions)
+        first = [_first_changes(pair) for pair in pairs]
+        shown = ActionTrials(trials, dimensions, {min(steps.values(), default=0) for steps in first})
+        if not shown.is_late:
+            yield from _measure_delays(pairs, opposites)
+        yield from judges_actions.judge(shown)
+
+
+def _play_first_actions(trials: Trials, dimensions: Sequence[ActionNumber]) -> tuple[list[Changes], list[Changes]]:
+    """Return what changes with the first action: from none to one end of its range, and from one end to the other."""
+    pairs, opposites = [], []
+    for seed in (FIRST_SEED, SECOND_SEED, SECOND_SEED + 1):
+        plain = trials.plain(seed, DELAY_STEPS)
+        for end in (0, 1):
+            values = {dimension: dimension.ends[end] for dimension in dimensions}
+            pairs.append(action_trials.find_differences(plain, trials.with_values(seed, DELAY_STEPS, values, at=0)))
+        low, high = _play_opposites(trials, dimensions, seed)
+        opposites.append(action_trials.find_differences(low, high, ROUNDING))
+    return pairs, opposites
+
+
+def _measure_delays(pairs: Sequence[Changes], opposites: Sequence[Changes]) -> Iterator[Fact]:
+    # Whatever the integrator: an element that answers later, such as a position, may be what the reward depends on.
+    last = {max(_first_changes(pair).values(), default=0) for pair in pairs}
+    for observed in last if len(last) == 1 and 0 not in last else ():
+        is_late = {observed + 1} in (_find_first_rewards(pairs), _find_first_rewards(opposites))
+        yield Fact("action effects", {"observation": observed, "reward": observed + 1 if is_late else observed})
+
+
+def _play_opposites(trials: Trials, dimensions: Sequence[ActionNumber], seed: int) -> list[list[Frame]]:
+    """Play two episodes of zero actions, but for the first ones, which are as far from 0 to one side as to the other: a
+    cost of acting, or of changing the action, is the same in both."""
+    sizes = {dimension: min(map(abs, dimension.ends)) for dimension in dimensions if min(dimension.ends) < 0}
+    return [
+        trials.with_first(seed, DELAY_STEPS, {dimension: sign * size for dimension, size in sizes.items()})
+        for sign in (-1, 1)
+    ]
+
+
+def _find_first_rewards(pairs: Sequence[Changes]) -> set[int]:
+    return {min((step for step, columns in pair.items() if REWARD in columns), default=0) for pair in pairs}
+
+
+def _first_changes(differences: Changes) -> dict[int, int]:
+    """Return the first step at which each element of the observation differs, by column."""
+    steps = sorted(differences, reverse=True)
+    return {column: step for step in steps for column in differences[step].tolist() if column < REWARD}

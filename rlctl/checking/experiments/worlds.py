@@ -1,0 +1,164 @@
+"""The experiment `worlds`: watches the simulated worlds of an instance, for rules about physics and robots."""
+
+import contextlib
+import dataclasses
+import functools
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
+from rlctl.checking.instance import Context, EnvironmentRaised, Instance, describe_failure
+from rlctl.checking.joint_copies import JointCopy, find_copies
+from rlctl.checking.motor_commands import CommandSpan, MotorCommands
+from rlctl.checking.mujoco_calls import MujocoCalls, join_calls
+from rlctl.checking.mujoco_trials import Look, are_equal, play
+from rlctl.checking.mujoco_worlds import MujocoStateReader
+from rlctl.checking.readings import join_logs
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Shortened
+from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding
+from rlctl.checking.world_logs import LoggedWorld, WorldLog, WorldLogger
+from rlctl.checking.worlds import Array
+from rlctl.environments.bullet_calls import BulletCalls, record_calls
+from rlctl.environments.bullet_clients import find_clients
+
+ENGINES = {"pybullet", "mujoco"}
+EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60)) + (("random", 2),) * 16
+"""Actions and logged steps. The last ones are for what resets draw."""
+ENOUGH_EPISODES, PART_FOR_THE_REST = 5, 0.3  # of a slow environment; of the experiment's time
+
+
+@dataclasses.dataclass(frozen=True)
+class ObservedWorld:
+    """A world, and what the environment observed of it."""
+
+    world: LoggedWorld
+    logs: list[WorldLog]
+    observed: Array  # In all looks. Shape (looks, elements)
+
+    @functools.cached_property
+    def copies(self) -> list[JointCopy]:
+        """The elements of the observation that are a copy of one value of one joint."""
+        return find_copies(self.logs, self.observed)
+
+
+@dataclasses.dataclass(frozen=True)
+class WatchedWorlds:
+    """The worlds of an instance that were logged and are there still, and what was called in them."""
+
+    instance: Instance
+    worlds: Sequence[LoggedWorld]
+    calls: BulletCalls
+    low: Array  # Of the action. Shape (n,)
+    high: Array
+
+    @functools.cached_property
+    def driven(self) -> list[tuple[LoggedWorld, list[CommandSpan]]]:
+        """The worlds, and between what its actions drive the motors of each, where that is known."""
+        commands = [MotorCommands.read(world, self.low, self.high) for world in self.worlds]
+        spans = [[] if one is None else one.find_spans() for one in commands]
+        return list(zip(self.worlds, spans, strict=True))
+
+    @functools.cached_property
+    def observed(self) -> list[ObservedWorld]:
+        """The worlds with enough observations to compare with what the engine has."""
+        joined = [(world, join_logs(world)) for world in self.worlds]
+        return [ObservedWorld(world, *both) for world, both in joined if both is not None]
+
+
+@dataclasses.dataclass(frozen=True)
+class MujocoTrials:
+    """An instance in MuJoCo whose episodes repeat exactly, so that they show what something changes."""
+
+    instance: Instance
+    calls: MujocoCalls
+    reader: MujocoStateReader
+    plain: Sequence[Look]  # An episode in which nothing was changed
+    found: Sequence[str]  # The ids of the rules with findings so far: one mistake is reported once
+
+
+judges_models = JudgeHook[Any]()
+"""Shows the environment after its first reset."""
+judges_worlds = JudgeHook[WatchedWorlds]()
+"""Shows all worlds, in which episodes have been played."""
+judges_resets = JudgeHook[Instance]()
+"""Shows an instance in MuJoCo that resets from equal seeds; parts may reset it."""
+judges_trials = JudgeHook[MujocoTrials]()
+"""Shows an instance in MuJoCo, with which the parts play episodes, by their places."""
+judges_logs = JudgeHook[LoggedWorld]()
+"""Shows each world at the end, when its bodies have also moved without the environment."""
+_HOOKS = (judges_models, judges_worlds, judges_resets, judges_trials, judges_logs)
+
+
+@experiment("worlds", INSTANCES, 20, share=4.0, hooks=_HOOKS)
+def watch_worlds(context: Context) -> Iterator[ChildMessage]:
+    """Log the worlds of an instance through a few episodes, then let them fall alone, which may change them."""
+    if not ENGINES & sys.modules.keys():
+        with context.fresh():
+            pass  # what it imports is imported now
+    if not ENGINES & sys.modules.keys():
+        raise NotApplicable("no world of PyBullet or MuJoCo")
+    older, mujoco_calls = set(find_clients()), MujocoCalls()
+    found: list[str] = []
+    with _join(mujoco_calls), record_calls() as calls, context.fresh() as instance:
+        with contextlib.suppress(EnvironmentRaised):  # the first episode raises it again
+            instance.reset(FIRST_SEED)
+        yield from judges_models.judge(instance.env)
+        logger = WorldLogger(instance, older, calls, mujoco_calls)
+        yield from _log_episodes(logger, context)
+        bounds = [leaf.flat_bounds for leaf in instance.action_leaves if leaf.supported]
+        low, high = (np.concatenate([pair[end] for pair in bounds] or [np.zeros(0)]) for end in (0, 1))
+        watched = WatchedWorlds(instance, logger.worlds, calls, low, high)
+        for message in list(judges_worlds.judge(watched)):
+            if isinstance(message, RuleFinding):
+                found.append(message.rule)
+            yield message
+        yield from _try_mujoco(instance, mujoco_calls, logger.worlds, found)
+        if logger.worlds and not context.budget.is_over():
+            with contextlib.suppress(EnvironmentRaised):  # its resets were logged by now
+                logger.simulate_alone(len(EPISODES))
+    if not logger.resets:
+        raise NotJudged("no episode could be logged")
+    if not logger.worlds:
+        raise NotApplicable("no world of PyBullet or MuJoCo")
+    for world in logger.worlds:
+        yield from judges_logs.judge(world)
+
+
+def _join(calls: MujocoCalls) -> contextlib.AbstractContextManager[None]:
+    return join_calls(calls) if "mujoco" in sys.modules else contextlib.nullcontext()
+
+
+def _log_episodes(logger: WorldLogger, context: Context) -> Iterator[ChildMessage]:
+    whole_s = context.budget.seconds_left
+    for number, (kind, steps) in enumerate(EPISODES):
+        if number and (not logger.worlds or context.budget.is_over()):
+            return
+        if number >= ENOUGH_EPISODES and context.budget.seconds_left < PART_FOR_THE_REST * whole_s:
+            yield Shortened("worlds", f"{number} of {len(EPISODES)} logged episodes")
+            return
+        try:
+            logger.play(number, kind, steps)
+        except EnvironmentRaised as error:
+            yield describe_failure(error, context.progress)
+
+
+def _try_mujoco(
+    instance: Instance, calls: MujocoCalls, worlds: Sequence[LoggedWorld], found: list[str]
+) -> Iterator[ChildMessage]:
+    readers = [world.reader for world in worlds if isinstance(world.reader, MujocoStateReader)]
+    if not readers or not instance.accepts_seed or instance.context.budget.is_over():
+        return
+    with contextlib.suppress(EnvironmentRaised):  # an episode that was logged raised it too
+        yield from judges_resets.judge(instance)
+        plain = play(instance, calls)
+        plain = play(instance, calls)  # an instance's first episode may differ from all others
+        if not are_equal(plain, play(instance, calls)):
+            return
+        trials = MujocoTrials(instance, calls, readers[0], plain, found)
+        for message in judges_trials.judge(trials):
+            if isinstance(message, RuleFinding):
+                found.append(message.rule)
+            yield message

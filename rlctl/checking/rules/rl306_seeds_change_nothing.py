@@ -1,0 +1,44 @@
+"""RL306: seeds change nothing."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rlctl.checking.differences import compare
+from rlctl.checking.experiment import judges_records
+from rlctl.checking.records import Records
+from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
+
+RULE = Rule(
+    "RL306",
+    "seeds change nothing",
+    Severity.INFO,
+    meaning="""
+        All seeds give the same start and, with the same actions, the same trajectory: a policy may memorise it.
+        Some tasks are fixed (a puzzle, a maze), so this is only an info. A fixed start with random steps is no
+        finding.
+    """,
+    fix="""
+        If the task should vary, draw the start from self.np_random in reset, after super().reset(seed=seed).
+    """,
+    task_fix="If the task should vary, draw the start from `rng`, the argument of reset.",
+    shows_one=True,
+)
+
+FEWEST_SEEDS = 4
+
+
+@judges_records(RULE, "comparisons", "episodes", of_absence=True)
+def _compare_seeds(records: Records) -> Iterator[RuleFinding]:
+    if compare(records, "alone", "seeds") is not None:
+        return
+    starts = [episode for episode in records.require_alone() if 0 in episode.observations]
+    if (seeds := len({start.seed for start in starts})) < FEWEST_SEEDS:
+        raise NotJudged(f"fewer than {FEWEST_SEEDS} seeds were tried")
+    for index, _ in enumerate(records.require_built().leaves):
+        values = [start.observations[index].values[0] for start in starts if index in start.observations]
+        if any(not np.array_equal(values[0], other) for other in values[1:]):
+            return
+    steps = records.require_role("alone").steps
+    message = f"{seeds} seeds give one start, and with the same actions one trajectory of {steps} steps"
+    yield RuleFinding(RULE, message, {"seeds": seeds, "value": 1, "expected": seeds})

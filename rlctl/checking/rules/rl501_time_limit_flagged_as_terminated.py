@@ -1,0 +1,63 @@
+"""RL501: time limit flagged as terminated."""
+
+from collections.abc import Iterator
+
+from rlctl.checking.episode_ends import FEWEST_EPISODES, SHORTEST_TIE, require_episodes, require_two_flags
+from rlctl.checking.experiment import judges_records
+from rlctl.checking.records import ENDS, CheckedEpisode, Records
+from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
+
+RULE = Rule(
+    "RL501",
+    "time limit flagged as terminated",
+    Severity.WARNING,
+    meaning="""
+        Episodes end with `terminated` after exactly the same number of steps. Learning then treats running out
+        of time as a state without a future: values near the end are wrong, and the policy learns to hurry or to
+        give up. A task that really is over after so many steps looks the same, so this is a warning. An info if
+        the last reward is unlike any before, as at an obstacle that no episode passes.
+    """,
+    fix="Return terminated=False, truncated=True when time is up, or use gymnasium.wrappers.TimeLimit.",
+)
+
+FEWEST_TIES = 4
+SHORTEST_LIMIT = 5  # shorter games with one length have no time limit [steps]
+
+
+@judges_records(RULE, "episodes", "search")  # of absence too, but for the counter
+def find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
+    """Yield that episodes end with `terminated` when their time is up."""
+    episodes = require_episodes(records)
+    require_two_flags(records)
+    if any(episode.ended in ("truncated", "both") for episode in episodes):
+        return
+    ended = [episode for episode in episodes if episode.ended == "terminated"]
+    limit = max((episode.steps for episode in ended), default=0)
+    if counter := (built := records.require_built()).counter:
+        message = f"step sets terminated by a counter ({counter}), and truncated is always False"
+        flags = {"value": "terminated", "expected": "truncated"}
+        yield RuleFinding(RULE, message, flags, where=built.counter_place)
+        return
+    records.require_whole("episodes", "search")
+    longer = [episode for episode in episodes if episode.ended not in ENDS] + records.role("search")
+    if any(episode.steps > limit for episode in longer):
+        return
+    if len(ended) < FEWEST_EPISODES or len({episode.actions for episode in ended}) < 2:
+        raise NotJudged(f"only {len(ended)} episodes ended")
+    ties = [episode for episode in ended if episode.steps == limit]
+    of = {"episodes": len(ties), "of": len(episodes)}
+    evidence = {"step": limit, **of, "value": "terminated", "expected": "truncated"}
+    has_obstacle = all(_ends_with_odd_reward(episode) for episode in ties)
+    if limit >= SHORTEST_LIMIT and len(ties) == len(episodes):
+        message = f"all {len(ties)} episodes, whatever the actions, end at step {limit} with terminated=True"
+        if has_obstacle:
+            message += ", and with a reward unlike any before: a time limit, or an obstacle that none of them passes"
+        yield RuleFinding(RULE, message, evidence, Severity.INFO if has_obstacle else None)
+    elif limit >= SHORTEST_TIE and len(ties) >= FEWEST_TIES and len({episode.actions for episode in ties}) > 1:
+        message = f"{len(ties)} of {len(episodes)} episodes end at step {limit} with terminated=True, none later"
+        yield from () if has_obstacle else (RuleFinding(RULE, message, evidence),)
+
+
+def _ends_with_odd_reward(episode: CheckedEpisode) -> bool:
+    before, last = episode.rewards[:-1], episode.rewards[-1]
+    return bool(before.size and (last < before.min() or last > before.max()))

@@ -1,0 +1,99 @@
+"""RL605: hovering pays more than finishing."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from rlctl.checking import rewards
+from rlctl.checking.episode import zero_action
+from rlctl.checking.experiments.search import ActionSearch, judges_searches
+from rlctl.checking.records import CheckedEpisode, ChildMessage, Skipped
+from rlctl.checking.rule import Rule, RuleFinding, Severity
+
+RULE = Rule(
+    "RL605",
+    "hovering pays more than finishing",
+    Severity.WARNING,
+    meaning="""
+        The goal ends the episode, and with it a positive reward per step: stopping just before the goal and
+        staying there earns more than finishing, so the policy learns to hover. rlctl repeated an episode that
+        finished, and stopped shortly before its end.
+    """,
+    fix="""
+        Pay for finishing at least what staying near the goal would earn to the end of the episode, pay for
+        progress instead of for being near, or do not end the episode at the goal.
+    """,
+)
+
+FAR_ABOVE = 5.0  # times the spread of early rewards; a robot that falls at speed ends with a good reward
+STOPS = (1, 2, 4, 8)  # steps before the end of a finished episode, to stop there
+CLEARLY = 0.1  # How much more stopping has to earn than finishing
+LATE = 10  # steps after the recorded ones are assumed to earn the mean of the last so many rewards
+
+
+@judges_searches(RULE)
+def _stop_early(search: ActionSearch) -> Iterator[ChildMessage]:
+    """Repeat an episode that finished, and stop it shortly before its end."""
+    is_reported = rewards.reports_success([attempt.played for attempt in search.attempts])
+    finished = [attempt for attempt in search.attempts if _finishes(attempt.played, is_reported)]
+    if not finished:
+        yield Skipped(RULE.id, "no searched episode ended in success", applies=False)
+        return
+    best = max(finished, key=lambda attempt: attempt.played.rewards[-1])
+    one, nothing = best.played, zero_action(search.space)
+    stops: list[Stop] = []
+    for before in STOPS:
+        at = max(0, one.steps - before)
+        if search.goes_on():
+            yield from search.play([*best.sequence[:at], *[nothing] * (search.length - at)])
+            two = search.attempts[-1].played
+            is_same = np.array_equal(one.rewards[:at], two.rewards[:at]) and two.ended != "raised"
+            if is_same and two.steps > one.steps and not _finishes(two, is_reported):
+                longest = search.instance.max_steps or max(attempt.played.steps for attempt in search.attempts)
+                stops.append(compare_returns(one, two, at, longest))
+    if not is_reported:
+        stops = [stop for stop in stops if stop.finishing > 0]  # an end that costs more than it pays is no goal
+    yield from _judge_stops(one, stops)
+
+
+def _finishes(episode: CheckedEpisode, success_is_reported: bool) -> bool:
+    if episode.ended not in ("terminated", "both"):
+        return False
+    if success_is_reported:
+        return rewards.ends_in_success(episode)
+    begin = episode.rewards[: episode.steps // 2]
+    last = episode.rewards[-1]
+    return len(begin) > 1 and bool(last > begin.max() + FAR_ABOVE * np.ptp(begin) and last >= episode.rewards.max())
+
+
+@dataclasses.dataclass(frozen=True)
+class Stop:
+    """What an episode earns that stops shortly before another one finishes."""
+
+    step: int  # The first step that is different
+    finishing: float  # The discounted rewards of the other one from that step on
+    stopping: float  # Its own, up to the time limit
+    per_step: float  # Its mean reward from that step on
+
+
+def compare_returns(one: CheckedEpisode, two: CheckedEpisode, at: int, longest: int) -> Stop:
+    """Compare an episode that finished with one that is the same for `at` steps. `longest`: the time limit [steps]."""
+    rest = two.rewards[at:]
+    to_come = 0 if two.has_ended else longest - two.steps
+    later = rewards.discounted_steps(float(rest[-LATE:].mean()), to_come)
+    stopping = rewards.discounted_sum(rest) + rewards.DISCOUNT ** len(rest) * later
+    return Stop(at + 1, rewards.discounted_sum(one.rewards[at:]), stopping, float(rest.mean()))
+
+
+def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[ChildMessage]:
+    if not stops:
+        yield Skipped(RULE.id, "no episode that stops just before the goal could be played")
+        return
+    best = max(stops, key=lambda stop: stop.stopping - stop.finishing)
+    if best.per_step > 0 and best.stopping > best.finishing + CLEARLY * abs(best.finishing):
+        more = f"{best.per_step:.3g} per step instead, {best.stopping:.4g} in all (discount {rewards.DISCOUNT})"
+        finishing = f"finishing at step {finished.steps} earns {best.finishing:.4g} from step {best.step} on"
+        message = f"{finishing}; stopping there earns {more}"
+        earned = {"value": best.stopping, "expected": f"below {best.finishing:.6g}", "per_step": best.per_step}
+        yield RuleFinding(RULE, message, finished.at(best.step, **earned))

@@ -1,0 +1,131 @@
+"""RL618: angle jumps in the reward."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking import rewards
+from rlctl.checking.experiment import judges_records
+from rlctl.checking.records import Records
+from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
+from rlctl.checking.transitions import Transitions, collect_transitions, find_unit_pairs
+
+RULE = Rule(
+    "RL618",
+    "angle jumps in the reward",
+    Severity.WARNING,
+    meaning="""
+        The reward jumps in the steps in which an observed angle passes from pi to -pi, and hardly ever else.
+        The robot itself moves on smoothly there: the reward uses a difference of two angles that is not
+        wrapped, so an error of 0.1 rad counts as one of 6.2, and turning the short way is punished.
+    """,
+    fix="Wrap the difference, (a - b + pi) % (2 * pi) - pi, or use 1 - cos(a - b).",
+)
+
+NEAR_TURN = 1.0  # an angle that passes pi changes by 2 pi +- NEAR_TURN [rad]
+SMALL_TURN = 1.5  # and by less than this in all other steps [rad]
+NEIGHBOURS = 3  # steps before and after a jump that it is compared with
+JUMP = 3.0  # times the largest change of its neighbours
+FEWEST_JUMPS, FEWEST_SEEDS = 4, 3
+MOST_PASSES = 0.4  # part of the passes with a jump: those near a difference of 0 have none
+LEAST_ROOM, SPREAD = 0.2, 1.5  # of pi - |e|: least [rad], and how much the largest of them exceed the smallest
+SAME_FACTOR, MOST_FIT = 0.15, 0.7  # how equal factors are, and what part of all jumps they explain
+RARE = 0.05  # the same of all other steps, relative to that of the passes
+_SHIFTS = [shift for shift in range(-NEIGHBOURS, NEIGHBOURS + 1) if shift]
+
+
+@judges_records(RULE, *rewards.WITH_SEARCH)
+def _find_jumps_of_angles(records: Records) -> Iterator[RuleFinding]:
+    rewards.require_rewarded(records)
+    steps = collect_transitions(records)
+    passes, pairs = _find_passes(steps), find_unit_pairs(steps.before)
+    if not passes and not pairs:
+        raise NotApplicable("no angle is observed that passes pi")
+    jumps = _find_jumps(steps)
+    size, where = _judge_passes(steps, passes, jumps) or _judge_errors(steps, pairs, jumps) or (0.0, "")
+    if where:
+        yield RuleFinding(RULE, f"the reward jumps by {size:.3g} {where}", {"value": size, "expected": "no jump"})
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Jumps:
+    """Where the reward changes much more than in the steps around."""
+
+    is_jump: NDArray[np.bool_]  # Shape (n,)
+    is_judged: NDArray[np.bool_]  # Whether the steps around are known. Shape (n,)
+    sizes: NDArray[np.float64]  # of the changes. Shape (n,)
+
+    def are_many(self, steps: Transitions, rows: NDArray[np.bool_]) -> bool:
+        return rows.sum() >= FEWEST_JUMPS and len(np.unique(steps.seeds[rows])) >= FEWEST_SEEDS
+
+
+def _judge_passes(
+    steps: Transitions, passes: Mapping[str, NDArray[np.bool_]], jumps: _Jumps
+) -> tuple[float, str] | None:
+    """Return how much the reward jumps where an angle passes pi, and where; None if it does not."""
+    for name, is_pass in passes.items():
+        judged, elsewhere = is_pass & jumps.is_judged, ~is_pass & jumps.is_judged
+        jumping = judged & jumps.is_jump
+        others = float((elsewhere & jumps.is_jump).sum() / max(1, elsewhere.sum()))
+        share = float(jumping.sum() / max(1, judged.sum()))
+        if jumps.are_many(steps, jumping) and share >= MOST_PASSES and others <= RARE * share:
+            size = float(np.median(jumps.sizes[jumping]))
+            where = f"in {int(jumping.sum())} of {int(judged.sum())} steps in which {name} passes pi"
+            return size, f"(median) {where}, and in {others:.1%} of all other steps"
+    return None
+
+
+def _judge_errors(steps: Transitions, pairs: Sequence[tuple[int, int]], jumps: _Jumps) -> tuple[float, str] | None:
+    """Return how the reward jumps as an error e that becomes e - 2 pi would make it, |e| and e^2 alike: by a constant
+    times pi - |e|, where only the cosine and the sine of e are observed. None if it does not."""
+    for cosine, sine in [pair for i, j in pairs for pair in ((i, j), (j, i))]:
+        room = np.pi - np.abs(_angle(steps.after, cosine, sine))
+        rows = jumps.is_jump & (room > LEAST_ROOM)
+        if not jumps.are_many(steps, rows):
+            continue
+        factors = jumps.sizes[rows] / room[rows]
+        fits = np.abs(factors / np.median(factors) - 1) < SAME_FACTOR
+        low, high = np.quantile(room[rows][fits], (0.1, 0.9)) if fits.any() else (1.0, 1.0)
+        rows[rows] = fits
+        if jumps.are_many(steps, rows) and fits.mean() >= MOST_FIT and high > SPREAD * low:
+            name = f"({steps.names[cosine]}, {steps.names[sine]})"
+            factor = float(np.median(factors))
+            where = f"in {int(rows.sum())} steps in which the angle e of {name} changes little"
+            return factor, f"times pi - |e| {where}, as if e were e + 2 pi there"
+    return None
+
+
+def _find_passes(steps: Transitions) -> dict[str, NDArray[np.bool_]]:
+    """Return for each observed angle in which steps it passes from pi to -pi or back, by name. Shape (n,) each."""
+    angles = {name: (steps.before[:, i], steps.after[:, i]) for i, name in enumerate(steps.names)}
+    for i, j in find_unit_pairs(steps.before):
+        names = f"({steps.names[i]}, {steps.names[j]})"
+        angles[f"the angle of {names}"] = (_angle(steps.before, i, j), _angle(steps.after, i, j))
+        angles[f"the angle of {names} from its sine"] = (_angle(steps.before, j, i), _angle(steps.after, j, i))
+    passes = {}
+    for name, (before, after) in angles.items():
+        change = np.abs(after - before)
+        is_pass = np.abs(change - 2 * np.pi) < NEAR_TURN
+        if is_pass.sum() >= FEWEST_JUMPS and (is_pass | (change < SMALL_TURN)).all():
+            passes[name] = is_pass
+    return passes
+
+
+def _angle(rows: NDArray[np.float64], cosine: int, sine: int) -> NDArray[np.float64]:
+    return np.arctan2(rows[:, sine], rows[:, cosine])
+
+
+def _find_jumps(steps: Transitions) -> _Jumps:
+    changes = np.abs(np.diff(steps.rewards, prepend=np.nan))
+    is_ordinary = ~(steps.success | steps.terminated | steps.is_last)
+    is_ordinary &= np.r_[False, np.diff(steps.episodes) == 0]
+    changes[~is_ordinary] = np.nan
+    padded = np.pad(changes, NEIGHBOURS, constant_values=np.nan)
+    around = [padded[NEIGHBOURS + shift : NEIGHBOURS + shift + len(changes)] for shift in _SHIFTS]
+    neighbours = np.max(around, axis=0)  # NaN where one of them is
+    is_judged = np.isfinite(neighbours) & np.isfinite(changes)
+    with np.errstate(invalid="ignore"):
+        is_jump = is_judged & (changes > JUMP * neighbours) & (changes > 0)
+    return _Jumps(is_jump, is_judged, changes)

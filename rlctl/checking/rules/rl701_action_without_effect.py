@@ -1,0 +1,134 @@
+"""RL701: action without effect."""
+
+from collections.abc import Iterator, Mapping
+from typing import Literal, get_args
+
+from rlctl.checking import action_trials
+from rlctl.checking.action_trials import REWARD, ActionNumber, Trials
+from rlctl.checking.experiments.action_effects import ActionTrials, judges_actions
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED
+from rlctl.checking.rule import OutOfTime, Rule, RuleFinding, Severity, list_names
+
+RULE = Rule(
+    "RL701",
+    "action without effect",
+    Severity.WARNING,
+    meaning="""
+        An element of the action was set to its lowest and to its highest value, and the episode stayed the same
+        to the last bit. Noise on such an element only costs exploration. An element that only changes the
+        reward of its own step (a cost) or its own copy in the observation moves nothing either. An error if no
+        element does anything else: there is nothing to learn. An info if the reward of the own step can also
+        rise, as in a bandit, or if all values in one half of the range do the same.
+    """,
+    fix="""
+        Use every element of the action in step(), or take it out of action_space. Look for a wrong index, a
+        joint that is not the motor's, a force or gain of zero.
+    """,
+)
+
+MOST_DIMENSIONS = 64
+STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows
+LONGEST_DELAY = 4  # steps; for earlier actions in observations and for penalties on changes
+Effect = Literal["lasting", "reward", "cost", "copy", "none"]
+"""Of a number of the action: on what follows; only on its step's reward, up or, as a cost, down; only on its own copy
+in the observation; or nothing."""
+
+
+@judges_actions(RULE)
+def _find_idle_numbers(shown: ActionTrials) -> Iterator[RuleFinding]:
+    trials, every = shown.trials, shown.dimensions
+    effects: dict[str, Effect] = {}
+    halves: list[str] = []
+    why = f"only {MOST_DIMENSIONS} are compared" if len(every) > MOST_DIMENSIONS else ""
+    try:
+        for dimension in every[:MOST_DIMENSIONS]:
+            effects[dimension.name] = _find_effect(trials, dimension)
+            halves += _find_dead_half(trials, dimension) if effects[dimension.name] == "lasting" else []
+        if "lasting" not in effects.values():
+            costly = [dimension for dimension in every if effects.get(dimension.name) == "reward"]
+            effects |= {dimension.name: "cost" for dimension in costly if _only_costs(trials, dimension)}
+    except OutOfTime:
+        why = "time ran out"
+        if not effects:
+            raise
+    left_out = f" ({len(effects)} of {len(every)} dimensions: {why})" if why else ""
+    yield from _without_effect(effects, len(every), left_out)
+    if halves:
+        message = f"every value in one half of the range has the same effect: {list_names(halves)}"
+        yield _finding(halves, message, Severity.INFO)
+
+
+def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:
+    copies = trials.copies(dimension, FIRST_SEED, action_trials.REPEATED_STEPS, LONGEST_DELAY)
+    effect: Effect = "none"
+    for seed, steps in STAGES:
+        plain = trials.plain(seed, steps)
+        for end in dimension.ends:
+            played = trials.with_values(seed, steps, {dimension: end})
+            if action_trials.observations_differ(plain, played, copies):
+                return "lasting"
+            if action_trials.find_other_rewards(plain, played):
+                effect = "reward"
+            elif effect == "none" and action_trials.observations_differ(plain, played):
+                effect = "copy"
+    return "lasting" if effect == "reward" and _lasts(trials, dimension) else effect
+
+
+def _find_dead_half(trials: Trials, dimension: ActionNumber) -> list[str]:
+    low, high = dimension.ends
+    copies = trials.copies(dimension, FIRST_SEED, action_trials.REPEATED_STEPS, LONGEST_DELAY)
+
+    def is_same(one: float, two: float) -> bool:
+        played = ([trials.with_values(*stage, {dimension: value}) for value in (one, two)] for stage in STAGES)
+        return not any(action_trials.observations_differ(a, b, copies) for a, b in played)
+
+    middle = (low + high) / 2
+    for end, other in ((low, high), (high, low)) if "float" in dimension.leaf.dtype else ():
+        if is_same(end, middle) and is_same(end, (end + middle) / 2) and not is_same(other, (other + middle) / 2):
+            return [f"{dimension.name} from {min(end, middle):g} to {max(end, middle):g}"]
+    return []
+
+
+def _lasts(trials: Trials, dimension: ActionNumber) -> bool:
+    for seed, steps in STAGES[1:]:
+        plain = trials.plain(seed, steps)
+        at = (len(plain) - 1) // 4
+        for end in dimension.ends:
+            played = trials.with_values(seed, steps, {dimension: end}, at)
+            # The action of index `at` gives frame `at + 1`.
+            if any(step > at + 1 + LONGEST_DELAY for step in action_trials.find_other_rewards(plain, played)):
+                return True
+    return False
+
+
+def _only_costs(trials: Trials, dimension: ActionNumber) -> bool:
+    """Say whether zero always earns as much as both ends: a cost for acting, not a choice."""
+    seed, steps = STAGES[1]
+    low, high = dimension.ends
+    zero = trials.with_values(seed, steps, {dimension: min(max(0, low), high)})
+    ends = [trials.with_values(seed, steps, {dimension: end}) for end in dimension.ends]
+    few = len(zero) <= LONGEST_DELAY  # in so few steps zero may be the right answer by chance
+    return not few and all(a[REWARD] >= b[REWARD] for end in ends for a, b in zip(zero, end, strict=False))
+
+
+def _without_effect(effects: Mapping[str, Effect], total: int, left_out: str) -> Iterator[RuleFinding]:
+    names = {kind: [name for name, effect in effects.items() if effect == kind] for kind in get_args(Effect)}
+    others_last, is_useless = bool(names["lasting"]), not names["lasting"] and not names["reward"]
+    for kind, what, severity in (
+        ("none", "", Severity.WARNING),
+        ("cost", " but its own step's reward, a cost for acting", Severity.WARNING),
+        # If no action moves anything, it is a bandit, or a series that is only watched.
+        ("reward", " but its own step's reward", Severity.WARNING if others_last else Severity.INFO),
+        ("copy", " but its own copy in the observation", Severity.INFO),
+    ):
+        if names[kind]:
+            is_all = len(names[kind]) == total
+            shown = "no element of the action" if is_all else list_names(names[kind])
+            how = f"at its lowest and highest value, over {STAGES[-1][1]} steps from two seeds"
+            message = f"{shown} changes {'anything' if is_all else 'nothing'}{what}: {how}{left_out}"
+            yield _finding(names[kind], message, Severity.ERROR if is_useless and not left_out else severity)
+
+
+def _finding(names: list[str], message: str, severity: Severity) -> RuleFinding:
+    evidence = {"value": names, "seed": FIRST_SEED, "seeds": [FIRST_SEED, SECOND_SEED], "steps": STAGES[-1][1]}
+    return RuleFinding(RULE, message, evidence, severity)

@@ -1,0 +1,177 @@
+"""RL815: state is one physics step old."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from rlctl.checking.derived_fields import (
+    DERIVED,
+    FEWEST_TRIAL_LOOKS,
+    POLLUTION,
+    SAME_READING,
+    RefreshAfterSteps,
+    find_fields,
+    find_stale_fields,
+)
+from rlctl.checking.experiments.worlds import MujocoTrials, WatchedWorlds, judges_trials, judges_worlds
+from rlctl.checking.instance import Instance
+from rlctl.checking.mujoco_calls import MujocoCalls
+from rlctl.checking.mujoco_trials import Look, name_columns, pair_rows, play
+from rlctl.checking.readings import FEWEST_LOOKS, MOST_ELEMENTS, NEARLY_ALL, name_features, read_features
+from rlctl.checking.records import FIRST_SEED
+from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
+from rlctl.checking.world_logs import LoggedWorld, WorldLog
+from rlctl.checking.worlds import Array
+from rlctl.environments.bullet_calls import BulletCalls
+from rlctl.environments.info import find_mujoco
+
+RULE = Rule(
+    "RL815",
+    "state is one physics step old",
+    Severity.INFO,
+    meaning="""
+        An observation or a reward is computed from a state before the last step of the physics, and so is late
+        by that step, by more the faster the robot moves. PyBullet - getLinkState without
+        computeForwardKinematics returns the position before that step (an info); or the state is read before
+        the last stepSimulation. MuJoCo - mj_step leaves xpos, site_xpos, sensordata and all else that follows
+        from positions as they were at the beginning of its last substep; and where reset writes qpos without
+        mj_forward, they are of the episode before.
+    """,
+    fix="""
+        Read after the last step; call getLinkState(..., computeForwardKinematics=True), and
+        mujoco.mj_forward(model, data) after mj_step and after qpos is written.
+    """,
+    shows_one=True,
+)
+
+TINY = 0.01  # of what a control step changes; less is an info
+FORWARD = (
+    "Call mujoco.mj_forward(model, data) after mj_step (mj_kinematics is enough for xpos and site_xpos) and before the "
+    "observation and the reward are computed."
+)
+FORWARD_AT_RESET = "Call mujoco.mj_forward(model, data) in reset, after qpos and qvel are written."
+EXACT = 2e-6  # relative; the last bits of float32 and of sums
+OLD = 1e-4  # An old value differs from the present one by more, in most looks [m], [rad], [m/s]
+LATE_LINK = 0.001  # [m]
+
+
+@judges_worlds(RULE)
+def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
+    yield from _find_late_links(watched.calls)
+    for world in watched.worlds:
+        yield from _find_old_elements(world)
+
+
+@judges_trials(RULE, place=10)
+def _judge_trials(trials: MujocoTrials) -> Iterator[RuleFinding]:
+    yield from _find_stale(trials.instance, trials.calls, trials.plain)
+    yield from _find_unforwarded(trials.instance, trials.calls, trials.plain)
+
+
+def _find_stale(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> Iterator[RuleFinding]:
+    refreshing = RefreshAfterSteps()
+    changed = play(instance, calls, after_step=refreshing, as_stepped=refreshing.as_stepped)
+    pair = pair_rows(plain, changed)
+    if pair is None or len(pair[0]) < FEWEST_TRIAL_LOOKS:
+        return
+    old, new = (part[1:] for part in pair)  # a reset has no step
+    off, moves = np.abs(new - old).max(axis=0), np.abs(np.diff(new, axis=0)).max(axis=0)
+    columns = np.flatnonzero(off > SAME_READING * (1 + np.abs(new).max(axis=0))).tolist()
+    if not columns:
+        return
+    size, fields = new.shape[1] - 1, find_fields(instance, calls, columns)
+    shown = sorted(columns, key=lambda c: c not in fields)
+    texts = [f"{name_columns([c], size)}{f' ({fields[c]})' if c in fields else ''}" for c in shown]
+    verb, worst = "is" if len(columns) == 1 else "are", shown[0]
+    value, step = float(off[worst]), int(np.abs(new - old)[:, worst].argmax())
+    what = f"{list_names(texts, 4)} {verb} computed from what mj_step leaves one substep old"
+    message = f"{what}: {texts[0]} is off by up to {value:.3g}, a step changes it by up to {moves[worst]:.3g}"
+    evidence = {"element": name_columns([worst], size), "seed": FIRST_SEED, "step": step + 1}
+    evidence |= {"value": float(old[step, worst]), "expected": float(new[step, worst])}
+    severity = Severity.WARNING if (off[columns] > TINY * moves[columns]).any() else Severity.INFO
+    yield RuleFinding(RULE, message, evidence, severity, fix=FORWARD)
+
+
+def _find_unforwarded(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> Iterator[RuleFinding]:
+    """Reset with other values in what is derived from positions, which a correct reset computes again."""
+
+    def pollute(_: Any, data: Any) -> None:
+        for name in DERIVED:
+            getattr(data, name)[:] += POLLUTION
+
+    def pollute_stale(_: Any, data: Any) -> None:
+        for name, is_stale in stale.items():
+            getattr(data, name)[is_stale] += POLLUTION
+
+    if (simulation := find_mujoco(instance.env)) is None:
+        return
+    pollute(*simulation)
+    pair = pair_rows(plain, play(instance, calls, 0, after_reset=pollute))
+    columns = [] if pair is None else np.flatnonzero(pair[0][0] != pair[1][0]).tolist()
+    if not columns:  # there is a call of mj_forward, but it may come too early
+        play(instance, calls, 0)
+        if stale := find_stale_fields(instance):
+            pair = pair_rows(plain, play(instance, calls, 0, after_forward=pollute_stale))
+            columns = [] if pair is None else np.flatnonzero(pair[0][0] != pair[1][0]).tolist()
+    if columns and pair is not None:
+        size = pair[0].shape[1] - 1
+        verb = "is" if len(columns) == 1 else "are"
+        what = f"{name_columns(columns, size)} of reset {verb} computed before mj_forward"
+        message = f"{what}: from poses and sensors as they were before qpos was written"
+        evidence = {"element": name_columns(columns[:1], size), "call": "reset", "seed": FIRST_SEED}
+        yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=FORWARD_AT_RESET)
+
+
+def _find_old_elements(world: LoggedWorld) -> Iterator[RuleFinding]:
+    """Yield the elements of the observation that equal the state before the last step of the physics, not the present
+    one; an element may have its episode's constant added, such as a goal."""
+    logs = [log for log in world.logs if sum(before is not None for before in log.before[1:]) >= FEWEST_LOOKS]
+    if not logs or len({row.size for log in logs for row in log.observed}) != 1:
+        return
+    observed, now, before = ([_center(part) for part in parts] for parts in zip(*map(_read_log, logs), strict=True))
+    names = name_features(logs[0])
+    old: dict[int, str] = {}
+    for column in range(min(MOST_ELEMENTS, observed[0].shape[1])):
+        values = np.concatenate([part[:, column] for part in observed])
+        if values.std() <= OLD:
+            continue
+        present, earlier = (_equals(values, np.concatenate(parts)) for parts in (now, before))
+        if earlier.any() and not present.any():
+            old[column] = names[int(earlier.argmax())]
+    if old:
+        elements = [f"observation[{column}] ({name})" for column, name in old.items()]
+        shown = ", ".join(elements[:4]) + (f" and {len(elements) - 4} more" if len(elements) > 4 else "")
+        verb = "is" if len(elements) == 1 else "are"
+        message = f"{shown} {verb} of the state before the last step of the physics, not of the present one"
+        evidence = {"element": f"observation[{next(iter(old))}]", "elements": [f"observation[{c}]" for c in old][:8]}
+        yield RuleFinding(RULE, message, evidence, Severity.WARNING)
+
+
+def _read_log(log: WorldLog) -> tuple[Array, Array, Array]:
+    looks = [i for i, before in enumerate(log.before) if i and before is not None]
+    observed = np.stack([log.observed[i] for i in looks]).astype(np.float64)
+    now = [(log.states[i], log.poses[i]) for i in looks]
+    before = [entry for entry in (log.before[i] for i in looks) if entry is not None]
+    present, earlier = (np.stack([read_features(log, *entry) for entry in entries]) for entries in (now, before))
+    return np.nan_to_num(observed), present, earlier
+
+
+def _center(values: Array) -> Array:
+    return values - values[0]
+
+
+def _equals(values: Array, features: Array) -> Array:
+    """Say for each column of centered features whether centered values equal it, up to their sign. Shape (k,)."""
+    scale = np.abs(values).max() + np.abs(features).max(axis=0)
+    moves = features.std(axis=0) > OLD
+    near = [np.abs(values[:, None] - sign * features) <= EXACT * (1 + scale) for sign in (1.0, -1.0)]
+    result: Array = moves & np.logical_or(*(part.mean(axis=0) >= NEARLY_ALL for part in near))
+    return result
+
+
+def _find_late_links(calls: BulletCalls) -> Iterator[RuleFinding]:
+    call = max(calls.late_links, key=lambda call: calls.late_links[call], default=None)
+    if call is not None and (distance := calls.late_links[call]) > LATE_LINK:
+        message = f"getLinkState returns the position before the last physics step: up to {1e3 * distance:.3g} mm away"
+        yield RuleFinding(RULE, message, {"value": distance, "expected": 0.0}, where=(call.file, call.line))
