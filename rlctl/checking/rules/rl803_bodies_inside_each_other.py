@@ -26,7 +26,7 @@ RULE = Rule(
     """,
 )
 
-LASTING_SOFT = 10  # the same for contacts of MuJoCo, which are soft by design, if they begin after a reset
+LASTING_SOFT = 10  # [steps]; contacts of MuJoCo are soft by design, if they begin after a reset
 
 
 @judges_logs(RULE)
