@@ -78,15 +78,14 @@ def run_cases(rules: Sequence[str]) -> dict[str, str]:
 
 
 def _find_cases() -> dict[str, Any]:
-    """Return one case per rule: of robots, if there is one."""
-    cases: dict[str, Any] = {}
-    for file in sorted(TESTS.glob("test_*.py"), key=lambda file: file.stem != "test_robots"):
-        for case in getattr(importlib.import_module(f"tests.checking.{file.stem}"), "CASES", []):
-            for rule in case.rules if ".py:" in case.broken else ():
-                cases.setdefault(rule, case)
-    from tests.checking.judging import IN_PROCESSES
+    """Return one case per rule: the first whose broken class has the rule's code in its name."""
+    from tests.checking.judging import list_cases
 
-    return cases | {case.rules[0]: case for case in IN_PROCESSES}
+    cases: dict[str, Any] = {}
+    for case in list_cases():
+        for rule in case.codes:
+            cases.setdefault(rule, case)
+    return cases
 
 
 def _render_index() -> str:

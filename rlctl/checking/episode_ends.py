@@ -4,7 +4,7 @@ from rlctl.checking.records import CheckedEpisode, Records
 from rlctl.checking.rule import NotJudged
 
 FEWEST_EPISODES = 5
-SHORTEST_TIE = 20  # The same, where only some episodes end together [steps]
+SHORTEST_TIE = 20  # so long are episodes that end together at a time limit, where others end earlier [steps]
 
 
 def require_episodes(records: Records) -> list[CheckedEpisode]:

@@ -9,7 +9,7 @@ from rlctl.checking.motor_commands import CommandSpan
 from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import JOINTS, Array, Motor, MotorTarget
 
-APART = 0.2  # of sorted targets and positions; of a target and its own joint's position [rad], [m]
+APART = 0.2  # of a target and its own joint's position [rad], [m]
 DEGREE = math.pi / 180
 ROUNDED = 1e-3  # relative; for what people round
 

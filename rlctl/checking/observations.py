@@ -9,14 +9,12 @@ from rlctl.checking.records import CheckedEpisode, Form, Records
 from rlctl.checking.rule import NotJudged
 from rlctl.environments.leaves import Leaf
 
+FEWEST_ROWS, FEWEST_SEEDS = 50, 3
+
 
 def name_moment(step: int) -> str:
     """Return when an observation was made, in words; 0 is the one of `reset`."""
     return "from reset" if step == 0 else f"at step {step}"
-
-
-FEWEST_ROWS = 50
-FEWEST_SEEDS = 3
 
 
 def list_forms(records: Records) -> Iterator[tuple[int, Leaf, CheckedEpisode, Form]]:

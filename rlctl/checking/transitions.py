@@ -16,6 +16,7 @@ MOST_ELEMENTS = 64
 MOST_COMPARED = 16  # numbers of an observation whose differences are looked at: there are many pairs
 LONGEST_BLOCK = 3  # consecutive numbers that may be a vector
 FEWEST_STEPS = 100
+MOST_ROWS = 1_200  # steps that rewards are fitted to
 SCALES = (1, 2, 3, 4, 5, 10, 20)  # [1/m] as rewards use them
 UNIT = 1e-4  # how far from 1 the squares of a cosine and a sine may add up
 Numbers = NDArray[np.float64]
@@ -183,9 +184,6 @@ def find_functions(rows: Numbers, names: Sequence[str]) -> Quantities:
 
 def _span(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"({names[0]} to {names[-1]})"
-
-
-MOST_ROWS = 1_200  # steps that rewards are fitted to
 
 
 def sample_ordinary_steps(steps: Transitions) -> Transitions:

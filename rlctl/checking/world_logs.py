@@ -37,6 +37,7 @@ from rlctl.environments.info import find_mujoco
 DEEPEST_FINE = 0.02  # [m]; Bullet pushes links apart over several steps, heavy robots leave up to 2 cm
 LEAST_LIMIT = 0.005  # The same for the smallest things [m]: collision margins alone are 1 to 4 mm
 PART_OF_LINK = 0.25  # Between those two it is this part of the thinner link
+LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved yet
 Place = dict[str, Any]
 """`seed`, `episode`, `actions` and `step` of a look at a world, as a finding's evidence; step 0 is the reset."""
 
@@ -247,9 +248,6 @@ class WorldLogger:
                 if not any(logged.gravity):
                     logged.weight_matters = logged.reader.weight_matters()
                 logged.jumps += logged.reader.find_jumps(FIRST_SEED + number)
-
-
-LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved yet
 
 
 def name_place(place: Place) -> str:

@@ -12,26 +12,26 @@ class OneAxis(Clean):
         return {"is_success": bool(abs(self.position[0]) < 0.1)}
 
 
-class DeadAction(OneAxis):
+class RL701DeadAction(OneAxis):
     def move(self, action):
         super().move(action * np.array([1, 0], np.float32))
 
 
-class NoAction(Clean):
+class RL701NoAction(Clean):
     """A point that drifts, whatever is done."""
 
     def move(self, action):
         super().move(self.np_random.uniform(-1, 1, 2).astype(np.float32))
 
 
-class LateAction(OneAxis):
+class RL701LateAction(OneAxis):
     """The second number acts only near the end: nothing is wrong with it."""
 
     def move(self, action):
         super().move(action * np.array([1, self.steps > 40], np.float32))
 
 
-class HiddenAction(OneAxis):
+class RL701HiddenAction(OneAxis):
     """The second number moves something that is not observed, and that is rewarded: it acts."""
 
     def start(self):
@@ -46,7 +46,7 @@ class HiddenAction(OneAxis):
         return super().reward() - 0.01 * abs(self.heat)
 
 
-class CostlyAction(OneAxis):
+class RL701CostlyAction(OneAxis):
     """The second number costs, and moves nothing."""
 
     def move(self, action):
@@ -57,13 +57,13 @@ class CostlyAction(OneAxis):
         return super().reward() - self.cost
 
 
-class ChangesAction(Clean):
+class RL705ChangesAction(Clean):
     def step(self, action):
         action *= 0.5
         return super().step(action)
 
 
-class ChangesPartOfAction(Clean):
+class RL705ChangesPartOfAction(Clean):
     """Takes a part out of the action, a dictionary."""
 
     rlctl_ignore = {"RL109": "this is about its actions"}
@@ -76,7 +76,7 @@ class ChangesPartOfAction(Clean):
         return super().step(action.pop("push"))
 
 
-class Watched(CostlyAction):
+class Watched(RL701CostlyAction):
     """Actions are rewarded, and change nothing else: a series that is watched."""
 
     def move(self, action):
@@ -85,7 +85,7 @@ class Watched(CostlyAction):
         self.position = self.np_random.uniform(-1, 1, 2).astype(np.float32)
 
 
-class CopiedAction(OneAxis):
+class RL701CopiedAction(OneAxis):
     """The last action is observed; the second number does nothing else."""
 
     def __init__(self):
@@ -104,7 +104,7 @@ class CopiedAction(OneAxis):
         return np.concatenate([self.position, self.last])
 
 
-class OnlyCosts(CostlyAction):
+class RL701OnlyCosts(RL701CostlyAction):
     """Actions cost, and move nothing."""
 
     def move(self, action):
@@ -112,7 +112,7 @@ class OnlyCosts(CostlyAction):
         self.position = self.np_random.uniform(-1, 1, 2).astype(np.float32)
 
 
-class OnlyCopies(CopiedAction):
+class RL701OnlyCopies(RL701CopiedAction):
     """Actions are observed, and do nothing else."""
 
     def move(self, action):
@@ -120,7 +120,7 @@ class OnlyCopies(CopiedAction):
         self.position = self.np_random.uniform(-1, 1, 2).astype(np.float32)
 
 
-class DeadChoice(Clean):
+class RL701DeadChoice(Clean):
     def __init__(self):
         super().__init__()
         self.action_space = spaces.Discrete(4)
@@ -129,7 +129,7 @@ class DeadChoice(Clean):
         super().move(self.np_random.uniform(-1, 1, 2).astype(np.float32))
 
 
-class Choice(DeadChoice):
+class RL701Choice(RL701DeadChoice):
     """Four directions: nothing is wrong with it."""
 
     def step(self, action):
@@ -141,7 +141,7 @@ class Choice(DeadChoice):
         Clean.move(self, np.array(way, np.float32))
 
 
-class DeadLater(DeadAction):
+class DeadLater(RL701DeadAction):
     """Its first episode is not like the others: a dead action shows all the same."""
 
     first = True
@@ -152,7 +152,7 @@ class DeadLater(DeadAction):
         self.first = False
 
 
-class Switch(Clean):
+class RL701Switch(Clean):
     """The second number opens or closes: nothing is wrong with it."""
 
     def move(self, action):

@@ -52,55 +52,55 @@ class Point(BatchTask):
         return np.abs(self.error()) < 0.05
 
 
-class ScalesByAll(Point):
+class RL406ScalesByAll(Point):
     def observe(self):
         speed = self.body.joint_velocities
         return {**super().observe(), "speed": speed / max(1.0, np.abs(speed).max())}
 
 
-class ScalesByEach(Point):
+class RL406ScalesByEach(Point):
     def observe(self):
         speed = self.body.joint_velocities
         return {**super().observe(), "speed": speed / np.maximum(1.0, np.abs(speed))}
 
 
-class SharesNoise(Point):
+class RL406SharesNoise(Point):
     def reset(self, rng, worlds):
         super().reset(rng, worlds)
         self.goal[worlds] += 0.01 * len(worlds)
 
 
-class ResetsAllGoals(Point):
+class RL407ResetsAllGoals(Point):
     def reset(self, rng, worlds):
         super().reset(rng, worlds)
         self.goal[:] = np.clip(self.goal[worlds][0], -0.9, 0.9)
 
 
-class ResetsItsGoal(Point):
+class RL407ResetsItsGoal(Point):
     def reset(self, rng, worlds):
         super().reset(rng, worlds)
         self.goal[worlds] = np.clip(self.goal[worlds], -0.9, 0.9)
 
 
-class MovesAllBases(Point):
+class RL407MovesAllBases(Point):
     def reset(self, rng, worlds):
         self.body.set_base([0.0, 0.0, float(rng.uniform(0.0, 0.1)[0])])
         super().reset(rng, worlds)
 
 
-class MovesItsBase(Point):
+class RL407MovesItsBase(Point):
     def reset(self, rng, worlds):
         height = rng.uniform(0.0, 0.1)
         self.body.set_base(np.stack([0 * height, 0 * height, height], axis=1), worlds=worlds)
         super().reset(rng, worlds)
 
 
-class OneRow(Point):
+class RL408OneRow(Point):
     def rewards(self, action):
         return {**super().rewards(action), "change": np.array([self.change.mean()])}
 
 
-class OneGoal(Point):
+class RL408OneGoal(Point):
     def build(self, sim):
         super().build(sim)
         self.offset = np.zeros((1, 2))
@@ -109,7 +109,7 @@ class OneGoal(Point):
         return super().error() + self.offset.reshape(self.worlds, 2)[:, 0]
 
 
-class CountsSteps(Point):
+class RL409CountsSteps(Point):
     def reset(self, rng, worlds):
         super().reset(rng, worlds)
         self.steps = 0
@@ -122,7 +122,7 @@ class CountsSteps(Point):
         return {**super().observe(), "time": np.full((self.worlds, 1), self.steps / 40)}
 
 
-class CountsStepsOfEach(Point):
+class RL409CountsStepsOfEach(Point):
     per_world = {**Point.per_world, "steps": ()}
 
     def act(self, action):
@@ -133,7 +133,7 @@ class CountsStepsOfEach(Point):
         return {**super().observe(), "time": self.steps[:, None] / 40}
 
 
-class KeepsLast(Point):
+class RL409KeepsLast(Point):
     per_world = {"goal": (), "change": ()}
 
     def build(self, sim):
@@ -145,13 +145,13 @@ class KeepsLast(Point):
         self.last_action[worlds] = 0.0
 
 
-class Logs(Point):
+class RL409Logs(Point):
     def rewards(self, action):
         self.mean_error = float(np.abs(self.error()).mean())
         return super().rewards(action)
 
 
-class CachesAndForgetsTheSeed(Point):
+class RL409CachesAndForgetsTheSeed(Point):
     """The error is computed anew in each step, and the goals are not drawn from the seed."""
 
     rlctl_ignore = {"RL301": "it is what the test is about", "RL308": "a consequence"}

@@ -77,11 +77,11 @@ class NeedsArgument(Clean):
         self.gain = gain
 
 
-class NoEnvironment:
+class RL003NoEnvironment:
     pass
 
 
-class OldGym:
+class RL003OldGym:
     """As written for the old `gym` package."""
 
     observation_space = spaces.Box(-5, 5, (2,), np.float32)
@@ -96,62 +96,62 @@ class OldGym:
         return np.array([self.steps, self.steps**2], np.float32) / 400, 0.0, self.steps % 20 == 0, {}
 
 
-class ExitsWhenBuilt(Clean):
+class RL004ExitsWhenBuilt(Clean):
     def __init__(self):
         os._exit(7)
 
 
-class WrongShape(Clean):
+class RL101WrongShape(Clean):
     def observe(self):
         return np.zeros(3, np.float32)
 
 
-class MissingKey(CleanDict):
+class RL101MissingKey(CleanDict):
     def observe(self):
         return {"position": self.position.copy()}
 
 
-class Float64(Clean):
+class RL102Float64(Clean):
     def observe(self):
         return self.position.astype(np.float64)
 
 
-class OutOfRange(Clean):
+class RL103OutOfRange(Clean):
     """Late in an episode only, where no library's checker looks."""
 
     def observe(self):
         return self.position + np.float32(7.0 * (self.steps == 30))
 
 
-class OutOfRangeAtReset(Clean):
+class RL103OutOfRangeAtReset(Clean):
     def observe(self):
         return self.position + np.float32(7.0 * (self.steps == 0))
 
 
-class OftenOutOfRange(Clean):
+class RL103OftenOutOfRange(Clean):
     def observe(self):
         return self.position + np.float32(7.0 * (self.steps % 5 == 3))
 
 
-class LastOutOfRange(Clean):
+class RL103LastOutOfRange(Clean):
     """Outside only when an episode has just ended."""
 
     def observe(self):
         return self.position + np.float32(7.0 * (self.steps == LIMIT))
 
 
-class Rounding(Clean):
+class RL103Rounding(Clean):
     def observe(self):
         rounded = np.nextafter(np.float32(self.size), np.float32(np.inf))
         return np.array([rounded if self.steps == 20 else 0.0, self.position[1]], np.float32)
 
 
-class NanObservation(Clean):
+class RL104NanObservation(Clean):
     def observe(self):
         return self.position * np.float32("nan" if self.steps == 11 else 1)
 
 
-class ReusedMemory(Clean):
+class RL105ReusedMemory(Clean):
     def start(self):
         super().start()
         self.buffer = getattr(self, "buffer", np.zeros(2, np.float32))
@@ -161,81 +161,81 @@ class ReusedMemory(Clean):
         return self.buffer
 
 
-class UnboundedActions(Clean):
+class RL106UnboundedActions(Clean):
     def __init__(self):
         super().__init__()
         self.action_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
 
 
-class WideActions(Clean):
+class RL106WideActions(Clean):
     def __init__(self):
         super().__init__()
         self.action_space = spaces.Box(-2.0, 2.0, (2,), np.float32)
 
 
-class FourValues(Clean):
+class RL201FourValues(Clean):
     def step(self, action):
         observation, reward, terminated, truncated, info = super().step(action)
         return observation, reward, terminated or truncated, info
 
 
-class NoSeed(Clean):
+class RL202NoSeed(Clean):
     def reset(self):
         return Clean.reset(self)
 
 
-class NoOptions(Clean):
+class RL203NoOptions(Clean):
     def reset(self, *, seed=None):
         return Clean.reset(self, seed=seed)
 
 
-class NumpyBool(Clean):
+class RL204NumpyBool(Clean):
     def is_terminated(self):
         return np.linalg.norm(self.position) < 0
 
 
-class ArrayReward(Clean):
+class RL204ArrayReward(Clean):
     def reward(self):
         return self.position[:1]
 
 
-class Float32Reward(Clean):
+class RL204Float32Reward(Clean):
     def reward(self):
         return self.position[0]
 
 
-class NoneInfo(Clean):
+class RL204NoneInfo(Clean):
     def info(self):
         return None
 
 
-class SuccessIsADistance(Clean):
+class RL204SuccessIsADistance(Clean):
     def info(self):
         return {"is_success": max(0.0, 0.1 - float(np.linalg.norm(self.position)))}
 
 
-class Raises(Clean):
+class RL207Raises(Clean):
     def move(self, action):
         if self.steps == 7:
             raise RuntimeError("joint 3 is gone")
         super().move(action)
 
 
-class Exits(Clean):
+class RL207Exits(Clean):
     def move(self, action):
         if self.steps == 7:
             sys.exit(0)
         super().move(action)
 
 
-class Segfaults(Clean):
+class RL208Segfaults(Clean):
     def move(self, action):
         if self.steps == 7:
             ctypes.string_at(0)
         super().move(action)
 
 
-class Hangs(Clean):
+class RL209Hangs(Clean):
     def move(self, action):
         if self.steps == 7:
             time.sleep(1e6)
@@ -247,13 +247,13 @@ class HangsAtOnce(Clean):
         time.sleep(1e6)
 
 
-class Prints(Clean):
+class RL211Prints(Clean):
     def move(self, action):
         print("moving", action)
         super().move(action)
 
 
-class TimeLimitTerminates(Clean):
+class RL501TimeLimitTerminates(Clean):
     def is_terminated(self):
         return self.steps >= LIMIT
 
@@ -261,27 +261,27 @@ class TimeLimitTerminates(Clean):
         return False
 
 
-class BothFlags(Clean):
+class RL502BothFlags(Clean):
     def is_terminated(self):
         return self.steps >= LIMIT
 
 
-class Endless(Clean):
+class RL503Endless(Clean):
     def is_truncated(self):
         return False
 
 
-class EndsAtOnce(Clean):
+class RL504EndsAtOnce(Clean):
     def is_terminated(self):
         return True
 
 
-class EndsAtStepTwo(Clean):
+class RL504EndsAtStepTwo(Clean):
     def is_truncated(self):
         return self.steps >= 2
 
 
-class NanReward(Clean):
+class RL601NanReward(Clean):
     def reward(self):
         return float("nan") if self.steps == 13 else 0.0
 

@@ -37,7 +37,7 @@ class Goal(Clean):
         return {"is_success": self.reward() > -0.25}
 
 
-class OtherReward(Goal):
+class RL614OtherReward(Goal):
     """Learns from another reward than what hindsight computes."""
 
     def reward(self):
@@ -57,14 +57,14 @@ class EndsInComputeReward(Goal):
         return -float(np.linalg.norm(self.position - self.goal))
 
 
-class OneByOne(Goal):
+class RL614OneByOne(Goal):
     """Cannot compute the rewards of many goals at once."""
 
     def compute_reward(self, achieved_goal, desired_goal, info):
         return -float(np.linalg.norm(achieved_goal - desired_goal))
 
 
-class NumberlessReward(Goal):
+class RL614NumberlessReward(Goal):
     def compute_reward(self, achieved_goal, desired_goal, info):
         return "far"
 
@@ -75,7 +75,7 @@ class NumberlessReward(Goal):
         return Clean.info(self)
 
 
-class NanComputed(EndsInComputeReward):
+class RL614NanComputed(EndsInComputeReward):
     """Computes NaN where the environment pays a number."""
 
     def compute_reward(self, achieved_goal, desired_goal, info):
@@ -102,7 +102,7 @@ class LosesItsGoal(Goal):
         return observation
 
 
-class NestedGoal(Goal):
+class RL614NestedGoal(Goal):
     """Its goals are dictionaries, which hindsight experience replay cannot take."""
 
     def __init__(self):
@@ -115,7 +115,7 @@ class NestedGoal(Goal):
         return {"observation": self.position.copy(), **goals}
 
 
-class RoundedReward(Goal):
+class RL614RoundedReward(Goal):
     """Differs by rounding to float32: nothing is wrong with it."""
 
     def reward(self):

@@ -11,7 +11,7 @@ with contextlib.suppress(ModuleNotFoundError):  # whatever needs it is skipped w
     import pybullet
 
 
-class NewSpaces(Clean):
+class RL404NewSpaces(Clean):
     def __init__(self):
         self.size = 5.0
         self.observation_space = spaces.Box(-5.0, 5.0, (2,), np.float32)
@@ -47,26 +47,26 @@ class Renders(Clean):
         return picture
 
 
-class TakesNoMode(Clean):
+class RL215TakesNoMode(Clean):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
 
 
-class RenderRaises(Renders):
+class RL215RenderRaises(Renders):
     def draw(self):
         raise RuntimeError("no camera")
 
 
-class RenderNeedsGraphics(Renders):
+class RL215RenderNeedsGraphics(Renders):
     def draw(self):
         raise RuntimeError("Cannot initialize a EGL device display")
 
 
-class RenderFloats(Renders):
+class RL215RenderFloats(Renders):
     def draw(self):
         return super().draw() / 255
 
 
-class RenderNothing(Renders):
+class RL215RenderNothing(Renders):
     def render(self):
         return None
 
@@ -81,7 +81,7 @@ class RenderWithoutLibrary(Renders):
         import library_for_pictures  # noqa: F401
 
 
-class Gui(Clean):
+class RL216Gui(Clean):
     def __init__(self):
         super().__init__()
         self.client = pybullet.connect(pybullet.GUI)
@@ -104,7 +104,7 @@ class CountsAsFlag(Clean):
         return observation, reward, int(terminated), truncated, info
 
 
-class Falls(Clean):
+class RL506Falls(Clean):
     """Falls soon with bad actions, and never ends with good ones; nothing is ever truncated."""
 
     def move(self, action):
@@ -122,7 +122,7 @@ class Falls(Clean):
         return observation, reward, terminated, False, info
 
 
-class FallsInTime(Falls):
+class RL506FallsInTime(RL506Falls):
     """The same with a limit, which random actions do not reach."""
 
     def step(self, action):

@@ -9,7 +9,7 @@ with contextlib.suppress(ModuleNotFoundError):  # whatever needs it is skipped w
     import pybullet_data
 
 
-class Raising(Clean):
+class RL002Raising(Clean):
     def __init__(self):
         raise RuntimeError("no licence")
 
@@ -19,7 +19,7 @@ class UnreadableError(Exception):
         raise RuntimeError("no text")
 
 
-class RaisingUnreadably(Clean):
+class RL002RaisingUnreadably(Clean):
     def __init__(self):
         raise UnreadableError
 
@@ -29,20 +29,20 @@ class RaisingUnreadablyInStep(Clean):
         raise UnreadableError
 
 
-class AnyAttribute(Clean):
+class RL002AnyAttribute(Clean):
     """Python expects AttributeError for a name that does not exist."""
 
     def __getattr__(self, name):
         return {}[name]
 
 
-class RaisingProperty(Clean):
+class RL002RaisingProperty(Clean):
     @property
     def sim(self):
         raise RuntimeError("not connected")
 
 
-class RaisingOfAnother(Clean):
+class RL002RaisingOfAnother(Clean):
     def __init__(self):
         try:
             import no_such_module_at_all  # noqa: F401
@@ -50,7 +50,7 @@ class RaisingOfAnother(Clean):
             raise RuntimeError("install the extra")  # noqa: B904
 
 
-class NeedsArgumentsInside(Clean):
+class RL002NeedsArgumentsInside(Clean):
     """The constructor's own call lacks an argument: nothing that a user can give."""
 
     def __init__(self):
@@ -61,12 +61,12 @@ class NeedsArgumentsInside(Clean):
         pass
 
 
-class NeedsArguments(Clean):
+class RL006NeedsArguments(Clean):
     def __init__(self, gain, *, offset):
         super().__init__()
 
 
-class NoFile(Clean):
+class RL007NoFile(Clean):
     def __init__(self):
         super().__init__()
         with open("gains.yaml") as file:
@@ -79,7 +79,7 @@ class NoTable(Clean):
         raise FileNotFoundError("data/table.csv not found.")
 
 
-class NoModel(Clean):
+class RL007NoModel(Clean):
     """PyBullet says only that it cannot load, and searches in more than one folder."""
 
     model = "kuka_iiwa/modell.urdf"
@@ -91,7 +91,7 @@ class NoModel(Clean):
         self.arm = pybullet.loadURDF(self.model, useFixedBase=True, physicsClientId=self.client)
 
 
-class NoModelAtReset(Clean):
+class RL007NoModelAtReset(Clean):
     def __init__(self):
         super().__init__()
         self.client = pybullet.connect(pybullet.DIRECT)

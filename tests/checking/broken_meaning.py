@@ -66,21 +66,21 @@ class Rover(Robot):
         return -self.distance() - 0.02 * np.square(action).sum()
 
 
-class RoverLateReward(Rover):
+class RL616RoverLateReward(Rover):
     def step(self, action):
         late = self.reward(action)
         self.advance(action)
         return self.result(late, self.distance() < self.near)
 
 
-class RoverLateSuccess(Rover):
+class RL617RoverLateSuccess(Rover):
     def step(self, action):
         success = self.distance() < self.near
         self.advance(action)
         return self.result(self.reward(action), success)
 
 
-class RoverLooks(Rover):
+class RL618RoverLooks(Rover):
     """It is to look at the goal, too."""
 
     def bearing(self):
@@ -91,7 +91,7 @@ class RoverLooks(Rover):
         return super().reward(action) - 0.3 * np.abs(self.bearing())
 
 
-class RoverLooksRound(RoverLooks):
+class RL618RoverLooksRound(RL618RoverLooks):
     def bearing(self):
         x, y = self.goal - self.place
         return np.arctan2(y, x) - self.heading
@@ -127,15 +127,15 @@ class Drone(Robot):
         return np.exp(-self.distance()) - 0.02 * np.square(action).sum()
 
 
-class DroneLateReward(Drone):
-    step = RoverLateReward.step
+class RL616DroneLateReward(Drone):
+    step = RL616RoverLateReward.step
 
 
 class DroneLateSuccess(Drone):
-    step = RoverLateSuccess.step
+    step = RL617RoverLateSuccess.step
 
 
-class DroneTurns(Drone):
+class RL618DroneTurns(Drone):
     """It is to keep a pitch that is drawn for each episode."""
 
     def start(self):
@@ -152,12 +152,12 @@ class DroneTurns(Drone):
         return super().reward(action) - 0.2 * self.error() ** 2
 
 
-class DroneTurnsBack(DroneTurns):
+class RL618DroneTurnsBack(RL618DroneTurns):
     def error(self):
         return self.pitch - self.wanted
 
 
-class DroneLeaves(Drone):
+class RL617DroneLeaves(Drone):
     """Its flight ends where it leaves its area, which costs more than all steps to come."""
 
     limit = 35  # [steps]
@@ -173,21 +173,21 @@ class DroneLeaves(Drone):
         return observation, reward - 50.0 * is_outside, terminated or is_outside, *rest
 
 
-class DroneLeavesLate(DroneLeaves):
+class RL617DroneLeavesLate(RL617DroneLeaves):
     def step(self, action):
         is_outside = self.is_outside()
         observation, reward, terminated, *rest = Drone.step(self, action)
         return self.end(observation, reward, terminated, is_outside, rest)
 
 
-class RoverMillimetres(Rover):
+class RL119RoverMillimetres(Rover):
     def observe(self):
         observation = super().observe()
         observation[:2] *= 1000
         return observation
 
 
-class DroneRadians(Drone):
+class RL119DroneRadians(Drone):
     def pitch_angle(self):
         return self.pitch
 
@@ -195,12 +195,12 @@ class DroneRadians(Drone):
         return np.append(super().observe(), np.float32(self.pitch_angle()))
 
 
-class DroneDegrees(DroneRadians):
+class RL119DroneDegrees(RL119DroneRadians):
     def pitch_angle(self):
         return np.rad2deg(self.pitch)
 
 
-class RoverInPond(Rover):
+class RL619RoverInPond(Rover):
     """A round pond of 1 m in radius, whose shore nothing passes."""
 
     farthest = 1.0
@@ -214,5 +214,5 @@ class RoverInPond(Rover):
         self.place = self.place / max(1.0, float(np.linalg.norm(self.place)))
 
 
-class RoverBehindTheShore(RoverInPond):
+class RL619RoverBehindTheShore(RL619RoverInPond):
     farthest = 1.6

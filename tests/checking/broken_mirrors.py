@@ -5,18 +5,18 @@ from rlctl_locomotion.walk import Walk
 SIDES_ONLY = (4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9)
 
 
-class MirrorsTurning(Walk):
+class RL120MirrorsTurning(Walk):
     mirror = {**Walk.mirror, "gyroscope": (-1, 2, -3)}
 
 
-class MirrorsTurningLikeVectors(Walk):
+class RL120MirrorsTurningLikeVectors(Walk):
     mirror = {**Walk.mirror, "gyroscope": (1, -2, 3)}
 
 
-class TurnsHipsTheSameWay(Walk):
+class RL120TurnsHipsTheSameWay(Walk):
     mirror = {**Walk.mirror, "action": SIDES_ONLY, "last_action": SIDES_ONLY}
 
 
-class PrefersItsLeft(Walk):
+class RL120PrefersItsLeft(Walk):
     def rewards(self, action):
         return {**super().rewards(action), "tracking": 10.0 * self.turning[:, 2]}

@@ -40,14 +40,14 @@ class CartTask(Task):
 
 
 @dataclass
-class TipWithoutInertial(CartTask):
+class RL809TipWithoutInertial(CartTask):
     """The tip has no <inertial>."""
 
     file = CART.with_name("cart_without_inertial.urdf")
 
 
 @dataclass
-class HeavyInertia(CartTask):
+class RL809HeavyInertia(CartTask):
     """The arm turns like a body of tons."""
 
     file = CART.with_name("cart_of_tons.urdf")

@@ -8,28 +8,28 @@ from scipy.spatial.transform import Rotation
 # RL116
 
 
-class HopperQuaternion(MujocoHopper):
+class RL116HopperQuaternion(MujocoHopper):
     rlctl_ignore = {"RL117": "a consequence"}
 
     def attitude(self):
         return Rotation.from_quat(self.data.qpos[3:7])
 
 
-class HopperVelocity(MujocoHopper):
+class RL116HopperVelocity(MujocoHopper):
     def observe(self):
         w, x, y, z = self.data.qpos[3:7]
         forward = Rotation.from_quat([w, x, y, z]).inv().apply(self.data.qvel[:3])
         return np.concatenate([forward, self.data.qpos[7:], self.touches()])
 
 
-class HopperRightVelocity(MujocoHopper):
+class RL116HopperRightVelocity(MujocoHopper):
     def observe(self):
         w, x, y, z = self.data.qpos[3:7]
         forward = Rotation.from_quat([x, y, z, w]).inv().apply(self.data.qvel[:3])
         return np.concatenate([forward, self.data.qpos[7:], self.touches()])
 
 
-class HopperHeading(MujocoHopper):
+class RL116HopperHeading(MujocoHopper):
     def turn(self):
         x, y, z, w = self.data.qpos[3:7]
         return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -39,19 +39,19 @@ class HopperHeading(MujocoHopper):
         return np.array([cosine * x + sine * y, cosine * y - sine * x, *self.data.qpos[7:]])
 
 
-class HopperRightHeading(HopperHeading):
+class RL116HopperRightHeading(RL116HopperHeading):
     def turn(self):
         w, x, y, z = self.data.qpos[3:7]
         return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-class ArmQuaternion(MujocoArm):
+class RL116ArmQuaternion(MujocoArm):
     def observe(self):
         angles = Rotation.from_quat(self.data.body("hand").xquat).as_euler("xyz")
         return np.concatenate([super().observe(), angles])
 
 
-class ArmRightQuaternion(ArmQuaternion):
+class RL116ArmRightQuaternion(RL116ArmQuaternion):
     def observe(self):
         angles = Rotation.from_matrix(self.data.body("hand").xmat.reshape(3, 3)).as_euler("xyz")
         return np.concatenate([MujocoArm.observe(self), angles])
@@ -60,13 +60,13 @@ class ArmRightQuaternion(ArmQuaternion):
 # RL804, RL805, RL807, RL813, RL814
 
 
-class ArmBeyondLimits(MujocoArm):
+class RL804ArmBeyondLimits(MujocoArm):
     def start(self):
         super().start()
         self.data.qpos[1] = -0.9
 
 
-class HopperExplodes(MujocoHopper):
+class RL805HopperExplodes(MujocoHopper):
     rlctl_ignore = {
         "RL603": "a consequence",
         "RL118": "a consequence",
@@ -82,7 +82,7 @@ class HopperExplodes(MujocoHopper):
         self.forward()
 
 
-class HopperInTheGround(MujocoHopper):
+class RL807HopperInTheGround(MujocoHopper):
     rlctl_ignore = {"RL117": "a consequence", "RL610": "a consequence", "RL803": "a consequence"}
 
     def start(self):
@@ -90,26 +90,26 @@ class HopperInTheGround(MujocoHopper):
         self.data.qpos[2] = 0.15
 
 
-class ArmLongSteps(MujocoArm):
+class RL813ArmLongSteps(MujocoArm):
     frames = 1
     xml = ARM.replace('timestep="0.004"', 'timestep="0.025"')
 
 
-class ArmWeakMotors(MujocoArm):
+class RL814ArmWeakMotors(MujocoArm):
     xml = ARM.replace('forcerange="-60 60"', 'forcerange="-1 1"')
 
 
 # RL810
 
 
-class ArmDegrees(MujocoArm):
+class RL810ArmDegrees(MujocoArm):
     rlctl_ignore = {"RL701": "a consequence", "RL804": "a consequence"}
 
     def targets(self, action):
         return np.degrees(super().targets(action))
 
 
-class ArmRangeInDegrees(MujocoArm):
+class RL810ArmRangeInDegrees(MujocoArm):
     rlctl_ignore = {"RL611": "a consequence"}
 
     def targets(self, action):
@@ -123,16 +123,16 @@ class ArmRange(MujocoArm):
         return low + (action + 1) / 2 * (high - low)
 
 
-class ArmRangeOfActuatorInDegrees(MujocoArm):
+class RL810ArmRangeOfActuatorInDegrees(MujocoArm):
     xml = ARM.replace('ctrlrange="-1.04 2.61"', 'ctrlrange="-60 150"')
 
 
-class ArmObservesRadiansOfRadians(MujocoArm):
+class RL810ArmObservesRadiansOfRadians(MujocoArm):
     def observe(self):
         return np.concatenate([np.radians(self.data.qpos), self.data.qvel, self.goal - self.tip()])
 
 
-class HopperStartsInDegrees(MujocoHopper):
+class RL810HopperStartsInDegrees(MujocoHopper):
     rlctl_ignore = {
         "RL610": "a consequence",
         "RL805": "a consequence",
@@ -151,7 +151,7 @@ class HopperStartsInDegrees(MujocoHopper):
 # RL811
 
 
-class ArmOrder(MujocoArm):
+class RL811ArmOrder(MujocoArm):
     rlctl_ignore = {"RL701": "a consequence"}
 
     def __init__(self):
@@ -159,13 +159,13 @@ class ArmOrder(MujocoArm):
         self.motors = [0, 1, 2]
 
 
-class ArmOrderOfRanges(ArmRange):
+class RL811ArmOrderOfRanges(ArmRange):
     def __init__(self):
         super().__init__()
         self.motors = [0, 1, 2]
 
 
-class HopperOrder(MujocoHopper):
+class RL811HopperOrder(MujocoHopper):
     rlctl_ignore = {
         "RL701": "a consequence",
         "RL803": "a consequence",
@@ -180,20 +180,20 @@ class HopperOrder(MujocoHopper):
 # RL812
 
 
-class HopperOtherSoles(MujocoHopper):
+class RL812HopperOtherSoles(MujocoHopper):
     rlctl_ignore = {"RL110": "a consequence"}
     soles = ("left_thigh", "right_thigh", "back_thigh")
 
 
-class HopperThighs(MujocoHopper):
+class RL812HopperThighs(MujocoHopper):
     def observe(self):
-        soles, self.soles = self.soles, HopperOtherSoles.soles
+        soles, self.soles = self.soles, RL812HopperOtherSoles.soles
         thighs = self.touches()
         self.soles = soles
         return np.concatenate([super().observe(), thighs])
 
 
-class ArmTouchesWithPalm(MujocoArm):
+class RL812ArmTouchesWithPalm(MujocoArm):
     rlctl_ignore = {"RL611": "a consequence"}
     home = np.array([1.6, 1.2, 0.3])
     part = "palm"
@@ -206,30 +206,30 @@ class ArmTouchesWithPalm(MujocoArm):
         return super().reward() - 1.0 * any(self.part_id in contact.geom for contact in self.data.contact)
 
 
-class ArmTouchesWithFinger(ArmTouchesWithPalm):
+class RL812ArmTouchesWithFinger(RL812ArmTouchesWithPalm):
     part = "finger"
 
 
 # RL815
 
 
-class ArmOldTip(MujocoArm):
+class RL815ArmOldTip(MujocoArm):
     def move(self, action):
         self.data.ctrl[self.motors] = self.targets(action)
         mujoco.mj_step(self.model, self.data, nstep=5)
 
 
-class ArmOldSensor(ArmOldTip):
+class RL815ArmOldSensor(RL815ArmOldTip):
     def tip(self):
         return self.data.sensordata[:3]
 
 
-class ArmRightSensor(MujocoArm):
+class RL815ArmRightSensor(MujocoArm):
     def tip(self):
         return self.data.sensordata[:3]
 
 
-class ArmResetsWithoutForward(MujocoArm):
+class RL815ArmResetsWithoutForward(MujocoArm):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         mujoco.mj_resetData(self.model, self.data)
@@ -237,14 +237,14 @@ class ArmResetsWithoutForward(MujocoArm):
         return self.observe().astype(np.float32), {}
 
 
-class ArmForwardTooEarly(MujocoArm):
+class RL815ArmForwardTooEarly(MujocoArm):
     def forward(self):
         super().forward()
         if self.data.time == 0:
             self.data.qpos[0] += 0.2
 
 
-class HopperStateInTheLoop(MujocoHopper):
+class RL815HopperStateInTheLoop(MujocoHopper):
     def move(self, action):
         self.height = None
         for _ in range(5):
@@ -265,19 +265,19 @@ class HopperStateInTheLoop(MujocoHopper):
 # RL816
 
 
-class ArmBeyondRange(MujocoArm):
+class RL816ArmBeyondRange(MujocoArm):
     rlctl_ignore = {"RL805": "a consequence"}
     home, gain = np.zeros(3), 4.0
 
 
-class HopperTorqueBeyondRange(MujocoHopper):
+class RL816HopperTorqueBeyondRange(MujocoHopper):
     def move(self, action):
         self.data.ctrl[:] = 30.0 * action
         mujoco.mj_step(self.model, self.data, nstep=5)
         self.forward()
 
 
-class HopperTorque(HopperTorqueBeyondRange):
+class RL816HopperTorque(RL816HopperTorqueBeyondRange):
     def move(self, action):
         super().move(0.4 * action)
 
@@ -285,7 +285,7 @@ class HopperTorque(HopperTorqueBeyondRange):
 # RL817
 
 
-class ArmGrowsHeavy(MujocoArm):
+class RL817ArmGrowsHeavy(MujocoArm):
     rlctl_ignore = {"RL302": "a consequence"}
 
     def start(self):
@@ -293,7 +293,7 @@ class ArmGrowsHeavy(MujocoArm):
         self.model.body_mass[:] *= self.np_random.uniform(0.8, 1.2)
 
 
-class ArmNominalMass(MujocoArm):
+class RL817ArmNominalMass(MujocoArm):
     def __init__(self):
         super().__init__()
         self.mass = self.model.body_mass.copy()
@@ -303,7 +303,7 @@ class ArmNominalMass(MujocoArm):
         self.model.body_mass[:] = self.mass * self.np_random.uniform(0.8, 1.2)
 
 
-class HopperSlips(MujocoHopper):
+class RL817HopperSlips(MujocoHopper):
     rlctl_ignore = {"RL302": "a consequence"}
 
     def start(self):
@@ -311,7 +311,7 @@ class HopperSlips(MujocoHopper):
         self.model.geom_friction[0, 0] *= self.np_random.uniform(0.7, 1.3)
 
 
-class HopperFriction(MujocoHopper):
+class RL817HopperFriction(MujocoHopper):
     def start(self):
         super().start()
         self.model.geom_friction[0, 0] = self.np_random.uniform(0.7, 1.3)
@@ -320,25 +320,25 @@ class HopperFriction(MujocoHopper):
 # RL818
 
 
-class HopperForces(MujocoHopper):
+class RL818HopperForces(MujocoHopper):
     rlctl_ignore = {"RL110": "a consequence"}
 
     def observe(self):
         return np.concatenate([super().observe(), np.clip(self.data.cfrc_ext[1:].ravel(), -1, 1)])
 
 
-class HopperRightForces(HopperForces):
+class RL818HopperRightForces(RL818HopperForces):
     def move(self, action):
         super().move(action)
         mujoco.mj_rnePostConstraint(self.model, self.data)
 
 
-class ArmInverse(MujocoArm):
+class RL818ArmInverse(MujocoArm):
     def reward(self):
         return super().reward() - 0.001 * np.abs(self.data.qfrc_inverse).sum()
 
 
-class ArmActuator(MujocoArm):
+class RL818ArmActuator(MujocoArm):
     def reward(self):
         return super().reward() - 0.001 * np.abs(self.data.qfrc_actuator).sum()
 
@@ -346,19 +346,19 @@ class ArmActuator(MujocoArm):
 # RL301, RL302
 
 
-class ArmKeepsActivation(MujocoArm):
+class RL302ArmKeepsActivation(MujocoArm):
     xml = ARM.replace('<position name="bend"', '<position timeconst=".2" name="bend"')
 
     def clear(self):
         self.data.qpos[:], self.data.qvel[:] = self.model.qpos0, 0.0
 
 
-class ArmResets(ArmKeepsActivation):
+class RL302ArmResets(RL302ArmKeepsActivation):
     def clear(self):
         mujoco.mj_resetData(self.model, self.data)
 
 
-class HopperKeepsTime(MujocoHopper):
+class RL301HopperKeepsTime(MujocoHopper):
     def clear(self):
         self.data.qpos[:], self.data.qvel[:], self.data.qacc_warmstart[:] = self.model.qpos0, 0.0, 0.0
 
@@ -366,6 +366,6 @@ class HopperKeepsTime(MujocoHopper):
         return np.append(super().observe(), np.sin(self.data.time))
 
 
-class HopperResets(HopperKeepsTime):
+class RL301HopperResets(RL301HopperKeepsTime):
     def clear(self):
         mujoco.mj_resetData(self.model, self.data)

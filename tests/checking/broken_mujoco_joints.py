@@ -7,7 +7,7 @@ from mujoco_robots import ARM, MujocoArm, MujocoHopper
 # RL804
 
 
-class ArmLimitsInRadians(MujocoArm):
+class RL804ArmLimitsInRadians(MujocoArm):
     """Its compiler reads degrees."""
 
     rlctl_ignore = dict.fromkeys(("RL701", "RL611"), "a consequence")
@@ -33,7 +33,7 @@ class ArmIncrements(MujocoArm):
         return self.target
 
 
-class ArmIncrementsInOtherOrder(ArmIncrements):
+class RL811ArmIncrementsInOtherOrder(ArmIncrements):
     rlctl_ignore = {"RL804": "a consequence"}
 
     def __init__(self):
@@ -41,7 +41,7 @@ class ArmIncrementsInOtherOrder(ArmIncrements):
         self.motors = [0, 1, 2]
 
 
-class ArmIncrementsTooFar(ArmIncrements):
+class RL816ArmIncrementsTooFar(ArmIncrements):
     """The ranges of the elbow and the wrist are those of the wrist."""
 
     rlctl_ignore = {"RL611": "hard to find"}
@@ -55,7 +55,7 @@ class ArmFollowsMeasured(ArmIncrements):
         return self.data.qpos + 0.5 * action
 
 
-class HopperIncrements(MujocoHopper):
+class RL811HopperIncrements(MujocoHopper):
     """Torques that follow targets, which change by the action."""
 
     order = np.arange(6)
@@ -69,7 +69,7 @@ class HopperIncrements(MujocoHopper):
         return super().torques((self.target - self.home) / 0.4)[self.order]
 
 
-class HopperIncrementsInOtherOrder(HopperIncrements):
+class RL811HopperIncrementsInOtherOrder(RL811HopperIncrements):
     rlctl_ignore = dict.fromkeys(("RL117", "RL701", "RL803", "RL804", "RL805", "RL816"), "a consequence")
     order = np.array([1, 0, 2, 3, 4, 5])
 
@@ -94,7 +94,7 @@ class HopperObserves(MujocoHopper):
         return [*(positions - self.home), *(0.1 * speeds)]
 
 
-class HopperInDegrees(HopperObserves):
+class RL119HopperInDegrees(HopperObserves):
     def joints_of(self, positions, speeds):
         return [*np.rad2deg(positions[:2]), *speeds]
 
@@ -106,12 +106,12 @@ class HopperAllInDegrees(MujocoHopper):
         return np.concatenate([np.rad2deg(self.data.qpos[7:]), np.rad2deg(self.data.qvel[6:])])
 
 
-class HopperSpeedsInOtherOrder(HopperObserves):
+class RL819HopperSpeedsInOtherOrder(HopperObserves):
     def joints_of(self, positions, speeds):
         return super().joints_of(positions, speeds[[0, 2, 4, 1, 3, 5]])
 
 
-class ArmVelocity(MujocoArm):
+class RL820ArmVelocity(MujocoArm):
     """Observes the velocity of the tip, from the tip of the step before."""
 
     def start(self):
@@ -128,6 +128,6 @@ class ArmVelocity(MujocoArm):
         return np.concatenate([self.data.qpos, velocity, self.goal - tip])
 
 
-class ArmVelocityOfSubsteps(ArmVelocity):
+class RL820ArmVelocityOfSubsteps(RL820ArmVelocity):
     def time(self):
         return self.model.opt.timestep

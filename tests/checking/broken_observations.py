@@ -2,7 +2,7 @@
 
 import numpy as np
 from broken_envs import LIMIT, Clean
-from broken_repeats import FixedStart
+from broken_repeats import RL306FixedStart
 from gymnasium import spaces
 
 
@@ -21,12 +21,12 @@ class Wide(Clean):
         return x + y * y
 
 
-class ConstantElement(Wide):
+class RL110ConstantElement(Wide):
     def third(self, x, y):
         return 0.25
 
 
-class ConstantCounter(Clean):
+class RL110ConstantCounter(Clean):
     """A counter that never counts, beside a space with a single value, which could not change."""
 
     def __init__(self):
@@ -42,12 +42,12 @@ class ConstantCounter(Clean):
         return 0
 
 
-class Counter(ConstantCounter):
+class RL110Counter(RL110ConstantCounter):
     def count(self):
         return self.steps
 
 
-class ConstantSpeed(Clean):
+class RL110ConstantSpeed(Clean):
     """A measurement that is an array of its own, and never updated."""
 
     def __init__(self):
@@ -62,7 +62,7 @@ class ConstantSpeed(Clean):
         return np.zeros(2, np.float32)
 
 
-class Speed(ConstantSpeed):
+class RL110Speed(RL110ConstantSpeed):
     def speed(self):
         return self.position * np.float32(0.5)
 
@@ -78,7 +78,7 @@ class SomeFlags(Clean):
         return {"position": self.position.copy(), "flags": np.array([self.position[0] > 0, 0], np.int8)}
 
 
-class HiddenGoal(FixedStart):
+class RL114HiddenGoal(RL306FixedStart):
     """The goal is drawn at reset, and not observed."""
 
     def start(self):
@@ -92,7 +92,7 @@ class HiddenGoal(FixedStart):
         return {"is_success": self.reward() > -0.1}
 
 
-class HiddenGoalNoisyStart(HiddenGoal):
+class RL114HiddenGoalNoisyStart(RL114HiddenGoal):
     """The same, from a start that is drawn too, but not far from the same place."""
 
     def start(self):
@@ -100,7 +100,7 @@ class HiddenGoalNoisyStart(HiddenGoal):
         self.position += self.np_random.uniform(-0.02, 0.02, 2).astype(np.float32)
 
 
-class Bandit(HiddenGoal):
+class Bandit(RL114HiddenGoal):
     """What the arms pay is hidden, and there is nothing to observe: nothing is wrong with it."""
 
     def __init__(self):
@@ -111,7 +111,7 @@ class Bandit(HiddenGoal):
         return np.zeros(1, np.float32)
 
 
-class SeenGoal(HiddenGoal):
+class RL114SeenGoal(RL114HiddenGoal):
     """The goal is observed: nothing is wrong with it."""
 
     def __init__(self):
@@ -122,14 +122,14 @@ class SeenGoal(HiddenGoal):
         return np.concatenate([self.position, self.goal])
 
 
-class NoisyReward(FixedStart):
+class RL114NoisyReward(RL306FixedStart):
     """Chance in each reward, not in the episode: nothing is hidden."""
 
     def reward(self):
         return super().reward() + float(self.np_random.normal(0.0, 0.5))
 
 
-class ShownChance(FixedStart):
+class ShownChance(RL306FixedStart):
     """Chance in each step, which the next observation shows."""
 
     def move(self, action):

@@ -1,5 +1,5 @@
 import gym  # the package that Gymnasium came from, which is not installed
 
 
-class Pushed(gym.Env):
+class RL008Pushed(gym.Env):
     pass

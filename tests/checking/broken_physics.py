@@ -90,12 +90,12 @@ class FixedCart(Cart):
     fixed = True
 
 
-class NoGravity(Cart):
+class RL801NoGravity(Cart):
     def vary(self):
         p.setGravity(0, 0, 0, physicsClientId=self.client)
 
 
-class Flat(FixedCart):
+class RL801Flat(FixedCart):
     """Gravity is off, but nothing could fall: the arm turns about an upright axis."""
 
     def vary(self):
@@ -105,7 +105,7 @@ class Flat(FixedCart):
         p.setGravity(0, 0, 0, physicsClientId=self.client)
 
 
-class InTheFloor(Cart):
+class RL803InTheFloor(Cart):
     """A block is set back into the floor at every step."""
 
     def vary(self):
@@ -119,20 +119,20 @@ class InTheFloor(Cart):
         super().move(action)
 
 
-class BeyondLimits(Cart):
+class RL804BeyondLimits(Cart):
     def move(self, action):
         super().move(action)
         self.angle = 1.8 * float(action[0])
         p.resetJointState(self.cart, SHOULDER, self.angle, physicsClientId=self.client)
 
 
-class TurnsWithoutEnd(BeyondLimits):
+class RL804TurnsWithoutEnd(RL804BeyondLimits):
     """Its joint is continuous: the <limit> of its model means nothing."""
 
     model = CART.replace("cart.urdf", "cart_with_a_wheel.urdf")
 
 
-class Explodes(Cart):
+class RL805Explodes(Cart):
     """A ball beside the cart is driven by a force without a bound."""
 
     def vary(self):
@@ -146,11 +146,11 @@ class Explodes(Cart):
         super().move(action)
 
 
-class StartsInTheFloor(Cart):
+class RL807StartsInTheFloor(Cart):
     height = -0.02
 
 
-class LongPhysicsSteps(Cart):
+class RL813LongPhysicsSteps(Cart):
     def vary(self):
         p.setTimeStep(1 / 48, physicsClientId=self.client)
         p.setPhysicsEngineParameter(numSubSteps=1, physicsClientId=self.client)

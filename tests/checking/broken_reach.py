@@ -69,7 +69,7 @@ class Arm(Robot):
         return -self.distance() - 0.02 * np.square(action).sum()
 
 
-class ArmFarGoals(Arm):
+class RL619ArmFarGoals(Arm):
     farthest = 1.4
 
 

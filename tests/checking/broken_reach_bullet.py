@@ -4,7 +4,7 @@ import numpy as np
 from robots import Arm
 
 
-class Reacher(Arm):
+class RL619Reacher(Arm):
     """Its tip is at most 0.82 m from its base."""
 
     farthest = 0.6  # goal, from the base [m]
@@ -36,5 +36,5 @@ class Reacher(Arm):
         return {"is_success": success}
 
 
-class ReacherFarGoals(Reacher):
+class RL619ReacherFarGoals(RL619Reacher):
     farthest = 1.4

@@ -13,17 +13,17 @@ with contextlib.suppress(ModuleNotFoundError):  # whatever needs it is skipped w
     import pybullet
 
 
-class GlobalRandom(Clean):
+class RL301RL309GlobalRandom(Clean):
     def start(self):
         self.position = np.random.uniform(-1, 1, 2).astype(np.float32)  # noqa: NPY002
 
 
-class NoisyStep(Clean):
+class RL302NoisyStep(Clean):
     def move(self, action):
         super().move(action + np.float32(0.001 * random.randint(0, 9)))
 
 
-class LeakyReset(Clean):
+class RL303LeakyReset(Clean):
     """Keeps the wind of an episode that did not come to its end."""
 
     wind = np.zeros(2, np.float32)
@@ -56,7 +56,7 @@ class OldActions(Clean):
         super().move(action)
 
 
-class OldActionsAsRegistered(OldActions):
+class RL301OldActionsAsRegistered(OldActions):
     """Its registration calls chance what reset keeps."""
 
     spec = EnvSpec("OldActions-v0", nondeterministic=True)
@@ -94,7 +94,7 @@ class KeptChance(Clean):
         super().move(action)
 
 
-class ClassCounter(Clean):
+class RL304ClassCounter(Clean):
     count = 0
 
     def __init__(self):
@@ -107,26 +107,26 @@ class ClassCounter(Clean):
         self.position += np.float32(self.bias)
 
 
-class HashOrder(Clean):
+class RL305HashOrder(Clean):
     def start(self):
         super().start()
         self.position += np.float32(0.1 * next(iter({"left": 0, "right": 1, "up": 2, "down": 3}.keys())).__len__())
         self.position += np.float32(0.01 * (hash("goal") % 7))
 
 
-class FixedStart(Clean):
+class RL306FixedStart(Clean):
     def start(self):
         self.position = np.array([0.5, -0.3], np.float32)
 
 
-class FixedStartNoise(FixedStart):
+class FixedStartNoise(RL306FixedStart):
     """A fixed start, with chance in the steps: nothing is wrong with it."""
 
     def move(self, action):
         super().move(action + self.np_random.uniform(-0.1, 0.1, 2).astype(np.float32))
 
 
-class UnseededLater(Clean):
+class RL308UnseededLater(Clean):
     """Draws from a new generator at every reset, seeded or not."""
 
     def start(self):
@@ -138,7 +138,7 @@ class UnseededLater(Clean):
         return super().reset(seed=seed)
 
 
-class Residue(Clean):
+class RL301Residue(Clean):
     """Keeps a trace of what was before, far below what matters, like a simulation that is not reset in full."""
 
     trace = np.float32(0.0)
@@ -149,7 +149,7 @@ class Residue(Clean):
         self.trace += np.float32(1e-6)
 
 
-class SharedWorld(Clean):
+class RL401RL808SharedWorld(Clean):
     """PyBullet without physicsClientId, as most tutorials have it."""
 
     def __init__(self):
@@ -175,7 +175,7 @@ class SharedWorld(Clean):
         self.client = -1
 
 
-class OwnWorld(SharedWorld):
+class OwnWorld(RL401RL808SharedWorld):
     """The same with physicsClientId everywhere: nothing is wrong with it."""
 
     def start(self):
@@ -194,7 +194,7 @@ class OwnWorld(SharedWorld):
         self.position = np.array(place[:2], np.float32)
 
 
-class CloseBreaks(Clean):
+class RL402CloseBreaks(Clean):
     """The last thing that `close` ends is needed by all."""
 
     device = {"open": 0}
@@ -212,13 +212,13 @@ class CloseBreaks(Clean):
         self.device["open"] = 0
 
 
-class OnlyOne(Clean):
+class RL403OnlyOne(Clean):
     taken = False
 
     def __init__(self):
-        if OnlyOne.taken:
+        if RL403OnlyOne.taken:
             raise OSError("port 5000 is in use")
-        OnlyOne.taken = True
+        RL403OnlyOne.taken = True
         super().__init__()
 
     def close(self):

@@ -30,7 +30,7 @@ class ReconnectsProperly(OwnWorld):
         super().start()
 
 
-class LeavesBodies(OwnWorld):
+class RL405LeavesBodies(OwnWorld):
     """Takes the ball away, and forgets the marker."""
 
     ball = -1
@@ -46,7 +46,7 @@ class LeavesBodies(OwnWorld):
         pybullet.createMultiBody(0.0, -1, -1, **own)
 
 
-class KeepsFiles(Clean):
+class RL405KeepsFiles(Clean):
     def __init__(self):
         super().__init__()
         self.files = []
@@ -60,7 +60,7 @@ class KeepsFiles(Clean):
             self.files.pop().close()
 
 
-class KeepsThreads(Clean):
+class RL405KeepsThreads(Clean):
     def __init__(self):
         super().__init__()
         self.end = threading.Event()
@@ -75,7 +75,7 @@ class KeepsThreads(Clean):
         self.end.set()
 
 
-class KeepsMemory(Clean):
+class RL405KeepsMemory(Clean):
     def __init__(self):
         super().__init__()
         self.kept = []
@@ -85,7 +85,7 @@ class KeepsMemory(Clean):
         self.kept.append(np.ones(50_000))
 
 
-class Caches(KeepsMemory):
+class RL405Caches(RL405KeepsMemory):
     """Keeps what it made in the first resets only."""
 
     def start(self):
@@ -93,7 +93,7 @@ class Caches(KeepsMemory):
         del self.kept[20:]
 
 
-class ClassSpaces(Clean):
+class RL404ClassSpaces(Clean):
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def __init__(self):
@@ -101,7 +101,7 @@ class ClassSpaces(Clean):
         del self.action_space
 
 
-class ClassObservations(Clean):
+class RL404ClassObservations(Clean):
     observation_space = spaces.Box(-5.0, 5.0, (2,), np.float32)
 
     def __init__(self):

@@ -4,12 +4,12 @@ import numpy as np
 from broken_envs import Clean
 
 
-class ConstantReward(Clean):
+class RL602ConstantReward(Clean):
     def reward(self):
         return 1.0
 
 
-class SparseNeverFound(Clean):
+class RL602SparseNeverFound(Clean):
     """-1 per step; its goal is too far for any search, so is_success cannot be told apart from a broken one."""
 
     def reward(self):
@@ -19,24 +19,24 @@ class SparseNeverFound(Clean):
         return {"is_success": bool(self.position[0] > 4.9)}
 
 
-class LargeReward(Clean):
+class RL603LargeReward(Clean):
     def reward(self):
         return 100.0 * super().reward()
 
 
-class HugeOnce(Clean):
+class RL603HugeOnce(Clean):
     def reward(self):
         return super().reward() - 5000.0 * (self.steps == 20)
 
 
-class FinalBonus(Clean):
+class RL603FinalBonus(Clean):
     """A large bonus at the end: nothing is wrong with it."""
 
     def reward(self):
         return super().reward() + 100.0 * self.is_truncated()
 
 
-class Falls(Clean):
+class RL604Falls(Clean):
     """Ends outside of a square; the reward is negative everywhere."""
 
     fall = 0.0
@@ -51,13 +51,13 @@ class Falls(Clean):
         return super().reward() - self.fall * self.has_fallen()
 
 
-class FallsBadly(Falls):
+class RL604FallsBadly(RL604Falls):
     """The same with a penalty that outweighs all steps to come."""
 
     fall = 200.0
 
 
-class FallsUntold(Falls):
+class RL604FallsUntold(RL604Falls):
     """Success is not told."""
 
     def info(self):
@@ -74,7 +74,7 @@ class EndsAtUntoldGoal(Clean):
         return {}
 
 
-class Hovering(Clean):
+class RL605Hovering(Clean):
     """+10 per step within 0.4 of the goal; the episode ends within 0.1."""
 
     bonus = 0.0
@@ -89,7 +89,7 @@ class Hovering(Clean):
         return -self.distance() + 10.0 * (self.distance() < 0.4) + self.bonus * (self.distance() < 0.1)
 
 
-class HoveringUntold(Hovering):
+class RL605HoveringUntold(RL605Hovering):
     """The same, without is_success, and with a bonus that is too small."""
 
     bonus = 5.0
@@ -98,13 +98,13 @@ class HoveringUntold(Hovering):
         return {}
 
 
-class FinishingPays(Hovering):
+class RL605FinishingPays(RL605Hovering):
     """The same with a bonus for finishing that outweighs hovering."""
 
     bonus = 500.0
 
 
-class PaysProgress(Hovering):
+class RL605PaysProgress(RL605Hovering):
     """Pays for coming nearer: nothing is to be earned by staying."""
 
     def start(self):
@@ -148,74 +148,74 @@ class SparseTerm(Terms):
         return {"distance": -float(np.linalg.norm(self.position)), "far": float(self.position[0] > 4.9)}
 
 
-class WrongSlice(Terms):
+class RL612WrongSlice(Terms):
     """The effort is computed from something that never changes."""
 
     def effort(self):
         return -0.05 * self.size
 
 
-class TimePenalty(Terms):
+class RL612TimePenalty(Terms):
     def terms(self):
         return {**super().terms(), "time": -0.01}
 
 
-class AliveBonus(Terms):
+class RL606AliveBonus(Terms):
     """A bonus per step beside a term for speed that can hardly be had, and a cost of moving."""
 
     def terms(self):
         return {"alive": 1.0, "speed": 0.02 * float(np.abs(self.action).sum()), "effort": 5 * self.effort()}
 
 
-class AliveUntold(AliveBonus):
+class RL606AliveUntold(RL606AliveBonus):
     def info(self):
         return Clean.info(self)
 
 
-class Paid(AliveBonus):
+class RL606Paid(RL606AliveBonus):
     """A speed that pays more than the bonus."""
 
     def terms(self):
         return {**super().terms(), "speed": float(np.abs(self.action).sum())}
 
 
-class SuccessUntold(Clean):
+class RL609SuccessUntold(Clean):
     def info(self):
         return {}
 
 
-class SuccessMisnamed(Clean):
+class RL609SuccessMisnamed(Clean):
     def info(self):
         return {"goal_reached": bool(np.linalg.norm(self.position) < 0.1)}
 
 
-class SuccessOtherwiseNamed(Clean):
+class RL609SuccessOtherwiseNamed(Clean):
     """The name and the numbers of Adroit and Meta-World count too."""
 
     def info(self):
         return {"success": float(np.linalg.norm(self.position) < 0.1)}
 
 
-class SuccessIsAShare(Clean):
+class RL609SuccessIsAShare(Clean):
     """A `success` that is no flag means something else."""
 
     def info(self):
         return {"success": 0.37}
 
 
-class SuccessArray(Clean):
+class RL609SuccessArray(Clean):
     """An array without axes is a number too."""
 
     def info(self):
         return {"is_success": np.array(np.linalg.norm(self.position) < 0.1)}
 
 
-class SuccessAtStart(Clean):
+class RL610SuccessAtStart(Clean):
     def info(self):
         return {"is_success": bool(np.linalg.norm(self.position) < 1.0)}
 
 
-class SuccessOnAverage(Clean):
+class RL610SuccessOnAverage(Clean):
     """Success is about the mean distance of the episode so far, which grows if nothing is done."""
 
     def reset(self, **kwargs):
@@ -227,7 +227,7 @@ class SuccessOnAverage(Clean):
         return {"is_success": bool(np.mean(self.distances) < 1.0)}
 
 
-class SuccessNever(Clean):
+class RL611SuccessNever(Clean):
     """Success is a reward that cannot be reached."""
 
     def info(self):

@@ -5,13 +5,13 @@ import pybullet as p
 from robots import Arm, Boat, Crawler, Pusher, Tank
 
 
-class BoatHiddenBuoy(Boat):
+class RL114BoatHiddenBuoy(Boat):
     def observe(self):
         c, s = np.cos(self.heading), np.sin(self.heading)
         return np.array([*self.place, s, c, *self.speed], np.float32)
 
 
-class TankHiddenWish(Tank):
+class RL114TankHiddenWish(Tank):
     def size(self):
         return 2
 
@@ -19,14 +19,14 @@ class TankHiddenWish(Tank):
         return np.array([self.temperature, self.rate], np.float32)
 
 
-class BoatOldObservation(Boat):
+class RL115BoatOldObservation(Boat):
     def step(self, action):
         observation = self.observe()
         _, *rest = super().step(action)
         return observation, *rest
 
 
-class ArmOldObservation(Arm):
+class RL115ArmOldObservation(Arm):
     def move(self, action):
         self.before = super().observe()
         super().move(action)
@@ -35,13 +35,13 @@ class ArmOldObservation(Arm):
         return super().observe() if self.steps == 0 else self.before
 
 
-class CrawlerQuaternion(Crawler):
+class RL116CrawlerQuaternion(Crawler):
     def angles(self):
         _, (x, y, z, w) = p.getBasePositionAndOrientation(self.robot, physicsClientId=self.client)
         return p.getEulerFromQuaternion((w, x, y, z))
 
 
-class ArmQuaternion(Arm):
+class RL116ArmQuaternion(Arm):
     def size(self):
         return 9
 
@@ -53,36 +53,36 @@ class ArmQuaternion(Arm):
         return np.array([*super().observe(), *self.angles()], np.float32)
 
 
-class ArmRightQuaternion(ArmQuaternion):
+class RL116ArmRightQuaternion(RL116ArmQuaternion):
     def angles(self):
         return p.getEulerFromQuaternion(self.hand()[5])
 
 
-class BoatWraps(Boat):
+class RL117BoatWraps(Boat):
     def observe(self):
         heading = (self.heading + np.pi) % (2 * np.pi) - np.pi
         return np.array([*(self.buoy - self.place), heading, 0.1 * heading**2, *self.speed], np.float32)
 
 
-class CrawlerWraps(Crawler):
+class RL117CrawlerWraps(Crawler):
     def angles(self):
         self.turn = 0.0 if self.steps == 0 else self.turn + 0.3
         return [*super().angles()[:2], np.arctan2(np.sin(self.turn), np.cos(self.turn))]
 
 
-class BoatMillimetres(Boat):
+class RL118BoatMillimetres(Boat):
     def observe(self):
         observation = super().observe()
         observation[:2] *= 1000  # [mm]
         return observation
 
 
-class CrawlerDegrees(Crawler):
+class RL118CrawlerDegrees(Crawler):
     def observe(self):
         return np.rad2deg(super().observe() + 2.0).astype(np.float32)
 
 
-class BoatStaysAtBuoy(Boat):
+class RL310BoatStaysAtBuoy(Boat):
     arrived = False
 
     def is_success(self):
@@ -90,13 +90,13 @@ class BoatStaysAtBuoy(Boat):
         return self.distance() < (0.24 if self.arrived else 0.2)
 
 
-class BoatArrives(BoatStaysAtBuoy):
+class RL310BoatArrives(RL310BoatStaysAtBuoy):
     def start(self):
         super().start()
         self.arrived = False
 
 
-class TankCountsOn(Tank):
+class RL310TankCountsOn(Tank):
     failures = 0
 
     def has_failed(self):
@@ -108,13 +108,13 @@ class TankCountsOn(Tank):
         return super().reward() - 0.5 * self.failures
 
 
-class TankCountsAnew(TankCountsOn):
+class RL310TankCountsAnew(RL310TankCountsOn):
     def start(self):
         super().start()
         self.failures = 0
 
 
-class BoatGusts(Boat):
+class RL311BoatGusts(Boat):
     def __init__(self):
         super().__init__()
         self.gusts = np.random.default_rng()
@@ -125,67 +125,67 @@ class BoatGusts(Boat):
         super().move(action)
 
 
-class BoatSeededGusts(BoatGusts):
+class RL311BoatSeededGusts(RL311BoatGusts):
     def start(self):
         super().start()
         self.gusts = self.np_random
 
 
-class TankSpills(Tank):
+class RL311TankSpills(Tank):
     def move(self, action):
         if self.temperature > 0.8:
             self.temperature -= np.random.default_rng().uniform(0.0, 0.1)
         super().move(action)
 
 
-class TankSeededSpills(Tank):
+class RL311TankSeededSpills(Tank):
     def move(self, action):
         if self.temperature > 0.8:
             self.temperature -= self.np_random.uniform(0.0, 0.1)
         super().move(action)
 
 
-class TankFailsAsTruncated(Tank):
+class RL507TankFailsAsTruncated(Tank):
     def step(self, action):
         observation, reward, terminated, truncated, info = super().step(action)
         return observation, reward, False, terminated or truncated, info
 
 
-class CrawlerFallsAsTruncated(Crawler):
+class RL507CrawlerFallsAsTruncated(Crawler):
     def step(self, action):
         observation, reward, _, truncated, info = super().step(action)
         fell = abs(self.angles()[1]) > 0.06
         return observation, reward, False, bool(truncated or fell), info
 
 
-class CrawlerFalls(Crawler):
+class RL507CrawlerFalls(Crawler):
     def has_failed(self):
         return bool(abs(self.angles()[1]) > 0.06)
 
 
-class BoatTermsOff(Boat):
+class RL607BoatTermsOff(Boat):
     def info(self, success):
         terms = {"distance": -self.distance(), "speed": 0.1 * self.speed[0]}
         return {"is_success": success, "reward_terms": terms}
 
 
-class BoatTerms(Boat):
+class RL607BoatTerms(Boat):
     def info(self, success):
         terms = {"distance": -self.distance(), "arrival": 2.0 * success}
         return {"is_success": success, "reward_terms": terms}
 
 
-class CrawlerTermsOff(Crawler):
+class RL607CrawlerTermsOff(Crawler):
     def info(self, success):
         return {**super().info(success), "reward_terms": {"forward": 0.5 * self.forward()}}
 
 
-class CrawlerTerms(Crawler):
+class RL607CrawlerTerms(Crawler):
     def info(self, success):
         return {**super().info(success), "reward_terms": {"forward": self.forward()}}
 
 
-class BoatMovingBuoy(Boat):
+class RL615BoatMovingBuoy(Boat):
     def observe(self):
         return np.array([*self.place, np.sin(self.heading), np.cos(self.heading), *self.speed], np.float32)
 
@@ -199,12 +199,12 @@ class BoatMovingBuoy(Boat):
             self.buoy = self.draw_buoy()
 
 
-class BoatFixedBuoy(BoatMovingBuoy):
+class RL615BoatFixedBuoy(RL615BoatMovingBuoy):
     def draw_buoy(self):
         return np.array([0.5, 0.5])
 
 
-class TankOneWish(Tank):
+class RL615TankOneWish(Tank):
     def start(self):
         self.temperature, self.rate, self.wanted = 0.0, 0.0, 0.5
         self.power = self.np_random.uniform(0.5, 1.0)
@@ -216,67 +216,67 @@ class TankOneWish(Tank):
         super().move(self.power * action)
 
 
-class TankOtherWish(TankOneWish):
+class RL615TankOtherWish(RL615TankOneWish):
     def move(self, action):
         super().move(action)
         if self.steps == 30:
             self.wanted = 0.2
 
 
-class BoatLateReward(Boat):
+class RL616BoatLateReward(Boat):
     def step(self, action):
         reward = self.reward()
         observation, _, *rest = super().step(action)
         return observation, reward, *rest
 
 
-class ArmLateReward(Arm):
+class RL616ArmLateReward(Arm):
     def step(self, action):
         height = self.hand()[4][2]
         observation, _, *rest = super().step(action)
         return observation, height - 0.8, *rest
 
 
-class BoatNan(Boat):
+class RL704BoatNan(Boat):
     def step(self, action):
         self.steps += 1
         self.move(np.clip(action, -1.0, 1.0).astype(float))
         return self.observe(), self.reward(), False, self.steps >= self.limit, {"is_success": self.is_success()}
 
 
-class TankNan(Tank):
+class RL704TankNan(Tank):
     def step(self, action):
         self.steps += 1
         self.move(np.clip(action, -1.0, 1.0).astype(float))
         return self.observe(), self.reward(), False, self.steps >= self.limit, self.info(False)
 
 
-class ArmDegrees(Arm):
+class RL810ArmDegrees(Arm):
     def start(self):
         super().start()
         self.drive(np.rad2deg(self.home))
 
 
-class CrawlerStartsInDegrees(Crawler):
+class RL810CrawlerStartsInDegrees(Crawler):
     def start(self):
         p.resetJointState(self.robot, 0, np.rad2deg(0.3), physicsClientId=self.client)
         super().start()
 
 
-class ArmOrder(Arm):
+class RL811ArmOrder(Arm):
     home = np.array([0.9, -0.5, 0.3])
 
     def target(self, action):
         return super().target(action)[[1, 2, 0]]
 
 
-class CrawlerOrder(Crawler):
+class RL811CrawlerOrder(Crawler):
     def target(self, action):
         wrist, *others = super().target(action)
         return [*others, wrist]
 
 
-class ArmTouchesNothing(Arm):
+class RL812ArmTouchesNothing(Arm):
     home = np.array([1.0, 1.1, 0.0])
     height = 0.2
 
@@ -284,12 +284,12 @@ class ArmTouchesNothing(Arm):
         return super().reward() - 1.0 * self.touches(3)
 
 
-class ArmTouches(ArmTouchesNothing):
+class RL812ArmTouches(RL812ArmTouchesNothing):
     def reward(self):
         return Arm.reward(self) - 1.0 * self.touches(2)
 
 
-class CrawlerOtherFloor(Crawler):
+class RL812CrawlerOtherFloor(Crawler):
     def touches(self, link):
         floor = self.robot + 1
         return len(p.getContactPoints(self.robot, floor, link, -1, physicsClientId=self.client) or ()) > 0
@@ -298,51 +298,51 @@ class CrawlerOtherFloor(Crawler):
         return super().reward() + 0.1 * self.touches(0)
 
 
-class CrawlerFloor(Crawler):
+class RL812CrawlerFloor(Crawler):
     def reward(self):
         return super().reward() + 0.1 * self.touches(0)
 
 
-class ArmLongPhysicsSteps(Arm):
+class RL813ArmLongPhysicsSteps(Arm):
     def __init__(self):
         super().__init__()
         p.setTimeStep(1 / 30, physicsClientId=self.client)
 
 
-class ArmWeakMotors(Arm):
+class RL814ArmWeakMotors(Arm):
     def drive(self, targets):
         p.setJointMotorControlArray(
             self.robot, range(3), p.POSITION_CONTROL, list(targets), forces=[0.9] * 3, physicsClientId=self.client
         )
 
 
-class ArmOldHand(Arm):
+class RL815ArmOldHand(Arm):
     def hand(self):
         return p.getLinkState(self.robot, 3, physicsClientId=self.client)
 
 
-class CrawlerOldFoot(Crawler):
+class RL815CrawlerOldFoot(Crawler):
     def reward(self):
         return super().reward() - p.getLinkState(self.robot, 0, physicsClientId=self.client)[4][2]
 
 
-class CrawlerFoot(Crawler):
+class RL815CrawlerFoot(Crawler):
     def reward(self):
         foot = p.getLinkState(self.robot, 0, computeForwardKinematics=True, physicsClientId=self.client)
         return super().reward() - foot[4][2]
 
 
-class ArmPullsOnly(Arm):
+class RL701ArmPullsOnly(Arm):
     def target(self, action):
         return super().target(np.array([max(0.0, action[0]), *action[1:]]))
 
 
-class BoatForwardOnly(Boat):
+class RL701BoatForwardOnly(Boat):
     def move(self, action):
         super().move(np.maximum(action, 0.0))
 
 
-class PusherInsideItsCube(Pusher):
+class RL803PusherInsideItsCube(Pusher):
     rlctl_ignore = {**Pusher.rlctl_ignore, "RL302": "a consequence"}
 
     def put_cube(self, place):

@@ -5,7 +5,7 @@ from broken_envs import Clean, CleanDict
 from gymnasium import spaces
 
 
-class Asymmetric(Clean):
+class RL106Asymmetric(Clean):
     def __init__(self):
         super().__init__()
         self.action_space = spaces.Box(np.float32([-1.0, -0.5]), np.float32([1.0, 1.0]))
@@ -14,13 +14,13 @@ class Asymmetric(Clean):
         super().move(np.clip(action, self.action_space.low, self.action_space.high))
 
 
-class Thrust(Asymmetric):
+class RL106Thrust(RL106Asymmetric):
     def __init__(self):
         super().__init__()
         self.action_space = spaces.Box(np.float32([-1.0, 0.0]), np.float32([1.0, 1.0]))
 
 
-class Seen(Clean):
+class RL108Seen(Clean):
     """The point in a picture: nothing is wrong with it."""
 
     shape, dtype, low, high = (48, 48, 1), np.uint8, 0, 255
@@ -36,21 +36,21 @@ class Seen(Clean):
         return picture.reshape(self.shape)
 
 
-class FloatPicture(Seen):
+class RL108FloatPicture(RL108Seen):
     dtype, high = np.float32, 1
 
 
-class TwoAxes(Seen):
+class RL108TwoAxes(RL108Seen):
     shape = (48, 48)
 
 
-class FloatTable(TwoAxes):
+class RL108FloatTable(RL108TwoAxes):
     """Rows of measurements: nothing is wrong with it."""
 
     dtype, high = np.float32, 1
 
 
-class Tiles(Seen):
+class RL108Tiles(RL108Seen):
     """A board of 9 x 9 tiles: nothing is wrong with it."""
 
     shape = (9, 9)
@@ -61,12 +61,12 @@ class Tiles(Seen):
         return board
 
 
-class Dark(Seen):
+class RL108Dark(RL108Seen):
     def observe(self):
         return super().observe() // 255
 
 
-class CountsFromOne(Clean):
+class RL109CountsFromOne(Clean):
     def __init__(self):
         super().__init__()
         self.action_space = spaces.Discrete(2, start=1)
@@ -75,7 +75,7 @@ class CountsFromOne(Clean):
         return super().step(np.full(2, action - 1.5, np.float32))
 
 
-class OddImage(Clean):
+class RL108OddImage(Clean):
     def __init__(self):
         super().__init__()
         self.observation_space = spaces.Box(0, 255, (8, 8, 3), np.uint8)
@@ -84,7 +84,7 @@ class OddImage(Clean):
         return np.full((8, 8, 3), int(100 + 10 * self.position[0]), np.uint8)
 
 
-class TupleObservation(CleanDict):
+class RL109TupleObservation(CleanDict):
     def __init__(self):
         super().__init__()
         self.observation_space = spaces.Tuple(list(self.observation_space.spaces.values()))
@@ -93,7 +93,7 @@ class TupleObservation(CleanDict):
         return self.position.copy(), self.steps
 
 
-class TextObservation(Clean):
+class RL109TextObservation(Clean):
     """Of a space that no rule can look into."""
 
     def __init__(self):

@@ -25,7 +25,7 @@ def work(seconds):
         sum(range(20_000))
 
 
-class SlowStep(Clean):
+class RL901SlowStep(Clean):
     """Slow only in the episodes in which time is measured, so that the test is not."""
 
     def move(self, action):
@@ -34,7 +34,7 @@ class SlowStep(Clean):
         super().move(action)
 
 
-class Sleeps(Clean):
+class RL903Sleeps(Clean):
     """Keeps real time, for nobody."""
 
     def move(self, action):
@@ -48,7 +48,7 @@ class SleepsInReset(Clean):
         super().start()
 
 
-class Renders(Clean):
+class RL903Renders(Clean):
     """Draws at every step what nobody asked for."""
 
     def move(self, action):
@@ -62,12 +62,12 @@ class Renders(Clean):
         return picture
 
 
-class RendersNothing(Renders):
+class RendersNothing(RL903Renders):
     def render(self):
         return None
 
 
-class Sees(Renders):
+class RL903Sees(RL903Renders):
     """Its observation is the picture."""
 
     def __init__(self):
@@ -115,7 +115,7 @@ class World(Clean):
             self.bullet.disconnect()
 
 
-class Reconnects(World):
+class RL904Reconnects(World):
     def start(self):
         self.close()
         self.connect()
@@ -136,7 +136,7 @@ class Rebuilds(World):
         super().start()
 
 
-class ReadsFile(Clean):
+class RL904ReadsFile(Clean):
     """Reads at every step what never changes."""
 
     def move(self, action):

@@ -40,7 +40,7 @@ class Sound(Reach):
 
 
 @dataclass
-class Misspelled(Reach):
+class RL013Misspelled(Reach):
     """Two names that have no effect, and one that is close to such a name and is used."""
 
     episode_seconds = 2.0
@@ -51,44 +51,44 @@ class Misspelled(Reach):
 
 
 @dataclass
-class WrongBody(Reach):
+class RL011WrongBody(Reach):
     events = {"mass": Event("reset", events.scale_mass, body="amr", factor=(0.8, 1.2))}
 
 
 @dataclass
-class OwnChance(Reach):
+class RL011OwnChance(Reach):
     events = {"home": Event("start", shift_home)}
 
 
 @dataclass
-class BreaksDown(Reach):
+class RL011BreaksDown(Reach):
     events = {"gear": Event("interval", break_down, every_s=0.5)}
 
 
 @dataclass
-class NeedsItsEvents(Reach):
+class RL011NeedsItsEvents(Reach):
     """What is on by itself is off in nothing that can be trained; nothing is wrong with it."""
 
     events = {"mass": Event("reset", events.scale_mass, body="arm", factor=(0.8, 1.2), enabled=True)}
 
 
 @dataclass
-class WrongKey(Reach):
+class RL012WrongKey(Reach):
     stages = [{"taks": {"tolerance": 0.2}, "promote": {"success": 0.8}}, {}]
 
 
 @dataclass
-class WrongParameter(Reach):
+class RL012WrongParameter(Reach):
     stages = [{"task": {"tolerence": 0.2}, "promote": {"success": 0.8}}, {}]
 
 
 @dataclass
-class WrongEvent(Reach):
+class RL012WrongEvent(Reach):
     stages = [{"promote": {"success": 0.8}}, {"events": {"masss": {"factor": [1, 2]}}}]
 
 
 @dataclass
-class OtherSpaces(Reach):
+class RL012OtherSpaces(Reach):
     see_goal: bool = True
 
     observation_units = {}

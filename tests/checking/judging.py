@@ -3,8 +3,10 @@
 import dataclasses
 import functools
 import itertools
+import re
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,11 @@ sys.dont_write_bytecode = False  # each experiment imports its environment's fil
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A mistake: what is found in an environment that makes it, and a twin that does not make it."""
+    """A mistake: what is found in an environment that makes it, and a twin that does not make it.
+
+    The class that proves a rule has the rule's code at the beginning of its name, and so has its twin, unless that is
+    the twin of other rules as well.
+    """
 
     broken: str
     """`file.py:Class` in this folder, or any other task."""
@@ -48,6 +54,12 @@ class Case:
     def rules(self) -> tuple[str, ...]:
         return tuple(sorted(rule for rule, _ in self.expected))
 
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """The rules that it proves: those whose codes the name of its class begins with."""
+        name = self.broken.rpartition(":")[2]
+        return tuple(re.findall(r"RL\d{3}", re.match(r"(RL\d{3})*", name)[0]))
+
 
 def case(broken: str, *expected: tuple[str, str], **settings: Any) -> Case:
     return Case(broken, frozenset(expected), **settings)
@@ -60,14 +72,21 @@ def mark_slow(cases: Sequence[Case]) -> list[Any]:
 
 
 IN_PROCESSES = [
-    case("broken_envs.py:ExitsWhenBuilt", ("RL004", "error")),
-    case("broken_envs.py:Segfaults", ("RL208", "error")),
-    case("broken_envs.py:Hangs", ("RL209", "error")),
-    case("broken_envs.py:Prints", ("RL211", "warning")),
-    case("broken_interface.py:Gui", ("RL216", "error"), pybullet=True),
-    case("broken_repeats.py:HashOrder", ("RL305", "error")),
+    case("broken_envs.py:RL004ExitsWhenBuilt", ("RL004", "error")),
+    case("broken_envs.py:RL208Segfaults", ("RL208", "error")),
+    case("broken_envs.py:RL209Hangs", ("RL209", "error")),
+    case("broken_envs.py:RL211Prints", ("RL211", "warning")),
+    case("broken_interface.py:RL216Gui", ("RL216", "error"), pybullet=True),
+    case("broken_repeats.py:RL305HashOrder", ("RL305", "error")),
 ]
 """What only shows with real child processes: tested in test_processes.py, and RL216 in test_interface.py."""
+
+
+def list_cases():
+    """The cases of all test files; those of robots first, which show a mistake where it happens."""
+    files = sorted(FOLDER.glob("test_*.py"), key=lambda file: (file.stem != "test_robots", file.stem))
+    modules = [import_module(f"tests.checking.{file.stem}") for file in files if file.stem != "test_all_rules"]
+    return [*itertools.chain(*(getattr(module, "CASES", []) for module in modules)), *IN_PROCESSES]
 
 
 def records_of(task, *experiments):

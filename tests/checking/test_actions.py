@@ -10,19 +10,19 @@ from tests.checking.judging import case, check_case, findings, found, mark_slow,
 
 FILE = "broken_actions.py"
 CASES = [
-    case(f"{FILE}:DeadAction", ("RL701", "warning"), twin=f"{FILE}:LateAction"),
-    case(f"{FILE}:NoAction", ("RL701", "error")),
-    case(f"{FILE}:DeadChoice", ("RL701", "error"), twin=f"{FILE}:Choice"),
-    case(f"{FILE}:CostlyAction", ("RL701", "warning"), twin=f"{FILE}:HiddenAction"),
-    case(f"{FILE}:CopiedAction", ("RL701", "info")),
-    case(f"{FILE}:OnlyCosts", ("RL701", "error"), twin=f"{FILE}:Switch"),
-    case(f"{FILE}:OnlyCopies", ("RL701", "error"), twin=f"{FILE}:Switch"),
-    case(f"{FILE}:ChangesAction", ("RL705", "warning")),
-    case(f"{FILE}:ChangesPartOfAction", ("RL705", "warning")),
-    case("broken_robots.py:ArmPullsOnly", ("RL701", "info"), twin="robots.py:Arm"),
-    case("broken_robots.py:BoatForwardOnly", ("RL701", "info"), twin="robots.py:Boat"),
+    case(f"{FILE}:RL701DeadAction", ("RL701", "warning"), twin=f"{FILE}:RL701LateAction"),
+    case(f"{FILE}:RL701NoAction", ("RL701", "error")),
+    case(f"{FILE}:RL701DeadChoice", ("RL701", "error"), twin=f"{FILE}:RL701Choice"),
+    case(f"{FILE}:RL701CostlyAction", ("RL701", "warning"), twin=f"{FILE}:RL701HiddenAction"),
+    case(f"{FILE}:RL701CopiedAction", ("RL701", "info")),
+    case(f"{FILE}:RL701OnlyCosts", ("RL701", "error"), twin=f"{FILE}:RL701Switch"),
+    case(f"{FILE}:RL701OnlyCopies", ("RL701", "error"), twin=f"{FILE}:RL701Switch"),
+    case(f"{FILE}:RL705ChangesAction", ("RL705", "warning")),
+    case(f"{FILE}:RL705ChangesPartOfAction", ("RL705", "warning")),
+    case("broken_robots.py:RL701ArmPullsOnly", ("RL701", "info"), twin="robots.py:Arm"),
+    case("broken_robots.py:RL701BoatForwardOnly", ("RL701", "info"), twin="robots.py:Boat"),
 ]
-CLEAN = [f"{FILE}:Switch"]
+CLEAN = [f"{FILE}:RL701Switch"]
 
 
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
@@ -47,7 +47,7 @@ def the_finding(name, rule):
 
 
 def test_dead_actions_are_named():
-    finding = the_finding("DeadAction", "RL701")
+    finding = the_finding("RL701DeadAction", "RL701")
     assert finding.message == (
         "action[1] changes nothing: at its lowest and highest value, over 60 steps from two seeds"
     )
@@ -57,7 +57,7 @@ def test_dead_actions_are_named():
         "seeds": [1000, 1001],
         "steps": 60,
     }
-    assert the_finding("NoAction", "RL701").message.startswith("no element of the action changes anything: at its")
+    assert the_finding("RL701NoAction", "RL701").message.startswith("no element of the action changes anything: at its")
 
 
 def test_a_first_episode_unlike_the_others_hides_nothing():
@@ -71,7 +71,7 @@ def test_rewards_that_actions_change_in_a_series_are_worth_knowing():
 
 
 def test_what_is_not_repeatable_is_not_judged():
-    verdict = verdict_of("broken_repeats.py:NoisyStep", "RL701")
+    verdict = verdict_of("broken_repeats.py:RL302NoisyStep", "RL701")
     assert verdict.not_judged["RL701"] == "equal seeds and actions give unequal episodes (RL3)"
 
 

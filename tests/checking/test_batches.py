@@ -11,17 +11,23 @@ pytest.importorskip("mujoco")
 FILE = "broken_batches.py"
 SOUND = f"{FILE}:Point"
 CASES = [
-    case(f"{FILE}:ScalesByAll", ("RL406", "error"), twin=f"{FILE}:ScalesByEach"),
-    case(f"{FILE}:SharesNoise", ("RL406", "error"), twin=SOUND),
-    case(f"{FILE}:ResetsAllGoals", ("RL407", "error"), ("RL406", "error"), twin=f"{FILE}:ResetsItsGoal"),
-    case(f"{FILE}:MovesAllBases", ("RL407", "error"), ("RL406", "warning"), twin=f"{FILE}:MovesItsBase"),
-    case(f"{FILE}:OneRow", ("RL408", "error"), twin=SOUND),
-    case(f"{FILE}:OneGoal", ("RL408", "error"), twin=SOUND),
-    case(f"{FILE}:CountsSteps", ("RL409", "error"), twin=f"{FILE}:CountsStepsOfEach"),
-    case(f"{FILE}:KeepsLast", ("RL409", "error"), twin=SOUND),
-    case(f"{FILE}:Logs", ("RL409", "warning"), twin=SOUND),
+    case(f"{FILE}:RL406ScalesByAll", ("RL406", "error"), twin=f"{FILE}:RL406ScalesByEach"),
+    case(f"{FILE}:RL406SharesNoise", ("RL406", "error"), twin=SOUND),
+    case(f"{FILE}:RL407ResetsAllGoals", ("RL407", "error"), ("RL406", "error"), twin=f"{FILE}:RL407ResetsItsGoal"),
+    case(f"{FILE}:RL407MovesAllBases", ("RL407", "error"), ("RL406", "warning"), twin=f"{FILE}:RL407MovesItsBase"),
+    case(f"{FILE}:RL408OneRow", ("RL408", "error"), twin=SOUND),
+    case(f"{FILE}:RL408OneGoal", ("RL408", "error"), twin=SOUND),
+    case(f"{FILE}:RL409CountsSteps", ("RL409", "error"), twin=f"{FILE}:RL409CountsStepsOfEach"),
+    case(f"{FILE}:RL409KeepsLast", ("RL409", "error"), twin=SOUND),
+    case(f"{FILE}:RL409Logs", ("RL409", "warning"), twin=SOUND),
 ]
-CLEAN = [SOUND, f"{FILE}:ScalesByEach", f"{FILE}:ResetsItsGoal", f"{FILE}:MovesItsBase", f"{FILE}:CountsStepsOfEach"]
+CLEAN = [
+    SOUND,
+    f"{FILE}:RL406ScalesByEach",
+    f"{FILE}:RL407ResetsItsGoal",
+    f"{FILE}:RL407MovesItsBase",
+    f"{FILE}:RL409CountsStepsOfEach",
+]
 
 
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
@@ -37,24 +43,32 @@ def test_a_sound_task_has_no_finding_of_batches(task):
 @pytest.mark.parametrize(
     ("name", "rule", "message"),
     [
-        ("ScalesByAll", "RL406", "the episode of a world differs with other seeds and actions in the other worlds: at"),
-        ("SharesNoise", "RL406", "the episode of a world differs with one world alone: at reset goal is"),
-        ("ResetsAllGoals", "RL407", "the reset of world 2 of 4 changes in the others: self.goal"),
-        ("MovesAllBases", "RL407", "the reset of world 2 of 4 changes in the others: base_position of 'cart'"),
         (
-            "OneRow",
-            "RL408",
-            "step with 4 worlds raises ShapeError: OneRow: rewards()['change'] is an array of float64 of shape (1,), "
-            "expected numbers of shape (4,): a row per world",
+            "RL406ScalesByAll",
+            "RL406",
+            "the episode of a world differs with other seeds and actions in the other worlds: at",
         ),
-        ("OneGoal", "RL408", "step with 4 worlds raises ValueError: cannot reshape array of size 2 into shape (4,2)"),
+        ("RL406SharesNoise", "RL406", "the episode of a world differs with one world alone: at reset goal is"),
+        ("RL407ResetsAllGoals", "RL407", "the reset of world 2 of 4 changes in the others: self.goal"),
+        ("RL407MovesAllBases", "RL407", "the reset of world 2 of 4 changes in the others: base_position of 'cart'"),
         (
-            "CountsSteps",
+            "RL408OneRow",
+            "RL408",
+            "step with 4 worlds raises ShapeError: RL408OneRow: rewards()['change'] is an array of float64 of shape "
+            "(1,), expected numbers of shape (4,): a row per world",
+        ),
+        (
+            "RL408OneGoal",
+            "RL408",
+            "step with 4 worlds raises ValueError: cannot reshape array of size 2 into shape (4,2)",
+        ),
+        (
+            "RL409CountsSteps",
             "RL409",
             "self.steps changes from step to step, changes what later steps give, and is not in per_world",
         ),
-        ("KeepsLast", "RL409", "self.last_action changes from step to step, changes what later steps give"),
-        ("Logs", "RL409", "self.mean_error changes from step to step, is the same for all worlds, and is not in"),
+        ("RL409KeepsLast", "RL409", "self.last_action changes from step to step, changes what later steps give"),
+        ("RL409Logs", "RL409", "self.mean_error changes from step to step, is the same for all worlds, and is not in"),
     ],
 )
 def test_the_message_names_what_is_wrong(name, rule, message):
@@ -65,7 +79,7 @@ def test_the_message_names_what_is_wrong(name, rule, message):
 def test_kept_values_are_not_judged_where_the_seed_does_not_determine_an_episode():
     from tests.checking.judging import verdict_of
 
-    verdict = verdict_of(f"{FILE}:CachesAndForgetsTheSeed", "RL409")
+    verdict = verdict_of(f"{FILE}:RL409CachesAndForgetsTheSeed", "RL409")
     assert "differs from its repetition" in verdict.not_judged["RL409"]
 
 

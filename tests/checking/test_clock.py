@@ -52,8 +52,8 @@ def test_no_call_begins_when_the_time_of_the_process_is_over(tmp_path):
     file.write_text(
         "import sys, time\n"
         f"sys.path.append({str(FOLDER)!r})\n"
-        "from broken_repeats import SharedWorld\n"
-        "class Slow(SharedWorld):\n"
+        "from broken_repeats import RL401RL808SharedWorld\n"
+        "class Slow(RL401RL808SharedWorld):\n"
         "    def start(self):\n"
         f"        open({str(resets)!r}, 'a').write('.')\n"
         "        time.sleep(0.2)\n"

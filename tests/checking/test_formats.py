@@ -55,12 +55,12 @@ def rlctl(*arguments, folder=ROOT, **environment):
 
 @pytest.fixture(scope="module")
 def broken():
-    return report_of("broken_envs.py:NanReward", experiments=PROBE)
+    return report_of("broken_envs.py:RL601NanReward", experiments=PROBE)
 
 
 @pytest.fixture(scope="module")
 def unbuilt():
-    return report_of("broken_loading.py:NoFile", experiments=["build"])
+    return report_of("broken_loading.py:RL007NoFile", experiments=["build"])
 
 
 @pytest.fixture(scope="module")
@@ -132,9 +132,9 @@ def test_sarif_places_a_finding_at_the_method(broken):
     ("task", "rule", "line"),
     [
         ("broken_waivers.py:Wide", "RL106", "self.action_space = spaces.Box"),
-        ("broken_loading.py:Raising", "RL002", 'raise RuntimeError("no licence")'),
-        ("broken_import.py:Anything", "RL001", "raise ZeroDivisionError"),
-        ("broken_repeats.py:GlobalRandom", "RL301", "def reset(self"),
+        ("broken_loading.py:RL002Raising", "RL002", 'raise RuntimeError("no licence")'),
+        ("broken_import.py:RL001Anything", "RL001", "raise ZeroDivisionError"),
+        ("broken_repeats.py:RL301RL309GlobalRandom", "RL301", "def reset(self"),
         ("broken_interface.py:CountsAsFlag", "RL204", "def step(self, action)"),
     ],
 )
@@ -161,7 +161,7 @@ def test_annotations_point_at_the_class(broken, monkeypatch):
         r"the reward is nan at step 13%0Afix: ",
         line,
     )
-    assert last.startswith("broken_envs.py:NanReward: 1 error; ") or "NanReward: 1 error" in last
+    assert last.startswith("broken_envs.py:RL601NanReward: 1 error; ") or "RL601NanReward: 1 error" in last
 
 
 def test_annotations_escape_what_would_end_them(broken):
@@ -205,7 +205,7 @@ def test_a_waiver_that_is_none_is_refused(task, message):
 
 
 def test_strict_counts_warnings():
-    report = report_of("broken_repeats.py:UnseededLater", ["RL308"])
+    report = report_of("broken_repeats.py:RL308UnseededLater", ["RL308"])
     assert report.exit_code == 0
     assert dataclasses.replace(report, strict=True).exit_code == 1
 
@@ -259,7 +259,7 @@ def test_command_explains_a_rule_without_a_task():
 
 def test_command_writes_a_file_whole_and_says_so(tmp_path):
     file = tmp_path / "report.sarif"
-    run = rlctl(f"{HERE}/broken_envs.py:NanReward", "--select", "RL601", "--format", "sarif", "-o", str(file))
+    run = rlctl(f"{HERE}/broken_envs.py:RL601NanReward", "--select", "RL601", "--format", "sarif", "-o", str(file))
     assert (run.returncode, run.stdout) == (1, "")
     assert run.stderr.rstrip().endswith(f"written to {file}")
     assert sarif_pydantic.Sarif.model_validate_json(file.read_text()).runs[0].results[0].rule_id == "RL601"
@@ -376,7 +376,7 @@ def test_every_format_says_why_nothing_could_be_built(form, unbuilt):
 
 
 def test_command_says_why_nothing_could_be_built():
-    run = rlctl(f"{HERE}/broken_loading.py:NoFile", "--format", "github")
+    run = rlctl(f"{HERE}/broken_loading.py:RL007NoFile", "--format", "github")
     assert run.returncode == 3
     assert run.stdout.startswith("::error ")
     assert "RL007" in run.stdout

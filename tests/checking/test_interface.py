@@ -11,13 +11,13 @@ from tests.checking.judging import case, check_case, findings, mark_slow, verdic
 
 FILE = "broken_interface.py"
 CASES = [
-    case(f"{FILE}:NewSpaces", ("RL404", "warning")),
-    case(f"{FILE}:TakesNoMode", ("RL215", "warning"), twin=f"{FILE}:Renders"),
-    case(f"{FILE}:RenderRaises", ("RL215", "warning"), twin=f"{FILE}:Renders"),
-    case(f"{FILE}:RenderNeedsGraphics", ("RL215", "info"), twin=f"{FILE}:Renders"),
-    case(f"{FILE}:RenderFloats", ("RL215", "warning"), twin=f"{FILE}:Renders"),
-    case(f"{FILE}:RenderNothing", ("RL215", "warning"), twin=f"{FILE}:Renders"),
-    case(f"{FILE}:Falls", ("RL506", "warning"), twin=f"{FILE}:FallsInTime"),
+    case(f"{FILE}:RL404NewSpaces", ("RL404", "warning")),
+    case(f"{FILE}:RL215TakesNoMode", ("RL215", "warning"), twin=f"{FILE}:Renders"),
+    case(f"{FILE}:RL215RenderRaises", ("RL215", "warning"), twin=f"{FILE}:Renders"),
+    case(f"{FILE}:RL215RenderNeedsGraphics", ("RL215", "info"), twin=f"{FILE}:Renders"),
+    case(f"{FILE}:RL215RenderFloats", ("RL215", "warning"), twin=f"{FILE}:Renders"),
+    case(f"{FILE}:RL215RenderNothing", ("RL215", "warning"), twin=f"{FILE}:Renders"),
+    case(f"{FILE}:RL506Falls", ("RL506", "warning"), twin=f"{FILE}:RL506FallsInTime"),
 ]
 
 
@@ -31,21 +31,21 @@ def messages(name, rule):
 
 
 def test_a_space_that_is_made_anew_is_named():
-    assert messages("NewSpaces", "RL404") == [
+    assert messages("RL404NewSpaces", "RL404") == [
         "action_space is a new object each time it is read, so that seeding it has no effect"
     ]
 
 
 def test_pictures_are_told():
-    (message,) = messages("RenderFloats", "RL215")
+    (message,) = messages("RL215RenderFloats", "RL215")
     assert message == (
         "with render_mode='rgb_array' render returns an array of float64 and shape (20, 30, 3), not a uint8 array of "
         "shape (height, width, 3)"
     )
-    (message,) = messages("TakesNoMode", "RL215")
+    (message,) = messages("RL215TakesNoMode", "RL215")
     assert message.startswith("metadata lists the render mode rgb_array, but ")
     assert message.endswith("takes no render_mode")
-    (message,) = messages("RenderNothing", "RL215")
+    (message,) = messages("RL215RenderNothing", "RL215")
     assert message.startswith("with render_mode='rgb_array' render returns a NoneType")
 
 
@@ -66,7 +66,7 @@ def test_a_library_that_is_not_installed_is_not_the_environments_fault():
 
 
 def test_no_limit_is_told_with_what_is_known():
-    (message,) = messages("Falls", "RL506")
+    (message,) = messages("RL506Falls", "RL506")
     assert message.startswith(
         "no time limit was seen: step always returns truncated=False; all 16 episodes ended with "
     )
@@ -76,7 +76,7 @@ def test_no_limit_is_told_with_what_is_known():
 @pytest.mark.parametrize(
     ("name", "rule", "severity", "text"),
     [
-        ("Gui", "RL216", "error", "PyBullet opens a window (p.GUI, tests/checking/broken_interface.py:"),
+        ("RL216Gui", "RL216", "error", "PyBullet opens a window (p.GUI, tests/checking/broken_interface.py:"),
         ("GuiInReset", "RL216", "error", "in reset, because there is no display: 'cannot connect to X server'"),
     ],
 )

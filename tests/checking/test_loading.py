@@ -15,20 +15,20 @@ from tests.checking.judging import case, check_case, findings, mark_slow
 
 ERROR = "error"
 CASES = [
-    case("broken_import.py:Anything", ("RL001", ERROR)),
-    case("broken_loading.py:Raising", ("RL002", ERROR)),
-    case("broken_loading.py:RaisingUnreadably", ("RL002", ERROR)),
-    case("broken_loading.py:AnyAttribute", ("RL002", ERROR)),
-    case("broken_loading.py:RaisingProperty", ("RL002", ERROR)),
-    case("broken_loading.py:RaisingOfAnother", ("RL002", ERROR)),
-    case("broken_loading.py:NeedsArgumentsInside", ("RL002", ERROR)),
-    case("broken_envs.py:NoEnvironment", ("RL003", ERROR)),
-    case("broken_envs.py:Cleen", ("RL005", ERROR)),
-    case("broken_loading.py:NeedsArguments", ("RL006", ERROR)),
-    case("broken_loading.py:NoFile", ("RL007", ERROR)),
-    case("broken_loading.py:NoModel", ("RL007", ERROR), pybullet=True),
-    case("broken_loading.py:NoModelAtReset", ("RL007", ERROR), pybullet=True),
-    case("broken_old_gym.py:Pushed", ("RL008", ERROR)),
+    case("broken_import.py:RL001Anything", ("RL001", ERROR)),
+    case("broken_loading.py:RL002Raising", ("RL002", ERROR)),
+    case("broken_loading.py:RL002RaisingUnreadably", ("RL002", ERROR)),
+    case("broken_loading.py:RL002AnyAttribute", ("RL002", ERROR)),
+    case("broken_loading.py:RL002RaisingProperty", ("RL002", ERROR)),
+    case("broken_loading.py:RL002RaisingOfAnother", ("RL002", ERROR)),
+    case("broken_loading.py:RL002NeedsArgumentsInside", ("RL002", ERROR)),
+    case("broken_envs.py:RL003NoEnvironment", ("RL003", ERROR)),
+    case("broken_envs.py:RL005Clean", ("RL005", ERROR)),
+    case("broken_loading.py:RL006NeedsArguments", ("RL006", ERROR)),
+    case("broken_loading.py:RL007NoFile", ("RL007", ERROR)),
+    case("broken_loading.py:RL007NoModel", ("RL007", ERROR), pybullet=True),
+    case("broken_loading.py:RL007NoModelAtReset", ("RL007", ERROR), pybullet=True),
+    case("broken_old_gym.py:RL008Pushed", ("RL008", ERROR)),
 ]
 
 
@@ -38,7 +38,7 @@ def test_finds_the_mistake_and_only_that(case):
 
 
 def test_arguments_are_named_and_how_to_give_them():
-    (finding,) = findings("broken_loading.py:NeedsArguments", "RL006")
+    (finding,) = findings("broken_loading.py:RL006NeedsArguments", "RL006")
     assert "missing 1 required positional argument: 'gain'" in finding.message
     assert "(--set task.gain=...)" in finding.fix
 
@@ -46,11 +46,14 @@ def test_arguments_are_named_and_how_to_give_them():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("RaisingUnreadably", r"UnreadableError: \(message unavailable: RuntimeError\)"),
-        ("AnyAttribute", "__getattr__ for an attribute that it lacks: KeyError: 'num_envs'"),
-        ("RaisingProperty", r"reading an attribute raises RuntimeError: not connected \(.*broken_loading.py:"),
-        ("RaisingOfAnother", "RuntimeError: install the extra .*; the first error was ModuleNotFoundError: No module"),
-        ("NeedsArgumentsInside", "missing 1 required positional argument: 'link'"),
+        ("RL002RaisingUnreadably", r"UnreadableError: \(message unavailable: RuntimeError\)"),
+        ("RL002AnyAttribute", "__getattr__ for an attribute that it lacks: KeyError: 'num_envs'"),
+        ("RL002RaisingProperty", r"reading an attribute raises RuntimeError: not connected \(.*broken_loading.py:"),
+        (
+            "RL002RaisingOfAnother",
+            "RuntimeError: install the extra .*; the first error was ModuleNotFoundError: No module",
+        ),
+        ("RL002NeedsArgumentsInside", "missing 1 required positional argument: 'link'"),
     ],
 )
 def test_what_a_constructor_raises_is_named(name, message):
@@ -72,13 +75,13 @@ def test_an_import_names_the_first_error_of_a_chain(tmp_path):
 
 
 def test_a_missing_class_gets_the_closest_name():
-    (finding,) = findings("broken_envs.py:Cleen", "RL005")
-    assert "has no 'Cleen'. Did you mean 'Clean'?" in finding.message
+    (finding,) = findings("broken_envs.py:RL005Clean", "RL005")
+    assert "has no 'RL005Clean'. Did you mean 'Clean'?" in finding.message
 
 
 @pytest.mark.pybullet
 def test_a_missing_model_is_named_with_the_search_path():
-    (finding,) = findings("broken_loading.py:NoModel", "RL007")
+    (finding,) = findings("broken_loading.py:RL007NoModel", "RL007")
     data = Path(pybullet_data.getDataPath())
     assert finding.evidence["file"] == "kuka_iiwa/modell.urdf"
     assert finding.evidence["searched"] == [str(Path.cwd()), str(data)]
@@ -100,7 +103,7 @@ def test_a_missing_file_is_named_without_the_words_around_it():
 
 @pytest.mark.pybullet
 def test_a_missing_model_of_a_reset_is_named():
-    (finding,) = findings("broken_loading.py:NoModelAtReset", "RL007")
+    (finding,) = findings("broken_loading.py:RL007NoModelAtReset", "RL007")
     assert finding.message.startswith("reset does not find 'robot.urdf', looked for in ")
     assert finding.evidence["searched"][0] == str(Path.cwd())
 

@@ -23,22 +23,22 @@ def broken(name, *expected, twin, file=MEANING, **settings):
 
 
 CASES = [
-    broken("RoverLateReward", ("RL616", "warning"), twin="Rover", slow=True),
-    broken("DroneLateReward", ("RL616", "warning"), twin="Drone"),
-    broken("RoverLateSuccess", ("RL617", "warning"), twin="Rover"),
-    broken("DroneLeavesLate", ("RL617", "warning"), twin="DroneLeaves"),
-    broken("RoverLooksRound", ("RL618", "warning"), twin="RoverLooks", slow=True),
-    broken("DroneTurnsBack", ("RL618", "warning"), twin="DroneTurns"),
-    broken("RoverBehindTheShore", ("RL619", "warning"), twin="RoverInPond", slow=True),
-    broken("ArmFarGoals", ("RL619", "warning"), twin="Arm", file=REACH),
+    broken("RL616RoverLateReward", ("RL616", "warning"), twin="Rover", slow=True),
+    broken("RL616DroneLateReward", ("RL616", "warning"), twin="Drone"),
+    broken("RL617RoverLateSuccess", ("RL617", "warning"), twin="Rover"),
+    broken("RL617DroneLeavesLate", ("RL617", "warning"), twin="RL617DroneLeaves"),
+    broken("RL618RoverLooksRound", ("RL618", "warning"), twin="RL618RoverLooks", slow=True),
+    broken("RL618DroneTurnsBack", ("RL618", "warning"), twin="RL618DroneTurns"),
+    broken("RL619RoverBehindTheShore", ("RL619", "warning"), twin="RL619RoverInPond", slow=True),
+    broken("RL619ArmFarGoals", ("RL619", "warning"), twin="Arm", file=REACH),
     case(
-        "broken_reach_bullet.py:ReacherFarGoals",
+        "broken_reach_bullet.py:RL619ReacherFarGoals",
         ("RL619", "warning"),
-        twin="broken_reach_bullet.py:Reacher",
+        twin="broken_reach_bullet.py:RL619Reacher",
         pybullet=True,
     ),
-    broken("RoverMillimetres", ("RL118", "info"), ("RL119", "warning"), twin="Rover", slow=True),
-    broken("DroneDegrees", ("RL119", "warning"), twin="DroneRadians"),
+    broken("RL119RoverMillimetres", ("RL118", "info"), ("RL119", "warning"), twin="Rover", slow=True),
+    broken("RL119DroneDegrees", ("RL119", "warning"), twin="RL119DroneRadians"),
 ]
 
 
@@ -95,7 +95,7 @@ def test_attributes_of_mixed_shapes_are_left_out():
 
 
 def test_units_are_told_apart_by_the_time_of_a_step():
-    (finding,) = findings(f"{MEANING}:RoverMillimetres", "RL119")
+    (finding,) = findings(f"{MEANING}:RL119RoverMillimetres", "RL119")
     # 0.1 m in a step at 1 m/s are 100 mm; the heading changes by 0.1 times the turning rate.
     assert finding.evidence["value"] == pytest.approx(100.0, rel=1e-3)
     assert "millimetres" in finding.message
@@ -112,7 +112,7 @@ def test_where_nothing_changes_nothing_has_a_rate(rows, columns, last):
 
 
 def test_jump_of_an_angle_is_measured():
-    (finding,) = findings(f"{MEANING}:RoverLooksRound", "RL618")
+    (finding,) = findings(f"{MEANING}:RL618RoverLooksRound", "RL618")
     # 0.3 times a change of the difference by 2 pi, at most.
     assert 0.1 < finding.evidence["value"] < 0.3 * 2 * np.pi
 

@@ -11,11 +11,11 @@ from tests.checking.judging import case, check_case, findings, found, mark_slow,
 pytest.importorskip("mujoco")
 
 FILE = "broken_mirrors.py"
-TWIN = f"{FILE}:MirrorsTurning"
+TWIN = f"{FILE}:RL120MirrorsTurning"
 CASES = [
-    case(f"{FILE}:MirrorsTurningLikeVectors", ("RL120", "error"), twin=TWIN),
-    case(f"{FILE}:TurnsHipsTheSameWay", ("RL120", "error"), twin=TWIN),
-    case(f"{FILE}:PrefersItsLeft", ("RL120", "error"), twin=TWIN),
+    case(f"{FILE}:RL120MirrorsTurningLikeVectors", ("RL120", "error"), twin=TWIN),
+    case(f"{FILE}:RL120TurnsHipsTheSameWay", ("RL120", "error"), twin=TWIN),
+    case(f"{FILE}:RL120PrefersItsLeft", ("RL120", "error"), twin=TWIN),
 ]
 
 
@@ -32,9 +32,9 @@ def test_sound_declarations(task):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("MirrorsTurningLikeVectors", "after 1 step from a mirrored state, with mirrored actions, gyroscope["),
-        ("TurnsHipsTheSameWay", "at the start from a mirrored state"),
-        ("PrefersItsLeft", "after 1 step from a mirrored state, with mirrored actions, reward term tracking is"),
+        ("RL120MirrorsTurningLikeVectors", "after 1 step from a mirrored state, with mirrored actions, gyroscope["),
+        ("RL120TurnsHipsTheSameWay", "at the start from a mirrored state"),
+        ("RL120PrefersItsLeft", "after 1 step from a mirrored state, with mirrored actions, reward term tracking is"),
     ],
 )
 def test_the_message_names_what_is_wrong(name, message):

@@ -6,11 +6,11 @@ from tests.checking.judging import case, check_case, findings, found, mark_slow,
 
 BROKEN = "broken_observations.py"
 CASES = [
-    case(f"{BROKEN}:ConstantElement", ("RL110", "info"), twin=f"{BROKEN}:Wide"),
-    case(f"{BROKEN}:ConstantCounter", ("RL110", "info"), twin=f"{BROKEN}:Counter"),
-    case(f"{BROKEN}:ConstantSpeed", ("RL110", "warning"), twin=f"{BROKEN}:Speed"),
-    case(f"{BROKEN}:HiddenGoal", ("RL114", "warning"), twin=f"{BROKEN}:SeenGoal"),
-    case(f"{BROKEN}:HiddenGoalNoisyStart", ("RL114", "warning"), twin=f"{BROKEN}:NoisyReward"),
+    case(f"{BROKEN}:RL110ConstantElement", ("RL110", "info"), twin=f"{BROKEN}:Wide"),
+    case(f"{BROKEN}:RL110ConstantCounter", ("RL110", "info"), twin=f"{BROKEN}:RL110Counter"),
+    case(f"{BROKEN}:RL110ConstantSpeed", ("RL110", "warning"), twin=f"{BROKEN}:RL110Speed"),
+    case(f"{BROKEN}:RL114HiddenGoal", ("RL114", "warning"), twin=f"{BROKEN}:RL114SeenGoal"),
+    case(f"{BROKEN}:RL114HiddenGoalNoisyStart", ("RL114", "warning"), twin=f"{BROKEN}:RL114NoisyReward"),
 ]
 
 
@@ -19,7 +19,10 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
-CLEAN = [f"{BROKEN}:{name}" for name in ("Wide", "Counter", "SomeFlags", "SeenGoal", "NoisyReward", "ShownChance")]
+CLEAN = [
+    f"{BROKEN}:{name}"
+    for name in ("Wide", "RL110Counter", "SomeFlags", "RL114SeenGoal", "RL114NoisyReward", "ShownChance")
+]
 
 
 @pytest.mark.slow
@@ -40,13 +43,13 @@ def finding_of(name):
 
 
 def test_constant_elements_are_named_with_their_value():
-    finding = finding_of("ConstantElement")
+    finding = finding_of("RL110ConstantElement")
     assert finding.message == "1 of 4 elements of the observation never changed: observation[2] (0.25)"
     assert finding.evidence == {"value": 1, "expected": 0, "elements": ["observation[2]"]}
-    assert finding_of("ConstantCounter").evidence["elements"] == ["observation['step']"]
+    assert finding_of("RL110ConstantCounter").evidence["elements"] == ["observation['step']"]
 
 
 def test_reward_shows_what_is_hidden():
-    finding = finding_of("HiddenGoal")
+    finding = finding_of("RL114HiddenGoal")
     assert finding.evidence["element"] == "self.goal"
     assert finding.evidence["value"] != finding.evidence["expected"]

@@ -11,14 +11,14 @@ from tests.checking.judging import case, check_case, findings, found, mark_slow,
 RULES = set(rules_of("RL8"))
 CART = "broken_physics.py:Cart"
 CASES = [
-    case("broken_physics.py:NoGravity", ("RL801", "warning"), twin="broken_physics.py:Flat"),
-    case("broken_physics.py:InTheFloor", ("RL803", "warning"), twin=CART, slow=True),
-    case("broken_physics.py:BeyondLimits", ("RL804", "warning"), twin="broken_physics.py:TurnsWithoutEnd"),
-    case("broken_physics.py:Explodes", ("RL805", "warning"), twin=CART),
-    case("broken_physics.py:LongPhysicsSteps", ("RL813", "warning"), twin=CART),
-    case("broken_physics.py:StartsInTheFloor", ("RL807", "warning"), twin=CART),
-    case("broken_models.py:HeavyInertia", ("RL809", "warning"), twin="broken_models.py:CartTask"),
-    case("broken_models.py:TipWithoutInertial", ("RL809", "info"), twin="broken_models.py:CartTask"),
+    case("broken_physics.py:RL801NoGravity", ("RL801", "warning"), twin="broken_physics.py:RL801Flat"),
+    case("broken_physics.py:RL803InTheFloor", ("RL803", "warning"), twin=CART, slow=True),
+    case("broken_physics.py:RL804BeyondLimits", ("RL804", "warning"), twin="broken_physics.py:RL804TurnsWithoutEnd"),
+    case("broken_physics.py:RL805Explodes", ("RL805", "warning"), twin=CART),
+    case("broken_physics.py:RL813LongPhysicsSteps", ("RL813", "warning"), twin=CART),
+    case("broken_physics.py:RL807StartsInTheFloor", ("RL807", "warning"), twin=CART),
+    case("broken_models.py:RL809HeavyInertia", ("RL809", "warning"), twin="broken_models.py:CartTask"),
+    case("broken_models.py:RL809TipWithoutInertial", ("RL809", "info"), twin="broken_models.py:CartTask"),
 ]
 
 
@@ -42,7 +42,7 @@ def the_finding(name):
 
 @pytest.mark.pybullet
 def test_joint_beyond_its_limits_is_placed():
-    finding = the_finding("BeyondLimits")
+    finding = the_finding("RL804BeyondLimits")
     # Actions are within +-1, and an action of 1 sets 1.8 rad.
     assert finding.evidence["joint"] == "shoulder of cart"
     assert finding.evidence["expected"] == [-1.0, 1.0]
@@ -53,7 +53,7 @@ def test_joint_beyond_its_limits_is_placed():
 
 @pytest.mark.pybullet
 def test_penetration_is_measured():
-    finding = the_finding("InTheFloor")
+    finding = the_finding("RL803InTheFloor")
     # Set back to 5 cm every step, of which the solver takes away a fifth.
     assert finding.evidence["value"] == pytest.approx(0.04, abs=0.003)
     assert finding.evidence["expected"] == 0.02
@@ -63,7 +63,7 @@ def test_penetration_is_measured():
 @pytest.mark.slow
 @pytest.mark.pybullet
 def test_explosion_is_measured():
-    finding = the_finding("Explodes")
+    finding = the_finding("RL805Explodes")
     # PyBullet stops at 100 m/s along each of three axes.
     assert finding.evidence["value"] == pytest.approx(100 * 3**0.5, rel=0.01)
     assert finding.message.startswith("link0 moves at 173.")
@@ -114,7 +114,7 @@ def test_calls_are_recorded_as_they_are_meant(tmp_path):
 
 @pytest.mark.pybullet
 def test_a_frame_without_inertial_is_named():
-    (finding,) = findings("broken_models.py:TipWithoutInertial", "RL809")
+    (finding,) = findings("broken_models.py:RL809TipWithoutInertial", "RL809")
     assert finding.message == "cart_without_inertial.urdf: links without <inertial> weigh 1 mg: 'tip'"
     assert finding.evidence == {}
 
@@ -127,6 +127,6 @@ def test_a_joint_without_effort_limit_is_named():
 
 @pytest.mark.pybullet
 def test_impossible_inertia_is_named():
-    (finding,) = findings("broken_models.py:HeavyInertia", "RL809")
+    (finding,) = findings("broken_models.py:RL809HeavyInertia", "RL809")
     # An arm of 0.2 kg, 0.04 m x 0.04 m x 0.2 m, can have at most 0.2 * (0.04^2 + 0.04^2 + 0.2^2) = 0.0087 kg m^2.
     assert "a moment of 1 kg m^2 is more than 0.2 kg within 0.21 m can have" in finding.message

@@ -35,7 +35,7 @@ def in_root(monkeypatch):
 @pytest.mark.parametrize(
     ("task", "expected", "message", "fix"),
     [
-        ("tests/checking/broken_import.py:Anything", "RL001", "ZeroDivisionError: at import", "Repair the line"),
+        ("tests/checking/broken_import.py:RL001Anything", "RL001", "ZeroDivisionError: at import", "Repair the line"),
         (f"{BROKEN}:RaisingConstructor", "RL007", "does not find 'robot.urdf', looked for in", "__file__"),
         pytest.param(
             *(
@@ -49,12 +49,12 @@ def in_root(monkeypatch):
         (f"{BROKEN}:NeedsArgument", "RL006", "missing 1 required", "(--set task.gain=...)"),
         (f"{BROKEN}:NUMBER", "RL005", "NUMBER is of type int, not a class", "case-sensitive"),
         (
-            f"{BROKEN}:NoEnvironment",
+            f"{BROKEN}:RL003NoEnvironment",
             "RL003",
             "is neither a Gymnasium environment",
             "Inherit from gymnasium.Env",
         ),
-        (f"{BROKEN}:ExitsWhenBuilt", "RL004", "the process ended with exit code 7 in the constructor", "input"),
+        (f"{BROKEN}:RL004ExitsWhenBuilt", "RL004", "the process ended with exit code 7 in the constructor", "input"),
     ],
 )
 def test_without_an_instance_there_is_a_finding_and_exit_code_3(task, expected, message, fix, in_root):
@@ -68,7 +68,7 @@ def test_without_an_instance_there_is_a_finding_and_exit_code_3(task, expected, 
 
 
 def test_segfault_is_a_finding(in_root):
-    report = check(EnvSpec(f"{BROKEN}:Segfaults"), env_timeout_s=10)
+    report = check(EnvSpec(f"{BROKEN}:RL208Segfaults"), env_timeout_s=10)
     (finding,) = report.verdict.findings
     assert (finding.rule, finding.message) == ("RL208", "the process was killed by SIGSEGV in step 7")
     assert finding.evidence["seed"] == 1000
@@ -77,7 +77,9 @@ def test_segfault_is_a_finding(in_root):
 
 
 def test_hang_is_a_finding_after_the_timeout(in_root):
-    report = check(EnvSpec(f"{BROKEN}:Hangs"), env_timeout_s=0.7)  # of its own clock; other calls take microseconds
+    report = check(
+        EnvSpec(f"{BROKEN}:RL209Hangs"), env_timeout_s=0.7
+    )  # of its own clock; other calls take microseconds
     (finding,) = report.verdict.findings
     assert (finding.rule, finding.message) == ("RL209", "step 7 did not return within 0.7 s")
     assert report.exit_code == 1
@@ -117,7 +119,7 @@ def test_what_hangs_for_nan_is_not_called_a_hang(tmp_path):
 
 @pytest.mark.slow
 def test_printing_is_worth_knowing_and_does_not_reach_the_result(in_root):
-    run = rlctl(f"{BROKEN}:Prints", "--select", "RL211", "--json", "-")
+    run = rlctl(f"{BROKEN}:RL211Prints", "--select", "RL211", "--json", "-")
     content = json.loads(run.stdout)
     (finding,) = content["findings"]
     assert (finding["rule"], finding["severity"]) == ("RL211", "warning")
@@ -126,7 +128,9 @@ def test_printing_is_worth_knowing_and_does_not_reach_the_result(in_root):
 
 
 def test_hash_order_shows_in_a_new_process(in_root):
-    report = check(EnvSpec("tests/checking/broken_repeats.py:HashOrder"), rules=choose_rules(["RL3"]), env_timeout_s=10)
+    report = check(
+        EnvSpec("tests/checking/broken_repeats.py:RL305HashOrder"), rules=choose_rules(["RL3"]), env_timeout_s=10
+    )
     assert [finding.rule for finding in report.verdict.findings] == ["RL305"]
 
 
@@ -143,7 +147,7 @@ def test_the_tools_own_process_loads_neither_learner_nor_simulator(in_root):
     code = (
         "import sys; from rlctl.checking.check import check; import rlctl.checking.formats; "
         "from rlctl.environments.spec import EnvSpec; "
-        "check(EnvSpec('tests/checking/broken_import.py:Anything'), env_timeout_s=10); "
+        "check(EnvSpec('tests/checking/broken_import.py:RL001Anything'), env_timeout_s=10); "
         "print([name for name in ('torch', 'stable_baselines3', 'pybullet', 'broken_import') if name in sys.modules])"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=250, check=True)
@@ -175,7 +179,7 @@ def test_command_of_a_clean_environment(tmp_path):
 def test_command_of_a_broken_environment(tmp_path):
     file = tmp_path / "report.json"
     chosen = ["--select", "RL1,RL901"]
-    run = rlctl(f"{BROKEN}:OftenOutOfRange", "--set", "task.size=4.0", *chosen, "--json", str(file))
+    run = rlctl(f"{BROKEN}:RL103OftenOutOfRange", "--set", "task.size=4.0", *chosen, "--json", str(file))
     assert run.returncode == 1
     assert run.stdout.startswith("error RL103")
     content = json.loads(file.read_text())
@@ -198,7 +202,7 @@ def test_a_baseline_that_is_a_device_is_refused():
 
 @pytest.mark.slow
 def test_findings_of_the_baseline_fail_nothing(tmp_path):
-    task, file = f"{BROKEN}:ArrayReward", str(tmp_path / "report.json")
+    task, file = f"{BROKEN}:RL204ArrayReward", str(tmp_path / "report.json")
     assert rlctl(task, "--select", "RL2", "--json", file).returncode == 1
     run = rlctl(task, "--select", "RL2", "--baseline", file)
     assert run.returncode == 0
@@ -209,7 +213,7 @@ def test_findings_of_the_baseline_fail_nothing(tmp_path):
 
 @pytest.mark.slow
 def test_command_shows_the_worst_first_with_numbers_and_fix():
-    run = rlctl(f"{BROKEN}:ArrayReward", "--select", "RL2")
+    run = rlctl(f"{BROKEN}:RL204ArrayReward", "--select", "RL2")
     assert run.returncode == 1
     assert run.stdout.splitlines()[:4] == [
         "error RL204  types of what step returns",

@@ -14,12 +14,12 @@ from tests.checking.judging import case, check_case, findings, mark_slow, record
 
 FILE = "broken_resources.py"
 CASES = [
-    case(f"{FILE}:LeavesBodies", ("RL405", "error"), twin="broken_repeats.py:OwnWorld", pybullet=True),
-    case(f"{FILE}:KeepsFiles", ("RL405", "warning")),
-    case(f"{FILE}:KeepsThreads", ("RL405", "warning")),
-    case(f"{FILE}:KeepsMemory", ("RL405", "warning"), twin=f"{FILE}:Caches"),
-    case(f"{FILE}:ClassSpaces", ("RL404", "warning")),
-    case(f"{FILE}:ClassObservations", ("RL404", "info")),
+    case(f"{FILE}:RL405LeavesBodies", ("RL405", "error"), twin="broken_repeats.py:OwnWorld", pybullet=True),
+    case(f"{FILE}:RL405KeepsFiles", ("RL405", "warning")),
+    case(f"{FILE}:RL405KeepsThreads", ("RL405", "warning")),
+    case(f"{FILE}:RL405KeepsMemory", ("RL405", "warning"), twin=f"{FILE}:RL405Caches"),
+    case(f"{FILE}:RL404ClassSpaces", ("RL404", "warning")),
+    case(f"{FILE}:RL404ClassObservations", ("RL404", "info")),
 ]
 
 
@@ -45,7 +45,7 @@ def test_each_reset_leaves_a_client(monkeypatch):
 
 
 def test_memory_is_counted():
-    finding = the_finding("KeepsMemory", "RL405")
+    finding = the_finding("RL405KeepsMemory", "RL405")
     # 50,000 numbers of 8 bytes.
     assert finding.evidence["per_reset"] == pytest.approx(400_000, rel=0.1)
     assert finding.evidence["resets"] == 90

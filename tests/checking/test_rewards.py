@@ -19,22 +19,22 @@ def broken(name, *expected, twin=None, **settings):
 
 
 CASES = [
-    broken("ConstantReward", ("RL602", "warning")),
-    broken("SparseNeverFound", ("RL602", "info"), ("RL611", "info")),
-    broken("LargeReward", ("RL603", "warning"), twin="FinalBonus"),
-    broken("HugeOnce", ("RL603", "warning"), twin="FinalBonus"),
-    broken("Falls", ("RL604", "warning"), twin="FallsBadly"),
-    broken("FallsUntold", ("RL604", "warning"), ("RL609", "info"), twin="FallsBadly"),
-    broken("Hovering", ("RL605", "warning"), twin="FinishingPays"),
-    broken("HoveringUntold", ("RL605", "warning"), ("RL609", "info"), twin="PaysProgress"),
-    broken("AliveBonus", ("RL606", "warning"), twin="Paid"),
-    broken("AliveUntold", ("RL606", "info"), twin="Paid"),
-    broken("SuccessUntold", ("RL609", "info"), twin="SuccessArray"),
-    broken("SuccessMisnamed", ("RL609", "info"), twin="SuccessOtherwiseNamed"),
-    broken("SuccessIsAShare", ("RL609", "info")),
-    broken("SuccessAtStart", ("RL610", "warning"), twin="SuccessOnAverage"),
-    broken("SuccessNever", ("RL611", "info")),
-    broken("WrongSlice", ("RL612", "warning"), twin="TimePenalty", slow=True),
+    broken("RL602ConstantReward", ("RL602", "warning")),
+    broken("RL602SparseNeverFound", ("RL602", "info"), ("RL611", "info")),
+    broken("RL603LargeReward", ("RL603", "warning"), twin="RL603FinalBonus"),
+    broken("RL603HugeOnce", ("RL603", "warning"), twin="RL603FinalBonus"),
+    broken("RL604Falls", ("RL604", "warning"), twin="RL604FallsBadly"),
+    broken("RL604FallsUntold", ("RL604", "warning"), ("RL609", "info"), twin="RL604FallsBadly"),
+    broken("RL605Hovering", ("RL605", "warning"), twin="RL605FinishingPays"),
+    broken("RL605HoveringUntold", ("RL605", "warning"), ("RL609", "info"), twin="RL605PaysProgress"),
+    broken("RL606AliveBonus", ("RL606", "warning"), twin="RL606Paid"),
+    broken("RL606AliveUntold", ("RL606", "info"), twin="RL606Paid"),
+    broken("RL609SuccessUntold", ("RL609", "info"), twin="RL609SuccessArray"),
+    broken("RL609SuccessMisnamed", ("RL609", "info"), twin="RL609SuccessOtherwiseNamed"),
+    broken("RL609SuccessIsAShare", ("RL609", "info")),
+    broken("RL610SuccessAtStart", ("RL610", "warning"), twin="RL610SuccessOnAverage"),
+    broken("RL611SuccessNever", ("RL611", "info")),
+    broken("RL612WrongSlice", ("RL612", "warning"), twin="RL612TimePenalty", slow=True),
 ]
 
 
@@ -46,8 +46,8 @@ def test_finds_the_mistake_and_only_that(case):
 CLEAN = [
     f"{BROKEN}:{name}"
     for name in (
-        *("FinalBonus", "FallsBadly", "FinishingPays", "PaysProgress", "Terms", "SparseTerm"),
-        *("TimePenalty", "Paid", "SuccessArray"),
+        *("RL603FinalBonus", "RL604FallsBadly", "RL605FinishingPays", "RL605PaysProgress", "Terms", "SparseTerm"),
+        *("RL612TimePenalty", "RL606Paid", "RL609SuccessArray"),
     )
 ]
 
@@ -75,7 +75,7 @@ def test_worth_is_discounted():
 
 
 def test_falling_is_compared_with_going_on():
-    evidence = finding_of("Falls").evidence
+    evidence = finding_of("RL604Falls").evidence
     mean, last, steps = evidence["mean_reward"], evidence["value"], evidence["step"]
     # The fall is beyond 1.5 m in one direction, so at least that far from the middle.
     assert -2.2 < last <= -1.5
@@ -97,7 +97,7 @@ def test_stopping_is_compared_from_where_it_begins():
 
 
 def test_hovering_is_found_and_placed():
-    finding = finding_of("Hovering")
+    finding = finding_of("RL605Hovering")
     # Between 9.6 (0.4 from the goal) and 9.9 (0.1 from it) per step.
     assert 9.6 < finding.evidence["per_step"] < 9.9
     assert finding.message.startswith("finishing at step ")
@@ -105,14 +105,14 @@ def test_hovering_is_found_and_placed():
 
 
 def test_doing_nothing_earns_the_bonus():
-    evidence = finding_of("AliveBonus").evidence
+    evidence = finding_of("RL606AliveBonus").evidence
     # 50 steps of 1: (1 - 0.99^50) / 0.01 = 39.4994
     assert evidence["value"] == pytest.approx(39.4994, abs=1e-4)
     assert (evidence["term"], evidence["share"]) == ("alive", 1.0)
 
 
 def test_constant_penalty_is_named():
-    evidence = finding_of("WrongSlice").evidence
+    evidence = finding_of("RL612WrongSlice").evidence
     # -0.05 * 5
     assert (evidence["term"], evidence["value"]) == ("effort", -0.25)
 

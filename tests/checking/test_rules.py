@@ -8,74 +8,80 @@ from importlib import import_module
 
 import pytest
 
-from rlctl.checking.rules import RULES
+from rlctl.checking.rules import EXPERIMENTS, PROCESSES, RULES, find_needs
 from rlctl.checking.values import find_numbers
 from tests.checking.judging import (
     FOLDER,
-    IN_PROCESSES,
     case,
     check_case,
     findings,
     found,
+    list_cases,
     mark_slow,
     records_of,
     verdict_of,
 )
 
 CASES = [
-    case("broken_envs.py:OldGym", ("RL003", "error"), ("RL201", "error"), ("RL202", "error")),
-    case("broken_envs.py:WrongShape", ("RL101", "error")),
-    case("broken_envs.py:MissingKey", ("RL101", "error")),
-    case("broken_envs.py:Float64", ("RL102", "warning")),
-    case("broken_envs.py:OutOfRange", ("RL103", "warning")),
-    case("broken_envs.py:OutOfRangeAtReset", ("RL103", "error")),
-    case("broken_envs.py:OftenOutOfRange", ("RL103", "error")),
-    case("broken_envs.py:LastOutOfRange", ("RL103", "info")),
-    case("broken_envs.py:Rounding", ("RL103", "warning")),
-    case("broken_envs.py:NanObservation", ("RL104", "error")),
-    case("broken_envs.py:ReusedMemory", ("RL105", "info")),
-    case("broken_envs.py:UnboundedActions", ("RL106", "error")),
-    case("broken_envs.py:WideActions", ("RL106", "info")),
-    case("broken_spaces.py:OddImage", ("RL108", "warning")),
-    case("broken_spaces.py:FloatPicture", ("RL108", "warning"), twin="broken_spaces.py:Tiles"),
-    case("broken_spaces.py:TwoAxes", ("RL108", "warning"), twin="broken_spaces.py:FloatTable"),
-    case("broken_spaces.py:Dark", ("RL108", "warning"), twin="broken_spaces.py:Seen"),
-    case("broken_spaces.py:Asymmetric", ("RL106", "warning")),
-    case("broken_spaces.py:Thrust", ("RL106", "info")),
-    case("broken_spaces.py:TupleObservation", ("RL109", "warning")),
-    case("broken_spaces.py:TextObservation", ("RL109", "warning")),
-    case("broken_spaces.py:CountsFromOne", ("RL109", "warning")),
-    case("broken_envs.py:FourValues", ("RL201", "error")),
-    case("broken_envs.py:NoSeed", ("RL202", "error")),
-    case("broken_envs.py:NoOptions", ("RL203", "warning")),
-    case("broken_envs.py:NumpyBool", ("RL204", "info")),
-    case("broken_envs.py:ArrayReward", ("RL204", "error")),
-    case("broken_envs.py:Float32Reward", ("RL204", "info")),
-    case("broken_envs.py:NoneInfo", ("RL204", "error")),
-    case("broken_envs.py:SuccessIsADistance", ("RL204", "warning")),
-    case("broken_envs.py:Raises", ("RL207", "error")),
-    case("broken_envs.py:Exits", ("RL207", "error")),
-    case("broken_repeats.py:GlobalRandom", ("RL301", "error"), ("RL309", "warning")),
-    case("broken_repeats.py:NoisyStep", ("RL302", "error"), ("RL309", "warning")),
-    case("broken_repeats.py:LeakyReset", ("RL303", "error")),
-    case("broken_repeats.py:ClassCounter", ("RL304", "error")),
-    case("broken_repeats.py:FixedStart", ("RL306", "info")),
-    case("broken_repeats.py:UnseededLater", ("RL308", "warning")),
-    case("broken_repeats.py:OldActionsAsRegistered", ("RL301", "error")),
-    case("broken_repeats.py:Residue", ("RL301", "warning")),
-    case("broken_repeats.py:SharedWorld", ("RL401", "error"), ("RL402", "error"), ("RL808", "error"), pybullet=True),
-    case("broken_repeats.py:CloseBreaks", ("RL402", "error")),
-    case("broken_repeats.py:OnlyOne", ("RL403", "error")),
-    case("broken_envs.py:TimeLimitTerminates", ("RL501", "warning")),
-    case("broken_envs.py:BothFlags", ("RL502", "error")),
-    case("broken_envs.py:Endless", ("RL503", "warning")),
-    case("broken_envs.py:EndsAtOnce", ("RL504", "warning")),
-    case("broken_envs.py:EndsAtStepTwo", ("RL504", "warning")),
-    case("broken_envs.py:NanReward", ("RL601", "error")),
-    case("broken_goals.py:OtherReward", ("RL614", "error"), twin="broken_goals.py:Goal"),
-    case("broken_goals.py:OneByOne", ("RL614", "error"), twin="broken_goals.py:RoundedReward"),
-    case("broken_goals.py:NanComputed", ("RL614", "error")),
-    case("broken_goals.py:NumberlessReward", ("RL614", "error"), twin="broken_goals.py:NestedGoal"),
+    case("broken_envs.py:RL003OldGym", ("RL003", "error"), ("RL201", "error"), ("RL202", "error")),
+    case("broken_envs.py:RL101WrongShape", ("RL101", "error")),
+    case("broken_envs.py:RL101MissingKey", ("RL101", "error")),
+    case("broken_envs.py:RL102Float64", ("RL102", "warning")),
+    case("broken_envs.py:RL103OutOfRange", ("RL103", "warning")),
+    case("broken_envs.py:RL103OutOfRangeAtReset", ("RL103", "error")),
+    case("broken_envs.py:RL103OftenOutOfRange", ("RL103", "error")),
+    case("broken_envs.py:RL103LastOutOfRange", ("RL103", "info")),
+    case("broken_envs.py:RL103Rounding", ("RL103", "warning")),
+    case("broken_envs.py:RL104NanObservation", ("RL104", "error")),
+    case("broken_envs.py:RL105ReusedMemory", ("RL105", "info")),
+    case("broken_envs.py:RL106UnboundedActions", ("RL106", "error")),
+    case("broken_envs.py:RL106WideActions", ("RL106", "info")),
+    case("broken_spaces.py:RL108OddImage", ("RL108", "warning")),
+    case("broken_spaces.py:RL108FloatPicture", ("RL108", "warning"), twin="broken_spaces.py:RL108Tiles"),
+    case("broken_spaces.py:RL108TwoAxes", ("RL108", "warning"), twin="broken_spaces.py:RL108FloatTable"),
+    case("broken_spaces.py:RL108Dark", ("RL108", "warning"), twin="broken_spaces.py:RL108Seen"),
+    case("broken_spaces.py:RL106Asymmetric", ("RL106", "warning")),
+    case("broken_spaces.py:RL106Thrust", ("RL106", "info")),
+    case("broken_spaces.py:RL109TupleObservation", ("RL109", "warning")),
+    case("broken_spaces.py:RL109TextObservation", ("RL109", "warning")),
+    case("broken_spaces.py:RL109CountsFromOne", ("RL109", "warning")),
+    case("broken_envs.py:RL201FourValues", ("RL201", "error")),
+    case("broken_envs.py:RL202NoSeed", ("RL202", "error")),
+    case("broken_envs.py:RL203NoOptions", ("RL203", "warning")),
+    case("broken_envs.py:RL204NumpyBool", ("RL204", "info")),
+    case("broken_envs.py:RL204ArrayReward", ("RL204", "error")),
+    case("broken_envs.py:RL204Float32Reward", ("RL204", "info")),
+    case("broken_envs.py:RL204NoneInfo", ("RL204", "error")),
+    case("broken_envs.py:RL204SuccessIsADistance", ("RL204", "warning")),
+    case("broken_envs.py:RL207Raises", ("RL207", "error")),
+    case("broken_envs.py:RL207Exits", ("RL207", "error")),
+    case("broken_repeats.py:RL301RL309GlobalRandom", ("RL301", "error"), ("RL309", "warning")),
+    case("broken_repeats.py:RL302NoisyStep", ("RL302", "error"), ("RL309", "warning")),
+    case("broken_repeats.py:RL303LeakyReset", ("RL303", "error")),
+    case("broken_repeats.py:RL304ClassCounter", ("RL304", "error")),
+    case("broken_repeats.py:RL306FixedStart", ("RL306", "info")),
+    case("broken_repeats.py:RL308UnseededLater", ("RL308", "warning")),
+    case("broken_repeats.py:RL301OldActionsAsRegistered", ("RL301", "error")),
+    case("broken_repeats.py:RL301Residue", ("RL301", "warning")),
+    case(
+        "broken_repeats.py:RL401RL808SharedWorld",
+        ("RL401", "error"),
+        ("RL402", "error"),
+        ("RL808", "error"),
+        pybullet=True,
+    ),
+    case("broken_repeats.py:RL402CloseBreaks", ("RL402", "error")),
+    case("broken_repeats.py:RL403OnlyOne", ("RL403", "error")),
+    case("broken_envs.py:RL501TimeLimitTerminates", ("RL501", "warning")),
+    case("broken_envs.py:RL502BothFlags", ("RL502", "error")),
+    case("broken_envs.py:RL503Endless", ("RL503", "warning")),
+    case("broken_envs.py:RL504EndsAtOnce", ("RL504", "warning")),
+    case("broken_envs.py:RL504EndsAtStepTwo", ("RL504", "warning")),
+    case("broken_envs.py:RL601NanReward", ("RL601", "error")),
+    case("broken_goals.py:RL614OtherReward", ("RL614", "error"), twin="broken_goals.py:Goal"),
+    case("broken_goals.py:RL614OneByOne", ("RL614", "error"), twin="broken_goals.py:RL614RoundedReward"),
+    case("broken_goals.py:RL614NanComputed", ("RL614", "error")),
+    case("broken_goals.py:RL614NumberlessReward", ("RL614", "error"), twin="broken_goals.py:RL614NestedGoal"),
 ]
 
 
@@ -121,7 +127,7 @@ def test_gymnasiums_own_environments_have_no_errors(task):
 
 
 def test_hindsight_rewards_are_compared():
-    (finding,) = findings("broken_goals.py:OtherReward", "RL614")
+    (finding,) = findings("broken_goals.py:RL614OtherReward", "RL614")
     # Each reward is 0.5 below what compute_reward says.
     assert finding.evidence["value"] - finding.evidence["expected"] == pytest.approx(0.5)
 
@@ -139,7 +145,7 @@ def test_a_number_that_is_too_large_for_a_float_is_left_out():
 
 
 def test_out_of_range_is_placed():
-    (finding,) = findings("broken_envs.py:OutOfRange", "RL103")
+    (finding,) = findings("broken_envs.py:RL103OutOfRange", "RL103")
     assert re.match(
         r"observation\[[01]\] is [\d.]+ at step 30; the space allows \[-5, 5\]; \d+ of \d+ observations are outside",
         finding.message,
@@ -151,7 +157,7 @@ def test_out_of_range_is_placed():
 
 
 def test_exception_is_placed():
-    (finding,) = findings("broken_envs.py:Raises", "RL207")
+    (finding,) = findings("broken_envs.py:RL207Raises", "RL207")
     assert finding.message.startswith("step 7 raised RuntimeError: joint 3 is gone (tests/checking/broken_envs.py:")
     assert finding.evidence["step"] == 7
     assert finding.evidence["seed"] == 1000
@@ -165,7 +171,7 @@ def test_names_of_a_tasks_observation_are_used():
 
 
 def test_difference_is_named():
-    (finding,) = findings("broken_repeats.py:GlobalRandom", "RL301")
+    (finding,) = findings("broken_repeats.py:RL301RL309GlobalRandom", "RL301")
     assert finding.message.startswith("reset twice with one seed: first difference at reset: observation[")
     assert finding.evidence["step"] == 0
     assert finding.evidence["seed"] == 1000
@@ -190,26 +196,50 @@ def test_chance_that_reset_keeps_is_no_missing_seed():
 
 
 def test_what_a_nearer_rule_explains_is_not_judged():
-    verdict = verdict_of("broken_repeats.py:NoisyStep", "RL303", "RL304", "RL305", "RL401", "RL402")
+    verdict = verdict_of("broken_repeats.py:RL302NoisyStep", "RL303", "RL304", "RL305", "RL401", "RL402")
     assert {"RL303", "RL304", "RL305", "RL401", "RL402"} <= verdict.not_judged.keys()
     assert verdict.not_judged["RL305"] == "the same instance already differs from itself (RL301, RL302)"
     assert not {"RL303", "RL304", "RL305", "RL401", "RL402"} & set(verdict.judged)
 
 
 def test_space_that_no_rule_can_look_into_is_said():
-    verdict = verdict_of("broken_spaces.py:TextObservation", "RL101", "RL102", "RL103", "RL104")
+    verdict = verdict_of("broken_spaces.py:RL109TextObservation", "RL101", "RL102", "RL103", "RL104")
     assert verdict.findings == []
     assert verdict.not_judged["observation['say']"] == "rules cannot examine a Text space"
 
 
-def test_every_rule_has_an_environment_that_breaks_it():
-    modules = [import_module(f"tests.checking.{file.stem}") for file in FOLDER.glob("test_*.py")]
-    broken = {rule for module in modules for case in getattr(module, "CASES", []) for rule, _ in case.expected}
-    assert broken | {rule for case in IN_PROCESSES for rule in case.rules} == set(RULES)
+@pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
+def test_every_rule_has_a_file_and_environments_that_prove_it(rule):
+    words = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[()]", "", rule.name.lower()))
+    module = import_module(f"rlctl.checking.rules.{rule.id.lower()}_{words}")
+    assert module.RULE is rule
+    assert re.fullmatch(r"RL\d{3}", rule.id)
+    assert rule.meaning
+    assert rule.fix
+    proofs = [one for one in list_cases() if rule.id in one.codes]
+    assert proofs, f"no environment whose name begins with {rule.id}"
+    for proof in proofs:
+        assert rule.id in proof.rules
+        twin = proof.twin.rpartition(":")[2]
+        assert not twin.startswith("RL") or twin.startswith(proof.codes)
 
 
-def test_rules_are_complete():
-    for rule in RULES.values():
-        assert re.fullmatch(r"RL\d{3}", rule.id)
-        assert rule.meaning
-        assert rule.fix
+def test_a_class_that_is_named_for_a_rule_belongs_to_a_case():
+    named = {f"{file.name}:{name}" for file in FOLDER.glob("broken_*.py") for name in find_named_classes(file)}
+    in_cases = {name for case in list_cases() for name in (case.broken, case.twin)}
+    assert named - in_cases == set()
+
+
+def find_named_classes(file):
+    return re.findall(r"^class (RL\d{3}\w+)", file.read_text(), re.MULTILINE)
+
+
+def test_every_experiment_has_a_place_of_its_own():
+    places = [(one.process, one.place) for one in EXPERIMENTS.values()]
+    assert len(places) == len(set(places))
+    assert {need for rule in RULES for need in find_needs([rule])} <= EXPERIMENTS.keys()
+    assert sum(len(names) for names in PROCESSES.values()) == len(EXPERIMENTS)
+
+
+def test_every_rule_is_judged():
+    assert {rule for rule in RULES if not find_needs([rule])} == set()

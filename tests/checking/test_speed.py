@@ -16,11 +16,11 @@ from rlctl.checking.speed import Speed, format_speed
 from tests.checking.judging import case, check_case, mark_slow, shared_records_of
 
 CASES = [
-    case("broken_speed.py:SlowStep", ("RL901", "warning")),
-    case("broken_speed.py:Sleeps", ("RL903", "warning")),
-    case("broken_speed.py:Renders", ("RL903", "warning"), twin="broken_speed.py:Sees"),
-    case("broken_speed.py:ReadsFile", ("RL904", "warning")),
-    case("broken_speed.py:Reconnects", ("RL904", "warning"), twin="broken_speed.py:World", pybullet=True),
+    case("broken_speed.py:RL901SlowStep", ("RL901", "warning")),
+    case("broken_speed.py:RL903Sleeps", ("RL903", "warning")),
+    case("broken_speed.py:RL903Renders", ("RL903", "warning"), twin="broken_speed.py:RL903Sees"),
+    case("broken_speed.py:RL904ReadsFile", ("RL904", "warning")),
+    case("broken_speed.py:RL904Reconnects", ("RL904", "warning"), twin="broken_speed.py:World", pybullet=True),
 ]
 STEP = TimedCall("pybullet.stepSimulation", "world.py:10", 0.61)
 NOTHING = Speed(66e-6, 52e-6, 200, 5, [STEP], [], [], False)
@@ -55,7 +55,7 @@ def test_finds_the_mistake_and_only_that(case):
         "reach",
         "CartPole-v1",
         "broken_envs.py:Clean",
-        "broken_speed.py:Sees",
+        "broken_speed.py:RL903Sees",
         "broken_speed.py:RendersNothing",
         pytest.param("broken_speed.py:World", marks=pytest.mark.pybullet),
         pytest.param("broken_speed.py:KeepsPartials", marks=pytest.mark.pybullet),

@@ -7,14 +7,14 @@ from tests.checking.judging import FOLDER, case, check_case, findings, mark_slow
 ERROR = "error"
 SOUND = "broken_variants.py:Sound"
 CASES = [
-    case("broken_variants.py:WrongBody", ("RL011", ERROR), twin=SOUND, slow=True),
-    case("broken_variants.py:OwnChance", ("RL011", ERROR), twin=SOUND),
-    case("broken_variants.py:BreaksDown", ("RL011", ERROR), twin="broken_variants.py:NeedsItsEvents"),
-    case("broken_variants.py:Misspelled", ("RL013", "warning"), twin=SOUND),
-    case("broken_variants.py:WrongKey", ("RL012", ERROR), twin=SOUND),
-    case("broken_variants.py:WrongParameter", ("RL012", ERROR), twin=SOUND),
-    case("broken_variants.py:WrongEvent", ("RL012", ERROR), twin=SOUND),
-    case("broken_variants.py:OtherSpaces", ("RL012", ERROR), twin=SOUND),
+    case("broken_variants.py:RL011WrongBody", ("RL011", ERROR), twin=SOUND, slow=True),
+    case("broken_variants.py:RL011OwnChance", ("RL011", ERROR), twin=SOUND),
+    case("broken_variants.py:RL011BreaksDown", ("RL011", ERROR), twin="broken_variants.py:RL011NeedsItsEvents"),
+    case("broken_variants.py:RL013Misspelled", ("RL013", "warning"), twin=SOUND),
+    case("broken_variants.py:RL012WrongKey", ("RL012", ERROR), twin=SOUND),
+    case("broken_variants.py:RL012WrongParameter", ("RL012", ERROR), twin=SOUND),
+    case("broken_variants.py:RL012WrongEvent", ("RL012", ERROR), twin=SOUND),
+    case("broken_variants.py:RL012OtherSpaces", ("RL012", ERROR), twin=SOUND),
 ]
 
 
@@ -27,13 +27,21 @@ def test_finds_the_mistake_and_only_that(case):
 @pytest.mark.parametrize(
     ("name", "rule", "message"),
     [
-        ("WrongBody", "RL011", "with randomize=true: events.mass: no body 'amr'. Did you mean 'arm'? "),
-        ("OwnChance", "RL011", "with randomize=true: equal seeds and actions give unequal episodes"),
-        ("BreaksDown", "RL011", "with randomize=true: RuntimeError: a gear broke (tests/checking/broken_variants.py:"),
-        ("WrongKey", "RL012", "stages: stage 1: no key 'taks'. Did you mean 'task'?"),
-        ("WrongParameter", "RL012", "stage 1 of 2: task.tolerence: WrongParameter has no parameter 'tolerence'."),
-        ("WrongEvent", "RL012", "stage 2 of 2: events: this task has no event 'masss'. Did you mean 'mass'?"),
-        ("OtherSpaces", "RL012", "stage 2 of 2: its observation space is Box"),
+        ("RL011WrongBody", "RL011", "with randomize=true: events.mass: no body 'amr'. Did you mean 'arm'? "),
+        ("RL011OwnChance", "RL011", "with randomize=true: equal seeds and actions give unequal episodes"),
+        (
+            "RL011BreaksDown",
+            "RL011",
+            "with randomize=true: RuntimeError: a gear broke (tests/checking/broken_variants.py:",
+        ),
+        ("RL012WrongKey", "RL012", "stages: stage 1: no key 'taks'. Did you mean 'task'?"),
+        (
+            "RL012WrongParameter",
+            "RL012",
+            "stage 1 of 2: task.tolerence: RL012WrongParameter has no parameter 'tolerence'.",
+        ),
+        ("RL012WrongEvent", "RL012", "stage 2 of 2: events: this task has no event 'masss'. Did you mean 'mass'?"),
+        ("RL012OtherSpaces", "RL012", "stage 2 of 2: its observation space is Box"),
     ],
 )
 def test_what_is_wrong_is_named(name, rule, message):
@@ -42,14 +50,14 @@ def test_what_is_wrong_is_named(name, rule, message):
 
 
 def test_names_that_have_no_effect_are_found():
-    assert {finding.message for finding in findings("broken_variants.py:Misspelled", "RL013")} == {
-        "nothing uses Misspelled.episode_seconds. Did you mean 'episode_s'?",
-        "nothing uses Misspelled.is_terminate. Did you mean 'is_terminated'?",
+    assert {finding.message for finding in findings("broken_variants.py:RL013Misspelled", "RL013")} == {
+        "nothing uses RL013Misspelled.episode_seconds. Did you mean 'episode_s'?",
+        "nothing uses RL013Misspelled.is_terminate. Did you mean 'is_terminated'?",
     }
 
 
 def test_a_task_that_randomises_is_judged_so(rlctl):
-    task = f"{FOLDER}/broken_variants.py:BreaksDown"
+    task = f"{FOLDER}/broken_variants.py:RL011BreaksDown"
     done = rlctl("check-env", task, "--select", "RL011,RL301", "--set", "randomize=true")
     assert "not judged: RL011: the task raises with and without its events (RL2)" in done.stdout
     assert "not judged: RL301: the episode failed (RL201, RL207)" in done.stdout

@@ -54,7 +54,9 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
         yield from judges_actions.judge(shown)
 
 
-def _play_first_actions(trials: Trials, dimensions: Sequence[ActionNumber]) -> tuple[list[Changes], list[Changes]]:
+def _play_first_actions(
+    trials: Trials, dimensions: Sequence[ActionNumber]
+) -> tuple[Sequence[Changes], Sequence[Changes]]:
     """Return what changes with the first action: from none to one end of its range, and from one end to the other."""
     pairs, opposites = [], []
     for seed in (FIRST_SEED, SECOND_SEED, SECOND_SEED + 1):

@@ -26,9 +26,9 @@ def record_starts(context: Context) -> Iterator[ChildMessage]:
             yield Skipped("starts", f"only {number} of {STARTS} starts were made: {why}")
             return
         episode = EpisodePlayer(context.instance, FIRST + number, "zero", number=number, max_steps=START_STEPS)
-        recorded = Recording("starts", episode).run()
-        yield from recorded
-        if played_on < ENOUGH and succeeds_and_goes_on(recorded[0]):
+        recording = Recording("starts", episode)
+        yield from recording.run()
+        if played_on < ENOUGH and succeeds_and_goes_on(recording.trajectory):
             played_on += 1
             again = EpisodePlayer(context.instance, FIRST + number, "zero", number=number, max_steps=WHOLE_STEPS)
             yield from Recording(WHOLE, again).run()

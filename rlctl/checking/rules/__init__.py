@@ -22,8 +22,8 @@ finding; `yield Skipped(RULE.id, why)` in an experiment applies to one. An exper
 caught, and hangs and crashes can be located. `context.budget` limits time and memory. An experiment that records
 episodes yields what `Recording.run()` returns. A finding has its own severity or fix only if they differ.
 
-Write an environment that makes the mistake and one that does not in `tests/checking/`, and then the rule's page:
-`python docs/make_rules.py --run RL1xx`.
+Write a class that makes the mistake, `RL1xxSomeName`, and one that does not in `tests/checking/`, a `case` of both, and
+then the rule's page: `python docs/make_rules.py --run RL1xx`.
 '''
 
 import importlib

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiment import PROBE, judges_records
 from rlctl.checking.instance import display_error
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
@@ -24,6 +24,6 @@ RULE = Rule(
 def _find_end_while_loading(records: Records) -> Iterator[RuleFinding]:
     if records.built is None:
         for failure in records.failures:
-            if failure.process == "probe" and failure.call in ("load", "build") and not display_error(failure):
+            if failure.process == PROBE and failure.call in ("load", "build") and not display_error(failure):
                 evidence = {"last_output": failure.details} if failure.details else {}
                 yield RuleFinding(RULE, failure.message, evidence)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiment import PROBE, judges_records
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -24,7 +24,7 @@ RULE = Rule(
 @judges_records(RULE, "instances")
 def _find_single_instance(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
-        if failure.call in ("load", "build") and failure.process != "probe":
+        if failure.call in ("load", "build") and failure.process != PROBE:
             where = "in one process" if failure.phase in ("fresh instance", "interleaved") else "in a second process"
             yield RuleFinding(RULE, f"a second instance {where} cannot be built: {failure.error}", failure.place)
             return

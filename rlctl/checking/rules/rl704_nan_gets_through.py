@@ -25,7 +25,7 @@ RULE = Rule(
     fix="Refuse such an action in step: if not np.isfinite(action).all(): raise ValueError(...).",
 )
 
-NAN_STEPS = 4  # Of episodes whose first action is changed, or NaN
+NAN_STEPS = 4  # Of an episode whose first action is NaN
 
 
 @experiment("nan action", INSTANCES, 80, RULE, share=0.2)

@@ -27,7 +27,7 @@ RULE = Rule(
 )
 
 FEWEST_OVERLAPS = 2  # resets that put something into something else
-LASTING_SOFT = 10  # the same for contacts of MuJoCo, which are soft by design, if they begin after a reset
+LASTING_SOFT = 10  # [steps]; contacts of MuJoCo are soft by design, if they begin after a reset
 
 
 @judges_logs(RULE)

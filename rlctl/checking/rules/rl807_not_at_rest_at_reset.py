@@ -24,11 +24,6 @@ RULE = Rule(
 FASTEST_JUMP = 1.0  # above falling, 0.1 s after a reset: ten times gravity [m/s]
 
 
-def find_thrown(world: LoggedWorld) -> dict[str, Jump]:
-    """Return how bodies that are not at rest after a reset move, by the name of the body."""
-    return {jump.body: jump for jump in reversed(world.jumps) if jump.speed > jump.explained + FASTEST_JUMP}
-
-
 @judges_logs(RULE)
 def _find_unrest(world: LoggedWorld) -> Iterator[RuleFinding]:
     for jump in find_thrown(world).values():
@@ -36,3 +31,8 @@ def _find_unrest(world: LoggedWorld) -> Iterator[RuleFinding]:
         message = f"{moves}; falling explains {jump.explained:.2f} m/s"
         evidence = {"seed": jump.seed, "body": jump.body, "value": jump.speed, "expected": jump.explained}
         yield RuleFinding(RULE, message, evidence)
+
+
+def find_thrown(world: LoggedWorld) -> dict[str, Jump]:
+    """Return how bodies that are not at rest after a reset move, by the name of the body."""
+    return {jump.body: jump for jump in reversed(world.jumps) if jump.speed > jump.explained + FASTEST_JUMP}

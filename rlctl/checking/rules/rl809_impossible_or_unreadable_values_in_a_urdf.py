@@ -37,10 +37,10 @@ def _find_faults_of_models(env: Any) -> Iterator[ChildMessage]:
     if not is_task(env):
         yield Skipped(RULE.id, "only the model files of tasks of rlctl are known", applies=False)
         return
-    from rlctl.task.model_faults import _find_faults_of_models, find_frames
+    from rlctl.task.model_faults import find_frames, find_model_faults
 
     for body in env.unwrapped.sim.bodies.values():
-        for fault in _find_faults_of_models(body):
+        for fault in find_model_faults(body):
             yield RuleFinding(RULE, fault.rstrip("."))
         if frames := find_frames(body):
             yield RuleFinding(RULE, frames, severity=Severity.INFO)

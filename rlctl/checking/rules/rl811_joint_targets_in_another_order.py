@@ -42,7 +42,7 @@ MOVES = (0.01, 0.3, -0.3, 1.0, -1.0, 2.0, -2.0)
 """By so much a joint is moved [rad], [m], or its speed changed [rad/s], [m/s]: by more, where a command
 that is clipped does not answer."""
 FEWEST_JOINTS = 3
-NEAR = 0.05  # of sorted targets and positions; of a target and its own joint's position [rad], [m]
+NEAR = 0.05  # of sorted targets and positions [rad], [m]
 
 
 @judges_worlds(RULE)
