@@ -151,7 +151,7 @@ class RL409Logs(Point):
         return super().rewards(action)
 
 
-class RL409CachesAndForgetsTheSeed(Point):
+class CachesAndForgetsTheSeed(Point):
     """The error is computed anew in each step, and the goals are not drawn from the seed."""
 
     rlctl_ignore = {"RL301": "it is what the test is about", "RL308": "a consequence"}

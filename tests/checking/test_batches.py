@@ -79,7 +79,7 @@ def test_the_message_names_what_is_wrong(name, rule, message):
 def test_kept_values_are_not_judged_where_the_seed_does_not_determine_an_episode():
     from tests.checking.judging import verdict_of
 
-    verdict = verdict_of(f"{FILE}:RL409CachesAndForgetsTheSeed", "RL409")
+    verdict = verdict_of(f"{FILE}:CachesAndForgetsTheSeed", "RL409")
     assert "differs from its repetition" in verdict.not_judged["RL409"]
 
 
