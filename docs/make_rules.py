@@ -72,7 +72,7 @@ def run_cases(rules: Sequence[str]) -> dict[str, str]:
         for finding in verdict.findings:
             if finding.rule == rule and rule not in printed:
                 lines = [f"{finding.severity} {rule}  {finding.name}", f"  {finding.message}"]
-                text = "\n".join(lines).replace(f"{TESTS}/", "")
+                text = "\n".join(lines).replace(f"{TESTS}/", "").replace(f"{TESTS.relative_to(ROOT)}/", "")
                 printed[rule] = text.replace(str(Path.cwd()), "FOLDER") + "\n"
     return printed
 

@@ -327,7 +327,7 @@ def test_a_file_belongs_to_the_format_before_it(arguments, pairs):
 
 @pytest.mark.parametrize(("rule", "is_example"), [("RL816", True), ("RL301", True), ("RL115", False), ("RL818", False)])
 def test_a_baseline_knows_a_finding_whichever_element_it_shows(broken, rule, is_example):
-    one, other = (broken.fingerprint(RuleFinding(rule, "", {"element": f"action[{i}]"})) for i in range(2))
+    one, other = (broken.fingerprint(RuleFinding(RULES[rule], "", {"element": f"action[{i}]"})) for i in range(2))
     assert (one == other) is is_example
 
 
