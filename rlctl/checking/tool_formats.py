@@ -18,7 +18,7 @@ from rlctl.checking.rules import FAMILIES, RULES
 from rlctl.checking.speed import Speed
 from rlctl.environments.leaves import Leaf, name_leaf
 from rlctl.errors import ArtifactError
-from rlctl.storage import files
+from rlctl.storage import files, sarif
 from rlctl.version import __version__
 
 SCHEMA = Path(__file__).with_name("report.schema.json")
@@ -167,10 +167,7 @@ def _row(name: str, leaf: Leaf, part: slice, values: list[NDArray[np.float64]]) 
 
 
 def to_sarif(report: CheckReport) -> str:
-    """Return a report as SARIF, which code scanning services read.
-
-    Format: OASIS, "Static Analysis Results Interchange Format (SARIF) Version 2.1.0".
-    """
+    """Return a report as SARIF, which code scanning services read."""
     verdict, built = report.verdict, report.records.built
     known = {finding.rule for finding in (*verdict.findings, *verdict.waived, *verdict.known)}
     rules = [rule for rule in RULES if rule in known]
@@ -191,7 +188,7 @@ def to_sarif(report: CheckReport) -> str:
         "originalUriBaseIds": {"SRCROOT": {"uri": Path.cwd().as_uri() + "/"}},
         "results": results,
     }
-    return _dump({"$schema": "https://json.schemastore.org/sarif-2.1.0.json", "version": "2.1.0", "runs": [run]})
+    return _dump(sarif.make_log(run))
 
 
 def _describe_rule(id: str) -> dict[str, Any]:

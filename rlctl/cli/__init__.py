@@ -186,7 +186,7 @@ def _call(arguments: list[str]) -> int:
 
 
 def _present_failure(arguments: list[str], error: RlctlError) -> None:
-    """Write the error to the targets of `--json` and `--junit`: their reader must not find those of an earlier call."""
+    """Write the error to the targets of `--json` and the like: their reader must not find those of an earlier call."""
     if (target := _find_value(arguments, "--json")) is not None:
         from rlctl import output
 
@@ -198,6 +198,16 @@ def _present_failure(arguments: list[str], error: RlctlError) -> None:
         case = junit.Case(f"rlctl {arguments[0]}", "error", [junit.CaseEntry("error", message=str(error))])
         with contextlib.suppress(RlctlError, OSError):
             junit.write(Path(target), [junit.Suite(f"rlctl {arguments[0]}", 0.0, [case])])
+    if (target := _find_value(arguments, "--markdown")) is not None:
+        from rlctl.storage import files
+
+        with contextlib.suppress(RlctlError, OSError):
+            files.write_result(Path(target), f"**rlctl {arguments[0]} failed**: {error}\n".encode())
+    if (target := _find_value(arguments, "--sarif")) is not None:
+        from rlctl.storage import sarif
+
+        with contextlib.suppress(RlctlError, OSError):
+            sarif.write_failure(Path(target), str(error))
 
 
 def _find_value(arguments: list[str], option: str) -> str | None:

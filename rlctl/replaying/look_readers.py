@@ -200,9 +200,9 @@ class MujocoWorldReader:
         return name, _strength(float(body.joint_max_force[index])), _strength(float(body.joint_max_speed[index]))
 
     def read_poses(self) -> Mapping[str, Pose]:
-        """Return the poses of the bodies that are not fixed, by name."""
+        """Return the poses of the bodies that are not fixed, by name: of their centres of mass, as in PyBullet."""
         data = self._data
-        poses = {self._names[root]: (data.xpos[body], data.xquat[body]) for root, (body, _) in self._trunks.items()}
+        poses = {self._names[root]: (data.xipos[body], data.xquat[body]) for root, (body, _) in self._trunks.items()}
         return {name: Pose(position.copy(), turn[[1, 2, 3, 0]]) for name, (position, turn) in poses.items()}
 
     def read_touches(self) -> Iterator[Touch]:

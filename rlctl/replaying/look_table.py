@@ -7,6 +7,7 @@ from rlctl.replaying.look import TIPPED, Contact, JointSummary, Motion, WorldSum
 
 _SHOWN_CONTACTS = 16
 _DEEP = 1e-4  # [m]; smaller overlaps are those of any contact
+_UPRIGHT = 10.0  # [degrees]; what tilts further may be about to fall
 _WIDE = 100.0  # larger limits are written in few digits
 
 
@@ -83,7 +84,12 @@ def list_findings(world: WorldSummary) -> Iterator[str]:
     falls = [line for motion in world.motions if (line := _describe_fall(motion, world.dt))]
     yield from falls
     if world.motions and not falls:
-        yield "nothing falls"
+        furthest = max(world.motions, key=lambda motion: motion.tilt)
+        if furthest.tilt < _UPRIGHT:
+            yield "nothing falls"
+        else:
+            tilts = f"{furthest.body} tilts by {furthest.tilt:.0f}"
+            yield f"nothing drops by a fifth or tips by {TIPPED:.0f} degrees; {tilts}"
 
 
 def _describe_fall(motion: Motion, dt: float | None) -> str:

@@ -5,6 +5,7 @@ given, and the closest name.
 """
 
 import dataclasses
+import difflib
 import json
 import numbers
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,6 +22,7 @@ _Model = TypeVar("_Model", bound=pydantic.BaseModel)
 Place = tuple[str | int, ...]  # keys and indices that lead to a value
 _MOST_LINES = 3
 _ANY = "any value"
+_CLOSE = 0.7  # how alike a key is to the one that is meant, as `difflib` has it
 
 
 class Section(pydantic.BaseModel, extra="forbid", frozen=True, use_attribute_docstrings=True):
@@ -137,6 +139,15 @@ def _locate(problem: Any, root: Schema) -> Place:
     return path if problem["type"] == "extra_forbidden" else path[: _descend(root, path)[1]]
 
 
+def _suggest(name: str, keys: Sequence[str], root: Schema, path: Sequence[str | int], otherwise: str) -> str:
+    """Return the closest key here, or the closest one inside of a key here: `gama` means `algo_kwargs.gamma`."""
+    if difflib.get_close_matches(name, keys, n=1, cutoff=_CLOSE):
+        return did_you_mean(name, keys)
+    nested = {inner: f"{key}.{inner}" for key in keys for inner in list_keys(root, find_schema(root, [*path, key]))}
+    closest = difflib.get_close_matches(name, nested, n=1, cutoff=_CLOSE)
+    return f" Did you mean {nested[closest[0]]!r}?" if closest else did_you_mean(name, keys, otherwise)
+
+
 def explain(
     problem: Any,
     path: Sequence[str | int],
@@ -156,7 +167,7 @@ def explain(
         keys = list_keys(root, find_schema(root, path[:-1]))
         name, outer = path[-1], (find_schema(root, [*path[:-1], key_here]) for key_here in keys)
         inner = [f"{parent}.{name}" for parent, node in zip(keys, outer, strict=True) if name in list_keys(root, node)]
-        hint = f" Did you mean {inner[0]!r}?" if inner else did_you_mean(str(name), keys, otherwise)
+        hint = f" Did you mean {inner[0]!r}?" if inner else _suggest(str(name), keys, root, path[:-1], otherwise)
         return f"no key {key!r}{of}.{hint} Keys here: {', '.join(keys)}."
     label = f"{key}: " if key else ""
     if problem["type"] == "value_error":  # raised by a validator of rlctl

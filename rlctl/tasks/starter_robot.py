@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rlctl.tasks.arms import ArmModel, Tip
 
 _PLANAR_ARM = Path(__file__).with_name("arm.urdf")
+_SUSPICIOUS = 3  # so many joints with the same number for effort and speed
 _FASTEST = {"rotates": 3.0, "slides": 0.5}  # [rad/s], [m/s] of a first task; models often have no useful limit
 _GUESSED_FORCE = 10.0  # [N m or N], of a joint without a limit
 _LOWEST_TIP = 0.03  # [m], above the floor, at the start
@@ -153,7 +154,13 @@ def list_faults(body: MujocoBody) -> list[str]:
     """Return what is wrong with a model's file, without a full stop; `rlctl check-env` finds it, too."""
     from rlctl.task.model_faults import find_model_faults
 
-    return [fault.rstrip(".") for fault in find_model_faults(body)]
+    faults = [fault.rstrip(".") for fault in find_model_faults(body)]
+    forces, speeds = body.joint_max_force, body.joint_max_speed
+    if len(forces) >= _SUSPICIOUS and len({*forces}) == 1 and len({*speeds}) == 1 and forces[0] == speeds[0] > 0:
+        faults.append(
+            f"All joints have an effort and a velocity of {forces[0]:g}: these may be placeholders; see the data sheet"
+        )
+    return faults
 
 
 def _describe(arm: _Arm) -> dict[str, str]:

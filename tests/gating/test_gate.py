@@ -63,11 +63,15 @@ def test_a_gate_that_could_not_say_no_is_refused(options, message):
 
 
 def test_without_a_policy_the_files_say_so(rlctl, tmp_path):
-    done = rlctl("gate", "nothing.onnx", "--min-success", 0.5, "--json", "gate.json", "--junit", "gate.xml")
+    files = ("--json", "gate.json", "--junit", "gate.xml", "--sarif", "gate.sarif", "--markdown", "gate.md")
+    done = rlctl("gate", "nothing.onnx", "--min-success", 0.5, *files)
     assert done.returncode == ArtifactError.exit_code
     assert json.loads((tmp_path / "gate.json").read_text())["exit_code"] == ArtifactError.exit_code
     (suite,) = ElementTree.fromstring((tmp_path / "gate.xml").read_text())
     assert suite.get("errors") == "1"
+    assert "no such file" in (tmp_path / "gate.md").read_text()
+    (run,) = json.loads((tmp_path / "gate.sarif").read_text())["runs"]
+    assert run["invocations"][0]["executionSuccessful"] is False
 
 
 @pytest.mark.slow

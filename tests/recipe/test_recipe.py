@@ -136,6 +136,7 @@ def test_a_resolved_recipe_is_a_config(packaged, config):
         ({"alog": "ppo"}, "no key 'alog'. Did you mean 'algo'? Keys here: task, reward_weights, "),
         ({"tolerance": 0.02}, "no key 'tolerance'. Did you mean 'task.tolerance'? Keys here: task, "),
         ({"gamma": 0.9}, "no key 'gamma'. Did you mean 'algo_kwargs.gamma'? Keys here: task, "),
+        ({"gama": 0.9}, "no key 'gama'. Did you mean 'algo_kwargs.gamma'? Keys here: task, "),
         (
             {"eval": {"episode": 3}},
             "no key 'eval.episode'. Did you mean 'episodes'? Keys here: every_steps, episodes, seed, deterministic.",

@@ -9,6 +9,8 @@ import pytest
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import PolicyError, UsageError
 from rlctl.play.episode import load_episode
+from rlctl.replaying.look import Motion, WorldSummary
+from rlctl.replaying.look_table import list_findings
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.sources import TaskSource
@@ -203,3 +205,10 @@ def test_it_imports_neither_torch_nor_scipy(tmp_path):
     command = [sys.executable, "-c", textwrap.dedent(code)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.stderr == "0 []\n"
+
+
+@pytest.mark.parametrize(("tilt", "line"), [(2.0, "nothing falls"), (43.0, "robot tilts by 43")])
+def test_what_tilts_far_is_not_said_to_stand(tilt, line):
+    motion = Motion("robot", 0.2, 0.18, 0.2, 0.18, tilt, None, None, None)
+    (_, last) = list_findings(WorldSummary(0, [], [], [motion], 0.02))
+    assert last.endswith(line)

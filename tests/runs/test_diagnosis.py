@@ -115,6 +115,12 @@ def test_healthy_training_has_no_finding(write_training):
     assert diagnose(write_training(episodes=[make_episode(SMOOTH)])) == []
 
 
+def test_a_reward_that_is_hardly_ever_paid_is_not_constant(write_training):
+    # As of a kernel that is far too narrow: only costs are there.
+    costly = make_episode(SMOOTH, terms=np.column_stack([np.full(100, 1e-9), -1.0 + 0.1 * SMOOTH[:, 0]]))
+    assert "Q1" not in ids(write_training(STANDING, episodes=[costly]))
+
+
 def test_training_that_is_still_flat_at_a_third_has_no_finding(write_training):
     run = write_training({**FLAT, "explained_variance": 0.0}, recipe={"total_timesteps": 90_000}, status="running")
     assert diagnose(run) == []

@@ -13,7 +13,7 @@ import aiohttp
 import pydantic
 from aiohttp import web
 
-from rlctl.errors import UsageError
+from rlctl.errors import UsageError, check_name
 from rlctl_robot.play.controls import Controls, PageMessage
 from rlctl_robot.serve.access import find_problem, is_websocket
 
@@ -30,6 +30,7 @@ class PageServer:
         self._port, self._controls = port, controls
         self._page = (Path(__file__).parent / "page.html").read_text("utf-8")
         self._description = self._frame = "{}"
+        self._commands: list[str] = []  # names of those that the page may set
         self._news: set[asyncio.Event] = set()  # one per page that is open
         self._loop = asyncio.new_event_loop()
         self._end = asyncio.Event()
@@ -49,6 +50,7 @@ class PageServer:
     def describe(self, description: dict[str, Any]) -> None:
         """Show another episode: what stays the same in its frames."""
         self._description = json.dumps(description, allow_nan=False)
+        self._commands = list(description["commands"])
 
     def show(self, frame: dict[str, Any]) -> None:
         """Show a frame; a page that is too slow gets the newest only."""
@@ -118,7 +120,12 @@ class PageServer:
     def _read(self, text: str) -> str:
         """Read a message of the page; return what is wrong with it, or nothing."""
         try:
-            self._controls.apply(PageMessage.model_validate_json(text))
+            message = PageMessage.model_validate_json(text)
+            for name in message.commands or ():
+                check_name(name, self._commands, "commands: no command", UsageError, listed="There is")
+            self._controls.apply(message)
+        except UsageError as error:
+            return str(error)
         except pydantic.ValidationError as error:
             problem = error.errors()[0]
             key = ".".join(str(part) for part in problem["loc"])

@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 
 _LEAST_STEPS = 20
 _EVERY_STEP = 0.8  # fraction of the steps; white noise reverses in 0.67, the shipped policies in 0.6
+_LEAST_PAID = 0.02  # of all rewards and penalties
 _LEAST_CHANGE = 0.1  # of half the action range, from step to step
 _MOST_SPEED = {"m/s": 50.0, "rad/s": 300.0}  # no joint or body of a robot is faster: 300 rad/s are 2,900 turns a minute
 _MOST_POSITION_SPEED = 50.0  # [m/s]
@@ -103,7 +104,9 @@ def _constant_share(episode: RecordedEpisode, weights: dict[str, float]) -> floa
     positive = np.maximum(inner, 0).sum(axis=0)
     constant = inner.std(axis=0) <= 0.05 * np.abs(inner.mean(axis=0))
     total = float(positive.sum())
-    return float(positive[constant].sum()) / total if total > 0 else None
+    if total <= _LEAST_PAID * float(np.abs(inner).sum()):  # hardly anything is paid: its parts say nothing
+        return None
+    return float(positive[constant].sum()) / total
 
 
 def impossible_motion(run: RunHistory) -> str | None:

@@ -95,11 +95,16 @@ def test_what_was_recorded_before_an_error_is_written(tmp_path):
         ('{"speed": 100}', "speed: Input should be less than or equal to 2"),
         ('{"commands": {"lin_vel_x": NaN}}', "commands.lin_vel_x: Input should be a finite number"),
         ('{"comands": {}}', "comands: Extra inputs are not permitted"),
+        (
+            '{"commands": {"lin_vel_q": 1}}',
+            "commands: no command 'lin_vel_q'. Did you mean 'lin_vel_x'? There is: lin_vel_x.",
+        ),
         ("[", "Invalid JSON: EOF while parsing a list at line 1 column 1"),
     ],
 )
 def test_what_the_page_cannot_ask_for(message, problem):
     server = PageServer(0, Controls())
+    server.describe({"commands": {"lin_vel_x": {}}})
     assert server._read(message) == problem
 
 
