@@ -40,7 +40,7 @@ class AuditReport:
         if not ranking.wanted:
             return f"ranking alone: {ranking.why_alone}"
         if not ranking.beaten:
-            return f"nobody earns as much as {ranking.wanted}{ranking.describe_next()}"
+            return f"nobody earns as much as {ranking.wanted}{ranking.next_best}"
         return ranking.beaten[0].describe()
 
 

@@ -83,17 +83,7 @@ class Ranking:
     why_alone: str  # why there is none
     beaten: Sequence[Beaten]  # the one to name first
     learned: str = ""  # what the policy of a run has learned, as a sentence
-
-    def describe_next(self) -> str:
-        """Return who comes nearest to what is wanted: `; next is standing still with 40 %`; empty for nobody."""
-        best = next((row for row in self.rows if row.name == self.wanted), None)
-        others = [row for row in self.rows if row.kind in (Kind.idle, Kind.part) and not row.succeeds]
-        if best is None or not others:
-            return ""
-        following = others[0]
-        if best.mean_return > 0 and following.mean_return > 0:
-            return f"; next is {following.name} with {100 * following.mean_return / best.mean_return:.0f} %"
-        return f"; next is {following.name} ({following.mean_return:.4g} against {best.mean_return:.4g})"
+    next_best: str = ""  # who comes nearest to what is wanted, as part of a sentence
 
 
 KINDS = {one.name: one.kind for one in (*WANTED, *OTHERS)} | {SHIPPED: Kind.wanted, LEARNED: Kind.learned}
@@ -118,7 +108,18 @@ def rank(played: Sequence[PlayedEpisode], has_success: bool) -> Ranking:
             found = _compare(played, row, best if row.name in MOVED else wanted)
             beaten += [] if found is None else [found]
     why = "" if wanted else _explain_absence(rows, has_success)
-    return Ranking(ordered, wanted, why, _order(beaten), _describe_learned(rows, wanted))
+    others = [row for row in ordered if row.kind in (Kind.idle, Kind.part) and not row.succeeds]
+    if acting and not moved:  # without effort they would seem nearer than they are
+        others = [row for row in others if row.name not in MOVED]
+    following = _describe_next(rows[wanted], others[0]) if wanted and others else ""
+    return Ranking(ordered, wanted, why, _order(beaten), _describe_learned(rows, wanted), following)
+
+
+def _describe_next(best: MeanScore, row: MeanScore) -> str:
+    """Return `; next is standing still with 40 %`."""
+    if best.mean_return > 0 and row.mean_return > 0:
+        return f"; next is {row.name} with {100 * row.mean_return / best.mean_return:.0f} %"
+    return f"; next is {row.name} ({row.mean_return:.4g} against {best.mean_return:.4g})"
 
 
 def _select(played: Sequence[PlayedEpisode], name: str, seeds: set[int] | None = None) -> list[PlayedEpisode]:

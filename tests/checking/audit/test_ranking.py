@@ -124,6 +124,9 @@ def test_costs_that_who_is_held_saves_do_not_count():
     # A statue takes no torque: without the 400 that it saves it earns 600 of 1,000.
     shipped = episode("the shipped policy", {"alive": 1000.0, "progress": 400.0, "torque": -400.0}, success=True)
     statue = episode(STANDING, {"alive": 1000.0, "progress": 0.0, "torque": 0.0})
-    assert not judge(shipped, statue).beaten
+    weak = episode("trembling", {"alive": 140.0, "progress": 0.0, "torque": 0.0})
+    sound = judge(shipped, statue, weak)
+    assert not sound.beaten
+    assert sound.next_best == "; next is trembling with 14 %"
     nothing = episode("doing nothing", {"alive": 1000.0, "progress": 0.0, "torque": 0.0})
     assert judge(shipped, nothing).beaten[0].competitor == "doing nothing"
