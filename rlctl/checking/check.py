@@ -186,7 +186,7 @@ def check(
     needed = {"build"} | {name for name in find_needs(rules) if only is None or name in only}
     wanted = {process: [n for n in names if n in needed] for process, names in PROCESSES.items()}
     supervisor = Supervisor(spec, budget_s, env_timeout_s, records.add, most_growth)
-    with _status(spec.task, show_progress) as say:
+    with show_status(f"checking {spec.task}", show_progress) as say:
         supervisor.run({process: names for process, names in wanted.items() if names}, say)
     records.printed_lines, records.printed_first = supervisor.children[0].printed, supervisor.children[0].first_line
     return CheckReport(spec.task, judge(records, rules), records, time.monotonic() - started, budget_s, strict)
@@ -200,11 +200,12 @@ def _normalizes(task: str, what: str) -> bool:
 
 
 @contextlib.contextmanager
-def _status(task: str, wanted: bool) -> Iterator[Callable[[str], None]]:
+def show_status(what: str, wanted: bool) -> Iterator[Callable[[str], None]]:
+    """Show on a terminal what is done (`checking reach`); yields a function that takes the phase."""
     console = output.err()
-    status = console.status(f"checking {task}")
+    status = console.status(what)
     with status if wanted and console.is_terminal else contextlib.nullcontext():
-        yield lambda phase: status.update(f"checking {task}: {phase}")
+        yield lambda phase: status.update(f"{what}: {phase}")
 
 
 def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> CheckVerdict:

@@ -11,6 +11,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
+from typing import Any
 
 from gymnasium import spaces
 
@@ -51,15 +52,16 @@ def run(
     seconds: float,
     progress: CallProgress | None = None,
     most_growth: float = 1.0,
+    known: Mapping[str, Experiment] = EXPERIMENTS,
 ) -> Iterator[ChildMessage]:
     """Yield the messages of some experiments of one process, which may take so many seconds together.
 
-    A slow environment may take up to `most_growth` times as long.
+    A slow environment may take up to `most_growth` times as long. `known` has the experiments by name.
     """
     context = Context(spec, progress)
     context.seconds, context.most_growth = seconds, most_growth
     try:
-        for message in _run_all(context, [EXPERIMENTS[name] for name in experiments], seconds):
+        for message in _run_all(context, [known[name] for name in experiments], seconds):
             yield dataclasses.replace(message, process=process) if isinstance(message, CallFailure) else message
     except UsageError as error:
         yield Mistake(str(error))
@@ -132,11 +134,25 @@ FIRST_CALLS = 3.0  # So many times longer than others the first reset or step ma
 IDLE_TIMEOUT_S = 300.0  # outside of the environment: loading libraries [s]
 
 
+@dataclasses.dataclass(frozen=True)
+class ChildMain:
+    """The function that runs in the child processes; it takes the arguments of `main`, and `options`."""
+
+    function: str = "rlctl.checking.children:main"
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
 class Child:
     """A process of the check, watched."""
 
     def __init__(
-        self, name: str, spec: EnvSpec, experiments: Sequence[str], seconds: float, most_growth: float
+        self,
+        name: str,
+        spec: EnvSpec,
+        experiments: Sequence[str],
+        seconds: float,
+        most_growth: float,
+        main: ChildMain,
     ) -> None:
         self.name = name
         self.experiments = list(experiments)  # Those that it has not finished; the first is running
@@ -149,12 +165,12 @@ class Child:
         self._readers = LineReader(functools.partial(self._keep, counts=True)), LineReader(self._keep)
         arguments = {"process": name, "spec": spec, "experiments": self.experiments}
         self.process = ChildProcess(
-            "rlctl.checking.children:main",
-            {**arguments, "seconds": seconds, "most_growth": most_growth, "memory": self._memory},
+            main.function,
+            {**arguments, "seconds": seconds, "most_growth": most_growth, "memory": self._memory, **main.options},
             stdout=self._readers[0].descriptor,
             stderr=self._readers[1].descriptor,
             pass_fds=[self._memory],
-            env={"PYTHONHASHSEED": str(HASH_SEEDS[name])},
+            env={"PYTHONHASHSEED": str(HASH_SEEDS.get(name, 0))},
         )
         for reader in self._readers:
             reader.close_descriptor()
@@ -204,8 +220,9 @@ class Supervisor:
         env_timeout_s: float,
         receive: Callable[[ChildMessage], None],
         most_growth: float = 1.0,
+        main: ChildMain = ChildMain(),
     ) -> None:
-        self._most_growth = most_growth
+        self._most_growth, self._main = most_growth, main
         self._spec, self._budget_s, self._env_timeout_s, self._receive = spec, budget_s, env_timeout_s, receive
         self._waiting: dict[str, Sequence[str]] = {}
         self._active: dict[Connection, Child] = {}
@@ -238,7 +255,8 @@ class Supervisor:
     def _start(self) -> None:
         while self._waiting and len(self._active) < (2 if self._has_built else 1):
             name = next(iter(self._waiting))
-            child = Child(name, self._spec, self._waiting.pop(name), self._budget_s, self._most_growth)
+            experiments = self._waiting.pop(name)
+            child = Child(name, self._spec, experiments, self._budget_s, self._most_growth, self._main)
             self.children.append(child)
             self._active[child.process.connection] = child
 

@@ -12,6 +12,7 @@ from rlctl.errors import UsageError
 from rlctl.options import (
     TASK_FORMS,
     Argument,
+    EnvTimeout,
     EpisodeSeed,
     Json,
     Junit,
@@ -58,12 +59,23 @@ def list_runs(
 
 @app.command("show")
 @command
-def show_run(run: RunName = None, json: Json = None) -> None:
+def show_run(
+    run: RunName = None,
+    json: Json = None,
+    audit: Annotated[
+        bool, Option("First play its policy against scripted competitors: what has it learned?", ("--audit",))
+    ] = False,
+    env_timeout: EnvTimeout = 10.0,
+) -> None:
     """Show a run: its recipe, curve, evaluations, warnings and files."""
     from rlctl.runs.lookup import find_run
+    from rlctl.runs.report.audited import audit_run
     from rlctl.runs.report.show import RunDescription, show
 
-    show(RunDescription(find_run(run)), json)
+    found = find_run(run)
+    if audit:
+        audit_run(found, env_timeout_s=env_timeout)
+    show(RunDescription(found), json)
 
 
 @app.command("report")

@@ -3,7 +3,7 @@
 import enum
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperCommand
@@ -11,6 +11,9 @@ from typer.core import TyperCommand
 from rlctl.arguments import command, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.options import Argument, Config, EnvTimeout, Json, Option, OptionalTask, Settings, SimOption, TaskName
+
+if TYPE_CHECKING:
+    from rlctl.environments.spec import EnvSpec
 
 ReportFormat = enum.StrEnum("ReportFormat", ["text", "json", "sarif", "junit", "github"])
 
@@ -40,7 +43,7 @@ def _fill_targets(arguments: Iterable[str]) -> Iterator[str]:
         "Options": ["settings", "sim", "env_timeout", "budget"],
         "Rules": ["select", "ignore", "strict", "baseline"],
         "Output": ["form", "output", "json"],
-        "Instead of a check": ["list_rules", "explain"],
+        "Instead of a check": ["audit", "list_rules", "explain"],
     }
 )
 def check_env(
@@ -76,9 +79,12 @@ def check_env(
         Option(
             "Computing time in seconds of each process of the check.",
             min=1,
-            default_text="18, and up to 90 for slow environments",
+            default_text="18, and up to 90 for slow environments; of --audit 45",
         ),
     ] = None,
+    audit: Annotated[
+        bool, Option("Who earns most? Standing still, falling, ... play against what the task wants.", ("--audit",))
+    ] = False,
     list_rules: Annotated[bool, Option("List all rules and exit.", ("--list",))] = False,
     explain: Annotated[
         str | None, Option("Explain a rule, or a finding of a training, such as Q10.", metavar="RULE")
@@ -103,6 +109,8 @@ def check_env(
         return
     if task is None:
         raise UsageError("give an environment to check, e.g. rlctl check-env reach; --list and --explain need none")
+    if audit and (select or ignore or strict or form or output or baseline is not None):
+        raise UsageError("--audit judges no rules: of the other options it takes --set, --sim, --json and the times")
     if json == "-" and (form or output):
         raise UsageError("--json - prints only JSON: leave out --format and -o, or give --json a file")
     targets = formats.pair_targets(form, output)
@@ -111,6 +119,8 @@ def check_env(
         streams.print_notes([f"{task} has one environment class: {only}"])
         task = only
     spec = parse_changes(settings, sim).apply(make_spec(task))
+    if audit:
+        _audit(spec, env_timeout, budget, json)
     rules = choose_rules(select, ignore)
     report = check(spec, rules=rules, strict=strict, env_timeout_s=env_timeout, budget_s=budget)
     report.subtract(known)
@@ -121,6 +131,15 @@ def check_env(
     for name, target in targets if json != "-" else ():
         formats.show(report, name, target)
     raise typer.Exit(report.exit_code)
+
+
+def _audit(spec: "EnvSpec", env_timeout: float, budget: float | None, json: str | None) -> NoReturn:
+    from rlctl.checking.audit import report
+    from rlctl.checking.audit.audit import audit
+
+    result = audit(spec, env_timeout_s=env_timeout, budget_s=budget)
+    report.show(result, json)
+    raise typer.Exit(result.exit_code)
 
 
 app = typer.Typer()

@@ -53,6 +53,7 @@ class RunDirectory:
     evals_file = _RunPath("evals.csv")  # a row per evaluation
     printed_file = _RunPath("printed.log")  # what the environments have printed
     robustness_file = _RunPath("robustness.json")  # what `rlctl eval --vary` or `--push` measured last
+    audit_file = _RunPath("audit.json")  # what `rlctl runs show --audit` found last
     best_policy = _RunPath("policies/best.safetensors")  # the policy of the best evaluation
     last_policy = _RunPath("policies/last.safetensors")  # the policy at the end, or at the last checkpoint
     claim_file = _RunPath(".claim")  # the token of the process that may write the run

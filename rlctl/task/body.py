@@ -198,8 +198,13 @@ class Body:
         """Place the base at rest, its centre of mass at `position` [m]; `Sim.load` places its origin."""
         raise NotImplementedError
 
-    def add_velocity(self, velocity: Sequence[float]) -> None:
-        """Add to the velocity of the base [m/s], world frame; all links move with it."""
+    def add_velocity(
+        self, velocity: Sequence[float] | Array, turning: Sequence[float] | Array = (0.0, 0.0, 0.0)
+    ) -> None:
+        """Add to the velocity of the base's centre of mass [m/s] and to its angular velocity [rad/s], world frame.
+
+        All links move with it.
+        """
         self._refuse("add_velocity")
 
     def set_joints(

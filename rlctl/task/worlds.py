@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
@@ -129,6 +129,8 @@ class TaskWorlds:
         self._critic_rows = np.zeros((count, 0), np.float32)
         self.teacher: TeacherSight | None = None  # after `show_teacher`
         self._markers: dict[str, int] = {}
+        self.after_physics: Callable[[], None] | None = None
+        """Called after the physics of each step, before anything is judged: it may place bodies."""
         self.sim: Any = _make_sim(task, count, sim, render_mode, visuals=visuals)
         try:
             self._set_up(events or EventSettings(), observing, has_markers=render_mode is not None)
@@ -310,6 +312,8 @@ class TaskWorlds:
             calls.act(self._spread(acted, worlds))
             self.sim.step(worlds)
             chosen = self._spread(chosen, worlds)
+        if self.after_physics is not None:
+            self.after_physics()
         terminated = calls.is_terminated()
         gained = self.rewards(chosen)
         if is_all:

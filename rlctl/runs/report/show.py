@@ -16,10 +16,12 @@ from rlctl.runs.diagnosis.history import RunHistory
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import as_json
 from rlctl.runs.lookup import describe_source_change
+from rlctl.runs.report.audited import list_lines, read_audit
 from rlctl.runs.summary import summarize
 from rlctl.runs.tables import Rows, list_points
 
 _EVALUATIONS_SHOWN = 12
+_POOR_SUCCESS = 0.5  # below, the policy has learned something else
 _ALWAYS_SHOWN = ("steps", "success", "return")
 _PLOT_SIZE = (90, 13)  # columns and lines of a curve
 
@@ -41,6 +43,11 @@ class RunDescription(RunHistory):
                 self.robustness = robustness.read(run.robustness_file)
             except ArtifactError as error:
                 self.warnings.append(str(error))
+        self.audit: dict[str, Any] | None = None  # what `rlctl runs show --audit` found
+        try:
+            self.audit = read_audit(run)
+        except ArtifactError as error:
+            self.warnings.append(str(error))
 
 
 def _list_warnings(status: Mapping[str, Any]) -> Iterator[str]:
@@ -82,7 +89,7 @@ def show(run: RunDescription, json: str | None) -> None:
     """Print the description, or JSON alone for `-`."""
     out, summary, sizes = output.out(), run.summary, _measure_sizes(run.run)
     records = {"evaluations": run.evaluations, "metrics": run.metrics, "warnings": run.warnings}
-    measured = {"findings": run.findings, "robustness": run.robustness, "bytes": sizes}
+    measured = {"findings": run.findings, "robustness": run.robustness, "audit": run.audit, "bytes": sizes}
     if output.present({**as_json(summary), **records, **measured}, json):
         return
     title = f": {summary.task}, {summary.algo}, seed {summary.seed}: {summary.state_text}"
@@ -104,6 +111,10 @@ def show(run: RunDescription, json: str | None) -> None:
     _show_evaluations(run.evaluations)
     for line in () if run.robustness is None else describe_robustness(run.robustness):
         out.print(f"robustness: {line}")
+    for line in () if run.audit is None else list_lines(run.audit):
+        out.print(line)
+    if run.audit is None and summary.best_success is not None and summary.best_success < _POOR_SUCCESS:
+        out.print(f"what has it learned instead? rlctl runs show {summary.path} --audit")
     for finding in run.findings:
         out.print("\n".join(format_finding(finding)))
     files = "  ".join(f"{name} {format_bytes(size)}" for name, size in sizes.items())

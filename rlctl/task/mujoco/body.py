@@ -15,7 +15,7 @@ from rlctl.task.mujoco.inverse_kinematics import solve
 from rlctl.task.mujoco.motors import MujocoMotors
 from rlctl.task.mujoco.parts import Parts
 from rlctl.task.mujoco.world import Array, Rows
-from rlctl.task.rotations import rotate
+from rlctl.task.rotations import rotate, rotate_inverse
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.owner import BodyOwner
@@ -224,11 +224,17 @@ class MujocoBody(MujocoMotors):
             self._fields.data("qvel")[rows, velocity : velocity + 6] = 0.0
         self._fields.touch(worlds)
 
-    def add_velocity(self, velocity: Any) -> None:
-        if self.parts.free is not None:
-            start = self.parts.free[1]
-            self._fields.data("qvel")[..., start : start + 3] += velocity
-            self._fields.touch()
+    def add_velocity(self, velocity: Any, turning: Any = (0.0, 0.0, 0.0)) -> None:
+        if self.parts.free is None:
+            return
+        start, speeds = self.parts.free[1], self._fields.data("qvel")
+        if np.any(turning):
+            # MuJoCo has the velocity of the frame's origin, and the angular velocity in the frame of the base.
+            offset = rotate(self.base_orientation, self._fields.model("body_ipos")[..., self._base, :])
+            velocity = np.subtract(velocity, np.cross(turning, offset))
+            speeds[..., start + 3 : start + 6] += rotate_inverse(self.base_orientation, turning)
+        speeds[..., start : start + 3] += velocity
+        self._fields.touch()
 
     def set_joints(self, positions: Array, velocities: Array | None = None, *, worlds: Rows = None) -> None:
         rows: Any = ... if worlds is None else worlds

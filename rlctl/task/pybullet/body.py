@@ -215,9 +215,12 @@ class PybulletBody(Properties):
     def base_angular_velocity(self) -> Array:
         return np.array(pybullet.getBaseVelocity(self.id, physicsClientId=self.client)[1])
 
-    def add_velocity(self, velocity: Sequence[float]) -> None:
+    def add_velocity(
+        self, velocity: Sequence[float] | Array, turning: Sequence[float] | Array = (0.0, 0.0, 0.0)
+    ) -> None:
         linear, angular = pybullet.getBaseVelocity(self.id, physicsClientId=self.client)
-        pybullet.resetBaseVelocity(self.id, np.add(linear, velocity).tolist(), angular, physicsClientId=self.client)
+        new = np.add(linear, velocity).tolist(), np.add(angular, turning).tolist()
+        pybullet.resetBaseVelocity(self.id, *new, physicsClientId=self.client)
         self._cache.clear()
 
     def set_joints(self, positions: Array, velocities: Array | None = None, *, worlds: object = None) -> None:
