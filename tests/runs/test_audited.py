@@ -7,7 +7,8 @@ import pytest
 
 def test_the_last_audit_of_a_run_is_shown(write_run, rlctl):
     run = write_run("reach/a")
-    content = {"format": "rlctl check-env audit 1", "learned": "it has learned to stand (return 1)", "verdict": "alive pays it"}
+    learned = {"learned": "it has learned to stand (return 1)", "verdict": "alive pays it"}
+    content = {"format": "rlctl check-env audit 1", **learned}
     (run / "audit.json").write_text(json.dumps(content))
     shown = rlctl("runs", "show", run)
     assert "audit: it has learned to stand (return 1)\naudit: alive pays it\n" in shown.stdout
