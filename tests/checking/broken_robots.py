@@ -321,6 +321,21 @@ class RL815ArmOldHand(Arm):
         return p.getLinkState(self.robot, 3, physicsClientId=self.client)
 
 
+class RL815PusherOldCube(Pusher):
+    """How fast the cube is is read before the step."""
+
+    def put_cube(self, place):
+        super().put_cube(place)
+        self.slides = np.zeros(3)
+
+    def move(self, action):
+        self.slides = np.array(p.getBaseVelocity(self.cube, physicsClientId=self.client)[0])
+        super().move(action)
+
+    def observe(self):
+        return np.concatenate([super().observe()[:-3], self.slides]).astype(np.float32)
+
+
 class RL815CrawlerOldFoot(Crawler):
     def reward(self):
         return super().reward() - p.getLinkState(self.robot, 0, physicsClientId=self.client)[4][2]

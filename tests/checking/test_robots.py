@@ -47,6 +47,7 @@ CASES = [
     broken("RL813ArmLongPhysicsSteps", "RL813", "warning", "Arm"),
     broken("RL814ArmWeakMotors", "RL814", "warning", "Arm"),
     broken("RL815ArmOldHand", "RL815", "info", "Arm"),
+    broken("RL815PusherOldCube", "RL815", "warning", "Pusher"),
     broken("RL815CrawlerOldFoot", "RL815", "info", "RL815CrawlerFoot"),
 ]
 

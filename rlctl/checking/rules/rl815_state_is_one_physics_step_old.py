@@ -1,6 +1,6 @@
 """RL815: state is one physics step old."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,10 @@ LATE_LINK = 0.001  # [m]
 def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
     yield from _find_late_links(watched.calls)
     for world in watched.worlds:
-        yield from _find_old_elements(world)
+        old = list(_find_old_elements(world))
+        yield from old
+        if not old:
+            yield from _find_elements_of_last_look(world)
 
 
 @judges_trials(RULE, place=10)
@@ -140,12 +143,39 @@ def _find_old_elements(world: LoggedWorld) -> Iterator[RuleFinding]:
         if earlier.any() and not present.any():
             old[column] = names[int(earlier.argmax())]
     if old:
-        elements = [f"observation[{column}] ({name})" for column, name in old.items()]
-        shown = ", ".join(elements[:4]) + (f" and {len(elements) - 4} more" if len(elements) > 4 else "")
-        verb = "is" if len(elements) == 1 else "are"
-        message = f"{shown} {verb} of the state before the last step of the physics, not of the present one"
-        evidence = {"element": f"observation[{next(iter(old))}]", "elements": [f"observation[{c}]" for c in old][:8]}
-        yield RuleFinding(RULE, message, evidence, Severity.WARNING)
+        yield _describe_old(old, "before the last step of the physics, not of the present one")
+
+
+def _find_elements_of_last_look(world: LoggedWorld) -> Iterator[RuleFinding]:
+    """Yield the elements of the observation that equal the state at the observation before, whose present value is
+    nowhere in the observation: else they are a history."""
+    logs = [log for log in world.logs if len(log.observed) > FEWEST_LOOKS]
+    if not logs or len({row.size for log in logs for row in log.observed}) != 1:
+        return
+    features = [
+        np.stack([read_features(log, *look) for look in zip(log.states, log.poses, strict=True)]) for log in logs
+    ]
+    observed = np.concatenate([_center(np.nan_to_num(np.stack(log.observed[1:]).astype(np.float64))) for log in logs])
+    now, before = (np.concatenate([_center(part[window]) for part in features]) for window in (np.s_[1:], np.s_[:-1]))
+    columns = [c for c in range(min(MOST_ELEMENTS, observed.shape[1])) if observed[:, c].std() > OLD]
+    present, earlier = ({c: _equals(observed[:, c], part) for c in columns} for part in (now, before))
+    shown = np.any([*present.values()], axis=0) if columns else np.zeros(0)
+    names = name_features(logs[0])
+    old = {
+        c: names[int((earlier[c] & ~shown).argmax())]
+        for c in columns
+        if not present[c].any() and (earlier[c] & ~shown).any()
+    }
+    if old:
+        yield _describe_old(old, "before the whole step, not of the one after it")
+
+
+def _describe_old(old: Mapping[int, str], when: str) -> RuleFinding:
+    elements = [f"observation[{column}] ({name})" for column, name in old.items()]
+    verb = "is" if len(elements) == 1 else "are"
+    message = f"{list_names(elements, 4)} {verb} of the state {when}"
+    evidence = {"element": f"observation[{next(iter(old))}]", "elements": [f"observation[{c}]" for c in old][:8]}
+    return RuleFinding(RULE, message, evidence, Severity.WARNING)
 
 
 def _read_log(log: WorldLog) -> tuple[Array, Array, Array]:
