@@ -91,13 +91,13 @@ def _find_observe(instance: Instance) -> Callable[[], Any] | None:
 def _find_returned(author: Any, call: Callable[[], Moment]) -> str:
     """Return the name of the last method of the author's object, without arguments, that returns the same numbers as a
     call of reset or step; empty if there is none."""
-    returned: list[tuple[str, Numbers]] = []
+    returned: list[tuple[str, NDArray[np.float32]]] = []
 
     def watch(frame: FrameType, event: str, value: Any) -> None:
         code = frame.f_code
         has_one = code.co_argcount == 1 and not code.co_kwonlyargcount and not code.co_flags & VARIABLE_ARGUMENTS
         if event == "return" and has_one and frame.f_locals.get(code.co_varnames[0]) is author:
-            returned.append((code.co_name, flatten(value).astype(np.float64)))
+            returned.append((code.co_name, flatten(value).astype(np.float32)))
 
     earlier = sys.getprofile()
     sys.setprofile(watch)
@@ -105,7 +105,7 @@ def _find_returned(author: Any, call: Callable[[], Moment]) -> str:
         moment = call()
     finally:
         sys.setprofile(earlier)
-    observed = flatten(moment.observation).astype(np.float64)
+    observed = flatten(moment.observation).astype(np.float32)  # a method may return other floats than reset and step
     names = [name for name, numbers in returned if numbers.size and np.array_equal(numbers, observed, equal_nan=True)]
     return names[-1] if names else ""
 
