@@ -80,7 +80,7 @@ def _find_observe(instance: Instance) -> Callable[[], Any] | None:
     what they return, if there is one."""
     author = find_author(instance.env)
     if is_task(instance.env):
-        return author.observe  # type: ignore[no-any-return]
+        return author.observe
     episode = EpisodePlayer(instance, FIRST_SEED, max_steps=1)
     names = [_find_returned(author, call) for call in (episode.reset, episode.step)]
     if len(set(names)) > 1 or not names[0]:
@@ -172,7 +172,7 @@ def _accumulates(trials: Trials, look: _Look, name: str) -> bool:
 def _keep_generators(values: Sequence[Any]) -> Iterator[None]:
     """Give random generators, and those of the process, the state back that they have now."""
     states: list[tuple[Callable[[Any], None], Any]] = []
-    for value in (*values, np.random.mtrand._rand, random._inst):  # type: ignore[attr-defined]
+    for value in (*values, np.random.mtrand._rand, random._inst):
         if isinstance(value, np.random.Generator):
             states.append((functools.partial(setattr, value.bit_generator, "state"), value.bit_generator.state))
         elif isinstance(value, np.random.RandomState):
