@@ -261,3 +261,18 @@ class RL121RoverSeesBadly(RL121RoverLosesItsGoal):
     def look(self):
         self.seen = self.goal + self.np_random.normal(0, 0.01, 2)
         return self.seen
+
+
+class RoverSumsUp(Rover):
+    """Sums up in which direction its goal was seen, and pays for that."""
+
+    def start(self):
+        super().start()
+        self.sum = np.zeros(2)
+
+    def observe(self):
+        self.sum = self.sum + 0.1 * (self.goal - self.place)
+        return np.append(super().observe(), self.sum).astype(np.float32)
+
+    def reward(self, action):
+        return super().reward(action) - 0.1 * np.abs(self.sum).sum()

@@ -114,6 +114,10 @@ def test_looking_moves_the_goal():
     assert finding.evidence["value"] != finding.evidence["expected"]
 
 
+def test_a_sum_over_what_was_seen_is_no_goal():
+    assert findings(f"{MEANING}:RoverSumsUp", "RL121") == []
+
+
 def test_shaking_is_paid_in_proportion_to_the_way():
     (finding,) = findings(f"{MEANING}:RL623RoverShakes", "RL623")
     way = float(re.search(r"moves by ([\d.]+) and back", finding.message)[1])

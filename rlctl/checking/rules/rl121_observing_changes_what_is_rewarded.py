@@ -43,6 +43,8 @@ RULE = Rule(
 
 STEPS = 15  # of the compared episodes
 SAME = 1e-6  # relative
+MOST_LOOKS = 2  # of a reset
+FAR = 3.0  # times the change by a look: how far apart are the values that resets draw
 SHOWN = 4  # numbers of an attribute
 VARIABLE_ARGUMENTS = inspect.CO_VARARGS | inspect.CO_VARKEYWORDS
 Numbers = NDArray[np.float64]
@@ -64,8 +66,8 @@ def _look_twice(shown: ActionTrials) -> Iterator[RuleFinding]:
     other = _Look(instance, observe)
     trials.play(SECOND_SEED, [], other)
     for name in find_unequal(look.first, look.last):
-        is_drawn = name in find_unequal(look.first, other.first)
-        if is_drawn and not look.is_clock(name) and _accumulates(trials, look, name) and _decides(trials, look, name):
+        is_sensor = look.is_clock(name) or not _is_drawn(look, other, name) or not _accumulates(trials, look, name)
+        if not is_sensor and _decides(trials, look, name):
             before, after = (_list_numbers(values[name].numbers) for values in (look.first, look.last))
             value, expected = float(looked[step][REWARD]), float(plain[step][REWARD])
             twice = f"{observe.__name__}() changes {name}: called twice more after the reset, {before} becomes {after}"
@@ -146,6 +148,18 @@ class _Look:
         first, second, last = (values[name].numbers for values in (self.first, self.second, self.last))
         changes = np.concatenate([second - first, last - second])
         return bool(np.ptp(changes) <= SAME * np.abs(changes).max())
+
+
+def _is_drawn(look: _Look, other: _Look, name: str) -> bool:
+    """Say whether reset draws an attribute: not one that begins at 0, such as the integral of an error or the drift of
+    a sensor, and differs because reset observes once."""
+    if name not in find_unequal(look.first, other.first):
+        return False
+    first, second, last = (values[name].numbers for values in (look.first, look.second, look.last))
+    change, size = second - first, float(np.abs(first).max())
+    if np.abs(last - second - change).max() <= SAME * size:
+        return all(np.abs(first - times * change).max() > SAME * size for times in range(MOST_LOOKS + 1))
+    return bool(np.abs(first - other.first[name].numbers).max() > FAR * np.abs(change).max())
 
 
 def _decides(trials: Trials, look: _Look, name: str) -> bool:
