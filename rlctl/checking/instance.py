@@ -291,6 +291,8 @@ class Context:
         self.most_growth = 1.0  # how many times longer a slow environment may be checked
         self.seconds = math.inf  # what all experiments of the process may take together
         self.unseeded_calls: set[tuple[str, int]] = set()  # file and line of default_rng() in reset or step
+        self.longest_episode: int | None = None  # of the whole episodes [steps]; None before there are any
+        self.reached_limit = False  # whether one of them was truncated
         self.generators: dict[str, str] | None = None  # State of each after the first watched reset; None before
 
     def build(self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None) -> Instance:

@@ -155,6 +155,13 @@ def _is_own(value: Any) -> bool:
     return is_object and not inspect.ismodule(value) and type(value).__module__.partition(".")[0] not in LIBRARIES
 
 
+def shape_like(value: Any, numbers: NDArray[np.float64]) -> Any:
+    """Return numbers in the form of a value: an array, a list, a tuple or a number."""
+    if isinstance(value, np.ndarray):
+        return numbers.reshape(value.shape)
+    return type(value)(numbers.tolist()) if isinstance(value, list | tuple) else float(numbers[0])
+
+
 def find_unequal(one: Mapping[str, Attribute], two: Mapping[str, Attribute]) -> list[str]:
     """Return the names whose numbers differ, of those that both have with the same shape."""
     shared = [name for name in one.keys() & two.keys() if one[name].numbers.shape == two[name].numbers.shape]

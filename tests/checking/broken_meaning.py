@@ -216,3 +216,63 @@ class RL619RoverInPond(Rover):
 
 class RL619RoverBehindTheShore(RL619RoverInPond):
     farthest = 1.6
+
+
+class RL622RoverKeepsAway(Rover):
+    def reward(self, action):
+        return self.distance() - 0.02 * np.square(action).sum()
+
+
+class RL623RoverComesNearer(Rover):
+    """Is paid for the way to the place, and pays for the way back."""
+
+    def start(self):
+        super().start()
+        self.before = self.distance()
+
+    def progress(self):
+        before, self.before = self.before, self.distance()
+        return before - self.before  # [m]
+
+    def reward(self, action):
+        return 10 * self.progress() - 0.02 * np.square(action).sum()
+
+
+class RL623RoverShakes(RL623RoverComesNearer):
+    def reward(self, action):
+        return 10 * max(self.progress(), 0.0) - 0.02 * np.square(action).sum()
+
+
+class RL121RoverLosesItsGoal(Rover):
+    """Adds the camera's noise to its goal, each time that it looks."""
+
+    def look(self):
+        self.goal += self.np_random.normal(0, 0.01, 2)
+        return self.goal
+
+    def observe(self):
+        direction = [np.cos(self.heading), np.sin(self.heading)]
+        return np.array([*(self.look() - self.place), *direction, *self.speed], np.float32)
+
+
+class RL121RoverSeesBadly(RL121RoverLosesItsGoal):
+    """Keeps what it saw last, and where its goal is."""
+
+    def look(self):
+        self.seen = self.goal + self.np_random.normal(0, 0.01, 2)
+        return self.seen
+
+
+class RoverSumsUp(Rover):
+    """Sums up in which direction its goal was seen, and pays for that."""
+
+    def start(self):
+        super().start()
+        self.sum = np.zeros(2)
+
+    def observe(self):
+        self.sum = self.sum + 0.1 * (self.goal - self.place)
+        return np.append(super().observe(), self.sum).astype(np.float32)
+
+    def reward(self, action):
+        return super().reward(action) - 0.1 * np.abs(self.sum).sum()

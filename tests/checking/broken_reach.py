@@ -100,3 +100,37 @@ class ArmUnclearReward(Arm):
 
     def reward(self, action):
         return np.exp(-3 * self.distance()) + 0.1 * self.data.qvel[0]
+
+
+class RL622ArmKeepsAway(Arm):
+    def reward(self, action):
+        return self.distance() - 0.02 * np.square(action).sum()
+
+
+class RL623ArmComesNearer(Arm):
+    """Is paid for the way towards its goal, and pays for the way back."""
+
+    def start(self):
+        super().start()
+        self.before = self.distance()
+
+    def progress(self):
+        before, self.before = self.before, self.distance()
+        return before - self.before  # [m]
+
+    def reward(self, action):
+        return 10 * self.progress() - 0.02 * np.square(action).sum()
+
+
+class RL623ArmShakes(RL623ArmComesNearer):
+    def reward(self, action):
+        return 10 * max(self.progress(), 0.0) - 0.02 * np.square(action).sum()
+
+
+class RL121ArmMovesItsGoal(Arm):
+    """Subtracts where its hand is from the goal itself."""
+
+    def observe(self):
+        to_goal = self.goal
+        to_goal -= 0.01 * self.data.site("hand").xpos
+        return np.concatenate([self.data.qpos, self.data.qvel, to_goal]).astype(np.float32)

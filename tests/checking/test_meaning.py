@@ -1,6 +1,7 @@
 """Numbers that do not mean what they should: each mistake is found in two robots, and nothing in their twins."""
 
 import contextlib
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -37,6 +38,12 @@ CASES = [
         twin="broken_reach_bullet.py:RL619Reacher",
         pybullet=True,
     ),
+    broken("RL121RoverLosesItsGoal", ("RL121", "warning"), twin="RL121RoverSeesBadly"),
+    broken("RL121ArmMovesItsGoal", ("RL121", "warning"), twin="Arm", file=REACH, slow=True),
+    broken("RL622ArmKeepsAway", ("RL622", "warning"), twin="Arm", file=REACH),
+    broken("RL622RoverKeepsAway", ("RL605", "warning"), ("RL622", "warning"), twin="Rover", slow=True),
+    broken("RL623RoverShakes", ("RL623", "warning"), twin="RL623RoverComesNearer"),
+    broken("RL623ArmShakes", ("RL623", "warning"), twin="RL623ArmComesNearer", file=REACH, slow=True),
     broken("RL119RoverMillimetres", ("RL118", "info"), ("RL119", "warning"), twin="Rover", slow=True),
     broken("RL119DroneDegrees", ("RL119", "warning"), twin="RL119DroneRadians"),
 ]
@@ -99,6 +106,23 @@ def test_units_are_told_apart_by_the_time_of_a_step():
     # 0.1 m in a step at 1 m/s are 100 mm; the heading changes by 0.1 times the turning rate.
     assert finding.evidence["value"] == pytest.approx(100.0, rel=1e-3)
     assert "millimetres" in finding.message
+
+
+def test_looking_moves_the_goal():
+    (finding,) = findings(f"{MEANING}:RL121RoverLosesItsGoal", "RL121")
+    assert finding.message.startswith("observe() changes self.goal: called twice more after the reset, [")
+    assert finding.evidence["value"] != finding.evidence["expected"]
+
+
+def test_a_sum_over_what_was_seen_is_no_goal():
+    assert findings(f"{MEANING}:RoverSumsUp", "RL121") == []
+
+
+def test_shaking_is_paid_in_proportion_to_the_way():
+    (finding,) = findings(f"{MEANING}:RL623RoverShakes", "RL623")
+    way = float(re.search(r"moves by ([\d.]+) and back", finding.message)[1])
+    # 10 for each metre towards the goal, which is not quite in the direction of the way.
+    assert 0 < finding.evidence["value"] <= 10 * way
 
 
 @pytest.mark.parametrize(("rows", "columns", "last"), [(9, 0, False), (9, 3, True)], ids=["constant", "one step"])

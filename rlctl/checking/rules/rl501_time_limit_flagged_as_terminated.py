@@ -1,9 +1,10 @@
 """RL501: time limit flagged as terminated."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from rlctl.checking.episode_ends import FEWEST_EPISODES, SHORTEST_TIE, require_episodes, require_two_flags
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.held import HeldEpisode
 from rlctl.checking.records import ENDS, CheckedEpisode, Records
 from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
 
@@ -15,7 +16,9 @@ RULE = Rule(
         Episodes end with `terminated` after exactly the same number of steps. Learning then treats running out
         of time as a state without a future: values near the end are wrong, and the policy learns to hurry or to
         give up. A task that really is over after so many steps looks the same, so this is a warning. An info if
-        the last reward is unlike any before, as at an obstacle that no episode passes.
+        the last reward is unlike any before, as at an obstacle that no episode passes. A robot that falls sooner
+        was put back to its start before every step; an info if it could not be carried along as well, because the
+        end may come after some steps without progress.
     """,
     fix="Return terminated=False, truncated=True when time is up, or use gymnasium.wrappers.TimeLimit.",
 )
@@ -24,7 +27,7 @@ FEWEST_TIES = 4
 SHORTEST_LIMIT = 5  # shorter games with one length have no time limit [steps]
 
 
-@judges_records(RULE, "episodes", "search")  # of absence too, but for the counter
+@judges_records(RULE, "episodes", "search", "held")  # of absence too, but for the counter
 def find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
     """Yield that episodes end with `terminated` when their time is up."""
     episodes = require_episodes(records)
@@ -37,6 +40,10 @@ def find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
         message = f"step sets terminated by a counter ({counter}), and truncated is always False"
         flags = {"value": "terminated", "expected": "truncated"}
         yield RuleFinding(RULE, message, flags, where=built.counter_place)
+        return
+    longest = max(episode.steps for episode in [*episodes, *records.role("search")])
+    if found := list(_judge_held(records.facts.get("held", []), longest)):
+        yield from found
         return
     records.require_whole("episodes", "search")
     longer = [episode for episode in episodes if episode.ended not in ENDS] + records.role("search")
@@ -61,3 +68,20 @@ def find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
 def _ends_with_odd_reward(episode: CheckedEpisode) -> bool:
     before, last = episode.rewards[:-1], episode.rewards[-1]
     return bool(before.size and (last < before.min() or last > before.max()))
+
+
+def _judge_held(held: Sequence[HeldEpisode], longest: int) -> Iterator[RuleFinding]:
+    """Judge episodes that only time can end; the longest of the others ended before."""
+    limits = {len(episode.rewards) for episode in held}
+    limit = max(limits, default=0)
+    if len(limits) > 1 or limit <= max(longest, SHORTEST_TIE) or {episode.ended for episode in held} != {"terminated"}:
+        return
+    is_carried = any(episode.moves for episode in held)
+    kept = "put back to its start, or carried along," if is_carried else "put back to its start"
+    message = (
+        f"with the robot {kept} before every step, all {len(held)} episodes end at step {limit} with terminated=True"
+    )
+    if not is_carried:
+        message += ": a time limit, or a limit of steps without progress"
+    evidence = {"step": limit, "episodes": len(held), "value": "terminated", "expected": "truncated"}
+    yield RuleFinding(RULE, message, evidence, None if is_carried else Severity.INFO)

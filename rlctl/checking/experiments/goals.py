@@ -1,0 +1,244 @@
+"""The experiment `goals`: finds a goal that reset draws and the observation shows, for rules about rewards."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.episode import EpisodePlayer, Moment
+from rlctl.checking.experiment import PROBE, JudgeHook, experiment
+from rlctl.checking.experiments.episodes import EPISODES
+from rlctl.checking.experiments.starts import FIRST, STARTS
+from rlctl.checking.instance import Context, Instance
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact
+from rlctl.checking.rule import NotApplicable, NotJudged
+from rlctl.checking.transitions import find_float_leaves
+from rlctl.checking.values import Attribute, read_attributes, read_flag, shape_like
+from rlctl.checking.workspaces import Reach, find_chains, measure_reach
+from rlctl.environments.leaves import pick
+from rlctl.environments.success import SUCCESS
+
+SIZES = (1, 2, 3)  # of a place [numbers]
+MOST_CANDIDATES = 6
+STEPS = 3  # in which a goal does not change
+SHIFT = np.array([0.013, -0.021, 0.034])  # of a goal, to see what of the observation follows it
+ROUNDING, PART = 1e-5, 5e-7  # of observations to float32, and of large ones
+COMPARED = 4  # resets after which the places of links are compared with the observation
+NEAR = 2e-3  # how near they are [m]
+Numbers = NDArray[np.float64]
+Source = tuple[int, int]
+"""The element of an observation from which on it has a place, and the sign with which the goal is in it, or 0."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawnGoal:
+    """A place that each reset draws."""
+
+    name: str  # of the attribute
+    copies: Sequence[Source]  # Where the observation has it, or its difference to something
+    goals: Mapping[int, Sequence[float]]  # by seed
+    reaches: Mapping[Source, Reach]  # of links of a fixed robot, by where the observation has their places
+
+
+@dataclasses.dataclass(frozen=True)
+class GoalStep:
+    """What a step returned."""
+
+    reward: float  # NaN where it is no number
+    succeeds: bool | None  # None where no success is reported
+
+
+@dataclasses.dataclass(frozen=True)
+class GoalTrials:
+    """An instance whose goal can be moved: the parts play short episodes with it, and leave it as they like."""
+
+    instance: Instance
+    drawn: DrawnGoal
+
+    @functools.cached_property
+    def goals(self) -> Numbers:
+        """The drawn goals. Shape (n, size)."""
+        return np.array(list(self.drawn.goals.values()))
+
+    @property
+    def range(self) -> Numbers:
+        """How far the goals lie apart. Shape (size,)."""
+        return np.asarray(np.ptp(self.goals, axis=0))
+
+
+class GoalEpisode:
+    """An episode whose goal is set before each of its later steps."""
+
+    def __init__(self, trials: GoalTrials, seed: int, actions: str = "zero", first: int = 0) -> None:
+        """Reset, and play the first steps with the goal that was drawn; `actions` is a kind of `draw_actions`."""
+        self._instance = trials.instance
+        self._player = EpisodePlayer(self._instance, seed, actions)
+        moment = self._player.reset()
+        self._attribute = read_attributes(self._instance.env)[trials.drawn.name]
+        self.goal = self._attribute.numbers
+        self.observed = _flatten(self._instance, moment)  # Shape (elements,)
+        self.has_succeeded = False  # whether any of its steps was a success
+        self.play([None] * first)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether there is no other step."""
+        return bool(self._player.ended)
+
+    def step(self, goal: Numbers | None = None) -> GoalStep:
+        """Set the goal, if one is given, and take a step."""
+        if goal is not None:
+            self._attribute.assign(shape_like(self._attribute.value, goal))
+            self.goal = goal
+        moment = self._player.step()
+        self.observed = _flatten(self._instance, moment)
+        succeeds = _read_success(moment)
+        self.has_succeeded |= bool(succeeds)
+        return GoalStep(_read_reward(moment), succeeds)
+
+    def play(self, goals: Iterable[Numbers | None]) -> list[GoalStep]:
+        """Take a step for each goal; less if the episode ends."""
+        steps: list[GoalStep] = []
+        for goal in goals:
+            if self.has_ended:
+                break
+            steps.append(self.step(goal))
+        return steps
+
+
+def _read_success(moment: Moment) -> bool | None:
+    if not isinstance(moment.info, dict) or SUCCESS not in moment.info:
+        return None
+    return read_flag(moment.info[SUCCESS])
+
+
+def _read_reward(moment: Moment) -> float:
+    try:
+        return float(moment.reward)
+    except (TypeError, ValueError):  # its type is RL204's matter
+        return math.nan
+
+
+judges_goals = JudgeHook[GoalTrials]()
+"""Shows an instance with a goal that can be moved."""
+
+
+@experiment("goals", PROBE, 110, share=0.5, hooks=(judges_goals,))
+def find_goals(context: Context) -> Iterator[ChildMessage]:
+    """Find an attribute that is drawn at reset and stays, and the parts of the observation that follow it."""
+    instance = context.instance
+    if not instance.accepts_seed:
+        raise NotJudged("reset takes no seed (RL202)")
+    names, by_chance = _find_drawn(instance)
+    for name in names:
+        if copies := _find_copies(instance, name):
+            goals: dict[int, list[float]] = {}
+            for seed in [*range(FIRST_SEED, FIRST_SEED + len(EPISODES)), *range(FIRST, FIRST + STARTS)]:
+                if context.budget.why_spent():
+                    break
+                instance.reset(seed)
+                goals[seed] = read_attributes(instance.env)[name].numbers.tolist()
+            drawn = DrawnGoal(name, copies, goals, _find_reaches(instance, name, copies))
+            yield Fact("goals", drawn)
+            yield from judges_goals.judge(GoalTrials(instance, drawn))
+            return
+    if by_chance:
+        raise NotJudged("the seed does not determine what reset draws (RL301)")
+    raise NotApplicable("the observation follows no attribute that reset draws")
+
+
+def _find_drawn(instance: Instance) -> tuple[list[str], list[str]]:
+    """Return the attributes of the size of a place that a reset draws by its seed and no step changes, and the others
+    that it draws."""
+    again, *drawn = (_read_after_reset(instance, seed) for seed in (FIRST_SEED, FIRST_SEED, SECOND_SEED))
+    names = [name for name in drawn[0].keys() & drawn[1].keys() if _is_place(drawn[0][name], drawn[1][name])]
+    seeded = [name for name in names if name in again and np.array_equal(again[name].numbers, drawn[0][name].numbers)]
+    by_chance = sorted({*names} - {*seeded})
+    if not seeded:
+        return [], by_chance
+    for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=STEPS):
+        pass
+    after = read_attributes(instance.env)
+    stays = [name for name in seeded if name in after and np.array_equal(after[name].numbers, drawn[1][name].numbers)]
+    return sorted(stays)[:MOST_CANDIDATES], by_chance
+
+
+def _read_after_reset(instance: Instance, seed: int) -> dict[str, Attribute]:
+    EpisodePlayer(instance, seed, max_steps=0).reset()
+    return read_attributes(instance.env)
+
+
+def _is_place(one: Attribute, two: Attribute) -> bool:
+    if np.asarray(one.value).dtype.kind != "f":
+        return False  # whole numbers are states and cells: an environment looks them up in tables
+    sizes = one.numbers.size, two.numbers.size
+    return sizes[0] == sizes[1] and sizes[0] in SIZES and int((one.numbers != two.numbers).sum()) >= min(2, sizes[0])
+
+
+def _find_copies(instance: Instance, name: str) -> list[tuple[int, int]]:
+    """Return where the observation has the place, or its difference to something, and with which sign."""
+    plain, shifted = (_observe(instance, name, shift) for shift in (0.0, 1.0))
+    if plain.shape != shifted.shape:
+        return []
+    change, shift = shifted - plain, SHIFT[: read_attributes(instance.env)[name].numbers.size]
+    parts = [change[element : element + len(shift)] for element in range(len(change) - len(shift) + 1)]
+    rounding = [ROUNDING + PART * np.abs(plain[i : i + len(shift)]).max() for i in range(len(parts))]
+    return [
+        (i, sign) for i, part in enumerate(parts) for sign in (1, -1) if np.abs(part - sign * shift).max() < rounding[i]
+    ]
+
+
+def _observe(instance: Instance, name: str, shift: float) -> Numbers:
+    """Return the observation of the first step if the place is shifted before it. Shape (elements,)."""
+    episode = EpisodePlayer(instance, FIRST_SEED, "zero", max_steps=1)
+    episode.reset()
+    attribute = read_attributes(instance.env)[name]
+    moved = attribute.numbers + shift * SHIFT[: attribute.numbers.size]
+    attribute.assign(shape_like(attribute.value, moved))
+    return _flatten(instance, episode.step())
+
+
+def _flatten(instance: Instance, moment: Moment) -> Numbers:
+    leaves = [instance.leaves[index] for index in find_float_leaves(instance.leaves)]
+    parts = [np.ravel(pick(moment.observation, leaf.path)) for leaf in leaves]
+    return np.concatenate([np.zeros(0), *parts])
+
+
+def _find_reaches(instance: Instance, name: str, copies: Sequence[Source]) -> dict[Source, Reach]:
+    """Return how far the links of fixed robots get whose places are observed, by where they are observed."""
+    rows, goals, links = [], [], []
+    for seed in range(FIRST_SEED, FIRST_SEED + COMPARED):
+        rows.append(_flatten(instance, EpisodePlayer(instance, seed, max_steps=0).reset()))
+        goals.append(read_attributes(instance.env)[name].numbers)
+        chains = list(find_chains(instance.env))
+        if not chains:
+            return {}
+        links.append([chain.read() for chain in chains])
+    observed, drawn = np.array(rows), np.array(goals)
+    reaches: dict[Source, Reach] = {}
+    for source in find_sources(copies, observed, drawn):
+        places = read_place(source, observed, drawn)
+        for number, chain in enumerate(chains):
+            off = np.abs(np.array([one[number] for one in links])[:, :, : drawn.shape[1]] - places[:, None])
+            link = int(off.max(axis=(0, 2)).argmin())
+            if off[:, link].max() < NEAR and source not in reaches:
+                reach = measure_reach(chain, link, drawn.shape[1])
+                # A goal minus itself is the origin, where the base of many robots is.
+                reaches |= {source: reach} if reach.distance > NEAR else {}
+    return reaches
+
+
+def find_sources(copies: Sequence[Source], rows: Numbers, goals: Numbers) -> list[Source]:
+    """Return where an observation may have the place of the robot: relative to the goal, and then by itself."""
+    size = goals.shape[1]
+    return [*copies, *((element, 0) for element in range(rows.shape[1] - size + 1))]
+
+
+def read_place(source: Source, rows: Numbers, goals: Numbers) -> Numbers:
+    """Return the place of the robot. Shapes of rows: (n, elements), of goals and the result: (n, size)."""
+    element, sign = source
+    part = rows[:, element : element + goals.shape[1]]
+    return goals - sign * part if sign else part
