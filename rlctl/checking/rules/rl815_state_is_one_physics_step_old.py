@@ -158,14 +158,12 @@ def _find_elements_of_last_look(world: LoggedWorld) -> Iterator[RuleFinding]:
     observed = np.concatenate([_center(np.nan_to_num(np.stack(log.observed[1:]).astype(np.float64))) for log in logs])
     now, before = (np.concatenate([_center(part[window]) for part in features]) for window in (np.s_[1:], np.s_[:-1]))
     columns = [c for c in range(min(MOST_ELEMENTS, observed.shape[1])) if observed[:, c].std() > OLD]
-    present, earlier = ({c: _equals(observed[:, c], part) for c in columns} for part in (now, before))
-    shown = np.any([*present.values()], axis=0) if columns else np.zeros(0)
-    names = name_features(logs[0])
-    old = {
-        c: names[int((earlier[c] & ~shown).argmax())]
-        for c in columns
-        if not present[c].any() and (earlier[c] & ~shown).any()
-    }
+    if not columns:
+        return
+    present, earlier = (np.stack([_equals(observed[:, column], part) for column in columns]) for part in (now, before))
+    only_earlier = earlier & ~present.any(axis=0) & ~present.any(axis=1, keepdims=True)  # shape (columns, features)
+    names, found = name_features(logs[0]), zip(columns, only_earlier, strict=True)
+    old = {column: names[int(row.argmax())] for column, row in found if row.any()}
     if old:
         yield _describe_old(old, "before the whole step, not of the one after it")
 
