@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.derived_fields import (
     DERIVED,
@@ -189,12 +190,12 @@ def _center(values: Array) -> Array:
     return values - values[0]
 
 
-def _equals(values: Array, features: Array) -> Array:
+def _equals(values: Array, features: Array) -> NDArray[np.bool_]:
     """Say for each column of centered features whether centered values equal it, up to their sign. Shape (k,)."""
     scale = np.abs(values).max() + np.abs(features).max(axis=0)
     moves = features.std(axis=0) > OLD
     near = [np.abs(values[:, None] - sign * features) <= EXACT * (1 + scale) for sign in (1.0, -1.0)]
-    result: Array = moves & np.logical_or(*(part.mean(axis=0) >= NEARLY_ALL for part in near))
+    result: NDArray[np.bool_] = moves & np.logical_or(*(part.mean(axis=0) >= NEARLY_ALL for part in near))
     return result
 
 
