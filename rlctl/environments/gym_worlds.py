@@ -54,6 +54,9 @@ class GymWorlds:
         self.info = info
         return self._writer.read(observation)
 
+    def shorten(self, worlds: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
+        """Do nothing: the time limit is the environment's own."""
+
     def step(self, action: Any, worlds: NDArray[np.int64] | None = None) -> WorldsStep:
         """Take a step with an action of shape (1, ...)."""
         self.step_of[0] += 1

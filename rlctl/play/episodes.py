@@ -71,6 +71,7 @@ class Episodes:
         arrays.inside[envs, 0], arrays.inside[envs, 1] = seeds, 0
         self._playing.seeds[index] = seeds
         self.worlds.step_of[index] = 0
+        self.worlds.shorten(index, arrays.limit[envs])
         try:
             return self._show(self._playing.begin(index, seeds, arrays.level[envs]), index)
         except BaseException as error:  # a plugin may raise anything, SystemExit too
@@ -283,9 +284,10 @@ class _Segment(Actor):
         for key, part in segment.final.items():
             part[row, ended] = segment.observation[key][row + 1, ended]
         if asked.levels is not None:
-            for result in results:
+            for result in [result for result in results if not arrays.limit[result.env]]:
                 level = float(arrays.level[result.env])
                 arrays.level[result.env] = asked.levels.follow(level, result.success)
+        arrays.limit[envs] = 0  # only the first episodes are short
         self._rows[ended] = row + 1
         shown = self._episodes._begin(arrays, ended, [next(self._seeds[env]) for env in envs.tolist()])
         for key, part in shown.items():

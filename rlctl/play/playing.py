@@ -29,6 +29,10 @@ class Worlds(Protocol):
     def reset(self, worlds: Index, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
         """Begin the episodes of `seeds` in some worlds; return their first observations, shape (k, ...)."""
 
+    def shorten(self, worlds: Index, limits: Index) -> None:
+        """Truncate the next episodes of some worlds after so many steps, or after the task's time limit where it is 0;
+        only worlds of a task can."""
+
     def step(self, action: Any, worlds: Index | None = None) -> WorldsStep:
         """Advance some worlds by a step; `action` has a row for each, shape (k, ...)."""
 

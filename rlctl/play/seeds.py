@@ -16,6 +16,7 @@ class Stream(enum.IntEnum):
     REPLAY = 3
     VERIFY = 4
     CHECK = 5
+    AGE = 6  # how long the first episode of an environment is
 
 
 def episode_seed(run_seed: int, stream: Stream, env_index: int, episode: int) -> int:
@@ -23,6 +24,14 @@ def episode_seed(run_seed: int, stream: Stream, env_index: int, episode: int) ->
     sequence = np.random.SeedSequence(run_seed, spawn_key=(int(stream), env_index, episode))
     # Some environments pass the seed to a generator that takes signed 32-bit numbers.
     return int(sequence.generate_state(1)[0]) >> 1
+
+
+def first_length(run_seed: int, env_index: int, episode: int, longest: int) -> int:
+    """Return the length [steps], from 1 to `longest`, of an episode that begins together with all other environments'.
+
+    With episodes of mixed lengths at first, environments are at different steps of their episodes ever after.
+    """
+    return 1 + episode_seed(run_seed, Stream.AGE, env_index, episode) % longest
 
 
 def list_training_seeds(run_seed: int, env_index: int, first: int) -> Iterator[int]:

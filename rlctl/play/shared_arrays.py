@@ -77,6 +77,7 @@ class SharedArrays:
         arrays = map_arrays(
             descriptor,
             {"inside": ((n_envs, 3), np.dtype(np.int64)), "level": ((n_envs,), np.dtype(np.float64))}
+            | {"limit": ((n_envs,), np.dtype(np.int64))}
             | {f"observation/{key}": ((n_envs, *shape), dtype) for key, (shape, dtype) in observation.items()}
             | {f"segment/{name}": ((n_envs, steps, *shape), dtype) for name, (shape, dtype) in of_segment.items()}
             | {f"segment/observation/{k}": ((n_envs, steps + 1, *shape), d) for k, (shape, d) in observation.items()},
@@ -86,6 +87,9 @@ class SharedArrays:
         them if a worker dies or hangs. Step 0 is the reset; the step is negative outside of calls."""
         self.level = arrays["level"]
         """How hard the episode of each environment is, or the next one that begins, from 0 to 1; shape (n_envs,)."""
+        self.limit = arrays["limit"]
+        """Steps after which the episode of each environment is truncated, if it is shorter than the task's time limit;
+        else 0; shape (n_envs,)."""
         self.observation = {key: arrays[f"observation/{key}"] for key in observation}  # the current ones, by key
         self.segment = SegmentArrays(
             {key: arrays[f"segment/observation/{key}"] for key in observation},

@@ -97,6 +97,7 @@ class TaskWorlds:
         self.weights = _merge_weights(task, reward_weights or {})
         self._weight_values = np.array([*self.weights.values()])
         self.max_steps, self.has_success = task.max_steps, self.calls.has_success
+        self._limits = np.full(count, self.max_steps)  # steps after which each world's episode is truncated
         self.compute_reward = None
         """The task's method for other goals, where it defines one; see `Task.compute_reward`."""
         if isinstance(task, Task) and type(task).compute_reward is not Task.compute_reward:
@@ -236,7 +237,7 @@ class TaskWorlds:
                 self._add_markers(list(self._markers))
         self.step_of[worlds] = 0
         self._gained[worlds] = 0.0
-        self._steps_left = self.max_steps - int(self.step_of.max())
+        self._count_steps_left()
         if levels is None:
             levels = np.full(len(worlds), self.level)
         self._levels[worlds] = levels
@@ -263,6 +264,10 @@ class TaskWorlds:
         for world in listed if self.events else ():
             self._note(world, self._signals.drawn[world])
         return observation
+
+    def shorten(self, worlds: Worlds, limits: Worlds) -> None:
+        """Truncate the next episodes of some worlds after so many steps, or after `max_steps` where it is 0."""
+        self._limits[worlds] = np.where(limits > 0, limits, self.max_steps)
 
     def _run_events(self, when: Literal["reset", "start"], world: int) -> None:
         with in_world(world):
@@ -353,9 +358,11 @@ class TaskWorlds:
     def _find_truncated(self, terminated: Flags, worlds: Worlds) -> Flags:
         if self._steps_left > 0:  # no world can be at the time limit
             return self._no_flags if len(worlds) == self.count else self._no_flags[: len(worlds)]
-        steps = self.step_of[worlds]
-        self._steps_left = self.max_steps - int(self.step_of.max())
-        return (steps >= self.max_steps) & ~terminated
+        self._count_steps_left()
+        return (self.step_of[worlds] >= self._limits[worlds]) & ~terminated
+
+    def _count_steps_left(self) -> None:
+        self._steps_left = int((self._limits - self.step_of).min())
 
     def _spread(self, values: Any, worlds: Worlds) -> Any:
         """Return values of some worlds as rows of all worlds; the others have zeros."""

@@ -182,6 +182,7 @@ def environment_tensors(env: WorkerVecEnv) -> Tensors:
     return {
         "environments/episodes_started": np.array(env.episodes_started, np.int64),
         "environments/level": env.levels,
+        "environments/limit": env.limits,
         "environments/steps": np.array([len(actions) for actions in histories], np.int64),
         "environments/actions": np.concatenate(histories),
         **{f"environments/observation/{key}": observation for key, observation in last.items()},
@@ -194,6 +195,7 @@ def restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
     if len(steps) != env.num_envs:
         raise ArtifactError(f"it was saved with {len(steps)} environments, not {env.num_envs}")
     env.levels = tensors["environments/level"]
+    env.limits = tensors.get("environments/limit", np.zeros(env.num_envs, np.int64))  # older ones have none
     started = tensors["environments/episodes_started"].tolist()
     mismatch = set(env.begin_episodes(started, np.split(tensors["environments/actions"], np.cumsum(steps)[:-1])))
     for key, observation in env.workers.arrays.observation.items():

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from rlctl.environments.dict_spaces import Observations, count_outside, join
 from rlctl.errors import EpisodeFailed
 from rlctl.play.messages import EpisodeResult, LevelRule, Play
-from rlctl.play.seeds import Stream, episode_seed
+from rlctl.play.seeds import Stream, episode_seed, first_length
 from rlctl.play.shared_arrays import SegmentArrays
 from rlctl.play.workers import Workers
 from rlctl.policy.actor import Exploration
@@ -41,6 +41,9 @@ class WorkerVecEnv(VecEnv):
         self._actions: list[list[NDArray[Any]]] = []  # of the running episodes: by environment, in parts
         self._levels: NDArray[np.float64] = workers.arrays.level.copy()  # when the last segment had ended
         self._level_rule: LevelRule | None = None
+        self.mixes_ages = False
+        """Whether `reset` begins episodes of random lengths, so that environments are not all at the same step."""
+        self._limits: NDArray[np.int64] = workers.arrays.limit.copy()
         self.outside, self.outside_message = 0, ""  # observations outside their space since it was set to 0
         self.ended: list[EpisodeResult] = []  # episodes that ended since the list was emptied
         self.last_segment: SegmentArrays | None = None  # of `finish`; the next segment overwrites its arrays
@@ -67,11 +70,27 @@ class WorkerVecEnv(VecEnv):
         self._levels = levels.copy()
         self.workers.arrays.level[:] = levels
 
+    @property
+    def limits(self) -> NDArray[np.int64]:
+        """After how many steps the running episode of each environment is truncated; 0: by the task; shape (n_envs,)."""
+        return self._limits
+
+    @limits.setter
+    def limits(self, limits: NDArray[np.int64]) -> None:
+        self._limits = limits.copy()
+        self.workers.arrays.limit[:] = limits
+
     def _seed(self, env: int, episode: int) -> int:
         return episode_seed(self.run_seed, Stream.TRAIN, env, episode)
 
     def reset(self) -> Any:
         """Start the next episode of every environment; return the first observations, shape (n_envs, ...)."""
+        longest = self.workers.info.max_steps if self.mixes_ages else None
+        if longest is None:
+            self.limits = np.zeros(self.num_envs, np.int64)
+        else:
+            numbers = enumerate(self.episodes_started)
+            self.limits = np.array([first_length(self.run_seed, env, number, longest) for env, number in numbers])
         try:
             self.workers.reset({env: self._seed(env, number) for env, number in enumerate(self.episodes_started)})
         except EpisodeFailed as error:
@@ -126,7 +145,8 @@ class WorkerVecEnv(VecEnv):
             self._actions[episode.env] = []
         for env, actions in enumerate(segment.action[:, :steps]):
             self._actions[env].append(actions[last_rows.get(env, -1) + 1 :].copy())
-        self.ended += ended
+        self.ended += [episode for episode in ended if not self._is_short(episode, ended)]
+        self._limits = self.workers.arrays.limit.copy()
         last = segment.first(steps, ended)
         last = dataclasses.replace(last, observation=widen(last.observation), final=widen(last.final))
         seen = {key: rows[:, 1:] for key, rows in last.observation.items()}
@@ -134,6 +154,11 @@ class WorkerVecEnv(VecEnv):
         self.outside, self.outside_message = self.outside + count, self.outside_message or message
         self.last_segment = last
         return last
+
+    def _is_short(self, episode: EpisodeResult, ended: Sequence[EpisodeResult]) -> bool:
+        """Return whether an episode was shortened, which says little about the policy: the first of its environment."""
+        first = min(other.row for other in ended if other.env == episode.env)
+        return bool(self._limits[episode.env]) and episode.row == first
 
     @property
     def steps_in_segment(self) -> int:
