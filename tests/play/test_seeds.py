@@ -6,7 +6,7 @@ from rlctl.play.seeds import Stream, episode_seed, episode_seeds
 
 
 def test_seeds_stay_what_they_are():
-    assert [int(stream) for stream in Stream] == [0, 1, 2, 3, 4, 5]
+    assert [int(stream) for stream in Stream] == [0, 1, 2, 3, 4, 5, 6]
     assert episode_seed(0, Stream.TRAIN, 0, 0) == 1839233791
     assert episode_seed(7, Stream.TRAIN, 3, 12) == 1373206606
     assert episode_seeds(0, Stream.EVAL, 3) == [1051823301, 1814578502, 1185059641]
