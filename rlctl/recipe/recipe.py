@@ -133,7 +133,7 @@ class Recipe(Section):
     """Off-policy: whether environments play during an update; their policy is then one chunk (`train_freq`) older."""
     n_envs: Whole = Field(8, ge=1, le=_MOST_ENVS)
     """Number of parallel environments."""
-    mixed_ages: Switch | None = Field(None, json_schema_extra=decide_by("for the worlds of a BatchTask"))
+    mixed_ages: Switch = False
     """Whether the first episode of each environment has a random length, so that later ones do not end all at once."""
     total_timesteps: Whole = Field(300_000, ge=1, le=_MOST_STEPS)
     """Environment steps, all environments together."""

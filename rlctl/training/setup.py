@@ -153,7 +153,7 @@ def _build_learner(
     next_eval = 0 if start.is_trained else recipe.eval.every_steps or recipe.total_timesteps
     progress = start.checkpoint.state.progress if start.checkpoint else Progress(next_eval)
     env = WorkerVecEnv(workers, recipe.seed)
-    env.mixes_ages = specs[0].is_batch if recipe.mixed_ages is None else recipe.mixed_ages
+    env.mixes_ages = recipe.mixed_ages
     model, line = build_on_device(recipe, env, start.request.device, cuda_available=torch.cuda.is_available())
     if line is not None:
         display.message(line)
