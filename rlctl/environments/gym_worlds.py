@@ -55,7 +55,9 @@ class GymWorlds:
         return self._writer.read(observation)
 
     def shorten(self, worlds: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
-        """Do nothing: the time limit is the environment's own."""
+        """Truncate the next episode of a task after so many steps; a plain environment has a time limit of its own."""
+        if self.task_worlds is not None:
+            self.task_worlds.shorten(worlds, limits)
 
     def step(self, action: Any, worlds: NDArray[np.int64] | None = None) -> WorldsStep:
         """Take a step with an action of shape (1, ...)."""

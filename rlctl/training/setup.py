@@ -147,6 +147,8 @@ def _build_learner(
     # A plain Gymnasium environment shows only at the end of an episode whether it reports success.
     if workers.info.reward_weights and not workers.info.has_success:
         _refuse_success_rates(start)
+    if recipe.mixed_ages and not workers.info.reward_weights:
+        raise RecipeError(f"mixed_ages: {start.task} is a plain Gymnasium environment, whose time limit is its own")
     if any(isinstance(stage.level, FollowingLevel) for stage in recipe.stages) and not workers.info.reward_weights:
         raise RecipeError(f"level: {start.task} is a plain Gymnasium environment; only tasks have levels")
     # A policy that begins trained is evaluated first: it may be better than all later ones.

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rlctl.environments.spec import EnvSpec
+from rlctl.errors import RecipeError
 from rlctl.play.workers import Workers
 from rlctl.policy.actor import Exploration
 from rlctl.training.checkpoint_file import environment_tensors, restore_environments
@@ -75,3 +76,8 @@ def test_others_begin_at_once(make):
     env.mixes_ages = False
     env.reset()
     assert (env.limits == 0).all()
+
+
+def test_a_plain_environment_keeps_its_time_limit(train):
+    with pytest.raises(RecipeError, match="mixed_ages: .*CartPole-v1 is a plain Gymnasium environment"):
+        train("CartPole-v1", {"mixed_ages": True, "total_timesteps": 100})
