@@ -92,7 +92,7 @@ class RL014ForgetsTheMass(Reach):
 
 
 @dataclass
-class RL014AppliesTheMass(Reach):
+class RL014AppliesTheMass(RL014ForgetsTheMass):
     events = {"payload": Event("reset", apply_mass, factor=(0.8, 1.2))}
 
 
