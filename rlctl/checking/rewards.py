@@ -12,6 +12,10 @@ from rlctl.environments.success import SUCCESS
 WITH_SEARCH = ("comparisons", "episodes", "starts", "search")  # they play the first process's instance
 DISCOUNT = 0.99  # per step: what is hundreds of steps away hardly counts
 TERMS = "reward_terms/"
+RAW_TERMS = "metrics/"
+"""The same without their weights, of tasks."""
+SUM_TOLERANCE = 1e-3  # part of the reward or of 1: terms may be rounded for the log
+FEW_WRONG = 0.02  # part of the steps: the last of an episode may have a bonus
 ENOUGH_STEPS = 50  # With fewer steps no rule judges what never happens
 
 
@@ -55,26 +59,47 @@ def has_terms(episode: CheckedEpisode) -> bool:
     return any(name.startswith(TERMS) for name in episode.infos)
 
 
-def find_terms(episode: CheckedEpisode) -> dict[str, NDArray[np.float64]]:
-    """Return the reward terms of an episode by name; NaN where one is not in info. Shape (T,) each."""
+def find_terms(episode: CheckedEpisode, kind: str = TERMS) -> dict[str, NDArray[np.float64]]:
+    """Return the reward terms of an episode by name, or its `RAW_TERMS`; NaN where one is not in info. Shape (T,)
+    each."""
     terms = {}
     for name, series in episode.infos.items():
-        if name.startswith(TERMS):
+        if name.startswith(kind):
             values = np.full(episode.steps, np.nan)
             inside = (series.steps >= 1) & (series.steps <= episode.steps)
             values[series.steps[inside] - 1] = series.values[inside]
-            terms[name.removeprefix(TERMS)] = values
+            terms[name.removeprefix(kind)] = values
     return terms
+
+
+def join_terms(episodes: Sequence[CheckedEpisode], kind: str = TERMS) -> dict[str, NDArray[np.float64]]:
+    """Return the values that terms have at all steps of all episodes, of those that are in every episode."""
+    by_name: dict[str, list[NDArray[np.float64]]] = {}
+    for episode in episodes:
+        for name, values in find_terms(episode, kind).items():
+            by_name.setdefault(name, []).append(values)
+    return {name: np.concatenate(parts) for name, parts in by_name.items() if len(parts) == len(episodes)}
 
 
 def find_constant_terms(episodes: Sequence[CheckedEpisode]) -> dict[str, float]:
     """Return the terms that have one value at all steps of all episodes."""
-    by_name: dict[str, list[NDArray[np.float64]]] = {}
-    for episode in episodes:
-        for name, values in find_terms(episode).items():
-            by_name.setdefault(name, []).append(values)
-    terms = {name: np.concatenate(parts) for name, parts in by_name.items() if len(parts) == len(episodes)}
+    terms = join_terms(episodes)
     return {name: float(values[0]) for name, values in terms.items() if (values == values[0]).all()}
+
+
+def sum_terms(episodes: Sequence[CheckedEpisode]) -> NDArray[np.float64]:
+    """Return the sum of the terms at all steps of all episodes."""
+    return np.concatenate([np.sum(list(find_terms(episode).values()), axis=0) for episode in episodes])
+
+
+def find_wrong_sums(episodes: Sequence[CheckedEpisode]) -> NDArray[np.float64]:
+    """Return how far the sum of the terms is from the reward at all steps, relative to the reward or to 1; all 0 where
+    it hardly ever differs."""
+    rewards = np.concatenate([episode.rewards for episode in episodes])
+    off = np.abs(sum_terms(episodes) - rewards) / np.maximum(1.0, np.abs(rewards))
+    off = np.nan_to_num(off)  # a step without terms
+    is_wrong: NDArray[np.bool_] = off > SUM_TOLERANCE
+    return np.where(is_wrong & (is_wrong.mean() > FEW_WRONG), off, 0.0)
 
 
 def reports_success(episodes: Sequence[CheckedEpisode]) -> bool:

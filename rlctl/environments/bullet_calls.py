@@ -9,7 +9,7 @@ import math
 import re
 import sys
 import types
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any, NamedTuple
@@ -60,8 +60,9 @@ def is_library(frame: FrameType) -> bool:
 
 
 MOTORS = ("setJointMotorControl2", "setJointMotorControlArray", "resetJointState")
-RECORDED = (*MOTORS, "getContactPoints", "getLinkState", "loadURDF", "setAdditionalSearchPath")
-POSITION = 2  # PyBullet's POSITION_CONTROL
+MANY_AXES = ("setJointMotorControlMultiDof", "setJointMotorControlMultiDofArray")
+RECORDED = (*MOTORS, *MANY_AXES, "getContactPoints", "getLinkState", "loadURDF", "setAdditionalSearchPath")
+TORQUE, POSITION = 1, 2  # PyBullet's TORQUE_CONTROL and POSITION_CONTROL
 FULL_TURN = 2 * math.pi
 
 
@@ -76,6 +77,13 @@ class GivenPosition(NamedTuple):
     call: BulletCall
 
 
+class GivenTorque(NamedTuple):
+    """A force that a joint was given in TORQUE_CONTROL [N m], [N]."""
+
+    value: float
+    call: BulletCall
+
+
 @dataclasses.dataclass
 class ContactQuery:
     """The calls of getContactPoints at one line with the same arguments."""
@@ -86,6 +94,9 @@ class ContactQuery:
     links: tuple[int | None, int | None]
     calls: int = 0
     contacts: int = 0
+    others: int = 0  # calls that returned contacts of two bodies
+    own: int = 0  # calls that returned only contacts of a body with itself
+    met: tuple[int, int] = (-1, -1)  # two links of one body in such a contact
 
 
 class BulletCalls:
@@ -94,12 +105,15 @@ class BulletCalls:
     def __init__(self) -> None:
         self.without_client: set[BulletCall] = set()
         self.targets: dict[tuple[int, int, int], GivenPosition] = {}  # last motor target by client, body and joint
+        self.torques: dict[tuple[int, int, int], GivenTorque] = {}  # the largest by client, body and joint
+        self.motorized: set[tuple[int, int, int]] = set()  # joints whose motor was set: by client, body and joint
         self.far_targets: list[GivenPosition] = []  # Positions of more than a full turn
         self.queries: dict[tuple[Any, ...], ContactQuery] = {}
         self.late_links: dict[BulletCall, float] = {}  # how far getLinkState was from the present position [m]
         self.models: dict[tuple[int, int], str] = {}  # the file of a URDF, by client and body
         self.search_paths: list[str] = []
         self.before_step: Callable[[int], None] | None = None  # called with the client before each stepSimulation
+        self.hides_own = False  # whether getContactPoints leaves contacts of a body with itself out
         self._known: set[tuple[CodeType, int]] = set()
 
     def note_call(self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
@@ -136,34 +150,74 @@ class BulletCalls:
             bodies = tuple(-1 if body is None else int(body) for body in (one, two))
             query = self.queries.setdefault(key, ContactQuery(call, client, bodies, (link, other)))  # type: ignore[arg-type]
             query.calls, query.contacts = query.calls + 1, query.contacts + len(result or ())
+            if any(contact[1] != contact[2] for contact in result or ()):
+                query.others += 1
+            elif result:
+                query.own += 1
+                query.met = result[0][3], result[0][4]
             return
-        for body, joint, value, force in _read_positions(name, arguments, keywords):
-            target = GivenPosition(client, body, joint, value, force, call)
+        given = _read_motors(name, arguments, keywords)
+        if name != "resetJointState":
+            self._note_motors(client, call, given)
+        if given.mode != POSITION:
+            return
+        forces = given.forces or itertools.repeat(math.inf)
+        for joint, value, force in zip(given.joints, given.positions, forces, strict=False):
+            target = GivenPosition(client, given.body, joint, value, force, call)
             if name != "resetJointState":
-                self.targets[client, body, joint] = target
+                self.targets[client, given.body, joint] = target
             if abs(value) > FULL_TURN and len(self.far_targets) < 1_000:
                 self.far_targets.append(target)
 
+    def _note_motors(self, client: int, call: BulletCall, given: "_GivenMotors") -> None:
+        """Note which joints get a torque, or otherwise that the motors of joints are set."""
+        if given.mode != TORQUE:
+            self.motorized.update((client, given.body, joint) for joint in given.joints)
+            return
+        for joint, force in zip(given.joints, given.forces, strict=False):
+            key = client, given.body, joint
+            largest = self.torques.get(key)
+            if force and (largest is None or abs(force) > largest.value):
+                self.torques[key] = GivenTorque(abs(force), call)
 
-def _read_positions(
-    name: str, arguments: Sequence[Any], keywords: dict[str, Any]
-) -> list[tuple[int, int, float, float]]:
-    """Return body, joint, position and force of each joint that a call moves by a position; empty for other modes."""
+
+class _GivenMotors(NamedTuple):
+    """What a call gives the motors of joints, or the joints themselves."""
+
+    body: int
+    joints: Sequence[int]
+    mode: int  # That of PyBullet; `POSITION` where a call has none
+    positions: Sequence[float]
+    forces: Sequence[float]
+
+
+def _read_motors(name: str, arguments: Sequence[Any], keywords: Mapping[str, Any]) -> _GivenMotors:
+    """Return what a call gives the motors of one joint or of several; no joint where that cannot be read."""
     many = name.endswith("Array")
+    plural = "s" * many
     names = ["bodyUniqueId", "jointIndices" if many else "jointIndex"]
-    names += ["targetValue"] if name == "resetJointState" else ["controlMode", "targetPosition" + "s" * many]
+    position = "targetPosition" + plural
+    if name == "resetJointState":
+        position = "targetValue"
+        names += [position]
+    else:
+        names += ["controlMode", position, "targetVelocity" + plural, "force" + plural]
     named = {**dict(zip(names, arguments, strict=False)), **keywords}
-    body, joints, values = named.get("bodyUniqueId", named.get("bodyIndex")), named.get(names[1]), named.get(names[-1])
-    if body is None or joints is None or values is None or named.get("controlMode", POSITION) != POSITION:
-        return []
-    forces = named.get("force" + "s" * many)
+    joints, positions, forces = (named.get(key) for key in (names[1], position, "force" + plural))
     if not many:
-        joints, values, forces = [joints], [values], None if forces is None else [forces]
+        joints, positions, forces = ([value] if value is not None else None for value in (joints, positions, forces))
+    if name in MANY_AXES:
+        positions = forces = None  # several numbers per joint
     try:
-        triples = zip(joints, values, itertools.repeat(math.inf) if forces is None else forces, strict=False)
-        return [(int(body), int(joint), float(value), float(force)) for joint, value, force in triples]
+        return _GivenMotors(
+            body=int(named.get("bodyUniqueId", named.get("bodyIndex"))),  # type: ignore[arg-type]
+            joints=[int(joint) for joint in joints or ()],
+            mode=int(named.get("controlMode", POSITION)),
+            positions=[float(value) for value in positions or ()],
+            forces=[float(value) for value in forces or ()],
+        )
     except (TypeError, ValueError):  # PyBullet itself has refused or converted it
-        return []
+        return _GivenMotors(-1, (), POSITION, (), ())
 
 
 def _read_arguments(frame: FrameType) -> str:
@@ -212,6 +266,8 @@ def record_calls(with_results: Collection[str] = RECORDED) -> Iterator[BulletCal
             if name == "stepSimulation" and calls.before_step is not None:
                 calls.before_step(int(keywords.get("physicsClientId", arguments[0] if arguments else 0)))
             result = function(*arguments, **keywords)
+            if calls.hides_own and name == "getContactPoints":
+                return tuple(contact for contact in result or () if contact[1] != contact[2])
             if name in with_results:
                 calls.note_result(name, frame, arguments, keywords, result)
             return result

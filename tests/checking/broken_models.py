@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rlctl.task import Box, Task
+from rlctl.task import Box, Task, rewards
 
 CART = Path(__file__).parent / "cart.urdf"
 
@@ -37,6 +37,39 @@ class CartTask(Task):
 
     def is_success(self):
         return bool(abs(self.cart.joint_positions[0] - 0.3) < 0.1)
+
+
+@dataclass
+class RL620CartSmooth(CartTask):
+    """It also keeps its motions smooth; nothing is wrong with it."""
+
+    reward_weights = {"angle": -1.0, "smoothness": -0.1}
+
+    def reset(self, rng):
+        super().reset(rng)
+        self.last = self.action = np.zeros(1)
+
+    def act(self, action):
+        self.last, self.action = self.action, action.copy()
+        super().act(action)
+
+    def rewards(self, action):
+        return {**super().rewards(action), "smoothness": rewards.change(self.action, self.last)}
+
+
+@dataclass
+class RL620CartComparesWithItself(RL620CartSmooth):
+    def act(self, action):
+        super().act(action)
+        self.last = self.action
+
+
+@dataclass
+class RL621CartSignTwice(CartTask):
+    reward_weights = {"error": -1.0}
+
+    def rewards(self, action):
+        return {"error": -float(abs(self.cart.joint_positions[0] - 0.3))}
 
 
 @dataclass

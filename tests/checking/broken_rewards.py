@@ -24,6 +24,19 @@ class RL603LargeReward(Clean):
         return 100.0 * super().reward()
 
 
+class RL603LargeTerm(Clean):
+    """A term is in millimetres."""
+
+    def reward(self):
+        return sum(self.terms().values())
+
+    def terms(self):
+        return {"distance": 1000.0 * super().reward(), "bonus": 1.0}
+
+    def info(self):
+        return {**super().info(), "reward_terms": self.terms()}
+
+
 class RL603HugeOnce(Clean):
     def reward(self):
         return super().reward() - 5000.0 * (self.steps == 20)
@@ -158,6 +171,44 @@ class RL612WrongSlice(Terms):
 class RL612TimePenalty(Terms):
     def terms(self):
         return {**super().terms(), "time": -0.01}
+
+
+class RL620Smooth(Terms):
+    """A term for the change of the action; nothing is wrong with it."""
+
+    def start(self):
+        super().start()
+        self.last = np.zeros(2)
+
+    def move(self, action):
+        self.last = self.action
+        super().move(action)
+
+    def terms(self):
+        return {**super().terms(), "smoothness": -0.1 * float(np.square(self.action - self.last).sum())}
+
+
+class RL620ActionWithItself(RL620Smooth):
+    def move(self, action):
+        super().move(action)
+        self.last = self.action
+
+
+class RL621EffortPays(Terms):
+    """The minus is there twice."""
+
+    def effort(self):
+        return -super().effort()
+
+
+class RL621CalledPenalty(Terms):
+    def terms(self):
+        return {**super().terms(), "border_penalty": float(np.abs(self.position).max())}
+
+
+class RL621LowersTheReward(Terms):
+    def terms(self):
+        return {**super().terms(), "border_penalty": -float(np.abs(self.position).max())}
 
 
 class RL606AliveBonus(Terms):

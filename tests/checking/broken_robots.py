@@ -2,7 +2,7 @@
 
 import numpy as np
 import pybullet as p
-from robots import Arm, Boat, Crawler, Pusher, Tank
+from robots import HERE, Arm, Boat, Crawler, Pusher, Tank
 
 
 class RL114BoatHiddenBuoy(Boat):
@@ -365,3 +365,64 @@ class RL803PusherInsideItsCube(Pusher):
         if self.np_random.random() < 0.5:
             place = [0.26, 0.035, 0.03]
             p.resetBasePositionAndOrientation(self.cube, place, [0, 0, 0, 1], physicsClientId=self.client)
+
+
+class TorqueDriven:
+    """Its actions are torques of its joints."""
+
+    def move(self, action):
+        for _ in range(4):
+            torques = (self.torque * action).tolist()
+            p.setJointMotorControlArray(
+                self.robot, range(3), p.TORQUE_CONTROL, forces=torques, physicsClientId=self.client
+            )
+            p.stepSimulation(physicsClientId=self.client)
+
+    def drive(self, targets):
+        """Leave the joints where reset has put them."""
+
+    def release(self):
+        for joint in range(3):
+            p.setJointMotorControl2(self.robot, joint, p.VELOCITY_CONTROL, force=0, physicsClientId=self.client)
+
+
+class RL821ArmHeldByMotors(TorqueDriven, Arm):
+    torque = 3.0  # [N m]
+
+
+class RL821ArmDriven(RL821ArmHeldByMotors):
+    def load(self):
+        super().load()
+        self.release()
+
+
+class RL821CrawlerHeldByMotors(TorqueDriven, Crawler):
+    torque = 0.5  # [N m]
+
+
+class RL821CrawlerDriven(RL821CrawlerHeldByMotors):
+    def load(self):
+        super().load()
+        self.release()
+
+
+class RL822PincerStandsOnItself(Crawler):
+    """Its two front legs can hit each other; a foot that touches anything counts as one on the floor."""
+
+    home = np.array([0.0, 0.0, 0.0])
+
+    def load(self):
+        flags = p.URDF_USE_SELF_COLLISION
+        self.robot = p.loadURDF(str(HERE / "pincer.urdf"), [0, 0, 0.09], flags=flags, physicsClientId=self.client)
+
+    def stands(self, foot):
+        contacts = p.getContactPoints(bodyA=self.robot, linkIndexA=foot, physicsClientId=self.client)
+        return len(contacts) > 0
+
+    def reward(self):
+        return super().reward() + 0.1 * (self.stands(0) + self.stands(1))
+
+
+class RL822PincerStands(RL822PincerStandsOnItself):
+    def stands(self, foot):
+        return self.touches(foot)

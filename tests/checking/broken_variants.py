@@ -72,6 +72,30 @@ class RL011NeedsItsEvents(Reach):
     events = {"mass": Event("reset", events.scale_mass, body="arm", factor=(0.8, 1.2), enabled=True)}
 
 
+def forget_mass(sim, rng, *, factor: events.Range):
+    """Draw, and change nothing."""
+    drawn = float(rng.uniform(*factor))
+    sim.body("arm").scale_mass(1.0)
+    return {"factor": drawn}
+
+
+def apply_mass(sim, rng, *, factor: events.Range):
+    """Draw and change."""
+    drawn = float(rng.uniform(*factor))
+    sim.body("arm").scale_mass(drawn)
+    return {"factor": drawn}
+
+
+@dataclass
+class RL014ForgetsTheMass(Reach):
+    events = {"payload": Event("reset", forget_mass, factor=(0.8, 1.2))}
+
+
+@dataclass
+class RL014AppliesTheMass(RL014ForgetsTheMass):
+    events = {"payload": Event("reset", apply_mass, factor=(0.8, 1.2))}
+
+
 @dataclass
 class RL012WrongKey(Reach):
     stages = [{"taks": {"tolerance": 0.2}, "promote": {"success": 0.8}}, {}]

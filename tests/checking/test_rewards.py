@@ -9,6 +9,7 @@ from gymnasium import spaces
 from rlctl.checking.episode import action_at
 from rlctl.checking.rewards import discounted_steps, discounted_sum
 from rlctl.checking.rules.rl605_hovering_pays_more_than_finishing import compare_returns
+from rlctl.checking.term_names import is_about_actions
 from tests.checking.judging import case, check_case, findings, found, mark_slow, rules_of, shared_records_of
 
 BROKEN = "broken_rewards.py"
@@ -35,6 +36,11 @@ CASES = [
     broken("RL610SuccessAtStart", ("RL610", "warning"), twin="RL610SuccessOnAverage"),
     broken("RL611SuccessNever", ("RL611", "info")),
     broken("RL612WrongSlice", ("RL612", "warning"), twin="RL612TimePenalty", slow=True),
+    broken("RL620ActionWithItself", ("RL620", "info"), twin="RL620Smooth"),
+    broken("RL621EffortPays", ("RL621", "warning"), twin="Terms"),
+    broken("RL621CalledPenalty", ("RL621", "info"), twin="RL621LowersTheReward"),
+    case("broken_models.py:RL620CartComparesWithItself", ("RL620", "warning"), twin="broken_models.py:RL620CartSmooth"),
+    case("broken_models.py:RL621CartSignTwice", ("RL621", "warning"), twin="broken_models.py:CartTask"),
 ]
 
 
@@ -135,6 +141,23 @@ def test_numbers_become_actions_of_every_kind():
         assert action["arm"].tolist() == arm
         assert action["gear"] == gear
         assert tuple(part.tolist() for part in action["more"]) == more
+
+
+def test_the_term_that_makes_a_reward_large_is_named():
+    (finding,) = findings(f"{BROKEN}:RL603LargeTerm", "RL603")
+    assert finding.evidence["term"] == "distance"
+    assert finding.message.endswith("; most of it is the term 'distance'")
+
+
+@pytest.mark.parametrize(
+    ("name", "judged"),
+    [
+        *[("action_rate", True), ("actionRate", True), ("ctrl_cost", True), ("joint_torques_l2", True)],
+        *[("excess_torque", False), ("torque_limit", False), ("gripper_action", False), ("distance", False)],
+    ],
+)
+def test_costs_of_actions_are_known_by_their_names(name, judged):
+    assert is_about_actions(name) == judged
 
 
 @pytest.mark.slow

@@ -49,6 +49,12 @@ CASES = [
     broken("RL815ArmOldHand", "RL815", "info", "Arm"),
     broken("RL815PusherOldCube", "RL815", "warning", "Pusher"),
     broken("RL815CrawlerOldFoot", "RL815", "info", "RL815CrawlerFoot"),
+    case(
+        "broken_robots.py:RL821CrawlerHeldByMotors",
+        *(("RL821", "error"), ("RL701", "info")),  # what its motors do is chance
+        twin="broken_robots.py:RL821CrawlerDriven",
+    ),
+    broken("RL822PincerStandsOnItself", "RL822", "info", "RL822PincerStands"),
 ]
 
 
@@ -72,3 +78,11 @@ def test_finding_points_at_the_line_that_causes_it(name, rule, text):
     file, line = finding.where
     with open(file) as lines:
         assert text in lines.readlines()[line - 1]
+
+
+@pytest.mark.pybullet
+def test_joints_that_default_motors_hold_are_named():
+    (finding,) = findings("broken_robots.py:RL821ArmHeldByMotors", "RL821")
+    assert finding.message.startswith("shoulder, elbow, wrist get torques, and PyBullet's default motors hold them")
+    assert finding.evidence["torque"] == pytest.approx(3.0, rel=0.01)
+    assert findings("broken_robots.py:RL821ArmDriven", "RL821") == []

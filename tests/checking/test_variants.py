@@ -10,6 +10,7 @@ CASES = [
     case("broken_variants.py:RL011WrongBody", ("RL011", ERROR), twin=SOUND, slow=True),
     case("broken_variants.py:RL011OwnChance", ("RL011", ERROR), twin=SOUND),
     case("broken_variants.py:RL011BreaksDown", ("RL011", ERROR), twin="broken_variants.py:RL011NeedsItsEvents"),
+    case("broken_variants.py:RL014ForgetsTheMass", ("RL014", "warning"), twin="broken_variants.py:RL014AppliesTheMass"),
     case("broken_variants.py:RL013Misspelled", ("RL013", "warning"), twin=SOUND),
     case("broken_variants.py:RL012WrongKey", ("RL012", ERROR), twin=SOUND),
     case("broken_variants.py:RL012WrongParameter", ("RL012", ERROR), twin=SOUND),

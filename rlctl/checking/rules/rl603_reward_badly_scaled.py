@@ -1,12 +1,12 @@
 """RL603: reward badly scaled."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from rlctl.checking.experiment import judges_records
-from rlctl.checking.records import Records
-from rlctl.checking.rewards import require_rewarded
+from rlctl.checking.records import CheckedEpisode, Records
+from rlctl.checking.rewards import join_terms, require_rewarded
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
 RULE = Rule(
@@ -25,6 +25,7 @@ RULE = Rule(
 )
 
 LARGE = 10.0  # root mean square per step; a return is up to a hundred times as much
+MOST_OF = 0.5
 HUGE = 1_000.0  # a single larger reward spoils the values before it
 
 
@@ -45,5 +46,15 @@ def _find_badly_scaled(records: Records) -> Iterator[RuleFinding]:
         message = f"the reward is {value:.3g} at step {step + 1}; usual is {size:.2g}"
     else:
         return
-    evidence = largest.at(step + 1, value=value, root_mean_square=size, expected=[-LARGE, LARGE])
+    term = _find_largest_term(episodes)
+    if term:
+        message = f"{message}; most of it is the term {term!r}"
+    evidence = largest.at(step + 1, value=value, root_mean_square=size, term=term, expected=[-LARGE, LARGE])
     yield RuleFinding(RULE, message, evidence, Severity.INFO if records.normalizes("reward") else Severity.WARNING)
+
+
+def _find_largest_term(episodes: Sequence[CheckedEpisode]) -> str:
+    """Return the term that is most of the rewards' squares; empty without terms, or if none is most of them."""
+    squares = {name: float(np.nansum(values**2)) for name, values in join_terms(episodes).items()}
+    largest = max(squares, key=lambda name: squares[name], default="")
+    return largest if largest and squares[largest] > MOST_OF * sum(squares.values()) else ""

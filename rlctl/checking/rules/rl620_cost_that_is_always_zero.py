@@ -1,0 +1,56 @@
+"""RL620: cost that is always zero."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from rlctl.checking.experiment import judges_records
+from rlctl.checking.records import CheckedEpisode, Records
+from rlctl.checking.rewards import (
+    ENOUGH_STEPS,
+    RAW_TERMS,
+    WITH_SEARCH,
+    join_terms,
+    require_terms,
+    summarize,
+)
+from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
+from rlctl.checking.term_names import ENERGY_WORDS, is_about_actions
+
+RULE = Rule(
+    "RL620",
+    "cost that is always zero",
+    Severity.WARNING,
+    meaning="""
+        A reward term that is named after the actions, their change, or the effort of the motors is exactly 0 at
+        every recorded step, although the actions changed. It costs nothing, so nothing keeps the motions smooth or
+        cheap. Terms whose name says that only a part counts, such as excess_torque, are not judged. An info in a
+        plain environment, whose weight of the term may be 0.
+    """,
+    fix="""
+        Look at what the term is computed from. An action must not be compared with itself: keep a copy of the last
+        one, and replace it after the reward. PyBullet reports no torque of joints in TORQUE_CONTROL.
+    """,
+)
+
+
+@judges_records(RULE, *WITH_SEARCH, of_absence=True)
+def _find_zero_costs(records: Records) -> Iterator[RuleFinding]:
+    episodes = require_terms(records)
+    if _count_changes(episodes) < ENOUGH_STEPS:
+        raise NotJudged(f"the actions changed in fewer than {ENOUGH_STEPS} steps")
+    raw_terms = join_terms(episodes, RAW_TERMS)
+    for name, values in join_terms(episodes).items():
+        raw = raw_terms.get(name)
+        is_weightless = raw is not None and raw.any()
+        if not values.any() and not is_weightless and is_about_actions(name, ENERGY_WORDS):
+            message = f"reward term {name!r} is 0 at every step of {summarize(episodes)}"
+            severity = Severity.WARNING
+            if raw is None:
+                severity = Severity.INFO
+            yield RuleFinding(RULE, message, {"term": name, "value": 0.0, "episodes": len(episodes)}, severity)
+
+
+def _count_changes(episodes: Sequence[CheckedEpisode]) -> int:
+    """Return at how many steps the action was another one than at the step before."""
+    return sum(int((np.diff(episode.taken, axis=0) != 0).any(axis=1).sum()) for episode in episodes)

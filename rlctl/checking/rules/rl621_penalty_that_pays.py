@@ -1,0 +1,74 @@
+"""RL621: penalty that pays."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.experiment import judges_records
+from rlctl.checking.records import CheckedEpisode, Records
+from rlctl.checking.rewards import (
+    RAW_TERMS,
+    WITH_SEARCH,
+    find_terms,
+    find_wrong_sums,
+    join_terms,
+    require_enough,
+    require_terms,
+    summarize,
+)
+from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
+from rlctl.checking.term_names import is_about_actions, is_cost, is_error
+
+RULE = Rule(
+    "RL621",
+    "penalty that pays",
+    Severity.WARNING,
+    meaning="""
+        A reward term that should lower the reward raises it: its weight is negative and the term too, or it has no
+        minus. The policy learns to seek what the term should prevent. Judged are terms of a task with a negative
+        weight that are named after an error or a cost; costs of actions that pay more for moving than for doing
+        nothing; and, as an info, terms that are called cost or penalty.
+    """,
+    fix="Return the term without a sign, such as a distance or a squared action, and put the sign in the weight.",
+)
+
+MOVING_PAYS = 2.0  # times as much as doing nothing
+
+
+@judges_records(RULE, *WITH_SEARCH)
+def _find_paying_penalties(records: Records) -> Iterator[RuleFinding]:
+    episodes = require_enough(require_terms(records))
+    if find_wrong_sums(episodes).any():
+        raise NotJudged("reward_terms do not add up to the reward (RL607)")
+    raw_terms = join_terms(episodes, RAW_TERMS)
+    for name, values in join_terms(episodes).items():
+        always_pays = bool((values >= 0).all() and (values != values[0]).any())
+        if not always_pays:
+            continue
+        message = f"reward term {name!r} raises the reward at every step of {summarize(episodes)}"
+        if not values.all():
+            message = f"reward term {name!r} raises the reward, and never lowers it, in {summarize(episodes)}"
+        raw = raw_terms.get(name)
+        if raw is not None and raw.min() < 0 and is_error(name):  # their product is positive
+            message, severity = f"{message}: its weight and the term itself are both negative", Severity.WARNING
+        elif is_about_actions(name) and _pays_for_moving(episodes, name):
+            message, severity = f"{message}: moving earns more of it than doing nothing", Severity.WARNING
+        elif is_cost(name):
+            severity = Severity.INFO
+        else:
+            continue
+        evidence = {"term": name, "value": float(values.max()), "episodes": len(episodes)}
+        yield RuleFinding(RULE, message, evidence, severity)
+
+
+def _pays_for_moving(episodes: Sequence[CheckedEpisode], name: str) -> bool:
+    """Say whether a term is clearly larger with random and extreme actions than with none."""
+    idle = _read_term([episode for episode in episodes if not episode.taken.any()], name)
+    moving = _read_term([episode for episode in episodes if episode.actions in ("random", "extreme")], name)
+    return bool(idle.size and moving.size and moving.mean() > MOVING_PAYS * idle.mean())
+
+
+def _read_term(episodes: Sequence[CheckedEpisode], name: str) -> NDArray[np.float64]:
+    parts = [find_terms(episode)[name] for episode in episodes]
+    return np.concatenate(parts) if parts else np.zeros(0)
