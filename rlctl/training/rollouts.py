@@ -72,7 +72,7 @@ class WorkerVecEnv(VecEnv):
 
     @property
     def limits(self) -> NDArray[np.int64]:
-        """After how many steps the running episode of each environment is truncated; 0: by the task; shape (n_envs,)."""
+        """Steps after which the running episode of each environment is truncated; 0: by the task; shape (n_envs,)."""
         return self._limits
 
     @limits.setter

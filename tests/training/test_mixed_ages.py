@@ -79,5 +79,5 @@ def test_others_begin_at_once(make):
 
 
 def test_a_plain_environment_keeps_its_time_limit(train):
-    with pytest.raises(RecipeError, match="mixed_ages: .*CartPole-v1 is a plain Gymnasium environment"):
+    with pytest.raises(RecipeError, match=r"mixed_ages: .*CartPole-v1 is a plain Gymnasium environment"):
         train("CartPole-v1", {"mixed_ages": True, "total_timesteps": 100})
