@@ -386,11 +386,11 @@ class TorqueDriven:
             p.setJointMotorControl2(self.robot, joint, p.VELOCITY_CONTROL, force=0, physicsClientId=self.client)
 
 
-class RL821ArmHeldByMotors(TorqueDriven, Arm):
+class ArmHeldByMotors(TorqueDriven, Arm):
     torque = 3.0  # [N m]
 
 
-class RL821ArmDriven(RL821ArmHeldByMotors):
+class ArmDriven(ArmHeldByMotors):
     def load(self):
         super().load()
         self.release()

@@ -23,6 +23,7 @@ CASES = [
     broken("RL602ConstantReward", ("RL602", "warning")),
     broken("RL602SparseNeverFound", ("RL602", "info"), ("RL611", "info")),
     broken("RL603LargeReward", ("RL603", "warning"), twin="RL603FinalBonus"),
+    broken("RL603LargeTerm", ("RL603", "warning"), twin="RL603FinalBonus", slow=True),
     broken("RL603HugeOnce", ("RL603", "warning"), twin="RL603FinalBonus"),
     broken("RL604Falls", ("RL604", "warning"), twin="RL604FallsBadly"),
     broken("RL604FallsUntold", ("RL604", "warning"), ("RL609", "info"), twin="RL604FallsBadly"),

@@ -82,7 +82,7 @@ def test_finding_points_at_the_line_that_causes_it(name, rule, text):
 
 @pytest.mark.pybullet
 def test_joints_that_default_motors_hold_are_named():
-    (finding,) = findings("broken_robots.py:RL821ArmHeldByMotors", "RL821")
+    (finding,) = findings("broken_robots.py:ArmHeldByMotors", "RL821")
     assert finding.message.startswith("shoulder, elbow, wrist get torques, and PyBullet's default motors hold them")
     assert finding.evidence["torque"] == pytest.approx(3.0, rel=0.01)
-    assert findings("broken_robots.py:RL821ArmDriven", "RL821") == []
+    assert findings("broken_robots.py:ArmDriven", "RL821") == []

@@ -124,4 +124,5 @@ def _are_ends_equal(context: Context, name: str, ranges: Mapping[str, tuple[floa
         spec = dataclasses.replace(context.spec, events={**context.spec.events, name: changed})
         with context.fresh(spec=spec) as instance:
             episodes.append(play_variant(instance))
-    return bool(np.array_equal(*episodes))
+    at_low, at_high = episodes
+    return bool(np.array_equal(at_low, at_high))
