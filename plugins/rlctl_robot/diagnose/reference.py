@@ -20,7 +20,7 @@ from rlctl.task.events import EventSettings, delay
 from rlctl.task.events.event import Widening
 from rlctl_robot.diagnose.actor import LoggedActor
 from rlctl_robot.diagnose.candidates import TermStatistics, list_candidates
-from rlctl_robot.diagnose.correction import EVERYTHING, Correction
+from rlctl_robot.diagnose.correction import EVERYTHING, Correction, list_parts
 from rlctl_robot.diagnose.signals import ACTIONS, Array, LoggedSignals
 
 _SOUND_SHARE, _HELD_OUT_SHARE = 0.4, 0.2  # of all steps; the others are with mistakes
@@ -151,9 +151,9 @@ class _MistakenActor(Actor):
         sizes: Mapping[str, int],
         rng: np.random.Generator,
     ) -> None:
-        self._actor, self._mistakes, self._noise, self._rng = actor, mistakes, noise, rng
+        self._actor, self._mistakes, self._noise, self._rng = actor, list_parts(mistakes), noise, rng
         self._slices = LoggedSignals(np.zeros((0, 0)), np.zeros((0, 0)), (), dict(sizes)).slices
-        self._late = sum(one.delay for one in mistakes if one.term == ACTIONS)
+        self._late = sum(one.delay for one in self._mistakes if one.term == ACTIONS)
         self._disturbance = np.zeros(len(actor.low))
         self._sent: list[Array] = []
         self.observations: list[Array] = []  # what the sensors measured
