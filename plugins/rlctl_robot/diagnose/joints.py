@@ -11,7 +11,7 @@ from rlctl_robot.diagnose.physics import Physics
 from rlctl_robot.diagnose.search import LEAST_SHARE, Found
 from rlctl_robot.diagnose.signals import Array, LoggedSignals
 
-_FIRST_ROWS, _FIRST_PARTS = 36, 3  # of a log, for all mistakes of the joints
+_FIRST_ROWS, _FIRST_PARTS = 36, 2  # of a log, for all mistakes of the joints
 _ROWS, _PARTS = 60, 10  # for the best of them
 _BEST = 8  # mistakes of the joints that are compared in more rows
 _LEAST_DEVIATION = 5.0  # standard errors by which a mistake of the joints must be better than without it
