@@ -22,7 +22,7 @@ _SMALL_OFFSET = 0.3  # in standard deviations: the effect of an offset is measur
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _AffectedPart:
-    """What depends on some columns of the windows."""
+    """What depends on some columns of the windows; with float32, which halves the time of most of the search."""
 
     columns: Array
     relations: Array
@@ -89,9 +89,9 @@ class Likelihood:
             columns,
             relations,
             features,
-            windows.projection[np.ix_(columns, features)],
-            matrix[np.ix_(relations, columns)].T,
-            matrix[np.ix_(relations, windows.total + features)].T,
+            windows.projection[np.ix_(columns, features)].astype(np.float32),
+            matrix[np.ix_(relations, columns)].T.astype(np.float32),
+            matrix[np.ix_(relations, windows.total + features)].T.astype(np.float32),
         )
 
     def learn_more(self, recordings: LoggedSignals) -> "Likelihood":
@@ -151,6 +151,7 @@ class Scorer:
         self._before = self._window @ windows.projection + windows.bias
         self._errors = extended @ relations.matrix.T + relations.constant
         self._losses = compute_losses(self._errors).mean(axis=0)
+        self._single = [part.astype(np.float32) for part in (self._before, self._features, self._errors)]
 
     def _cost(self, one: Correction) -> float:
         """Return what a correction that makes values smaller gains where they are noise; it is no evidence."""
@@ -186,16 +187,18 @@ class Scorer:
         blocks = [windows.block(name, self._signals, self._rows, corrections) for name in names]
         block = np.concatenate(blocks, axis=1) * self._keep[self._likelihood.affect(names).columns]
         losses = self._losses.copy()
-        losses[self._likelihood.affect(names).relations] = compute_losses(self._errors_with(names, block)).mean(axis=0)
+        affected = self._likelihood.affect(names).relations
+        losses[affected] = compute_losses(self._errors_with(names, block)).mean(axis=0, dtype=np.float64)
         return losses
 
     def _errors_with(self, names: tuple[str, ...], block: Array) -> Array:
         """Return the errors of the affected relations with other parts of the windows, shape (rows, affected)."""
         part = self._likelihood.affect(names)
-        change = block - self._window[:, part.columns]
-        projected = self._before[:, part.features] + change @ part.projection
-        moved = np.tanh(projected) - self._features[:, part.features]
-        errors: Array = self._errors[:, part.relations] + change @ part.of_columns
+        before, features, all_errors = self._single
+        change = (block - self._window[:, part.columns]).astype(np.float32)
+        projected = before[:, part.features] + change @ part.projection
+        moved = np.tanh(projected) - features[:, part.features]
+        errors: Array = all_errors[:, part.relations] + change @ part.of_columns
         errors += moved @ part.of_features
         return errors
 
