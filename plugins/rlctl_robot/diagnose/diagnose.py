@@ -1,5 +1,6 @@
 """Finds what is wrong in the mapping between a robot and a policy, from a log of observations and actions."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -141,6 +142,11 @@ class Doctor:
         report(f"trying {len(self.candidates):,} corrections on sound robots")
         self.likelihood.learn_chances(self.candidates)
 
+    def close(self) -> None:
+        """Close the simulation."""
+        if self.physics is not None:
+            self.physics.close()
+
     def diagnose(
         self,
         signals: LoggedSignals,
@@ -163,7 +169,8 @@ class Doctor:
             by_limits = find_limited_rows(limits, self.policy.info.env, signals, self.likelihood.margin)
             limited = by_limits if limited is None else limited | by_limits
         self._report("comparing the logged actions with those of the policy")
-        is_unknown = limited is not None and (~limited[signals.inner_rows(MAX_DELAY + 1)]).sum() < _FEWEST_FREE
+        inner = signals.inner_rows(MAX_DELAY + 1)
+        is_unknown = limited is not None and int((~limited[inner]).sum()) < _FEWEST_FREE
         match = PolicyMatch(0.0, 0.0) if is_unknown else self._match(signals, frozen, limited)
         findings = [*self._describe_frozen(frozen, signals), *self._describe_match(match, signals, bool(frozen))]
         corrected = correct(signals, match.corrections)
@@ -397,10 +404,10 @@ def diagnose_log(
     log: RobotLog = read_robot_log(path, policy.info.env, columns)
     report(f"{len(log.signals.actions):,} rows")
     with threadpool_limits(1, "blas"):  # with other programs on the same cores, threads wait for each other
-        doctor = Doctor(policy, spec, seed, others, report=report)
-        findings, answers, mapping = doctor.diagnose(
-            log.signals, bounds, log.limited, is_of_controller=log.is_of_controller
-        )
+        with contextlib.closing(Doctor(policy, spec, seed, others, report=report)) as doctor:
+            findings, answers, mapping = doctor.diagnose(
+                log.signals, bounds, log.limited, is_of_controller=log.is_of_controller
+            )
     rows = len(log.signals.actions)
     return Diagnosis(
         log=path,

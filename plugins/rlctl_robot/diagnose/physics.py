@@ -27,6 +27,7 @@ _SETTLING = 12  # rows until the trunk's height and velocity are about right
 _DOWN = (0.0, 0.0, -1.0)
 _SMALLEST_ERROR = 0.02  # of an element's standard deviation
 _WIDER = 1.5  # errors are counted in units of so many usual errors
+_FARTHEST = 10.0  # standard deviations from the usual value, to which a logged state is clipped
 _MOST_ERROR = 0.5  # usual error of a task that can be simulated from what is logged, in standard deviations
 _BLOCK = 10  # rows after which errors are nearly independent
 _SOUND_ROWS = 40  # of each sound episode whose errors are the usual ones
@@ -58,6 +59,8 @@ class Physics:
         names = (terms.positions, terms.velocities, terms.gravity, terms.gyroscope)
         self._compared = np.concatenate([np.r_[self._slices[name]] for name in names])
         self._scale = np.ones(len(self._compared))
+        self._lowest: Array | float = -np.inf
+        self._highest: Array | float = np.inf
         self.usual_loss = 0.0
         """The largest mean loss of an episode of a sound robot in simulation."""
 
@@ -72,6 +75,9 @@ class Physics:
             return False
         errors = self._simulate([(sound, start) for start in starts], _SOUND_ROWS)
         usual = np.sqrt(np.square(errors).mean(axis=(0, 1)))
+        # In a wrong unit a state could be one that no simulation survives.
+        middle, reach = sound.observations.mean(axis=0), _FARTHEST * std
+        self._lowest, self._highest = middle - reach, middle + reach
         deviations = std[self._compared]
         self._scale = _WIDER * np.maximum(usual, _SMALLEST_ERROR * deviations)
         self.usual_loss = float(compute_losses(errors / self._scale).mean(axis=(1, 2)).max())
@@ -126,6 +132,7 @@ class Physics:
     def _set_state(self, observed: Array) -> None:
         """Set the measured part of the state; height, heading and velocity of the trunk stay."""
         terms, body = self._terms, self._body
+        observed = np.clip(observed, self._lowest, self._highest)
         place, velocity = np.array(body.base_position), np.array(body.base_velocity)
         orientation = _tilt(np.array(body.base_orientation), observed[:, self._slices[terms.gravity]])
         turning = rotate(orientation, observed[:, self._slices[terms.gyroscope]])
