@@ -350,22 +350,17 @@ class Doctor:
 
 
 def _mark_weak(findings: Sequence[MappingFinding]) -> list[MappingFinding]:
-    """Mark what may be a consequence of the first finding, which explains most of the difference."""
-    if not findings or findings[0].kind == "frozen" or findings[0].explains < _MAIN_SHARE:
+    """Mark what may be a consequence of a finding that explains most of what the simulation says."""
+    of_robot = [finding for finding in findings if finding.question != 1 and finding.kind != "frozen"]
+    if not of_robot or of_robot[0].explains < _MAIN_SHARE:
         return list(findings)
-    first, *others = findings
-    return [
-        first,
-        *(
-            dataclasses.replace(
-                other,
-                is_weak=other.is_mistake
-                and other.question != 1
-                and (other.explains < _MAIN_SHARE or other.evidence < _WEAK_EVIDENCE * first.evidence),
-            )
-            for other in others
-        ),
-    ]
+    main = of_robot[0]
+    marked = []
+    for finding in findings:
+        is_other = finding in of_robot[1:] and finding.is_mistake
+        is_smaller = finding.explains < _MAIN_SHARE or finding.evidence < _WEAK_EVIDENCE * main.evidence
+        marked.append(dataclasses.replace(finding, is_weak=is_other and is_smaller))
+    return marked
 
 
 def _has_large_gain(one: Correction) -> bool:
@@ -403,11 +398,13 @@ def diagnose_log(
     bounds = None if limits is None else read_limits(limits)
     log: RobotLog = read_robot_log(path, policy.info.env, columns)
     report(f"{len(log.signals.actions):,} rows")
-    with threadpool_limits(1, "blas"):  # with other programs on the same cores, threads wait for each other
-        with contextlib.closing(Doctor(policy, spec, seed, others, report=report)) as doctor:
-            findings, answers, mapping = doctor.diagnose(
-                log.signals, bounds, log.limited, is_of_controller=log.is_of_controller
-            )
+    with (
+        threadpool_limits(1, "blas"),  # with other programs on the same cores, threads wait for each other
+        contextlib.closing(Doctor(policy, spec, seed, others, report=report)) as doctor,
+    ):
+        findings, answers, mapping = doctor.diagnose(
+            log.signals, bounds, log.limited, is_of_controller=log.is_of_controller
+        )
     rows = len(log.signals.actions)
     return Diagnosis(
         log=path,
