@@ -66,7 +66,7 @@ class MappingFinding:
 
     def describe(self) -> str:
         """Return the finding as a sentence."""
-        return f"{self.text}: explains {self.explains:.0%} of the difference"
+        return f"{self.text}: explains {self.explains:.0%} of the difference" if self.is_mistake else self.text
 
 
 @dataclasses.dataclass(frozen=True)
