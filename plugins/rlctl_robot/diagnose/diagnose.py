@@ -38,7 +38,8 @@ _MAIN_SHARE = 0.8  # of the difference that a finding explains beside which weak
 _WEAK_EVIDENCE = 0.1  # of the evidence of the first finding
 _MOST_GAIN = 2.0  # factor of an action, or its inverse, that a mapping may have
 _LARGE_ERROR = 1.15  # times the usual error, from which something differs
-_LARGE_LOSS = 1.5  # the same of the simulation's prediction, relative to the worst episode of a sound robot
+_LARGER = 1.1  # than the largest error of a sound robot
+_LARGE_LOSS = 2.0  # the same of the simulation's prediction, relative to the worst episode of a sound robot
 _FEWEST_FREE = 20  # rows in which a server has not limited the action, to compare it with the policy's
 _FALLEN = 0.2  # by which the direction of gravity leaves what sound robots measure
 _FALLEN_SHARE = 0.02  # of the rows
@@ -215,10 +216,11 @@ class Doctor:
     def _describe_unexplained(self, answers: Answers, signals: LoggedSignals, judgement: Judgement | None) -> str:
         """Return how a log without a mistake that explains it differs; empty if it does not."""
         signs = []
-        if answers.step_error[0] > _LARGE_ERROR:
+        if judgement is not None:
+            if judgement.times_usual > _LARGE_LOSS:
+                signs.append("the simulation, set to each row, predicts the next one worse than for any sound robot")
+        elif answers.step_error[0] > max(_LARGE_ERROR, _LARGER * self.likelihood.largest_error):
             signs.append(f"errors of the next row are {answers.step_error[0]:.3g} times the usual ones")
-        elif judgement is not None and judgement.times_usual > _LARGE_LOSS:
-            signs.append("the simulation, set to each row, does not predict the next one as it does for sound robots")
         if self._falls(signals):
             signs.append("the robot falls")
         if not signs:

@@ -48,6 +48,8 @@ class Likelihood:
         self.margin = MAX_DELAY + reference.allowed_delay + STRIDE
         """Rows that are left out at both ends of a segment."""
         self._chances: dict[tuple[str, str] | Correction, float] = {}
+        self.largest_error = 1.0
+        """How many times the usual error the errors of the next row are in the worst log of a sound robot."""
 
     def learn_chances(self, candidates: Sequence[Correction]) -> None:
         """Learn which evidence wrong corrections have in simulation, where nothing is wrong.
@@ -69,6 +71,7 @@ class Likelihood:
                 continue
             chosen = choose_rows(part, inner, self.reference.statistics, _CHANCE_SAMPLE)
             scorer = Scorer(self, part, dataclasses.replace(chosen, stands_for=_CHANCE_ROWS))
+            self.largest_error = max(self.largest_error, scorer.times_usual(None))
             for one in candidates:
                 gain = scorer.gain(one)
                 for key in (one, _group(one)):
@@ -98,7 +101,7 @@ class Likelihood:
         """Return the likelihood with relations that are also those of further recordings in simulation."""
         varied = self.reference.varied.join(recordings)
         more = Likelihood(dataclasses.replace(self.reference, varied=varied))
-        more._chances = self._chances
+        more._chances, more.largest_error = self._chances, self.largest_error
         return more
 
     def chance(self, one: Correction) -> float:
