@@ -193,9 +193,19 @@ class Body:
         raise NotImplementedError
 
     def set_base(
-        self, position: Any, orientation: Any = (0.0, 0.0, 0.0, 1.0), *, worlds: NDArray[np.int64] | None = None
+        self,
+        position: Any,
+        orientation: Any = (0.0, 0.0, 0.0, 1.0),
+        *,
+        velocity: Any = None,
+        angular_velocity: Any = None,
+        worlds: NDArray[np.int64] | None = None,
     ) -> None:
-        """Place the base at rest, its centre of mass at `position` [m]; `Sim.load` places its origin."""
+        """Place the base, its centre of mass at `position` [m]; `Sim.load` places its origin.
+
+        It is at rest unless `velocity` [m/s], of its centre of mass, or `angular_velocity` [rad/s] are given, in the
+        world's frame; a fixed base has none.
+        """
         raise NotImplementedError
 
     def add_velocity(

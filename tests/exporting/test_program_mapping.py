@@ -13,7 +13,10 @@ from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.onnx_policy import encode
 from rlctl.policy.policy import Policy
+from rlctl.storage import yaml_text
 from rlctl.task import Joints, terms
+from rlctl_robot.diagnose.correction import Correction
+from rlctl_robot.diagnose.mapping import build_mapping
 from tests.exporting.controllers import make_arm, make_policy, plan_of
 
 MAPPING = """
@@ -125,6 +128,17 @@ def test_targets_are_the_programs(legs, tmp_path, text):
     assert MappedController(mapped, mapping).step(inputs)[1] == pytest.approx(target, abs=1e-6)
     units = dict(mapped.session.get_modelmeta().custom_metadata_map)["input_units"]
     assert units == "half turns,quaternion w; x; y; z"
+
+
+def test_what_diagnose_prints_of_actions_is_accepted_with_the_targets(legs, tmp_path):
+    swap = Correction("actions", "order", "", (1, 0), (0.8, 1.25), (-0.4, 0.5))  # of the targets, about the stance
+    joints = legs.info.env.joints
+    printed = build_mapping([], [swap], {"positions": 2}, joints).model_dump(exclude_defaults=True)
+    assert printed["targets"] == {"order": [1, 0]}
+    mapping = read(legs, tmp_path, yaml_text.dump(printed))
+    assert mapping.targets.order.tolist() == [1, 0]
+    with pytest.raises(UsageError, match="actions: what diagnose prints there is of the policy's action"):
+        read(legs, tmp_path, yaml_text.dump({"actions": printed["actions"]}))
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

@@ -1,11 +1,14 @@
 """The world: bodies and links by name, limits, pictures."""
 
+import contextlib
+
 import numpy as np
 import pytest
 
 import rlctl
 from rlctl.errors import RecipeError, TaskError
 from rlctl.task.env import TaskEnv
+from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.task.pybullet.library import pybullet
 from rlctl.task.pybullet.sim import PybulletSim
 from rlctl_manipulation import reach
@@ -194,3 +197,19 @@ def test_a_failing_build_leaves_no_client():
     with pytest.raises(TaskError, match="not found"):
         TaskEnv(task)
     assert not pybullet.isConnected(physicsClientId=task.client)
+
+
+@pytest.mark.parametrize("engine", [PybulletSim, MujocoSim])
+def test_a_base_is_placed_with_its_velocities(engine):
+    half = np.sqrt(0.5)  # a quarter turn about z
+    with contextlib.closing(engine(control_dt=1 / 60, substeps=4)) as sim:
+        cube = sim.load("cube", "cube_small.urdf")
+        cube.set_base(
+            (0.0, 0.0, 1.0), (0.0, 0.0, half, half), velocity=(1.0, 2.0, 3.0), angular_velocity=(0.1, 0.2, 0.3)
+        )
+        assert cube.base_velocity == pytest.approx([1.0, 2.0, 3.0])
+        assert cube.base_angular_velocity == pytest.approx([0.1, 0.2, 0.3])
+        cube.set_base((0.0, 0.0, 1.0), angular_velocity=(0.1, 0.2, 0.3))
+        assert cube.base_velocity == pytest.approx([0.0, 0.0, 0.0])
+        cube.set_base((0.0, 0.0, 1.0))
+        assert cube.base_angular_velocity.tolist() == [0.0, 0.0, 0.0]

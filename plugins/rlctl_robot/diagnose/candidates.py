@@ -10,7 +10,7 @@ import numpy as np
 from rlctl.environments.info import EnvInfo
 from rlctl.limits.observation import find_command_ranges
 from rlctl.policy.layers import Normalize
-from rlctl_robot.diagnose.correction import EVERYTHING, Correction
+from rlctl_robot.diagnose.correction import EVERYTHING, JOINTS, Correction, Kind
 from rlctl_robot.diagnose.signals import ACTIONS, MAX_DELAY, Array
 
 _DEGREE = math.pi / 180
@@ -127,7 +127,7 @@ def _list_raw_orders(name: str, values: TermStatistics, joints: Sequence[str], i
     A program confuses its own angles: it takes the stance off afterwards, and adds it before. Of angles without a
     stance, and of joints with equal default positions, these are the orders of `_list_orders`.
     """
-    stance = _find_stance(name, values, info)
+    stance = find_stance(name, values, info)
     if stance is None:
         return
     pose, scale = stance
@@ -144,7 +144,75 @@ def _list_raw_orders(name: str, values: TermStatistics, joints: Sequence[str], i
             )
 
 
-def _find_stance(name: str, values: TermStatistics, info: EnvInfo) -> tuple[Array, Array] | None:
+def list_joint_mistakes(info: EnvInfo, statistics: Mapping[str, TermStatistics]) -> list[Correction]:
+    """Return mistakes of the joints' driver: it exchanges or reverses all quantities of a joint together.
+
+    A program confuses its own angles, from which the policy's differ by the stance, or the policy's elements.
+    """
+    joints, size = info.joints, len(statistics[ACTIONS].mean)
+    quantities = [name for name in statistics if is_of_joints(name, statistics[name], info)]
+    if joints is None or len(joints.names) != size or not quantities:
+        return []
+    found = []
+    names, straight = list(joints.names), tuple(range(size))
+    terms = [*quantities, ACTIONS]
+    where = f" in {', '.join(quantities)} and {ACTIONS}"
+    orders = {order: _name_swapped(order, names) or text for order, text in list_permutations(size, names).items()}
+    signs = {one.factor: one.text for one in _list_signs(JOINTS, size)} if size > 1 else {}
+    named = {factor: f"{text}{_name_reversed(factor, names)}" for factor, text in signs.items()}
+    mistakes: list[tuple[Kind, tuple[int, ...], tuple[float, ...], str]] = [
+        *(("order", order, (1.0,) * size, text) for order, text in orders.items()),
+        *(("sign", straight, factor, text) for factor, text in named.items()),
+    ]
+    for kind, order, factor, text in mistakes:
+        of_angles = tuple(_make_part(name, statistics[name], info, kind, order, factor) for name in terms)
+        plain = tuple(Correction(name, kind, text, order, factor) for name in terms)
+        if any(one.offset for one in of_angles):
+            angles = f"{text}{where}, before the stance is subtracted"
+            found.append(Correction(JOINTS, kind, angles, parts=of_angles))
+        found.append(Correction(JOINTS, kind, f"{text}{where}", parts=plain))
+    return found
+
+
+def is_of_joints(name: str, values: TermStatistics, info: EnvInfo) -> bool:
+    """Return whether an observation has a quantity of each joint that its driver measures."""
+    joints = info.joints
+    if joints is None or name == ACTIONS or len(values.mean) != len(joints.names):
+        return False
+    return name == joints.measured or name.startswith("joint")
+
+
+def _name_swapped(order: tuple[int, ...], names: Sequence[str]) -> str:
+    """Return what is wrong where two joints are exchanged; empty for other orders."""
+    moved = [index for index, other in enumerate(order) if index != other]
+    if len(moved) != 2:
+        return ""
+    one, other = moved
+    return f"elements {one} and {other} ({names[one]} and {names[other]}) are swapped"
+
+
+def _name_reversed(factor: tuple[float, ...], names: Sequence[str]) -> str:
+    reversed_joints = [name for name, value in zip(names, factor, strict=True) if value < 0]
+    return f" ({reversed_joints[0]})" if len(reversed_joints) == 1 else ""
+
+
+def _make_part(
+    name: str, values: TermStatistics, info: EnvInfo, kind: Kind, order: tuple[int, ...], sign: tuple[float, ...]
+) -> Correction:
+    """Return what exchanged or reversed angles of a driver are in an observation or in the actions."""
+    stance = find_stance(name, values, info)
+    if stance is None:
+        return Correction(name, kind, "", order, sign)
+    pose, scale = stance
+    there, signs = list(order), np.array(sign)
+    # program's angle = pose + scale * value; the right one is sign * angle[order].
+    offset = (signs * pose[there] - pose) / scale
+    factor = signs * scale[there] / scale
+    shifts = () if np.allclose(offset, 0.0) else tuple(offset.tolist())
+    return Correction(name, kind, "", order, tuple(factor.tolist()), shifts)
+
+
+def find_stance(name: str, values: TermStatistics, info: EnvInfo) -> tuple[Array, Array] | None:
     """Return the angles [rad or m] for which a term is 0, and for which it is 1 more; None if it is no such term."""
     joints = info.joints
     if joints is None or len(joints.default_positions) != len(values.mean):

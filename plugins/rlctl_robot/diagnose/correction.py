@@ -10,6 +10,7 @@ from rlctl_robot.diagnose.signals import ACTIONS, Array, LoggedSignals, quaterni
 
 Kind = Literal["order", "sign", "scale", "unit", "offset", "delay", "frame", "normalised"]
 EVERYTHING = "observation"  # all observations together
+JOINTS = "joints"  # positions, velocities and commands of the joints together
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Correction:
     For the actions of a robot this is what the robot executed: factor * action[order] + offset, `delay` rows ago.
     """
 
-    term: str  # an observation's name, `actions`, or `observation` for all
+    term: str  # an observation's name, `actions`, `observation` for all, or `joints` for `parts`
     kind: Kind
     text: str  # what is wrong, for people
     order: tuple[int, ...] = ()
@@ -28,6 +29,8 @@ class Correction:
     delay: int = 0  # [control steps] by which the logged values are late
     frame: Literal["", "to body", "to world"] = ""
     attitude: str = ""  # for `frame`: the observation that holds roll, pitch and yaw or a quaternion (x, y, z, w)
+    parts: tuple["Correction", ...] = ()
+    """Of a mistake of the joints' driver: the corrections of each quantity of the joints, all of them together."""
 
     def describe(self) -> str:
         """Return a line such as `joint_velocities: elements 3 and 4 are swapped`."""
@@ -50,13 +53,18 @@ class Correction:
         return values[..., np.argsort(self.order)] if self.order else values
 
 
+def list_parts(corrections: Iterable[Correction]) -> list[Correction]:
+    """Return the corrections of single terms that corrections consist of, in their order."""
+    return [part for one in corrections for part in (one.parts or (one,))]
+
+
 def correct(signals: LoggedSignals, corrections: Iterable[Correction], *, on_robot: bool = False) -> LoggedSignals:
     """Return the signals with corrections applied one after the other.
 
     `on_robot`: corrections of `actions` give what the robot executed, so a delay takes older rows.
     """
     observations, actions = signals.observations, signals.actions
-    for one in corrections:
+    for one in list_parts(corrections):
         if one.term == ACTIONS:
             actions = one.change(shift(actions, -one.delay if on_robot else one.delay, signals.lengths))
             continue

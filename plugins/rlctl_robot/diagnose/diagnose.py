@@ -1,5 +1,6 @@
 """Finds what is wrong in the mapping between a robot and a policy, from a log of observations and actions."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,24 +13,36 @@ from rlctl.errors import AnswerIsNo, ArtifactError
 from rlctl.limits.limits import Limits, read_limits
 from rlctl.policy.file import PolicyFile
 from rlctl_robot.diagnose.actor import RIGHT, LoggedActor
-from rlctl_robot.diagnose.candidates import list_candidates, make_normalised
-from rlctl_robot.diagnose.correction import Correction, correct
+from rlctl_robot.diagnose.candidates import list_candidates, list_joint_mistakes, make_normalised
+from rlctl_robot.diagnose.correction import JOINTS, Correction, correct
 from rlctl_robot.diagnose.evidence import Likelihood, Scorer
 from rlctl_robot.diagnose.frozen import Frozen, find_frozen
+from rlctl_robot.diagnose.joints import Judgement, judge
 from rlctl_robot.diagnose.limited import find_limited_rows
 from rlctl_robot.diagnose.log import RobotLog, read_robot_log
 from rlctl_robot.diagnose.mapping import CorrectedMapping, build_mapping
+from rlctl_robot.diagnose.physics import make_physics
 from rlctl_robot.diagnose.policy_match import SAME, Matcher, PolicyMatch, describe_in_log
 from rlctl_robot.diagnose.reference import record_mistakes, record_reference
 from rlctl_robot.diagnose.rows import ChosenRows, choose_rows
 from rlctl_robot.diagnose.search import Found, Search
-from rlctl_robot.diagnose.signals import ACTIONS, Array, LoggedSignals
+from rlctl_robot.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
 
 MOST = 5  # findings that are listed
 _STEPS_PER_ELEMENT, _FEWEST_STEPS, _MOST_STEPS = 400, 16_000, 20_000  # of rollouts in simulation
 _GUESSES, _GUESS_STEPS = 4, 300  # mistakes with which the robot is simulated again, and for how many steps each
 _ROWS = 500  # of a log, for the answers in numbers
 _CERTAIN = 1e4  # evidence of what needs no statistics [nats]
+_SOMETHING = 0.005  # part of the difference that a finding must explain to say what is wrong
+_MAIN_SHARE = 0.8  # of the difference that a finding explains beside which weaker ones are checked again
+_WEAK_EVIDENCE = 0.1  # of the evidence of the first finding
+_MOST_GAIN = 2.0  # factor of an action, or its inverse, that a mapping may have
+_LARGE_ERROR = 1.15  # times the usual error, from which something differs
+_LARGER = 1.1  # than the largest error of a sound robot
+_LARGE_LOSS = 2.0  # the same of the simulation's prediction, relative to the worst episode of a sound robot
+_FEWEST_FREE = 20  # rows in which a server has not limited the action, to compare it with the policy's
+_FALLEN = 0.2  # by which the direction of gravity leaves what sound robots measure
+_FALLEN_SHARE = 0.02  # of the rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,21 +57,30 @@ class MappingFinding:
     explains: float  # part of the difference, in [0, 1]
     also: tuple[str, ...] = ()  # what this log cannot tell from it
     correction: Correction | None = None
+    is_weak: bool = False
+    """Whether another mistake explains so much more that this one may be a consequence of it."""
+
+    @property
+    def is_mistake(self) -> bool:
+        """Whether it says what is wrong: it explains a part of the difference."""
+        return self.explains >= _SOMETHING
 
     def describe(self) -> str:
         """Return the finding as a sentence."""
-        return f"{self.text}: explains {self.explains:.0%} of the difference"
+        return f"{self.text}: explains {self.explains:.0%} of the difference" if self.is_mistake else self.text
 
 
 @dataclasses.dataclass(frozen=True)
 class Answers:
     """The three questions as numbers."""
 
-    policy_difference: float  # mean |logged - computed action| in standard deviations, each at most 1
-    policy_difference_corrected: float
+    policy_difference: float | None
+    """Mean |logged - computed action| in standard deviations, each at most 1; None if a server limited all rows."""
+    policy_difference_corrected: float | None
     term_errors: dict[str, tuple[float, float]]
     """Per observation: how many times larger than in simulation errors are, as logged and corrected."""
     step_error: tuple[float, float]  # the same of the prediction of the next row from this row and the action
+    unexplained: str = ""  # how the log differs although no mistake was found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,10 +98,12 @@ class Diagnosis:
     mapping: CorrectedMapping
 
     def check(self) -> None:
-        """Raise `AnswerIsNo` if a mistake was found."""
-        if self.findings:
-            count = len(self.findings)
+        """Raise `AnswerIsNo` if a mistake was found, or if something differs and nothing explains it."""
+        count = sum(finding.is_mistake and not finding.is_weak for finding in self.findings)
+        if count:
             raise AnswerIsNo(f"{self.log}: {count} mistake{'s' if count > 1 else ''} in the mapping; see above")
+        if self.findings or self.answers.unexplained:
+            raise AnswerIsNo(f"{self.log}: something differs, the cause is unknown; see above")
 
 
 class Doctor:
@@ -95,55 +119,124 @@ class Doctor:
         seed: int = 0,
         others: Sequence[PolicyFile] = (),
         steps: int | None = None,
+        report: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """`steps` of rollouts in simulation in total; by default as many as the observation needs."""
+        """`steps` of rollouts in simulation in total; by default as many as the observation needs.
+
+        `report` is called with a line about each part of the work.
+        """
         self.policy, self.spec, self._others, self._seed = policy, spec, others, seed
+        self._report = report
         self.actor = LoggedActor(policy)
         width = int(np.prod(policy.info.env.spaces()[0].shape or ()))
         steps = steps or int(np.clip(_STEPS_PER_ELEMENT * width, _FEWEST_STEPS, _MOST_STEPS))
-        self.likelihood = Likelihood(record_reference(spec, self.actor, steps, seed))
-        statistics = self.likelihood.reference.statistics
+        report(f"simulating sound and faulty robots for {steps:,} control steps")
+        reference = record_reference(spec, self.actor, steps, seed)
+        report("learning how their signals depend on each other")
+        self.likelihood = Likelihood(reference)
+        statistics = reference.statistics
+        self.joint_mistakes = list_joint_mistakes(policy.info.env, statistics)
+        self.physics = make_physics(spec, policy.info.env, statistics, reference.held_out)
         self.candidates = list_candidates(policy.info.env, statistics, self.actor.normalize)
+        if self.physics is None:
+            self.candidates += self.joint_mistakes
+        report(f"trying {len(self.candidates):,} corrections on sound robots")
         self.likelihood.learn_chances(self.candidates)
 
+    def close(self) -> None:
+        """Close the simulation."""
+        if self.physics is not None:
+            self.physics.close()
+
     def diagnose(
-        self, signals: LoggedSignals, limits: Limits | None = None
+        self,
+        signals: LoggedSignals,
+        limits: Limits | None = None,
+        limited: Array | None = None,
+        *,
+        is_of_controller: bool = False,
     ) -> tuple[list[MappingFinding], Answers, CorrectedMapping]:
         """Return the mistakes, the one with the most evidence first, the answers in numbers and the mapping.
 
-        Actions that `limits` have changed are not compared with those of the policy.
+        Actions that `limits` have changed, and those of the rows in `limited`, shape (T,), are not compared with those
+        of the policy. The mapping is of angles themselves for the log of a program that runs a controller.
         """
         if not len(signals.inner_rows(self.likelihood.margin)):
             longest, needed = max(signals.lengths), 2 * self.likelihood.margin + 1
             raise ArtifactError(f"the longest part without gaps has {longest} rows; diagnose needs {needed}")
         reference = self.likelihood.reference
         frozen = find_frozen(signals, (reference.sound, reference.varied))
-        limited = (
-            None if limits is None else find_limited_rows(limits, self.policy.info.env, signals, self.likelihood.margin)
-        )
-        match = self._match(signals, frozen, limited)
+        if limits is not None:
+            by_limits = find_limited_rows(limits, self.policy.info.env, signals, self.likelihood.margin)
+            limited = by_limits if limited is None else limited | by_limits
+        self._report("comparing the logged actions with those of the policy")
+        inner = signals.inner_rows(MAX_DELAY + 1)
+        is_unknown = limited is not None and int((~limited[inner]).sum()) < _FEWEST_FREE
+        match = PolicyMatch(0.0, 0.0) if is_unknown else self._match(signals, frozen, limited)
         findings = [*self._describe_frozen(frozen, signals), *self._describe_match(match, signals, bool(frozen))]
         corrected = correct(signals, match.corrections)
         stuck = [(one.term, element) for one in frozen for element in one.elements]
         used = len(match.corrections) + bool(match.variant.text) + len(frozen)
+        self._report("searching for corrections with which the signals depend on each other as in simulation")
         found = self._search(corrected, stuck, max(0, 2 - used))
+        judgement = None
+        if self.physics is not None and not frozen:
+            self._report(f"simulating the log step by step, with {len(self.joint_mistakes):,} mistakes of the joints")
+            judgement = judge(self.physics, corrected, found, self.joint_mistakes)
+            found = found if judgement is None else list(judgement.found)
         for one in found:
             findings.append(
                 MappingFinding(
-                    3 if one.correction.term == ACTIONS else 2,
+                    3 if one.correction.term in (ACTIONS, JOINTS) else 2,
                     one.correction.term,
                     one.correction.kind,
-                    one.correction.describe(),
+                    _describe_on_robot(one.correction),
                     one.evidence,
                     one.explains,
                     tuple(other.describe() for other in one.also),
                     one.correction,
                 )
             )
-        findings.sort(key=lambda finding: -finding.evidence)
+        findings.sort(key=lambda finding: (not finding.is_mistake, -finding.evidence))
+        findings = _mark_weak(findings)[:MOST]
+        weak = [finding.correction for finding in findings if finding.is_weak]
         of_robot = [one.correction for one in found]
         answers = self._answer(signals, corrected, of_robot, match, stuck)
-        return findings[:MOST], answers, build_mapping(match.corrections, of_robot, dict(signals.sizes))
+        if is_unknown:
+            answers = dataclasses.replace(answers, policy_difference=None, policy_difference_corrected=None)
+        if not any(finding.is_mistake for finding in findings):
+            answers = dataclasses.replace(answers, unexplained=self._describe_unexplained(answers, signals, judgement))
+        mapped = [one for one in of_robot if one not in weak and not _has_large_gain(one)]
+        env = self.policy.info.env
+        mapping = build_mapping(
+            match.corrections, mapped, dict(signals.sizes), env.joints, is_of_controller=is_of_controller
+        )
+        return findings, answers, mapping
+
+    def _describe_unexplained(self, answers: Answers, signals: LoggedSignals, judgement: Judgement | None) -> str:
+        """Return how a log without a mistake that explains it differs; empty if it does not."""
+        signs = []
+        if judgement is not None:
+            if judgement.times_usual > _LARGE_LOSS:
+                signs.append("the simulation, set to each row, predicts the next one worse than for any sound robot")
+        elif answers.step_error[0] > max(_LARGE_ERROR, _LARGER * self.likelihood.largest_error):
+            signs.append(f"errors of the next row are {answers.step_error[0]:.3g} times the usual ones")
+        if self._falls(signals):
+            signs.append("the robot falls")
+        if not signs:
+            return ""
+        tried = f"{len(self.candidates):,} single corrections of observations and actions, and pairs"
+        if self.joint_mistakes:
+            tried += f"; {len(self.joint_mistakes):,} orders and signs of whole joints"
+        return f"{' and '.join(signs)}. Tried: {tried}. Not tried: the robot's masses, gains and friction, the ground"
+
+    def _falls(self, signals: LoggedSignals) -> bool:
+        """Return whether the trunk lies as that of a sound robot never does."""
+        if signals.sizes.get("gravity") != 3:
+            return False
+        sound = self.likelihood.reference.sound.term("gravity")[:, 2]
+        upright = signals.term("gravity")[:, 2]
+        return bool((upright > sound.max() + _FALLEN).mean() > _FALLEN_SHARE)
 
     def _search(self, signals: LoggedSignals, stuck: Sequence[tuple[str, int]], most: int) -> list[Found]:
         """Return what the simulation says is wrong.
@@ -165,11 +258,12 @@ class Doctor:
     def _match(self, signals: LoggedSignals, frozen: Sequence[Frozen], limited: Array | None) -> PolicyMatch:
         std = self.likelihood.reference.statistics[ACTIONS].std
         if self.actor.in_rows:
-            match = Matcher(self.actor, signals, std, self.candidates, None, limited).match(pairs=not frozen)
+            candidates = [one for one in self.candidates if not one.parts]
+            match = Matcher(self.actor, signals, std, candidates, None, limited).match(pairs=not frozen)
             if frozen and not match.is_explained:  # the policy may have received what the log does not hold
                 unknown = self._list_unknown(frozen, signals)
                 if len(unknown) < len(std):
-                    match = Matcher(self.actor, signals, std, self.candidates, unknown, limited).match(pairs=False)
+                    match = Matcher(self.actor, signals, std, candidates, unknown, limited).match(pairs=False)
             return self._decide_normalisation(match, signals)
         difference = np.minimum(np.abs(signals.actions - self.actor.act_on_log(signals)) / std, 1.0)
         difference = difference if limited is None else difference[~limited]
@@ -257,6 +351,34 @@ class Doctor:
         return Answers(match.difference, match.corrected, terms, step)
 
 
+def _mark_weak(findings: Sequence[MappingFinding]) -> list[MappingFinding]:
+    """Mark what may be a consequence of a finding that explains most of what the simulation says."""
+    of_robot = [finding for finding in findings if finding.question != 1 and finding.kind != "frozen"]
+    if not of_robot or of_robot[0].explains < _MAIN_SHARE:
+        return list(findings)
+    main = of_robot[0]
+    marked = []
+    for finding in findings:
+        is_other = finding in of_robot[1:] and finding.is_mistake
+        is_smaller = finding.explains < _MAIN_SHARE or finding.evidence < _WEAK_EVIDENCE * main.evidence
+        marked.append(dataclasses.replace(finding, is_weak=is_other and is_smaller))
+    return marked
+
+
+def _has_large_gain(one: Correction) -> bool:
+    """Return whether a correction of the actions would multiply some of them by a large or small factor."""
+    if one.term != ACTIONS or not one.factor or one.kind != "scale":
+        return False
+    factors = np.abs(one.factor)
+    return bool((np.maximum(factors, 1 / factors) > _MOST_GAIN).any())
+
+
+def _describe_on_robot(one: Correction) -> str:
+    if not _has_large_gain(one):
+        return one.describe()
+    return f"{one.describe()} (not in the mapping: look for the cause at the motors, such as a sign or a gain)"
+
+
 def diagnose_log(
     path: Path,
     policy: PolicyFile,
@@ -277,11 +399,14 @@ def diagnose_log(
 
     bounds = None if limits is None else read_limits(limits)
     log: RobotLog = read_robot_log(path, policy.info.env, columns)
-    report(f"{len(log.signals.actions):,} rows; rollouts in simulation")
-    with threadpool_limits(1, "blas"):  # with other programs on the same cores, threads wait for each other
-        doctor = Doctor(policy, spec, seed, others)
-        report("comparing the log with the policy and the simulation")
-        findings, answers, mapping = doctor.diagnose(log.signals, bounds)
+    report(f"{len(log.signals.actions):,} rows")
+    with (
+        threadpool_limits(1, "blas"),  # with other programs on the same cores, threads wait for each other
+        contextlib.closing(Doctor(policy, spec, seed, others, report=report)) as doctor,
+    ):
+        findings, answers, mapping = doctor.diagnose(
+            log.signals, bounds, log.limited, is_of_controller=log.is_of_controller
+        )
     rows = len(log.signals.actions)
     return Diagnosis(
         log=path,

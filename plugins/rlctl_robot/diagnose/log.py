@@ -31,6 +31,8 @@ class RobotLog:
     table: LogTable
     notes: tuple[str, ...]
     kept: Array  # rows of the table that became rows of the signals
+    limited: Array | None = None  # shape (T,): the server held the robot or limited the action; None if unknown
+    is_of_controller: bool = False  # whether it holds what a controller takes, not what the policy observes
 
     def row(self, index: int) -> int:
         """Return the line or row of the file for a row of the signals."""
@@ -64,8 +66,14 @@ def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> Ro
         raise ArtifactError(
             f"{path}: {sum(kept_lengths)} rows in parts without gaps{gap}; diagnose needs {_LEAST_ROWS} or more"
         )
+    limited = None if table.limited is None else table.limited[keep] > 0
+    if limited is not None and limited.any():
+        notes.append(
+            f"{path}: in {limited.sum():,} of {len(limited):,} rows the server held the robot or limited the action; "
+            "they are not compared with the policy's actions"
+        )
     all_notes = [*([table.note] if table.note else []), *assigned.notes, *notes]
-    return RobotLog(signals, table, tuple(all_notes), np.flatnonzero(keep))
+    return RobotLog(signals, table, tuple(all_notes), np.flatnonzero(keep), limited, assigned.is_of_controller)
 
 
 def _compute_observations(

@@ -5,7 +5,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from rlctl.storage.validation import Number, Section, Whole
-from rlctl_robot.diagnose.correction import EVERYTHING, Correction
+from rlctl.task.joints import Joints
+from rlctl_robot.diagnose.correction import EVERYTHING, Correction, list_parts
 from rlctl_robot.diagnose.signals import ACTIONS
 
 
@@ -42,19 +43,37 @@ class CorrectedMapping(Section):
     """From the program's value to the policy's, per observation; `rlctl export --controller --mapping` reads it."""
     actions: TermMapping | None = None
     """From the policy's action to what the program must send."""
+    targets: TermMapping | None = None
+    """The same of the joints' targets, which a controller returns: from the policy's to the program's."""
     log: LogMapping | None = None
 
 
 def build_mapping(
-    of_log: Sequence[Correction], of_robot: Sequence[Correction], sizes: dict[str, int]
+    of_log: Sequence[Correction],
+    of_robot: Sequence[Correction],
+    sizes: dict[str, int],
+    joints: Joints | None = None,
+    *,
+    is_of_controller: bool = False,
 ) -> CorrectedMapping:
-    """Return the mapping that corrections of the log alone and of the robot make."""
+    """Return the mapping that corrections of the log alone and of the robot make.
+
+    With `is_of_controller` the program has angles where the policy observes differences from the stance.
+    """
+    of_log, of_robot = list_parts(of_log), list_parts(of_robot)
     sent = [one for one in of_robot if one.term == ACTIONS]
     logged = [one for one in of_log if one.term == ACTIONS]
     observations, log_actions = _compose_terms(of_log, sizes), compose(logged) if logged else None
+    terms = _compose_terms(of_robot, sizes)
+    if is_of_controller and joints is not None and joints.measured in terms:
+        own = [one for one in of_robot if one.term == joints.measured]
+        if joints.default_positions and all(one.kind in ("order", "sign") for one in own):
+            pose = np.array(joints.default_positions)
+            terms[joints.measured] = _shift(terms[joints.measured], pose, np.ones(len(pose)))
     return CorrectedMapping(
-        observations=_compose_terms(of_robot, sizes),
+        observations=terms,
         actions=invert(sent) if sent else None,
+        targets=_find_targets(sent, of_robot, joints) if sent and joints is not None else None,
         log=LogMapping(observations=observations, actions=log_actions) if of_log else None,
     )
 
@@ -111,6 +130,30 @@ def invert(corrections: Sequence[Correction]) -> TermMapping:
     return _make(back, (1 / factor)[back], (-offset / factor)[back], whole.delay, None)
 
 
+def _find_targets(sent: Sequence[Correction], of_robot: Sequence[Correction], joints: Joints) -> TermMapping | None:
+    """Return the mapping from the policy's targets of the joints to the program's; None where it is unknown."""
+    if any(one.delay for one in sent):
+        return None
+    if joints.action_scale and joints.default_positions:
+        return _shift(invert(sent), np.array(joints.default_positions), np.array(joints.action_scale))
+    positions = [one for one in of_robot if one.term == joints.measured]
+    measured = {(one.order, tuple(np.sign(one.factor))) for one in positions}
+    commanded = {(one.order, tuple(np.sign(one.factor))) for one in sent}
+    # A target is a measured position and a step: known if the driver confuses both in the same way.
+    return invert(positions) if measured == commanded else None
+
+
+def _shift(mapping: TermMapping, pose: np.ndarray, scale: np.ndarray) -> TermMapping:
+    """Return a mapping of values as one of pose + scale * value."""
+    size = len(pose)
+    order = np.arange(size) if mapping.order is None else np.array(mapping.order)
+    factor = np.array(mapping.sign or np.ones(size)) * np.array(mapping.scale or np.ones(size))
+    offset = np.array(mapping.offset or np.zeros(size))
+    # value = (x - pose) / scale, so pose + scale * (factor * value[order] + offset) is in terms of x[order]:
+    of_x = scale * factor / scale[order]
+    return _make(order, of_x, pose + scale * offset - of_x * pose[order], mapping.delay, mapping.frame)
+
+
 def _make(
     order: np.ndarray | None, factor: np.ndarray | None, offset: np.ndarray | None, delay: int, frame: str | None
 ) -> TermMapping:
@@ -121,6 +164,6 @@ def _make(
         content["sign"] = np.sign(factor).tolist()
     if factor is not None and not np.allclose(np.abs(factor), 1.0):
         content["scale"] = [float(f"{value:.5g}") for value in np.abs(factor)]
-    if offset is not None and not np.allclose(offset, 0.0):
+    if offset is not None and not np.allclose(offset, 0.0, atol=1e-4):
         content["offset"] = [float(f"{value:.5g}") for value in offset]
     return TermMapping.model_validate(content)

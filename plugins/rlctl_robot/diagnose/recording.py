@@ -13,7 +13,8 @@ from rlctl.storage import untrusted
 from rlctl_robot.diagnose.signals import Array
 from rlctl_robot.diagnose.table import LogTable
 
-_ENTITY = re.compile(r"/client_(\d+)/(action|episode|observation/.+)")
+_ENTITY = re.compile(r"/client_(\d+)/(action|episode|limited|observation/.+)")
+_LIMITED = "limited"
 _NUMBERS, _TIME = "Scalars:scalars", "time"
 _LARGEST = 512 * 2**20  # [bytes], of a file, which is read as a whole
 
@@ -22,6 +23,8 @@ _Rows = dict[int, Array]  # numbers by time [ns]
 
 def read_recording(path: Path) -> LogTable:
     """Return the columns `time`, `episode`, `action_0`, .. and NAME_0, .. of each observation, client by client.
+
+    `limited`, of the table, has the rows in which the server held the robot or changed the policy's action.
 
     Raises `ArtifactError` for a file that is no such recording.
     """
@@ -39,10 +42,11 @@ def read_recording(path: Path) -> LogTable:
         raise ArtifactError(f"{path}: its clients had policies with other observations; record one policy per file")
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     lengths = tuple(len(part["time"]) for part in parts)
+    limited = columns.pop(_LIMITED, None)
     for name, values in columns.items():
         if (bad := np.flatnonzero(~np.isfinite(values))).size:
             raise ArtifactError(f"{path}, row {bad[0]}, column {name}: {values[bad[0]]} is not a finite number")
-    return LogTable(path, columns, np.arange(sum(lengths)), lengths, "row", has_row_per_action=True)
+    return LogTable(path, columns, np.arange(sum(lengths)), lengths, "row", has_row_per_action=True, limited=limited)
 
 
 def _read_clients(path: Path) -> dict[int, dict[str, _Rows]]:
@@ -73,14 +77,18 @@ def _join(path: Path, entities: dict[str, _Rows]) -> dict[str, Array] | None:
     names = [name for name in entities if name.startswith("observation/")]
     if not names or "action" not in entities or "episode" not in entities:
         return None
-    times = sorted(set.intersection(*(set(entities[name]) for name in [*names, "action", "episode"])))
+    of_rows = ["action", "episode", *([_LIMITED] if _LIMITED in entities else [])]  # old recordings have no `limited`
+    times = sorted(set.intersection(*(set(entities[name]) for name in [*names, *of_rows])))
     if not times:
         return None
     columns = {"time": (np.array(times) - times[0]) / 1e9}
-    for name in ["episode", "action", *names]:
+    for name in [*of_rows, *names]:
         rows = [entities[name][at] for at in times]
         if len({len(row) for row in rows}) > 1:
             raise ArtifactError(f"{path}: {name} changes its size")
         label, values = name.removeprefix("observation/"), np.array(rows, np.float64)
-        columns |= {label if name == "episode" else f"{label}_{index}": column for index, column in enumerate(values.T)}
+        columns |= {
+            label if name in ("episode", _LIMITED) else f"{label}_{index}": column
+            for index, column in enumerate(values.T)
+        }
     return columns

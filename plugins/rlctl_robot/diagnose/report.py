@@ -4,7 +4,7 @@ import dataclasses
 
 from rlctl import output
 from rlctl.storage import yaml_text
-from rlctl_robot.diagnose.diagnose import Diagnosis
+from rlctl_robot.diagnose.diagnose import Answers, Diagnosis
 from rlctl_robot.diagnose.policy_match import SAME
 
 _ODD = 1.6  # times the usual error, from which an observation is listed
@@ -20,29 +20,41 @@ def show(result: Diagnosis, json: str | None) -> None:
     out.print(f"{result.log}: {result.rows:,} rows, {result.seconds:.1f} s, policy {result.policy}", soft_wrap=True)
     for line in describe_answers(result):
         out.print(line, soft_wrap=True)
-    if not result.findings:
+    unexplained = result.answers.unexplained
+    if unexplained:
+        out.print(f"something differs, the cause is unknown: {unexplained}", soft_wrap=True)
+    elif not result.findings:
         out.print("no mistake in the mapping found")
-        return
-    out.print("\nfindings, the one with the most evidence first:")
-    for number, finding in enumerate(result.findings, start=1):
+    main = [finding for finding in result.findings if not finding.is_weak]
+    if main:
+        out.print("\nfindings, the one with the most evidence first:")
+    for number, finding in enumerate(main, start=1):
         out.print(f"{number}. {finding.describe()}", soft_wrap=True)
         for other in finding.also:
             out.print(f"   this log cannot tell it from: {other}", soft_wrap=True)
+    weak = [finding for finding in result.findings if finding.is_weak]
+    if weak:
+        out.print("\ncheck again after correcting; these are not in the mapping:")
+        for finding in weak:
+            out.print(f"- {finding.describe()}", soft_wrap=True)
     if mapping:
         out.print("\nthe corrected mapping, corrected = sign * scale * value[order] + offset:")
         out.print(yaml_text.dump(mapping), end="", soft_wrap=True)
 
 
+def _describe_difference(answers: Answers) -> str:
+    before, after = answers.policy_difference, answers.policy_difference_corrected
+    if before is None or after is None:
+        return "unknown: the server held the robot or limited the action in nearly all rows"
+    if before < SAME and not after < before:
+        return f"yes: they differ by {before:.2g} standard deviations on average"
+    return f"no: they differ by {before:.2g} standard deviations on average, {after:.2g} when corrected"
+
+
 def describe_answers(result: Diagnosis) -> list[str]:
     """Return a line for each of the three questions."""
     answers = result.answers
-    is_corrected = answers.policy_difference_corrected < answers.policy_difference
-    same = "yes" if answers.policy_difference < SAME and not is_corrected else "no"
-    first = f"1. does the policy produce the logged actions? {same}: they differ by {answers.policy_difference:.2g}"
-    if same == "no":
-        first += f" standard deviations on average, {answers.policy_difference_corrected:.2g} when corrected"
-    else:
-        first += " standard deviations on average"
+    first = f"1. does the policy produce the logged actions? {_describe_difference(answers)}"
     odd = sorted(answers.term_errors.items(), key=lambda item: -item[1][0])
     found = {finding.term for finding in result.findings if finding.question == 2}
     odd = [(name, errors) for name, errors in odd if errors[0] > _ODD or name in found]

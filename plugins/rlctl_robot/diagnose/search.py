@@ -132,6 +132,8 @@ class Search:
             late = [_Guess(self._search.rebase([*chosen, one]), base, [*chosen, one]) for one in self._late]
         score = self._search.rebase([*base, *chosen])
         possible = [one for one in self._candidates if not any(_exclude(one, other) for other in chosen)]
+        if chosen:  # a driver's mistake is searched alone: there are many
+            possible = [one for one in possible if not one.parts]
         ranked = [
             (gain - self._likelihood.chance(one) - _get_cost(one), one) for gain, one in self._search.rank(possible)
         ]
@@ -171,6 +173,7 @@ class Search:
         alike = []
         for more, other in self._search.rank(self._candidates)[:6]:
             is_same = (other.term, other.kind, other.order) == (one.term, one.kind, one.order)
+            is_same = is_same and bool(other.parts) == bool(one.parts)
             if not is_same and other.kind not in ("scale", "unit", "offset"):
                 alike += [other] if more + self._confirm.gain(other) > gain - _APART else []
         return tuple(alike[:2])

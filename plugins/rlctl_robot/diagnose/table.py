@@ -36,6 +36,7 @@ class LogTable:
     row_word: str  # `line` or `row`
     note: str = ""
     has_row_per_action: bool = False  # whatever the time between them is
+    limited: Array | None = None  # shape (T,): 1 where a server held the robot or limited the action; None if unknown
 
     def where(self, index: int) -> str:
         """Return `FILE, line 12` for a row of the table."""

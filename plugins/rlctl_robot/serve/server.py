@@ -183,6 +183,7 @@ class PolicyServer:
         recording.add(f"{root}/action", session.action, now)
         recording.add(f"{root}/infer_ms", infer_ms, now)
         recording.add(f"{root}/episode", float(session.episode), now)
+        recording.add(f"{root}/limited", float(session.is_limited), now)
         if session.observation is not None:
             flat = reader.flatten(session.observation)
             for name, part in reader.layout.columns.items():

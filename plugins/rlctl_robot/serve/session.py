@@ -69,6 +69,7 @@ def load_served_policy(file: Path) -> ServedPolicy:
 
 
 _MAX_AGE_S = 1e9
+_SAME = 1e-6  # difference of two actions by rounding
 
 
 class Session:
@@ -87,6 +88,7 @@ class Session:
         self._by_watchdog = False
         self.episode = 0  # how many episodes the client has begun with `reset`
         self.action: NDArray[Any] | None = None  # the last action
+        self.is_limited = False  # whether the last action is another one than the policy's
         self.observation: Any = None  # the last observation, in the policy's form
 
     def check_watchdog(self, now_s: float) -> None:
@@ -117,6 +119,7 @@ class Session:
             if (failure := self._limited.error) is not None:
                 error = f"the policy cannot act: {short_repr(str(failure), 200)}"
             self._row.step[0] += 1
+        self.is_limited = bool(error) or self._is_changed(action)
         self.action = action
         answer: dict[str, Any] = {
             "actions": action.reshape(1, -1) if action.ndim < 2 else action[None],
@@ -131,6 +134,11 @@ class Session:
             answer["sequence"] = number  # `rlctl robot` numbers its observations
         self._last_s = time.monotonic()  # the watchdog measures the client, not this answer
         return answer
+
+    def _is_changed(self, action: NDArray[Any]) -> bool:
+        """Return whether the filter returned another action than the policy."""
+        (requested,) = self._limited.requested
+        return requested is None or not np.allclose(action, requested, atol=_SAME)
 
     def _read(self, request: Any) -> tuple[Any, float]:
         """Return the observation of a request and its age [s]; reset if it asks for that."""

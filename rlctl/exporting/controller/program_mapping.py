@@ -54,7 +54,7 @@ class MappingFile(Section):
     targets: MappedValue | None = None
     """From the policy's targets of the joints to the program's."""
     actions: MappedValue | None = None
-    """From the policy's action to what the robot must execute; no controller applies it."""
+    """From the policy's action to what the robot must execute; no controller applies it, and `targets` replaces it."""
     log: Any = None
     """What only a log has otherwise; a controller needs no change for it."""
 
@@ -127,7 +127,7 @@ def read_mapping(path: Path, plan: ControllerPlan) -> ProgramMapping:
     Raises `RecipeError` for a mapping that does not fit the policy, `UsageError` for what a controller cannot do.
     """
     mapping, target = yaml_text.read_model(path, MappingFile), plan.find_target(None)
-    if mapping.actions is not None:
+    if mapping.actions is not None and mapping.targets is None:
         instead = "the controller returns targets of joints: map them with targets:"
         if target is None:
             instead = "change the action where the program sends it"

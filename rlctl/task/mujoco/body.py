@@ -209,7 +209,15 @@ class MujocoBody(MujocoMotors):
         turn = None if orientation is None else np.asarray(orientation, float)[WXYZ]
         return solve(sim, self.parts, self.find_link(link), np.asarray(position, float), turn)
 
-    def set_base(self, position: Any, orientation: Any = (0.0, 0.0, 0.0, 1.0), *, worlds: Rows = None) -> None:
+    def set_base(
+        self,
+        position: Any,
+        orientation: Any = (0.0, 0.0, 0.0, 1.0),
+        *,
+        velocity: Any = None,
+        angular_velocity: Any = None,
+        worlds: Rows = None,
+    ) -> None:
         rows: Any = ... if worlds is None else worlds
         turn = np.asarray(orientation, float)
         offset = rotate(turn, self._fields.model("body_ipos")[rows][..., self._base, :])
@@ -218,10 +226,17 @@ class MujocoBody(MujocoMotors):
             self._fields.model("body_pos")[rows, self._base, :] = origin
             self._fields.model("body_quat")[rows, self._base, :] = turn[..., WXYZ]
         else:
-            start, velocity = self.parts.free
+            start, speed = self.parts.free
             self._fields.data("qpos")[rows, start : start + 3] = origin
             self._fields.data("qpos")[rows, start + 3 : start + 7] = turn[..., WXYZ]
-            self._fields.data("qvel")[rows, velocity : velocity + 6] = 0.0
+            speeds = self._fields.data("qvel")
+            speeds[rows, speed : speed + 6] = 0.0
+            if velocity is not None:
+                speeds[rows, speed : speed + 3] = velocity
+            if angular_velocity is not None:
+                # MuJoCo has it in the frame of the base, and the velocity of the base's origin.
+                speeds[rows, speed : speed + 3] -= np.cross(angular_velocity, offset)
+                speeds[rows, speed + 3 : speed + 6] = rotate_inverse(turn, angular_velocity)
         self._fields.touch(worlds)
 
     def add_velocity(self, velocity: Any, turning: Any = (0.0, 0.0, 0.0)) -> None:

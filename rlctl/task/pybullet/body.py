@@ -203,8 +203,20 @@ class PybulletBody(Properties):
     def base_orientation(self) -> Array:
         return self._base_state()[1]
 
-    def set_base(self, position: Any, orientation: Any = (0.0, 0.0, 0.0, 1.0), *, worlds: object = None) -> None:
+    def set_base(
+        self,
+        position: Any,
+        orientation: Any = (0.0, 0.0, 0.0, 1.0),
+        *,
+        velocity: Any = None,
+        angular_velocity: Any = None,
+        worlds: object = None,
+    ) -> None:
         pybullet.resetBasePositionAndOrientation(self.id, position, orientation, physicsClientId=self.client)
+        if velocity is not None or angular_velocity is not None:
+            linear = np.zeros(3) if velocity is None else velocity
+            angular = np.zeros(3) if angular_velocity is None else angular_velocity
+            pybullet.resetBaseVelocity(self.id, list(linear), list(angular), physicsClientId=self.client)
         self._cache.clear()
 
     @property

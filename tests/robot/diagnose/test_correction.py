@@ -1,13 +1,26 @@
 """Corrections and the mapping that they make together, computed by hand."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from rlctl.errors import AnswerIsNo
+from rlctl.task.joints import Joints
 from rlctl_robot.diagnose.candidates import list_permutations, make_scale, make_sign
 from rlctl_robot.diagnose.correction import Correction, correct
+from rlctl_robot.diagnose.diagnose import (
+    Answers,
+    Diagnosis,
+    MappingFinding,
+    _describe_on_robot,
+    _has_large_gain,
+    _mark_weak,
+)
 from rlctl_robot.diagnose.mapping import build_mapping, compose, invert
 from rlctl_robot.diagnose.signals import LoggedSignals, shift
 
+ARM = Joints(["a", "b", "c"], default_positions=[0.1, 0.5, 0.0], action_scale=[0.2, 0.4, 1.0], measured="q")
 SWAP = Correction("q", "order", "", order=(1, 0, 2))
 AFFINE = Correction("q", "scale", "", factor=(2.0, -1.0, 1.0), offset=(0.5, 0.0, 0.0))
 
@@ -93,3 +106,69 @@ def test_texts_name_elements():
     assert make_scale("q", 3, range(3), 0.5).describe() == "q: all elements are 2 times too large"
     text = make_scale("actions", 3, [2], 0.5).describe()
     assert text == "actions: element 2 acts 0.5 times as strongly as in simulation"
+
+
+def test_the_targets_of_a_controller_are_mapped_as_the_actions_are():
+    # The robot moves a with what it gets for b, b with c, c with a: it must get a's target for c, b's for a, c's for b.
+    order, pose, scale = (1, 2, 0), np.array(ARM.default_positions), np.array(ARM.action_scale)
+    there = list(order)
+    factor, offset = scale[there] / scale, (pose[there] - pose) / scale
+    angles = Correction("actions", "order", "", order=order, factor=tuple(factor), offset=tuple(offset))
+    mapping = build_mapping([], [angles], {"q": 3}, ARM)
+    assert mapping.targets.model_dump(exclude_defaults=True) == {"order": [2, 0, 1]}
+    sent = np.array([0.3, 0.7, -0.2])[mapping.targets.order]
+    assert sent[there].tolist() == [0.3, 0.7, -0.2]
+
+
+def test_targets_of_steps_are_known_only_if_the_measured_angles_are_exchanged_too():
+    steps = Joints(["a", "b", "c"], default_positions=[0.1, 0.5, 0.0], action_step=[0.1] * 3, measured="q")
+    swap = Correction("actions", "order", "", order=(1, 0, 2))
+    assert build_mapping([], [swap], {"q": 3}, steps).targets is None
+    both = Correction("joints", "order", "", parts=(SWAP, swap))
+    mapping = build_mapping([], [both], {"q": 3}, steps)
+    assert mapping.targets.order == mapping.observations["q"].order == mapping.actions.order == [1, 0, 2]
+
+
+def test_the_mapping_of_a_controller_is_of_angles():
+    # q = angle - pose. Exchanged angles: q = logged[order] + pose[order] - pose; the angles themselves have no offset.
+    offset = np.array([0.4, -0.4, 0.0])
+    angles = Correction("q", "order", "", order=(1, 0, 2), offset=tuple(offset))
+    of_policy = build_mapping([], [angles], {"q": 3}, ARM).observations["q"]
+    assert of_policy.offset == offset.tolist()
+    of_controller = build_mapping([], [angles], {"q": 3}, ARM, is_of_controller=True).observations["q"]
+    assert of_controller.model_dump(exclude_defaults=True) == {"order": [1, 0, 2]}
+
+
+def test_a_large_gain_of_an_action_is_named_and_not_corrected():
+    weak = make_scale("actions", 3, [2], 0.18)
+    assert _has_large_gain(weak)
+    assert _has_large_gain(make_scale("actions", 3, [2], 5.5))
+    assert not _has_large_gain(make_scale("actions", 3, [2], 0.6))
+    assert not _has_large_gain(make_scale("q", 3, [2], 0.18))
+    assert "acts 0.18 times as strongly as in simulation (not in the mapping" in _describe_on_robot(weak)
+
+
+def make_finding(explains, evidence, question=2):
+    return MappingFinding(question, "q", "order", "q: wrong", evidence, explains)
+
+
+def test_what_a_main_finding_may_have_caused_is_checked_again():
+    findings = [make_finding(0.96, 900.0), make_finding(0.71, 300.0), make_finding(0.9, 40.0), make_finding(0.9, 500.0)]
+    assert [one.is_weak for one in _mark_weak(findings)] == [False, True, True, False]
+    assert not any(one.is_weak for one in _mark_weak([make_finding(0.6, 900.0), make_finding(0.3, 90.0)]))
+
+
+@pytest.mark.parametrize(
+    ("findings", "unexplained", "message"),
+    [
+        ([make_finding(0.96, 900.0), make_finding(0.0, 1e4, 1)], "", "log.csv: 1 mistake in the mapping"),
+        ([make_finding(0.0, 1e4, 1)], "", "log.csv: something differs, the cause is unknown"),
+        ([], "errors are 1.19 times the usual ones", "log.csv: something differs, the cause is unknown"),
+    ],
+)
+def test_only_what_explains_something_is_a_mistake_of_the_mapping(findings, unexplained, message):
+    answers = Answers(0.0, 0.0, {}, (1.0, 1.0), unexplained)
+    mapping = build_mapping([], [], {})
+    diagnosis = Diagnosis(Path("log.csv"), "p", "t", 100, 1.0, (), answers, tuple(findings), mapping)
+    with pytest.raises(AnswerIsNo, match=message):
+        diagnosis.check()

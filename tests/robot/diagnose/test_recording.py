@@ -42,6 +42,17 @@ def test_rows_client_by_client(tmp_path):
     }
 
 
+def test_rows_in_which_the_server_changed_the_action_are_told(tmp_path):
+    log = RerunLog(tmp_path / "served.rrd")
+    for second, limited in enumerate([0.0, 1.0, 0.0]):
+        for entity, values in (("action", [0.1]), ("episode", 0), ("limited", limited), ("observation/q", [1.0])):
+            log.add(f"client_1/{entity}", values, float(second))
+    log.close()
+    table = read_recording(tmp_path / "served.rrd")
+    assert table.limited.tolist() == [0.0, 1.0, 0.0]
+    assert table.columns.keys() == {"time", "episode", "action_0", "q_0"}
+
+
 def test_what_is_no_recording(tmp_path):
     (tmp_path / "text.rrd").write_text("time,action\n")
     with pytest.raises(ArtifactError, match=r"text\.rrd: damaged, or no Rerun recording"):

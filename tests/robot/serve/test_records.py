@@ -51,5 +51,18 @@ def test_a_recording_for_rerun(tmp_path):
     assert actions.tolist() == [[6.0, 1.0]] * 5
     _, goals = column(tmp_path / "served.rrd", "/client_2/observation/goal", timeline="time")
     assert goals.tolist() == [[1.0, 2.0, 3.0]] * 5
+    _, limited = column(tmp_path / "served.rrd", "/client_2/limited", timeline="time")
+    assert limited.tolist() == [[0.0]] * 5
     with pytest.raises(ArtifactError, match="the recording cannot be written"):
         RunningServer(file, rerun=file / "served.rrd")
+
+
+def test_rows_in_which_the_robot_is_held_are_recorded(tmp_path):
+    file = write_policy(tmp_path / "policy.safetensors")
+    server = RunningServer(file, watchdog=False, rerun=tmp_path / "served.rrd")
+    with server.client() as client:
+        client.ask(OBSERVATION)
+        client.ask({**OBSERVATION, "age_s": 1000.0})  # too old: the robot is held
+    server.close()
+    _, limited = column(tmp_path / "served.rrd", "/client_2/limited", timeline="time")
+    assert limited.tolist() == [[0.0], [1.0]]
