@@ -247,7 +247,8 @@ def _export_c(policy: TorchActor, workers: Workers, target: Path, code: CSource)
     fields: dict[str, Any] = {"not_verified": f"there is no C compiler {command!r}; set CC to one"}
     if compiler is not None:
         with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
-            library = build_library(code, policy.info, Path(folder), compiler)
+            with output.show_progress("compiling"):
+                library = build_library(code, policy.info, Path(folder), compiler)
             fields = _verify(policy, workers, target, CActor.load(library), library)
     files.write_text(header, code.header)
     files.write_text(target, code.source)

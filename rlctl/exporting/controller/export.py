@@ -151,7 +151,8 @@ class _Export:
         code = source.write()
         if compiler is not None:
             with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
-                library = compile_controller(code, Path(folder), compiler)
+                with output.show_progress("compiling"):
+                    library = compile_controller(code, Path(folder), compiler)
                 controller = CController(self.plan, library, has_target=source.target is not None)
                 fields, recorded = self._verify(path, controller, source.target, is_limited=self.limits is not None)
                 median, longest = verify.measure_step(controller, recorded)

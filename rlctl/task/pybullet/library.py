@@ -95,16 +95,63 @@ def draw_world(
     up: Sequence[float] = (0.0, 0.0, 1.0),
     field_of_view: float,
     sun: bool = False,
+    floor: float | None = None,
 ) -> NDArray[np.uint8]:
-    """Draw a client's world as `Sim.render` does; with `sun` there is more light from the side, and shadow."""
+    """Draw a client's world as `Sim.render` does.
+
+    With `sun` there is a sky, more light from the side, and shadow; and below it a floor at the height `floor` [m]
+    where the world has none.
+    """
     view = pybullet.computeViewMatrix(eye, target, up)
     projection = pybullet.computeProjectionMatrixFOV(field_of_view, width / height, 0.05, 10.0)
     light: dict[str, Any] = _SUN if sun else {"shadow": 0}
     image = pybullet.getCameraImage(
         width, height, view, projection, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=client, **light
     )
-    # PyBullet returns a flat tuple if it was built without numpy.
-    return np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[:, :, :3]
+    # PyBullet returns flat tuples if it was built without numpy.
+    picture = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[:, :, :3]
+    if not sun:
+        return picture
+    is_empty = np.asarray(image[4]).reshape(height, width) < 0
+    return _paint_background(picture, is_empty, eye, target, field_of_view, floor)
+
+
+_HORIZON, _ZENITH = np.array([242.0] * 3), np.array([191.0, 212.0, 235.0])  # of the sky, as in MuJoCo
+_SQUARES = np.array([[219.0, 224.0, 230.0], [189.0, 196.0, 204.0]])
+_SQUARE = 0.5  # [m]
+_FADES_AT = 8.0  # [m]; a floor is lost in the haze beyond a few times this
+
+
+def _paint_background(
+    picture: NDArray[np.uint8],
+    is_empty: NDArray[np.bool_],
+    eye: Sequence[float],
+    target: Sequence[float],
+    field_of_view: float,
+    floor: float | None,
+) -> NDArray[np.uint8]:
+    """Return a picture whose empty pixels show a sky, and below the horizon a floor of squares at a height [m]."""
+    height, width = is_empty.shape
+    rows, columns = np.nonzero(is_empty)
+    forward = np.subtract(target, eye)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    pixel = 2.0 * np.tan(np.radians(field_of_view) / 2) / height
+    across, down = pixel * (columns + 0.5 - width / 2), pixel * (rows + 0.5 - height / 2)
+    rays = forward + across[:, None] * right - down[:, None] * np.cross(right, forward)
+    rise = rays[:, 2] / np.linalg.norm(rays, axis=1)
+    colors = _HORIZON + np.clip(rise, 0.0, 1.0)[:, None] * (_ZENITH - _HORIZON)
+    if floor is not None:
+        hits = rays[:, 2] < -1e-6
+        way = (floor - eye[2]) / rays[hits, 2]
+        points = np.asarray(eye)[:2] + way[:, None] * rays[hits, :2]
+        squares = _SQUARES[np.floor(points / _SQUARE).astype(int).sum(axis=1) % 2]
+        haze = 1.0 - np.exp(-np.square(np.linalg.norm(points - np.asarray(eye)[:2], axis=1) / _FADES_AT))
+        colors[hits] = squares + haze[:, None] * (_HORIZON - squares)
+    painted = picture.copy()
+    painted[rows, columns] = colors.astype(np.uint8)
+    return painted
 
 
 def check_display() -> None:
