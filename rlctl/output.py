@@ -138,8 +138,8 @@ def _show_bar(what: str, total: int | None, unit: str) -> Iterator[Callable[[int
         yield lambda done: progress.update(task, completed=done)
 
 
-_FIRST_LINE_S = 5.0  # [s]
-_LINES_S = (10.0, 15.0, 30.0)  # [s] between further lines; the last one from then on
+_FIRST_LINE_S = 10.0  # [s]
+_LINES_S = (20.0, 30.0)  # [s] between further lines; the last one from then on
 
 
 @contextlib.contextmanager

@@ -343,7 +343,6 @@ def test_a_cell_that_fails_is_a_failed_cell(rlctl, tmp_path):
 
 @pytest.mark.pybullet
 def test_the_nominal_setting_may_be_the_worst(measured):
-    (found,) = measured.maps
     worse = measured.nominal.model_copy(update={"success_rate": -0.1})
     turned = measured.model_copy(update={"nominal": worse})
     assert turned.find_worst() is None  # no cell of a map
