@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -129,8 +130,12 @@ def _begin(picture: Picture) -> tuple[Any, Any, int]:
     return image, ImageDraw.Draw(image), max(9, picture.shape[0] // _LINES)
 
 
-def _write(draw: Any, place: tuple[float, float], text: str, font_size: int) -> None:
+@functools.cache
+def _load_font(size: int) -> Any:
     from PIL import ImageFont
 
-    font = ImageFont.load_default(font_size)
-    draw.text(place, text, font=font, stroke_width=max(1, font_size // 12), **_TEXT)
+    return ImageFont.load_default(size)
+
+
+def _write(draw: Any, place: tuple[float, float], text: str, font_size: int) -> None:
+    draw.text(place, text, font=_load_font(font_size), stroke_width=max(1, font_size // 12), **_TEXT)

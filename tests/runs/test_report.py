@@ -195,9 +195,9 @@ def test_curves_name_the_folders_that_the_user_named(write_run):
     picture = write(*texts, form="svg", target=Path("curves.svg"))
     assert picture.count(">ppo</text>") == picture.count(">a2c</text>") == 2  # legends of return and success
     assert picture.count(">reach</text>") == 1
-    assert "Lines: mean; bands: lowest to highest of 2 seeds (ppo), 2 seeds (a2c)." in picture
-    assert "ended early: seed 1 of a2c at step 1,000" in picture
-    assert "dots evaluations" in picture  # three evaluations are no curve
+    assert "Lines and dots: mean; bands and bars: lowest to highest of 2 seeds (ppo), 2 seeds (a2c)." in picture
+    assert "x: ended early (seed 1 of a2c at step 1,000)" in picture
+    assert "dots: evaluations" in picture  # three evaluations are no curve
 
 
 def test_labels_of_the_user(write_run):

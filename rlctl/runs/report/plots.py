@@ -62,20 +62,20 @@ def draw_learning(report: RunReport, form: Picture) -> bytes:
                 axes.set_title(_TITLES[column], loc="left", fontsize=9)
             else:
                 axes.remove()
-        figure.supxlabel(textwrap.fill(_explain_curves(report), 130), fontsize=7)
+        figure.supxlabel("\n".join(_explain_curves(report)), fontsize=7)
         _save(figure, file, form)
     return file.getvalue()
 
 
-def _explain_curves(report: RunReport) -> str:
-    """Return what the marks of the curves mean, and which seeds ended early, as sentences."""
+def _explain_curves(report: RunReport) -> list[str]:
+    """Return what the marks of the curves mean, and which seeds ended early, as lines."""
     several = [recipe for recipe in report.recipes if len(recipe.runs) > 1]
     counts = [
         f"{len(recipe.runs)} seeds" + (f" ({recipe.label})" if len(report.recipes) > 1 else "") for recipe in several
     ]
-    sentences = [f"Lines: mean; bands: lowest to highest of {', '.join(counts)}."] if counts else []
+    sentences = [f"Lines and dots: mean; bands and bars: lowest to highest of {', '.join(counts)}."] if counts else []
     if any(_has_training_curve(recipe, column) for recipe in report.recipes for column in _TITLES):
-        sentences.append("Lines are the training's episodes, dots evaluations.")
+        sentences.append("Lines: episodes of the training; dots: evaluations.")
     ended = {
         f"seed {recipe.runs[number].summary.seed}" + (f" of {recipe.label}" if recipe.label else ""): step
         for recipe in several
@@ -85,8 +85,8 @@ def _explain_curves(report: RunReport) -> str:
     }
     if ended:
         names = ", ".join(f"{name} at step {step:,.0f}" for name, step in ended.items())
-        sentences.append(f"x, ended early: {names}; from there on the others.")
-    return " ".join(sentences)
+        sentences.append(f"x: ended early ({names}); from there on the mean of the others.")
+    return [line for sentence in sentences for line in textwrap.wrap(sentence, 130)]
 
 
 def _list_curves(recipe: RecipeRuns, column: str) -> list[dict[str, Any]]:
@@ -215,7 +215,9 @@ def _draw_curve(axes: Axes, curve: dict[str, Any], label: str, style: dict[str, 
     (line,) = axes.plot(curve["steps"], curve["mean"], label=label, **style)
     for _, step, value in curve.get("ended", ()):
         axes.plot(step, value, marker="x", ms=5, color=line.get_color())
-    if curve["count"] > 1:
+    if curve["count"] > 1 and style.get("linestyle") == "none":
+        axes.vlines(curve["steps"], curve["low"], curve["high"], color=line.get_color(), linewidth=1.0)
+    elif curve["count"] > 1:
         axes.fill_between(curve["steps"], curve["low"], curve["high"], color=line.get_color(), alpha=0.2, linewidth=0)
 
 

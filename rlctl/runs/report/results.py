@@ -119,9 +119,9 @@ def _list_cells(result: Result) -> tuple[str, ...]:
 
 
 def _name_recipe(result: Result) -> str:
-    if result.label and result.recipe and result.label != result.recipe:
-        return f"{result.label}: {result.recipe}"
-    return result.label or result.recipe
+    """Return the label, or what differs where the label is the name of the run, which the row has already."""
+    is_name_of_run = result.label in result.run.split("/")
+    return result.recipe if is_name_of_run or not result.label else result.label
 
 
 def _format(value: float | None, interval: Interval | None, form: str) -> str:
