@@ -6,6 +6,7 @@ import contextlib
 import functools
 import itertools
 import json
+import math
 import os
 import re
 import stat
@@ -139,22 +140,37 @@ def _show_bar(what: str, total: int | None, unit: str) -> Iterator[Callable[[int
 
 
 _FIRST_LINE_S = 10.0  # [s]
+_LEAST_S = 0.5  # [s]; shorter work prints no line, however long the silence before it was
+_PAUSE_S = 5.0  # [s]; work that follows sooner continues the silence before it: ten calls of 9 s are 90 s
 _LINES_S = (20.0, 30.0)  # [s] between further lines; the last one from then on
+
+
+class _Silence:
+    """When work began of which no line was printed yet, and when the last one ended [s, monotonic]."""
+
+    began = ended = -math.inf
+
+
+_silence = _Silence()
 
 
 @contextlib.contextmanager
 def _print_lines_of_progress(what: str, total: int | None, unit: str) -> Iterator[Callable[[int], None]]:
     """A thread prints the lines: a single call, as of a compiler, may take minutes."""
     start, done, ended = time.monotonic(), 0, threading.Event()
+    if start - _silence.ended > _PAUSE_S:
+        _silence.began = start
 
     def show(count: int) -> None:
         nonlocal done
         done = count
 
     def print_now_and_then() -> None:
-        for wait in itertools.chain((_FIRST_LINE_S,), _LINES_S, itertools.repeat(_LINES_S[-1])):
+        first = max(_LEAST_S, _FIRST_LINE_S - (start - _silence.began))
+        for wait in itertools.chain((first,), _LINES_S, itertools.repeat(_LINES_S[-1])):
             if ended.wait(wait):
                 return
+            _silence.began = time.monotonic()
             with contextlib.suppress(OSError, ValueError):  # nobody reads stderr any more
                 print_notes([format_progress(what, done, total, unit, time.monotonic() - start)])
 
@@ -165,6 +181,7 @@ def _print_lines_of_progress(what: str, total: int | None, unit: str) -> Iterato
     finally:
         ended.set()
         printer.join()
+        _silence.ended = time.monotonic()
 
 
 def format_progress(what: str, done: int, total: int | None, unit: str, seconds: float) -> str:

@@ -2,7 +2,16 @@
 
 import time
 
+import pytest
+
 from rlctl import output
+
+
+@pytest.fixture(autouse=True)
+def fresh_silence(monkeypatch):
+    """No work before the test counts."""
+    monkeypatch.setattr(output, "_silence", output._Silence())
+    monkeypatch.setattr(output, "_LEAST_S", 0.01)
 
 
 def test_long_work_prints_a_line_with_the_time_that_is_left(monkeypatch, capfd):
@@ -21,6 +30,16 @@ def test_a_single_call_prints_a_line_too(monkeypatch, capfd):
     with output.show_progress("compiling"):
         time.sleep(0.15)
     assert capfd.readouterr().err == "compiling: 0 s so far\n"
+
+
+def test_a_chain_of_short_work_is_not_silent(monkeypatch, capfd):
+    monkeypatch.setattr(output, "_FIRST_LINE_S", 0.25)
+    for part in range(3):
+        with output.show_progress(f"part {part}"):
+            time.sleep(0.1)
+    lines = capfd.readouterr().err.splitlines()
+    assert lines  # none of the parts alone takes so long
+    assert all(line.endswith(": 0 s so far") for line in lines)
 
 
 def test_short_work_prints_nothing(capfd):

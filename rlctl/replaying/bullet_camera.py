@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from rlctl.replaying.bullet_bodies import BulletBody, find_bounds, list_body_ids, read_body, read_pose
 from rlctl.replaying.bullet_log import BulletLog
 from rlctl.replaying.camera import FIELD_OF_VIEW, FilmCamera, Viewpoint
-from rlctl.replaying.captions import Look
+from rlctl.replaying.captions import CameraPose
 from rlctl.task.pybullet.library import draw_world, pybullet
 
 Picture = NDArray[np.uint8]
@@ -62,7 +62,7 @@ class BulletCamera:
             moving = [body for body in moving if body is self._followed[0] or self._is_near(body, followed)]
         low, high = find_bounds(moving, only_moving=True)
         eye, target = self._camera.aim(low, high, followed)
-        self.look = Look(eye, target)
+        self.look = CameraPose(eye, target)
         return draw_world(
             self._client,
             *self._size,

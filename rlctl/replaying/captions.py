@@ -26,7 +26,7 @@ _TEXT = {"fill": (255, 255, 255), "stroke_fill": (35, 40, 48)}
 
 
 @dataclasses.dataclass(frozen=True)
-class Look:
+class CameraPose:
     """Where a camera is and where it looks [m], with z up and the field of view of films."""
 
     eye: Sequence[float]
@@ -47,7 +47,7 @@ class Look:
         return size[0] / 2 + scale * float(way @ right), size[1] / 2 - scale * float(way @ up), scale
 
 
-def draw_rings(picture: Picture, markers: Mapping[str, Any], look: Look) -> Picture:
+def draw_rings(picture: Picture, markers: Mapping[str, Any], look: CameraPose) -> Picture:
     """Return a picture with a ring and the name of each marker; `markers` are positions by name [m], shape (3,)."""
     height, width = picture.shape[:2]
     places = {name: look.project(np.asarray(position), (width, height)) for name, position in markers.items()}

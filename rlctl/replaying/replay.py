@@ -57,7 +57,7 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
                 draw=draw,
             )
         if draw is not None:
-            episodes = [source.save(number, rollout) for number, rollout in enumerate(rollouts)]
+            episodes = [source.record_rollout(number, rollout) for number, rollout in enumerate(rollouts)]
             return dataclasses.replace(source.report(episodes), film=film)
     elif request.gui and seeds:
         with closing(open_window(spec)) as env:

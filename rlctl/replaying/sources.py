@@ -70,7 +70,7 @@ class RecordedSource:
             rollout = record_episode(self._episode, recording, title=self._title)
         return [summarize(rollout, recording, self._path)]
 
-    def save(self, number: int, rollout: Rollout) -> ReplayedEpisode:
+    def record_rollout(self, number: int, rollout: Rollout) -> ReplayedEpisode:
         """Write the recording of a rollout that was played already."""
         recording = self._find_recording()
         write_recording(self._episode, rollout, recording, title=self._title)
@@ -125,14 +125,14 @@ class _NewEpisodes:
             for number, seed in enumerate(self.seeds):
                 choose = self.begin(env, seed)
                 rollout = play_episode(env, spec, seed, choose, policy=self.name, draw=print_warning, watch=watch)
-                episodes.append(self.save(number, rollout))
+                episodes.append(self.record_rollout(number, rollout))
         return episodes
 
-    def save(self, number: int, rollout: Rollout) -> ReplayedEpisode:
+    def record_rollout(self, number: int, rollout: Rollout) -> ReplayedEpisode:
         """Write an episode that was played, and its recording."""
         from rlctl.replaying.rrd import write_rrd
 
-        episode = self._save_episode(number, rollout.episode)
+        episode = self.save(number, rollout.episode)
         recording = episode.with_suffix(".rrd")
         title, several = f"{self.spec.task} / episode {recording.stem}", len(self.seeds) > 1
         write_rrd(recording, rollout, title=title, warn=print_warning, several=several)
@@ -149,7 +149,7 @@ class _NewEpisodes:
                 print_warning(f"warning: seed {episode.seed}: {returns}; {advice}")
         return ReplayResult(self.spec.task, self.name, episodes, policy_file=self.described, choice=self._choice)
 
-    def _save_episode(self, number: int, episode: RecordedEpisode) -> Path:
+    def save(self, number: int, episode: RecordedEpisode) -> Path:
         """Write an episode as `--output`, or under the next number in that folder, or in the default place.
 
         Return its file; the recording next to it has the same name.

@@ -8,7 +8,7 @@ from rlctl.errors import UsageError, describe_exception
 from rlctl.replaying.bullet_bodies import read_body
 from rlctl.replaying.bullet_camera import BulletCamera, Picture, find_world
 from rlctl.replaying.camera import FIELD_OF_VIEW, FilmCamera, Viewpoint
-from rlctl.replaying.captions import Look, draw_rings
+from rlctl.replaying.captions import CameraPose, draw_rings
 from rlctl.replaying.drawable import DrawableEnv, make_drawable
 from rlctl.replaying.mujoco_scene import find_missing_floor, find_mujoco_bounds
 from rlctl.replaying.scene import Env
@@ -115,7 +115,7 @@ class _MujocoTaskView:
         picture = sim.render(
             *self._size, eye=eye, target=target, field_of_view=FIELD_OF_VIEW, sun=True, floor=self._floor
         )
-        return draw_rings(picture, self._env.markers(), Look(eye, target))
+        return draw_rings(picture, self._env.markers(), CameraPose(eye, target))
 
 
 def look_at(

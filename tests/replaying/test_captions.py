@@ -7,12 +7,12 @@ import pytest
 
 from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
-from rlctl.replaying.captions import Caption, Look, draw_rings, write_lines
+from rlctl.replaying.captions import CameraPose, Caption, draw_rings, write_lines
 from rlctl.replaying.views import look_at, make_filmable
 
 
 def test_a_point_in_the_picture_by_hand():
-    look = Look((0.0, 0.0, 1.0), (2.0, 0.0, 1.0))
+    look = CameraPose((0.0, 0.0, 1.0), (2.0, 0.0, 1.0))
     # 2 m away a picture of 100 rows is 2 * 2 tan(22.5 degrees) = 1.657 m high: 60.36 pixels per metre.
     column, row, scale = look.project(np.array([2.0, 0.1, 1.2]), (200, 100))
     assert scale == pytest.approx(60.36, abs=0.01)
@@ -22,7 +22,7 @@ def test_a_point_in_the_picture_by_hand():
 
 def test_a_ring_is_seen_where_a_hand_hides_the_marker():
     picture = np.full((240, 320, 3), 90, np.uint8)
-    look = Look((1.0, 0.0, 0.5), (0.0, 0.0, 0.5))
+    look = CameraPose((1.0, 0.0, 0.5), (0.0, 0.0, 0.5))
     ringed = draw_rings(picture, {"goal": np.array([0.0, 0.0, 0.5])}, look)
     changed = (ringed != picture).any(axis=2)
     assert changed[105, 160] or changed[106, 160]  # 0.05 m above the middle: 14.5 pixels

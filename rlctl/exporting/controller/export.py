@@ -79,10 +79,12 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
     source, target = find_source(request, "controller")
     limits = None if request.limits is None else read_limits(request.limits)
     pin_threads()
-    torch_actor = TorchActor.load(source.file)
+    with output.show_progress("loading the policy"):
+        torch_actor = TorchActor.load(source.file)
     spec = _choose_spec(source.locate(torch_actor.info.spec), request.sim)
     try:
-        env = spec.make()
+        with output.show_progress("building the environment"):
+            env = spec.make()
         built = describe(env)
     except (UsageError, TaskError) as error:
         raise explain_unverifiable(source.file, error) from None

@@ -158,8 +158,8 @@ def verify_controller(
                     worst = max(worst, _compare(agreement, wanted, targets))
     agreement.observations = sum(len(episode.actions) for episode in recorded)
 
-    expected = [episode.episode for episode in recorded[:EPISODES]]
-    loop = compare_episodes(expected, _play_again(player, controller, expected, "closed loop, controller"))
+    episodes = [episode.episode for episode in recorded[:EPISODES]]
+    loop = compare_episodes(episodes, _play_again(player, controller, episodes, "closed loop, controller"))
     return ControllerAgreement(agreement, loop, None if target is None else worst)
 
 

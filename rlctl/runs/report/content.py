@@ -311,7 +311,7 @@ def mean_curve(tables: Sequence[Rows], column: str, points: int = 200) -> dict[s
     if last < first:
         return None
     steps = np.linspace(first, last, min(points, max(map(len, curves))))
-    values = np.array([np.interp(steps, *curve.T, right=np.nan) for curve in curves])
+    values = np.array([np.interp(steps, curve[:, 0], curve[:, 1], right=np.nan) for curve in curves])
     low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
     mean = np.nanmean(values, axis=0)
     return {"steps": steps, "mean": mean, "low": low, "high": high, "count": len(curves), "ended": ended}

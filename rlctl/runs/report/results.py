@@ -18,7 +18,7 @@ _LATEX |= {character: f"\\{character}" for character in "&%$#_{}"}
 
 
 @dataclasses.dataclass(frozen=True)
-class Result:
+class ResultRow:
     """The scores of a run, or their mean over the seeds of a recipe with its 95 % interval (Student's t)."""
 
     run: str  # name of the run; of a mean empty
@@ -41,7 +41,7 @@ class Result:
         return not self.run
 
 
-def list_results(report: RunReport) -> list[Result]:
+def list_results(report: RunReport) -> list[ResultRow]:
     """Return a result per run, and after the runs of a recipe with several seeds their mean."""
     results = []
     for recipe in report.recipes:
@@ -52,8 +52,8 @@ def list_results(report: RunReport) -> list[Result]:
     return results
 
 
-def _describe_run(recipe: RecipeRuns, run: RunSummary) -> Result:
-    return Result(
+def _describe_run(recipe: RecipeRuns, run: RunSummary) -> ResultRow:
+    return ResultRow(
         run=run.name,
         label=recipe.label,
         recipe=recipe.name,
@@ -70,7 +70,7 @@ def _describe_run(recipe: RecipeRuns, run: RunSummary) -> Result:
     )
 
 
-def _average(runs: Sequence[Result]) -> Result:
+def _average(runs: Sequence[ResultRow]) -> ResultRow:
     scored = [run for run in runs if run.mean_return is not None]
     successes = [run.success for run in scored if run.success is not None]
     returns = [run.mean_return for run in scored if run.mean_return is not None]
@@ -94,7 +94,7 @@ def _average(runs: Sequence[Result]) -> Result:
     )
 
 
-def format_markdown(results: Sequence[Result]) -> str:
+def format_markdown(results: Sequence[ResultRow]) -> str:
     """Return a Markdown table; intervals are in parentheses, and unfinished runs say so behind their name."""
     head = ("run", "recipe", "algo", "seed", "steps", "minutes", "success", "return")
     rows = [_list_cells(result) for result in results]
@@ -102,7 +102,7 @@ def format_markdown(results: Sequence[Result]) -> str:
     return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
 
 
-def _list_cells(result: Result) -> tuple[str, ...]:
+def _list_cells(result: ResultRow) -> tuple[str, ...]:
     name = f"mean of {result.seeds} seeds" if result.is_mean else result.run
     if result.state != "done":
         name += f" ({result.state})"
@@ -118,7 +118,7 @@ def _list_cells(result: Result) -> tuple[str, ...]:
     )
 
 
-def _name_recipe(result: Result) -> str:
+def _name_recipe(result: ResultRow) -> str:
     """Return the label, or what differs where the label is the name of the run, which the row has already."""
     is_name_of_run = result.label in result.run.split("/")
     return result.recipe if is_name_of_run or not result.label else result.label
@@ -132,7 +132,7 @@ def _format(value: float | None, interval: Interval | None, form: str) -> str:
     return f"{value:{form}} ({interval[0]:{form}} to {interval[1]:{form}})"
 
 
-def format_csv(results: Sequence[Result]) -> str:
+def format_csv(results: Sequence[ResultRow]) -> str:
     """Return CSV with unrounded numbers; a row whose `run` is empty is a mean over seeds."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -147,7 +147,7 @@ def format_csv(results: Sequence[Result]) -> str:
     return text.getvalue()
 
 
-def format_latex(report: RunReport, results: Sequence[Result]) -> str:
+def format_latex(report: RunReport, results: Sequence[ResultRow]) -> str:
     """Return a table for LaTeX with the package booktabs: a row per recipe, or per run where no recipe has seeds."""
     has_means = any(result.is_mean for result in results)
     alone = {result.label for result in results} - {result.label for result in results if result.is_mean}
