@@ -201,7 +201,7 @@ def _normalizes(task: str, what: str) -> bool:
 
 @contextlib.contextmanager
 def show_status(what: str, wanted: bool) -> Iterator[Callable[[str], None]]:
-    """Show what is done (`checking reach`), now and then where there is no terminal; yields a function that takes the phase."""
+    """Show what is done (`checking reach`), without a terminal now and then; yields a function that takes the phase."""
     console = output.err()
     status = console.status(what)
     display: contextlib.AbstractContextManager[object] = contextlib.nullcontext()

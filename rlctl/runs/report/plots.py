@@ -70,19 +70,21 @@ def draw_learning(report: RunReport, form: Picture) -> bytes:
 def _explain_curves(report: RunReport) -> list[str]:
     """Return what the marks of the curves mean, and which seeds ended early, as lines."""
     several = [recipe for recipe in report.recipes if len(recipe.runs) > 1]
-    counts = [
-        f"{len(recipe.runs)} seeds" + (f" ({recipe.label})" if len(report.recipes) > 1 else "") for recipe in several
-    ]
-    sentences = [f"Lines and dots: mean; bands and bars: lowest to highest of {', '.join(counts)}."] if counts else []
+    counts = []
+    for recipe in several:
+        of_recipe = f" ({recipe.label})" if len(report.recipes) > 1 else ""
+        counts.append(f"{len(recipe.runs)} seeds{of_recipe}")
+    sentences = []
+    if counts:
+        sentences.append(f"Lines and dots: mean; bands and bars: lowest to highest of {', '.join(counts)}.")
     if any(_has_training_curve(recipe, column) for recipe in report.recipes for column in _TITLES):
         sentences.append("Lines: episodes of the training; dots: evaluations.")
-    ended = {
-        f"seed {recipe.runs[number].summary.seed}" + (f" of {recipe.label}" if recipe.label else ""): step
-        for recipe in several
-        for column in _TITLES
-        for curve in _list_curves(recipe, column)
-        for number, step, _ in curve["ended"]
-    }
+    ended = {}
+    for recipe in several:
+        of_recipe = f" of {recipe.label}" if recipe.label else ""
+        for curve in [curve for column in _TITLES for curve in _list_curves(recipe, column)]:
+            for number, step, _ in curve["ended"]:
+                ended[f"seed {recipe.runs[number].summary.seed}{of_recipe}"] = step
     if ended:
         names = ", ".join(f"{name} at step {step:,.0f}" for name, step in ended.items())
         sentences.append(f"x: ended early ({names}); from there on the mean of the others.")

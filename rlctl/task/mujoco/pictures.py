@@ -13,9 +13,9 @@ from rlctl.task.mujoco.world import import_mujoco
 
 _NEAREST = 0.05  # of the distance from the eye to the target
 _SUN = (-0.45, -0.55, -0.7)  # the direction of its light
-_LARGE = 600  # [pixels]; higher pictures are drawn finer, which takes twice as long without a graphics card
+_LARGE = 600  # [pixels]; higher pictures are drawn finer, which takes a third longer without a graphics card
 _QUALITY = {"shadowsize": 2048}
-_FINE = {"shadowsize": 4096, "numslices": 64, "numstacks": 32}  # corners of MuJoCo's round shapes would be seen
+_FINE = {"shadowsize": 4096, "numslices": 40, "numstacks": 24}  # corners of MuJoCo's round shapes would be seen
 _FLOOR_SIDE, _FLOOR_DEPTH = 40.0, 0.02  # [m], where a world has no ground
 _OF_CAMERA = 0.5  # how much of the light from the camera is left
 _HINT = "without a display set MUJOCO_GL=egl (Debian: libegl1) or MUJOCO_GL=osmesa"
