@@ -6,10 +6,13 @@ import contextlib
 import functools
 import itertools
 import json
+import math
 import os
 import re
 import stat
 import sys
+import threading
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -103,16 +106,92 @@ def confirm(question: str, refusal: str) -> bool:
 
 
 @contextlib.contextmanager
-def show_progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on a terminal; yields a function that takes how much of `total` is done."""
-    if not err().is_terminal:
-        yield lambda done: None
-        return
-    from rich.progress import Progress
+def show_progress(what: str, total: int | None = None, unit: str = "") -> Iterator[Callable[[int], None]]:
+    """Show the progress of work that may take longer than a few seconds, with the time that is left.
 
-    with Progress(console=err(), transient=True, redirect_stdout=False) as progress:
+    Yields a function that takes how many of `total` are done, in `unit` (`episodes`); without `total` only the time is
+    shown. On a terminal it is a bar, elsewhere a line on stderr after `_FIRST_LINE_S`, and then now and then.
+    """
+    display = _show_bar if err().is_terminal else _print_lines_of_progress
+    with display(what, total, unit) as show:
+        yield show
+
+
+@contextlib.contextmanager
+def _show_bar(what: str, total: int | None, unit: str) -> Iterator[Callable[[int], None]]:
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns: list[ProgressColumn] = [TextColumn("{task.description}"), BarColumn()]
+    if total is None:
+        columns.append(TimeElapsedColumn())
+    else:
+        columns += [MofNCompleteColumn(" of "), TextColumn(unit), TimeRemainingColumn(), TextColumn("left")]
+    with Progress(*columns, console=err(), transient=True, redirect_stdout=False) as progress:
         task = progress.add_task(what, total=total)
         yield lambda done: progress.update(task, completed=done)
+
+
+_FIRST_LINE_S = 10.0  # [s]
+_LEAST_S = 0.5  # [s]; shorter work prints no line, however long the silence before it was
+_PAUSE_S = 5.0  # [s]; work that follows sooner continues the silence before it: ten calls of 9 s are 90 s
+_LINES_S = (20.0, 30.0)  # [s] between further lines; the last one from then on
+
+
+class _Silence:
+    """When work began of which no line was printed yet, and when the last one ended [s, monotonic]."""
+
+    began = ended = -math.inf
+
+
+_silence = _Silence()
+
+
+@contextlib.contextmanager
+def _print_lines_of_progress(what: str, total: int | None, unit: str) -> Iterator[Callable[[int], None]]:
+    """A thread prints the lines: a single call, as of a compiler, may take minutes."""
+    start, done, ended = time.monotonic(), 0, threading.Event()
+    if start - _silence.ended > _PAUSE_S:
+        _silence.began = start
+
+    def show(count: int) -> None:
+        nonlocal done
+        done = count
+
+    def print_now_and_then() -> None:
+        first = max(_LEAST_S, _FIRST_LINE_S - (start - _silence.began))
+        for wait in itertools.chain((first,), _LINES_S, itertools.repeat(_LINES_S[-1])):
+            if ended.wait(wait):
+                return
+            _silence.began = time.monotonic()
+            with contextlib.suppress(OSError, ValueError):  # nobody reads stderr any more
+                print_notes([format_progress(what, done, total, unit, time.monotonic() - start)])
+
+    printer = threading.Thread(target=print_now_and_then, name="progress", daemon=True)
+    printer.start()
+    try:
+        yield show
+    finally:
+        ended.set()
+        printer.join()
+        _silence.ended = time.monotonic()
+
+
+def format_progress(what: str, done: int, total: int | None, unit: str, seconds: float) -> str:
+    """Format progress after a time [s]: `filming: 60 of 900 steps, about 3 min left`, or `compiling: 12 s so far`."""
+    if total is None:
+        return f"{what}: {format_duration(seconds)} so far"
+    counted = f"{what}: {done:,} of {total:,} {unit}".rstrip()
+    if done <= 0:
+        return f"{counted}, {format_duration(seconds)} so far"
+    return f"{counted}, about {format_duration(seconds * max(total - done, 0) / done)} left"
 
 
 def format_duration(seconds: float) -> str:

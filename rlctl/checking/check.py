@@ -201,10 +201,15 @@ def _normalizes(task: str, what: str) -> bool:
 
 @contextlib.contextmanager
 def show_status(what: str, wanted: bool) -> Iterator[Callable[[str], None]]:
-    """Show on a terminal what is done (`checking reach`); yields a function that takes the phase."""
+    """Show what is done (`checking reach`), without a terminal now and then; yields a function that takes the phase."""
     console = output.err()
     status = console.status(what)
-    with status if wanted and console.is_terminal else contextlib.nullcontext():
+    display: contextlib.AbstractContextManager[object] = contextlib.nullcontext()
+    if wanted and console.is_terminal:
+        display = status
+    elif wanted:
+        display = output.show_progress(what)
+    with display:
         yield lambda phase: status.update(f"{what}: {phase}")
 
 

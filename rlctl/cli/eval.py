@@ -78,7 +78,6 @@ def evaluate(
         print_notes([f"--sim {sim} plays in one engine; to vary the stiffness of its contacts: --vary sim"])
     if vary or push:
         unsupported: dict[str, object] = {
-            "--policy": request.baseline,
             "--limits": request.limits,
             "--record": request.record,
             "--decide-early": request.decide_early or None,
@@ -135,7 +134,7 @@ def _fill_counts(arguments: Iterable[str]) -> Iterator[str]:
         "Options": ["baseline", "checkpoint", "pretrained", "task", "verify"],
         "Episodes": ["episodes", "worst", "best", "failures", "seed", "settings"],
         "Where": ["gui", "sim"],
-        "Output": ["output", "video", "json"],
+        "Output": ["output", "video", "size", "camera", "json"],
     }
 )
 def replay(request: ReplayRequest, pretrained: Pretrained = False, json: Json = None) -> None:

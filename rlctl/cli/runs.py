@@ -86,22 +86,36 @@ def report_runs(
         Argument("Runs, groups, globs or folders of runs, all of one task.", metavar="RUN", default_text="latest"),
     ] = [],
     output: Annotated[
-        Path | None, Option("Default: report.FORMAT; md and table go to stdout.", ("--output", "-o"), metavar="FILE")
+        Path | None,
+        Option("Default: report.FORMAT; md, table, csv and latex go to stdout.", ("--output", "-o"), metavar="FILE"),
     ] = None,
     format: Annotated[
-        Literal["html", "md", "table", "svg", "pdf", "png"],
-        Option("A page, text for pull requests, the table of results alone, or the learning curves alone."),
-    ] = "html",
+        Literal["html", "md", "table", "csv", "latex", "svg", "pdf", "png"] | None,
+        Option(
+            "A page, text for pull requests, the results alone (table, csv, latex), or the learning curves alone.",
+            default_text="by the suffix of --output, else html",
+        ),
+    ] = None,
+    label: Annotated[
+        list[str], Option("Name of a recipe in curves and tables; once per recipe, in the order of the runs.")
+    ] = [],
     pictures: Annotated[bool, Option("Do not replay episodes to draw pictures.", ("/--no-pictures",))] = True,
     episodes: Annotated[
-        int, Option("Episodes that each run plays to compare recipes; 0: do not compare.", min=0, max=1_000_000)
-    ] = 100,
+        int | None,
+        Option(
+            "Episodes that each run plays to compare recipes; 0: do not compare.",
+            min=0,
+            max=1_000_000,
+            default_text="100",
+        ),
+    ] = None,
 ) -> None:
     """Write the result of runs as one file: verdict, curves, evaluations, diagnosis, pictures, how to reproduce it."""
     from rlctl import output as streams
     from rlctl.runs.report.write import write_report
 
-    if (path := write_report(runs or ["latest"], format, output, pictures=pictures, episodes=episodes)) is not None:
+    path = write_report(runs or ["latest"], format, output, pictures=pictures, episodes=episodes, labels=label)
+    if path is not None:
         streams.out().print(f"report: {path}")
 
 

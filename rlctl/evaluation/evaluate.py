@@ -106,12 +106,13 @@ def run_evaluation(
 ) -> Evaluation:
     """Find the policy, play its episodes, and return their statistics; `print_notes` as in `find_player`."""
     if request.baseline is not None:
-        return _evaluate(load_baseline(request.baseline), _choose_task(request), request, gates)
+        return _evaluate(load_baseline(request.baseline), choose_baseline_task(request), request, gates)
     _, policy, spec = find_player(request, print_notes)
     return _evaluate(policy, spec, request, gates)
 
 
-def _choose_task(request: EvalRequest) -> EnvSpec:
+def choose_baseline_task(request: EvalRequest) -> EnvSpec:
+    """Return the environment in which a request's `--policy` plays; raises `UsageError` for options of runs."""
     name = str(request.baseline)
     if request.checkpoint != "best" or request.stage is not None or not request.deterministic or request.task:
         raise UsageError(
@@ -166,7 +167,7 @@ def _read_limits(file: Path, info: EnvInfo) -> dict[str, Any]:
 
 def _play(workers: Workers, request: EvalRequest) -> list[Episode]:
     seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
-    with output.show_progress("evaluating", len(seeds)) as show:
+    with output.show_progress("evaluating", len(seeds), "episodes") as show:
         return _play_seeds(workers, request, seeds, show)
 
 
@@ -183,7 +184,7 @@ def _play_until_decided(workers: Workers, request: EvalRequest, gates: Gates, ea
     seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
     episodes: list[Episode] = []
     successes = 0
-    with output.show_progress("evaluating", len(seeds)) as show:
+    with output.show_progress("evaluating", len(seeds), "episodes") as show:
         while chunk := seeds[len(episodes) : len(episodes) + max(_PLAYED_TOGETHER, workers.n_envs)]:
             for episode in _play_seeds(workers, request, chunk, functools.partial(_show_more, show, len(episodes))):
                 gates.check_possible(episode.result.success is not None)

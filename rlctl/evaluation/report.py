@@ -182,7 +182,8 @@ def show_robustness(result: Robustness, json: str | None) -> None:
     if output.present(result.model_dump(mode="json"), json):
         return
     out = output.out()
-    out.print(f"{result.task}: {result.policy_file} ({result.algo}, step {result.training_steps:,})")
+    about = "" if result.is_baseline else f" ({result.algo}, step {result.training_steps:,})"
+    out.print(f"{result.task}: {result.policy_file}{about}")
     mode = "" if result.deterministic else ", sampled actions"
     episodes = output.format_count(result.episodes, "episode")
     out.print(f"{episodes} in every cell, the same seeds (seed {result.seed}){mode}")
@@ -191,9 +192,11 @@ def show_robustness(result: Robustness, json: str | None) -> None:
     for varied in result.maps:
         out.print()
         _show_map(varied, worst[1] if worst else None)
+    if any(varied.played for varied in result.maps):
+        where, outcome = result.name_worst()
+        out.print(f"\nworst: {where}: {_format_outcome(outcome)}")
     if worst is not None:
         varied, cell = worst
-        out.print(f"\nworst: {varied.name_cell(cell)}: {_format_outcome(cell)}")
         out.print(f"to play only these episodes: {format_command(result, varied, cell)}")
     for line in result.list_failed():
         out.print(f"failed: {line}")
@@ -240,9 +243,10 @@ def _show_grid(varied: RobustnessMap, worst: Cell | None) -> None:
     columns = [f"{down.name} \\ {across.name} ", *(f" {value:.3g} " for value in across.values)]
     output.print_table(columns, rows, gap="")
     out = output.out()
-    marks = [*([f"{_NOMINAL} nominal"] if any(cell.nominal for cell in varied.cells) else []), f"{_WORST} worst"]
+    marks = [f"{_NOMINAL} nominal"] if any(cell.nominal for cell in varied.cells) else []
+    marks += [f"{_WORST} worst"] if any(cell is worst for cell in varied.cells) else []
     quantity = "success [%]" if varied.has_success else "mean return"
-    out.print(f"{quantity}; {', '.join(marks)}")
+    out.print("; ".join(filter(None, (quantity, ", ".join(marks)))))
 
 
 def _draw_cell(cell: Cell | FailedCell, color: str, worst: Cell | None) -> Text:

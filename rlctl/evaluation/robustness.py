@@ -42,17 +42,17 @@ class Outcome(_Content):
     mean_return: float
     return_interval: Interval  # 95 % interval of the mean, by Student's t; of one episode both ends are its return
 
+    @property
+    def score(self) -> tuple[float, float]:
+        """Outcomes are ordered by the success rate, if it is reported, then by the mean return."""
+        return (0.0 if self.success_rate is None else self.success_rate), self.mean_return
+
 
 class Cell(Outcome):
     """The scores in one cell of a map."""
 
     values: list[float]  # one per axis
     nominal: bool  # whether every value is that of the unchanged world
-
-    @property
-    def score(self) -> tuple[float, float]:
-        """Cells are ordered by the success rate, if it is reported, then by the mean return."""
-        return (0.0 if self.success_rate is None else self.success_rate), self.mean_return
 
 
 class Failure(_Content):
@@ -137,7 +137,8 @@ class Robustness(_Content):
     randomize: bool = False  # whether all events of the task are active in every cell
     sim: Engine = Engine()  # in which the cells were played; no choice: the policy's own
     other_task: str | None = None  # on which the policy was played; None: on that of its training
-    policy_file: str
+    policy_file: str  # or what `--policy` names: no file of rlctl, without algorithm and steps
+    is_baseline: bool = False  # whether `--policy` named the policy
     algo: str
     training_steps: int
     episodes: int  # in every cell, with the same seeds
@@ -150,7 +151,7 @@ class Robustness(_Content):
     versions: dict[str, str] = {}
 
     def name_worst(self) -> tuple[str, Outcome]:
-        """Return name and scores of the worst cell; without maps, of the nominal setting."""
+        """Return name and scores of the worst cell of all maps, or of the nominal setting where no cell is worse."""
         worst = self.find_worst()
         if worst is None:
             return "nominal", self.nominal
@@ -158,9 +159,12 @@ class Robustness(_Content):
         return varied.name_cell(cell), cell
 
     def find_worst(self) -> tuple[RobustnessMap, Cell] | None:
-        """Return the worst cell of all maps that has scores, with its map; None where nothing was varied."""
+        """Return the worst cell of all maps that has scores, with its map; None where the nominal setting is worse."""
         cells = ((varied, cell) for varied in self.maps for cell in varied.played)
-        return min(cells, key=lambda pair: pair[1].score, default=None)
+        worst = min(cells, key=lambda pair: pair[1].score, default=None)
+        if worst is None or self.nominal.score < worst[1].score:
+            return None
+        return worst
 
     def list_failed(self) -> list[str]:
         """Return a line for each cell in which the environment failed."""

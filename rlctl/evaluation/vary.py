@@ -21,8 +21,8 @@ from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.evaluation import robustness
 from rlctl.evaluation.episode_statistics import summarize
 from rlctl.evaluation.eval_request import NO_GATES, EvalRequest, Gates
-from rlctl.evaluation.evaluate import start_workers
-from rlctl.evaluation.players import LoadedPolicy, find_player
+from rlctl.evaluation.evaluate import choose_baseline_task, start_workers
+from rlctl.evaluation.players import Baseline, LoadedPolicy, find_player, load_baseline
 from rlctl.evaluation.push import measure_push
 from rlctl.evaluation.robustness import Axis, Cell, FailedCell, Failure, Outcome, Robustness, RobustnessMap
 from rlctl.play.collect import play_episodes
@@ -30,6 +30,7 @@ from rlctl.play.messages import EpisodeResult
 from rlctl.play.seeds import Stream, episode_seeds
 from rlctl.play.workers import Workers
 from rlctl.policy.actor import Exploration
+from rlctl.runs.directory import RunDirectory
 from rlctl.storage import files
 from rlctl.version import collect_versions
 
@@ -56,7 +57,13 @@ def measure_robustness(
     """
     if request.changes.randomize is None:
         request = dataclasses.replace(request, changes=dataclasses.replace(request.changes, randomize=False))
-    source, policy, spec = find_player(request)
+    policy: LoadedPolicy | Baseline
+    run: RunDirectory | None = None
+    if request.baseline is not None:
+        policy, spec = load_baseline(request.baseline), choose_baseline_task(request)
+    else:
+        source, policy, spec = find_player(request)
+        run = source.run
     maps = robustness.read_axes(vary, spec) if vary else []
     if any(axis.setting == robustness.SIM for axes in maps for axis in axes):
         dataclasses.replace(spec, sim=MUJOCO).make().close()  # raises for what MuJoCo cannot build
@@ -64,25 +71,31 @@ def measure_robustness(
     gates.check_reachable(request.episodes)
     with CellPlayer(spec, policy, request) as player:
         start = time.monotonic()
-        episodes = player.play(spec)
+        with output.show_progress("with nothing varied", request.episodes, "episodes") as show:
+            episodes = player.play(spec, watch=show)
         nominal = summarize(episodes)
         gates.check_possible(nominal.success_rate is not None)
         if play_cells is None:
             _ask(cells, time.monotonic() - start, yes)
-        play = player.play_cells if play_cells is None else functools.partial(play_cells, policy, request)
+        play = player.play_cells
+        if play_cells is not None:
+            if policy.info is None:
+                raise UsageError(f"--on: nodes play policy files only; leave it out, or --policy {request.baseline}")
+            play = functools.partial(play_cells, policy, request)
         measured = _play_maps(maps, spec, play) if maps else []
-        pushed = measure_push(spec, episodes, lambda force: player.play(spec, force)) if push else None
+        pushed = measure_push(spec, episodes, player.play_pushed) if push else None
     result = Robustness(
         task=spec.task,
         parameters=dict(spec.parameters),
         reward_weights=dict(spec.reward_weights),
         events={name: dict(event) for name, event in spec.events.items()},
         randomize=spec.randomize,
-        sim=_find_other_engine(spec, policy),
+        sim=_find_other_engine(spec, policy, request),
         other_task=request.task,
-        policy_file=str(source.file),
-        algo=policy.info.algo,
-        training_steps=policy.info.training_steps,
+        policy_file=policy.name,
+        is_baseline=policy.info is None,
+        algo="" if policy.info is None else policy.info.algo,
+        training_steps=0 if policy.info is None else policy.info.training_steps,
         episodes=request.episodes,
         seed=request.seed,
         deterministic=request.deterministic,
@@ -92,13 +105,15 @@ def measure_robustness(
         command=shlex.join(["rlctl", *sys.argv[1:]]),
         versions=collect_versions(),
     )
-    if source.run is not None and request.task in (None, policy.info.spec.task):
-        _store(source.run.robustness_file, result)
+    if run is not None and policy.info is not None and request.task in (None, policy.info.spec.task):
+        _store(run.robustness_file, result)
     return result
 
 
-def _find_other_engine(spec: EnvSpec, policy: LoadedPolicy) -> Engine:
-    """Return the engine of a measurement; no choice where it is the policy's own."""
+def _find_other_engine(spec: EnvSpec, policy: LoadedPolicy | Baseline, request: EvalRequest) -> Engine:
+    """Return the engine of a measurement; no choice where it is the policy's own, or that of the task's recipe."""
+    if policy.info is None:
+        return request.changes.sim
     own = policy.info.spec.replace_missing_engine()
     return Engine() if spec.sim == own.sim else spec.sim
 
@@ -106,7 +121,7 @@ def _find_other_engine(spec: EnvSpec, policy: LoadedPolicy) -> Engine:
 class CellPlayer(contextlib.AbstractContextManager["CellPlayer"]):
     """Plays the same episodes in one setting after another, with the same workers."""
 
-    def __init__(self, spec: EnvSpec, policy: LoadedPolicy, request: EvalRequest) -> None:
+    def __init__(self, spec: EnvSpec, policy: LoadedPolicy | Baseline, request: EvalRequest) -> None:
         self._spec, self._policy, self._request = spec, policy, request
         self._seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
         self._exploration = Exploration(stochastic=not request.deterministic)
@@ -125,7 +140,18 @@ class CellPlayer(contextlib.AbstractContextManager["CellPlayer"]):
     def __exit__(self, *_: object) -> None:
         self.workers.close()
 
-    def play(self, spec: EnvSpec, push: dict[str, object] | None = None) -> list[EpisodeResult]:
+    def play_pushed(self, push: dict[str, object]) -> list[EpisodeResult]:
+        """Play all episodes with a push, and show the progress."""
+        with output.show_progress("with a push", self._request.episodes, "episodes") as show:
+            return self.play(self._spec, push, watch=show)
+
+    def play(
+        self,
+        spec: EnvSpec,
+        push: dict[str, object] | None = None,
+        *,
+        watch: Callable[[int], None] = lambda done: None,
+    ) -> list[EpisodeResult]:
         """Play all episodes with the events and parameters of `spec`; `push` is as in `Workers.set_events`."""
         workers = self.workers
         if (spec.parameters, spec.sim) != (workers.spec.parameters, workers.spec.sim):
@@ -133,7 +159,7 @@ class CellPlayer(contextlib.AbstractContextManager["CellPlayer"]):
             self._policy.give_to(workers)
         if self._has_events:
             workers.set_events(spec, push)
-        return [episode.result for episode in play_episodes(workers, self._seeds, self._exploration)]
+        return [episode.result for episode in play_episodes(workers, self._seeds, self._exploration, watch=watch)]
 
     def play_cells(self, specs: Sequence[EnvSpec]) -> Iterator[tuple[int, Scores]]:
         """Play all episodes in each setting; yield its index and scores."""
@@ -167,7 +193,7 @@ def _play_maps(
 ) -> list[RobustnessMap]:
     points = [(axes, values) for axes in maps for values in itertools.product(*(axis.values for axis in axes))]
     cells: dict[int, Cell | FailedCell] = {}
-    with output.show_progress("varying", len(points)) as show:
+    with output.show_progress("varying", len(points), "cells") as show:
         for index, outcome in play([robustness.apply_axes(axes, values, spec) for axes, values in points]):
             pairs = list(zip(*points[index], strict=True))
             nominal = all(axis.nominal is not None and abs(axis.nominal - value) < 1e-9 for axis, value in pairs)
@@ -233,7 +259,17 @@ def format_command(result: Robustness, varied: RobustnessMap, cell: Cell) -> str
             engine = Engine("mujoco", value)
             continue
         settings[axis.setting] = str(int(value) if value.is_integer() else value)
-    words = ["rlctl", "eval", result.policy_file, "--episodes", str(result.episodes), "--seed", str(result.seed)]
+    played = [result.task, "--policy"] if result.is_baseline else []
+    words = [
+        "rlctl",
+        "eval",
+        *played,
+        result.policy_file,
+        "--episodes",
+        str(result.episodes),
+        "--seed",
+        str(result.seed),
+    ]
     if result.other_task is not None:
         words += ["--task", result.other_task]
     if engine:

@@ -45,7 +45,10 @@ def export_dataset(request: ExportRequest) -> dict[str, Any]:
     folder = request.output or default / f"{task}-{request.dataset}"
     if folder.exists():
         raise UsageError(f"--output {folder}: exists already; give a new folder, or remove this one")
-    with start_workers(spec, played) as workers, output.show_progress("playing", request.episodes) as show_progress:
+    with (
+        start_workers(spec, played) as workers,
+        output.show_progress("playing", request.episodes, "episodes") as show_progress,
+    ):
         policy.give_to(workers)
         env, seeds = workers.info, episode_seeds(played.seed, Stream.EVAL, request.episodes)
         episodes = play_episodes(workers, seeds, record=True, watch=show_progress)

@@ -182,11 +182,12 @@ def _export(source: FoundPolicy, targets: list[Path], sim: Engine | None) -> lis
         from rlctl.exporting.onnx_source import build
         from rlctl.policy.torch_policy import TorchActor, pin_threads
 
-        pin_threads()
-        models = [(target, build(policy)) for target in targets if target.suffix == ".onnx"]
-        sources = [(target, write_c(policy, target.stem)) for target in targets if target.suffix == ".c"]
-        torch_policy = TorchActor.load(source.file)
-        _check_environment(source.file, info, workers)
+        with output.show_progress("loading the policy and its environment"):
+            pin_threads()
+            models = [(target, build(policy)) for target in targets if target.suffix == ".onnx"]
+            sources = [(target, write_c(policy, target.stem)) for target in targets if target.suffix == ".c"]
+            torch_policy = TorchActor.load(source.file)
+            _check_environment(source.file, info, workers)
         return [
             *(_export_onnx(torch_policy, workers, target, model) for target, model in models),
             *(_export_c(torch_policy, workers, target, code) for target, code in sources),
@@ -247,7 +248,8 @@ def _export_c(policy: TorchActor, workers: Workers, target: Path, code: CSource)
     fields: dict[str, Any] = {"not_verified": f"there is no C compiler {command!r}; set CC to one"}
     if compiler is not None:
         with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
-            library = build_library(code, policy.info, Path(folder), compiler)
+            with output.show_progress("compiling"):
+                library = build_library(code, policy.info, Path(folder), compiler)
             fields = _verify(policy, workers, target, CActor.load(library), library)
     files.write_text(header, code.header)
     files.write_text(target, code.source)

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from rlctl import output
 from rlctl.environments.dict_spaces import map_parts, stack, take_row
 from rlctl.play.collect import Episode, play_episodes
 from rlctl.play.seeds import Stream, episode_seeds
@@ -181,16 +182,19 @@ def verify(
     comparison = Comparison(torch_actor, exported)
     seeds = episode_seeds(0, Stream.VERIFY, EPISODES)
     workers.set_policy(torch_actor.file)
-    expected = play_episodes(workers, seeds, record=True)
+    with output.show_progress("closed loop, policy", len(seeds), "episodes") as show:
+        expected = play_episodes(workers, seeds, record=True, watch=show)
     comparison.add_episodes(expected)
     if isinstance(exported, OnnxActor):
         comparison.add_batch(exported, expected)
     while (observations := comparison.agreement.observations) < min_observations:
         missing = max(1, round(1.1 * len(seeds) * (min_observations / observations - 1.0)))
         seeds = episode_seeds(0, Stream.VERIFY, len(seeds) + missing)
-        comparison.add_episodes(play_episodes(workers, seeds[-missing:], record=True))
+        with output.show_progress("more observations", missing, "episodes") as show:
+            comparison.add_episodes(play_episodes(workers, seeds[-missing:], record=True, watch=show))
     workers.set_other_policy(str(file.resolve()))
-    actual = play_episodes(workers, seeds[:EPISODES], record=True)
+    with output.show_progress("closed loop, exported file", EPISODES, "episodes") as show:
+        actual = play_episodes(workers, seeds[:EPISODES], record=True, watch=show)
     comparison.add_episodes(actual)
     comparison.agreement.observations = observations  # counts the original policy's episodes only
     comparison.close()
@@ -219,7 +223,9 @@ def _magnifies_rounding(policy: PolicyFile, workers: Workers, expected: Sequence
 
 def _play_again(policy: PolicyFile, workers: Workers, expected: Sequence[Episode]) -> ClosedLoop:
     workers.set_policy(policy)
-    return compare_episodes(expected, play_episodes(workers, [episode.result.seed for episode in expected]))
+    seeds = [episode.result.seed for episode in expected]
+    with output.show_progress("closed loop, policy again", len(seeds), "episodes") as show:
+        return compare_episodes(expected, play_episodes(workers, seeds, watch=show))
 
 
 def change_last_bits(tensors: Tensors) -> Iterator[dict[str, NDArray[Any]]]:

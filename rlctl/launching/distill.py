@@ -125,7 +125,7 @@ def compare(result: training.TrainResult, teacher: Teacher, request: DistillRequ
     seeds = episode_seeds(_EPISODE_SEED, Stream.EVAL, EPISODES)
     with Workers(spec, n_envs, timeout_s=request.env_timeout_s, teacher=teacher.to_message()) as workers:
         workers.set_policy(student)
-        with output.show_progress("comparing with the teacher", 2 * EPISODES) as show:
+        with output.show_progress("comparing with the teacher", 2 * EPISODES, "episodes") as show:
             own = play_episodes(workers, seeds, Exploration(), watch=show)
             taught = play_episodes(workers, seeds, Exploration(), taught=True, watch=lambda n: show(EPISODES + n))
     return _measure(own), _measure(taught)

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from rlctl.replaying.bullet_bodies import BulletBody, find_bounds, list_body_ids, read_body, read_pose
 from rlctl.replaying.bullet_log import BulletLog
 from rlctl.replaying.camera import FIELD_OF_VIEW, FilmCamera, Viewpoint
-from rlctl.task.pybullet.library import draw_world
+from rlctl.replaying.captions import CameraPose
+from rlctl.task.pybullet.library import draw_world, pybullet
 
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -22,6 +23,16 @@ def find_world(log: BulletLog) -> list[BulletBody]:
     ]
     worlds.sort(key=lambda bodies: (not any(body.joints for body in bodies), not bodies))
     return worlds[0] if worlds else []
+
+
+def _find_missing_floor(bodies: Sequence[BulletBody]) -> float | None:
+    """Return the height of the lowest point [m] where a floor is drawn; None where a world has a ground."""
+    terrain = pybullet.GEOM_HEIGHTFIELD
+    for body in bodies:
+        is_terrain = any(shape[2] == terrain for shape in body.visuals)
+        if is_terrain or body.find_ground_height() is not None:
+            return None
+    return float(find_bounds(bodies)[0][2])
 
 
 class BulletCamera:
@@ -40,6 +51,7 @@ class BulletCamera:
         else:
             low, high = find_bounds([self._followed[0]], only_moving=True)
         self._camera = FilmCamera(low, high, size, view)
+        self._floor = _find_missing_floor(bodies)
 
     def draw(self) -> Picture:
         """Return a picture of the present state, shape (height, width, 3)."""
@@ -50,7 +62,16 @@ class BulletCamera:
             moving = [body for body in moving if body is self._followed[0] or self._is_near(body, followed)]
         low, high = find_bounds(moving, only_moving=True)
         eye, target = self._camera.aim(low, high, followed)
-        return draw_world(self._client, *self._size, eye=eye, target=target, field_of_view=FIELD_OF_VIEW, sun=True)
+        self.look = CameraPose(eye, target)
+        return draw_world(
+            self._client,
+            *self._size,
+            eye=eye,
+            target=target,
+            field_of_view=FIELD_OF_VIEW,
+            sun=True,
+            floor=self._floor,
+        )
 
     def _is_near(self, body: BulletBody, place: Array) -> bool:
         return bool(np.linalg.norm(np.array(read_pose(body, 0)[0]) - place) < self._camera.near)

@@ -123,6 +123,19 @@ def find_trunk_joint(model: mujoco.MjModel, joint: int) -> Literal["free", "rail
     return "rail" if endless else None
 
 
+def find_missing_floor(sim: MujocoSim) -> float | None:
+    """Return the height of the lowest point [m] where a floor is drawn; None where a world has a ground."""
+    sim.world.refresh()
+    model, heights = sim.model, sim.data.geom_xpos[:, 2]
+    is_terrain = (model.geom_type == _enum("mjtGeom", "mjGEOM_HFIELD")).any()
+    if is_terrain or _find_ground(model) or model.ngeom == 0:
+        return None
+    turns = sim.data.geom_xmat.reshape(-1, 3, 3)[:, 2]
+    centers = heights + (turns * model.geom_aabb[:, :3]).sum(axis=1)
+    halves = (np.abs(turns) * model.geom_aabb[:, 3:]).sum(axis=1)
+    return float((centers - halves).min())
+
+
 def find_mujoco_bounds(sim: MujocoSim, bodies: Sequence[Body], markers: Sequence[Array]) -> tuple[Array, Array]:
     """Return the lowest and highest corner [m] of markers and of the links that are not fixed to the world."""
     sim.world.refresh()

@@ -19,6 +19,7 @@ from rlctl.errors import ArtifactError, UsageError, explain_missing_package
 from rlctl.play.episode import RecordedEpisode
 from rlctl.replaying.bullet_camera import Picture
 from rlctl.replaying.camera import Viewpoint
+from rlctl.replaying.captions import Caption, write_lines
 from rlctl.replaying.recorder import (
     DEFAULT_DT,
     Choose,
@@ -31,12 +32,14 @@ from rlctl.replaying.recorder import (
 )
 from rlctl.replaying.report import FilmReport
 from rlctl.replaying.reproduce import find_difference
-from rlctl.replaying.scene import Env, encode_jpeg
+from rlctl.replaying.scene import Env, Warn, encode_jpeg
 from rlctl.replaying.views import look_at, make_filmable
 from rlctl.storage import files
 from rlctl.task import Sim
+from rlctl.task.env import TaskEnv
 
 _SIZE = {".mp4": (640, 480), ".gif": (400, 300)}  # [pixels], of a film
+_SMALLEST, _LARGEST = 64, 3840  # [pixels], of a side of a film
 _RATE = {".mp4": 30.0, ".gif": 20.0}  # [1/s], at most
 _PAUSE_S = 0.5  # [s] at the end of each episode
 _STRIP_SIZE = (240, 180)  # [pixels], of a report's pictures
@@ -80,6 +83,21 @@ def take_pictures(episode: RecordedEpisode, count: int) -> PictureStrip:
     return PictureStrip(pictures, deepest)
 
 
+def read_size(text: str | None) -> tuple[int, int] | None:
+    """Read WIDTHxHEIGHT [pixels]; raises `UsageError` for anything else, and for odd numbers, which encoders refuse."""
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    numbers = [int(part) for part in parts if part.isascii() and part.isdigit()]
+    is_possible = all(_SMALLEST <= number <= _LARGEST and number % 2 == 0 for number in numbers)
+    if len(parts) != 2 or len(numbers) != 2 or not is_possible:
+        raise UsageError(
+            f"--size {text}: give WIDTHxHEIGHT, even numbers of pixels from {_SMALLEST} to {_LARGEST}, "
+            "for example 1280x720"
+        )
+    return numbers[0], numbers[1]
+
+
 def check_file(path: Path) -> None:
     """Raise `UsageError` for a file that is not a film, or if the package that encodes it is not installed."""
     if path.suffix not in _SIZE:
@@ -102,28 +120,39 @@ def film_episodes(
     policy: str,
     watch: Watch = lambda step: None,
     viewpoint: Viewpoint | None = None,
+    size: tuple[int, int] | None = None,
+    draw: Warn | None = None,
 ) -> tuple[list[Rollout], FilmReport]:
-    """Play an episode per seed and write one film of all of them, atomically; `watch` is called after every step."""
+    """Play an episode per seed and write one film of all of them, atomically; `watch` is called after every step.
+
+    `size` is width and height [pixels], by default that of the kind of file. With `draw` the rollouts have scenes, as
+    in `play_episode`. Raises `UsageError` for an environment that makes no pictures, or none of that size.
+    """
     rollouts: list[Rollout] = []
     reports: list[FilmReport] = []
 
     def write(part: Path) -> None:
-        film = _Film(env, part, viewpoint)
+        film = _Film(env, part, viewpoint, size)
         both = join_watches(watch, film.watch)
         for seed in seeds:
-            rollouts.append(play_episode(env, spec, seed, begin(seed), policy=policy, watch=both))
+            rollouts.append(play_episode(env, spec, seed, begin(seed), policy=policy, watch=both, draw=draw))
             film.pause()
         film.writer.close()
         reports.append(film.report(path))
 
+    files.remove_abandoned(path)
     files.write_with(path, write)
     return rollouts, reports[0]
 
 
 class _Film:
-    def __init__(self, env: Env, path: Path, viewpoint: Viewpoint | None) -> None:
-        self._view = look_at(env, *_SIZE[path.suffix], viewpoint)
-        dt = find_dt(env) or DEFAULT_DT
+    def __init__(self, env: Env, path: Path, viewpoint: Viewpoint | None, size: tuple[int, int] | None = None) -> None:
+        self._size = size
+        self._view = look_at(env, *(size or _SIZE[path.suffix]), viewpoint)
+        inner = env.unwrapped
+        self._caption = Caption(inner) if isinstance(inner, TaskEnv) else None
+        self._step = 0
+        self._dt = dt = find_dt(env) or DEFAULT_DT
         self._every = max(1, round(1 / (_RATE[path.suffix] * dt)))
         self._rate = 1 / (dt * self._every)
         self._count, self._seconds = 0, 0.0
@@ -132,6 +161,7 @@ class _Film:
 
     def watch(self, step: int) -> None:
         """Take a picture after the reset and after every n-th step."""
+        self._step = step
         if step == 0:
             self._begin()
         self._is_taken = step % self._every == 0
@@ -143,10 +173,17 @@ class _Film:
             self._view.begin()
         except UsageError as error:
             raise UsageError(f"--video: no pictures: {error}") from None
+        if self._caption is not None:
+            self._caption.begin()
 
     def _take(self) -> None:
         start = time.perf_counter()
         self._last = self._view.draw()
+        height, width = self._last.shape[:2]
+        if self._size not in (None, (width, height)):
+            raise UsageError(f"--size: this environment draws its own pictures of {width}x{height}: leave out --size")
+        if self._caption is not None:
+            self._last = write_lines(self._last, self._caption.list_lines(self._step * self._dt))
         self._seconds += time.perf_counter() - start
         self._count += 1
         self.writer.add(self._last)

@@ -286,6 +286,22 @@ def join_watches(*watches: Watch) -> Watch:
     return watch
 
 
+def count_steps(show: Callable[[int], None], most_steps: int) -> Watch:
+    """Return a function that shows how many steps are done of episodes that have `most_steps` each.
+
+    An episode that ends early counts as a whole one.
+    """
+    episode = -1
+
+    def watch(step: int) -> None:
+        nonlocal episode
+        if step == 0:
+            episode += 1
+        show(episode * most_steps + step)
+
+    return watch
+
+
 def find_dt(env: Env) -> float | None:
     """Return the time between two steps [s]; None if the environment does not give it."""
     fps = env.metadata.get("render_fps")

@@ -8,12 +8,12 @@ from pathlib import Path
 from rlctl import output
 from rlctl.errors import UsageError
 from rlctl.replaying.camera import read_viewpoint
-from rlctl.replaying.pictures import check_file, film_episodes
-from rlctl.replaying.recorder import Rollout
+from rlctl.replaying.pictures import check_file, film_episodes, read_size
+from rlctl.replaying.recorder import Rollout, join_watches
 from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.report import ReplayResult
-from rlctl.replaying.reproduce import verify_episode
-from rlctl.replaying.sources import PolicySource, RecordedSource, TaskSource, load_located, summarize
+from rlctl.replaying.reproduce import print_warning, verify_episode
+from rlctl.replaying.sources import PolicySource, RecordedSource, TaskSource, load_located, show_steps, summarize
 from rlctl.replaying.views import make_filmable
 from rlctl.replaying.window import open_window, show_episodes
 
@@ -36,12 +36,13 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
         recorded = load_located(request.verify)
         rollout, verification = verify_episode(recorded, request.verify)
         return ReplayResult(recorded.info.spec.task, recorded.info.policy, [summarize(rollout)], verification)
-    viewpoint = read_viewpoint(request.camera)
+    viewpoint, size = read_viewpoint(request.camera), read_size(request.size)
     source = _choose_source(request)
     spec, seeds, film = source.spec, source.seeds, None
     rollouts: list[Rollout] = []
     if request.video is not None and seeds:
-        with closing(make_filmable(spec)) as env:
+        draw = None if request.output is None else print_warning
+        with closing(make_filmable(spec)) as env, show_steps("filming", env, source) as show:
             begin = functools.partial(source.begin, env)
             rollouts, film = film_episodes(
                 request.video,
@@ -50,9 +51,14 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
                 seeds,
                 begin,
                 policy=source.name,
-                watch=source.watch,
+                watch=join_watches(source.watch, show),
                 viewpoint=viewpoint,
+                size=size,
+                draw=draw,
             )
+        if draw is not None:
+            episodes = [source.record_rollout(number, rollout) for number, rollout in enumerate(rollouts)]
+            return dataclasses.replace(source.report(episodes), film=film)
     elif request.gui and seeds:
         with closing(open_window(spec)) as env:
             rollouts = show_episodes(env, spec, seeds, functools.partial(source.begin, env), watch=source.watch)
@@ -77,11 +83,13 @@ def _check_request(request: ReplayRequest) -> None:
     source, target = request.source, request.output
     if source is not None and Path(source).suffix == ".rrd":
         raise UsageError(f"{source} is a recording already; open it with: rerun {source}")
-    for names in (("verify", "gui", "video", "output"), ("worst", "best", "failures")):
+    outputs = [("verify", "gui", "video"), ("verify", "gui", "output")]  # a film and recordings can be written at once
+    for names in (*outputs, ("worst", "best", "failures")):
         if len(given := [f"--{name}" for name in names if getattr(request, name)]) > 1:
             raise UsageError(f"{given[0]} and {given[1]} exclude each other: leave out {given[1]}")
-    if request.camera is not None and request.video is None:
-        raise UsageError("--camera is for films: add --video FILE.mp4")
+    for name in ("camera", "size"):
+        if getattr(request, name) is not None and request.video is None:
+            raise UsageError(f"--{name} is for films: add --video FILE.mp4")
     if request.verify is not None and source is not None:
         raise UsageError(f"--verify replays only {request.verify}: leave out {source}")
     if request.baseline is not None:

@@ -58,7 +58,13 @@ class ReplayRequest:
             metavar="PATH",
         ),
     ] = None
-    video: Annotated[Path | None, Option("Write a film instead, .mp4 or .gif.", metavar="FILE")] = None
+    video: Annotated[
+        Path | None, Option("Write a film, .mp4 or .gif; recordings too only with --output.", metavar="FILE")
+    ] = None
+    size: Annotated[
+        str | None,
+        Option("Size of the film in pixels.", metavar="WIDTHxHEIGHT", default_text="640x480; of a .gif 400x300"),
+    ] = None
     camera: Annotated[
         str | None,
         Option(

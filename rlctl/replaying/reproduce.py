@@ -61,20 +61,34 @@ def record_episode(
     `warn` receives a difference from the recorded episode; the file is written nevertheless. `several`: it is opened
     together with others. Returns the new rollout. Raises `TaskError` for an episode that failed, and fails again.
     """
-    from rlctl.replaying.rrd import write_rrd
-
     info, spec = episode.info, episode.info.spec
     if info.failure:
         _replay_failed(episode)
     with closing(make_drawable(spec)) as env:
         choose = recorded_actions(episode, env.action_space)
         rollout = play_episode(env, spec, info.seed, choose, policy=info.policy, draw=warn)
+    write_recording(episode, rollout, path, title=title, warn=warn, several=several)
+    return rollout
+
+
+def write_recording(
+    episode: RecordedEpisode,
+    rollout: Rollout,
+    path: Path,
+    *,
+    title: str,
+    warn: Warn = print_warning,
+    several: bool = False,
+) -> None:
+    """Write the recording of a new rollout of an episode's actions; `warn` receives a difference from the episode."""
+    from rlctl.replaying.rrd import write_rrd
+
+    info = episode.info
     if info.failure:
         warn(f"warning: {title}: it failed when it was recorded ({info.failure}), but not when it was replayed")
     elif difference := find_difference(episode, rollout):
         warn(f"warning: {title}: the replayed episode differs from the recorded one; {difference}")
     write_rrd(path, rollout, title=title, warn=warn, several=several)
-    return rollout
 
 
 def _replay_failed(episode: RecordedEpisode) -> None:

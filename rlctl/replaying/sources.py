@@ -1,7 +1,9 @@
 """Where the episodes of a replay come from: a recorded episode, the policy of a run, or a task and a named policy."""
 
+import contextlib
 import dataclasses
 import math
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -25,13 +27,16 @@ from rlctl.replaying.look_readers import make_world_reader
 from rlctl.replaying.recorder import (
     Choose,
     Rollout,
+    Watch,
+    count_steps,
     find_dt,
+    join_watches,
     play_episode,
     recorded_actions,
 )
 from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.report import ReplayedEpisode, ReplayResult
-from rlctl.replaying.reproduce import print_warning, record_episode
+from rlctl.replaying.reproduce import print_warning, record_episode, write_recording
 from rlctl.replaying.scene import Env
 from rlctl.runs.directory import RunDirectory, refuse_links_out
 from rlctl.runs.lookup import find_owner, find_policy, locate_task
@@ -49,6 +54,7 @@ class RecordedSource:
         self._episode = load_located(path)
         info = self._episode.info
         self.spec, self.seeds, self.name = info.spec, [info.seed], info.policy
+        self.most_steps: int | None = len(self._episode.actions)
 
     def begin(self, env: Env, seed: int) -> Choose:
         """Return a function that chooses the recorded actions."""
@@ -59,11 +65,26 @@ class RecordedSource:
 
     def record(self) -> list[ReplayedEpisode]:
         """Write the recording next to the episode, or to `--output`."""
+        recording = self._find_recording()
+        with output.show_progress("recording"):
+            rollout = record_episode(self._episode, recording, title=self._title)
+        return [summarize(rollout, recording, self._path)]
+
+    def record_rollout(self, number: int, rollout: Rollout) -> ReplayedEpisode:
+        """Write the recording of a rollout that was played already."""
+        recording = self._find_recording()
+        write_recording(self._episode, rollout, recording, title=self._title)
+        return summarize(rollout, recording, self._path)
+
+    @property
+    def _title(self) -> str:
+        return f"{self.spec.task} / episode {self._path.stem}"
+
+    def _find_recording(self) -> Path:
         recording = self._path.with_suffix(".rrd")
-        if self._output is not None:
-            recording = self._output if self._output.suffix == ".rrd" else self._output / recording.name
-        title = f"{self.spec.task} / episode {self._path.stem}"
-        return [summarize(record_episode(self._episode, recording, title=title), recording, self._path)]
+        if self._output is None:
+            return recording
+        return self._output if self._output.suffix == ".rrd" else self._output / recording.name
 
     def report(self, episodes: list[ReplayedEpisode]) -> ReplayResult:
         """Return the result."""
@@ -75,6 +96,7 @@ class _NewEpisodes:
 
     name: str  # of the policy, in the recording
     described: str  # the policy, for the result
+    most_steps: int | None = None  # of an episode; None: as the environment says
 
     def __init__(self, request: ReplayRequest, spec: EnvSpec, player: LoadedPolicy | Baseline) -> None:
         self._output, self.spec = request.output, spec
@@ -97,19 +119,24 @@ class _NewEpisodes:
 
     def record(self) -> list[ReplayedEpisode]:
         """Write each episode and its recording."""
-        from rlctl.replaying.rrd import write_rrd
-
         spec, episodes = self.spec, []
-        with closing(make_drawable(spec)) as env:
+        with closing(make_drawable(spec)) as env, show_steps("recording", env, self) as show:
+            watch = join_watches(self.watch, show)
             for number, seed in enumerate(self.seeds):
                 choose = self.begin(env, seed)
-                rollout = play_episode(env, spec, seed, choose, policy=self.name, draw=print_warning, watch=self.watch)
-                episode = self.save(number, rollout.episode)
-                recording = episode.with_suffix(".rrd")
-                title, several = f"{spec.task} / episode {recording.stem}", len(self.seeds) > 1
-                write_rrd(recording, rollout, title=title, warn=print_warning, several=several)
-                episodes.append(summarize(rollout, recording, episode))
+                rollout = play_episode(env, spec, seed, choose, policy=self.name, draw=print_warning, watch=watch)
+                episodes.append(self.record_rollout(number, rollout))
         return episodes
+
+    def record_rollout(self, number: int, rollout: Rollout) -> ReplayedEpisode:
+        """Write an episode that was played, and its recording."""
+        from rlctl.replaying.rrd import write_rrd
+
+        episode = self.save(number, rollout.episode)
+        recording = episode.with_suffix(".rrd")
+        title, several = f"{self.spec.task} / episode {recording.stem}", len(self.seeds) > 1
+        write_rrd(recording, rollout, title=title, warn=print_warning, several=several)
+        return summarize(rollout, recording, episode)
 
     def report(self, episodes: list[ReplayedEpisode]) -> ReplayResult:
         """Return the result; print a warning for an episode whose return has changed since it was chosen."""
@@ -221,6 +248,15 @@ class TaskSource(_NewEpisodes):
         file = Path(f"{make_slug(self.spec.task)}-{policy}{count}.npz")
         save_episode(file, episode)
         return file
+
+
+@contextlib.contextmanager
+def show_steps(what: str, env: Env, source: "RecordedSource | _NewEpisodes") -> Iterator[Watch]:
+    """Show the progress of the episodes of a source; yields what is to be called after every step."""
+    most = source.most_steps or describe(env).max_steps
+    total = None if most is None else most * len(source.seeds)
+    with output.show_progress(what, total, "steps") as show:
+        yield count_steps(show, most or 0)
 
 
 def load_located(path: Path) -> RecordedEpisode:

@@ -8,8 +8,9 @@ from rlctl.errors import UsageError, describe_exception
 from rlctl.replaying.bullet_bodies import read_body
 from rlctl.replaying.bullet_camera import BulletCamera, Picture, find_world
 from rlctl.replaying.camera import FIELD_OF_VIEW, FilmCamera, Viewpoint
+from rlctl.replaying.captions import CameraPose, draw_rings
 from rlctl.replaying.drawable import DrawableEnv, make_drawable
-from rlctl.replaying.mujoco_scene import find_mujoco_bounds
+from rlctl.replaying.mujoco_scene import find_missing_floor, find_mujoco_bounds
 from rlctl.replaying.scene import Env
 from rlctl.task.env import TaskEnv
 from rlctl.task.mujoco.sim import MujocoSim
@@ -78,7 +79,8 @@ class _TaskView:
 
     def draw(self) -> Picture:
         self._env.move_markers()
-        return self._camera.draw()
+        picture = self._camera.draw()
+        return draw_rings(picture, self._env.markers(), self._camera.look)
 
 
 class _MujocoTaskView:
@@ -100,6 +102,7 @@ class _MujocoTaskView:
         else:
             low, high = find_mujoco_bounds(sim, [self._followed], [])
         self._camera = FilmCamera(low, high, self._size, self._viewpoint)
+        self._floor = find_missing_floor(sim)
 
     def draw(self) -> Picture:
         self._env.move_markers()
@@ -109,7 +112,10 @@ class _MujocoTaskView:
             followed = self._followed.base_position
             moving = [body for body in moving if np.linalg.norm(body.base_position - followed) < self._camera.near]
         eye, target = self._camera.aim(*find_mujoco_bounds(sim, moving, []), followed)
-        return sim.render(*self._size, eye=eye, target=target, field_of_view=FIELD_OF_VIEW, sun=True)
+        picture = sim.render(
+            *self._size, eye=eye, target=target, field_of_view=FIELD_OF_VIEW, sun=True, floor=self._floor
+        )
+        return draw_rings(picture, self._env.markers(), CameraPose(eye, target))
 
 
 def look_at(

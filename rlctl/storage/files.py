@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import glob
 import hashlib
 import io
 import json
 import os
 import shutil
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,6 +49,29 @@ def write_with(path: Path, write: Callable[[Path], None]) -> None:
             os.unlink(temporary)
         raise
     _sync_folder(path.parent)
+
+
+_ABANDONED_S = 60.0  # [s] without a change: on a shared disk the writer may be a process of another machine
+
+
+def remove_abandoned(path: Path) -> None:
+    """Remove temporary files of `write_with` for `path` whose process was killed: it could not."""
+    for temporary in path.parent.glob(f".*.part.{glob.escape(path.name)}"):
+        number = temporary.name[1:].partition(".")[0]
+        with contextlib.suppress(OSError):  # removed by another process
+            is_old = time.time() - temporary.stat().st_mtime > _ABANDONED_S
+            if number.isdigit() and is_old and not _is_running(int(number)):
+                os.unlink(temporary)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # of another user
+        return True
+    return True
 
 
 def write_bytes(path: Path, content: bytes) -> None:

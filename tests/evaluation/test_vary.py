@@ -339,3 +339,26 @@ def test_a_cell_that_fails_is_a_failed_cell(rlctl, tmp_path):
     assert everywhere.returncode == 3
     assert "so it is in every cell of --vary" in everywhere.stderr
     assert read(run.robustness_file).maps == result.maps
+
+
+@pytest.mark.pybullet
+def test_the_nominal_setting_may_be_the_worst(measured):
+    worse = measured.nominal.model_copy(update={"success_rate": -0.1})
+    turned = measured.model_copy(update={"nominal": worse})
+    assert turned.find_worst() is None  # no cell of a map
+    assert turned.name_worst() == ("nominal", worse)
+    with pytest.raises(AnswerIsNo, match="gate missed in the worst cell, nominal: "):
+        check_gates(turned, Gates(min_success=0.0))
+
+
+@pytest.mark.pybullet
+def test_a_function_of_the_user_has_maps_too(tmp_path, monkeypatch, rlctl):
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text("def act(observation):\n    return [0.0]\n")
+    done = rlctl("eval", f"{ENVS}:Block", "--policy", "own.py:act", "--vary", "push=0:3:2", "--episodes", "3", "--push")
+    assert done.returncode == 0, done.stderr
+    assert "worst: push 3: success 0.0%" in done.stdout
+    words = shlex.split(done.stdout.partition("to play only these episodes: ")[2].splitlines()[0])
+    assert words[:5] == ["rlctl", "eval", f"{ENVS}:Block", "--policy", f"{tmp_path / 'own.py'}:act"]
+    again = rlctl(*words[1:])
+    assert "0.0%" in again.stdout

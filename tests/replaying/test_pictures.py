@@ -11,6 +11,8 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.play.episode import save_episode
 from rlctl.replaying.camera import find_distance
+from rlctl.replaying.pictures import read_size
+from rlctl.replaying.recorder import count_steps
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.report import ReplayResult, show
@@ -111,3 +113,43 @@ def test_a_small_robot_fills_the_picture_as_a_large_one_does():
     assert large == pytest.approx(3 * small)
     assert 0.4 < small < 0.8  # 0.45 m from corner to corner, seen at 45 degrees
     assert find_distance(low, high, (150, 300)) > small  # a narrow picture
+
+
+@pytest.mark.pybullet
+def test_a_film_and_recordings_in_one_call(short_episode, tmp_path):
+    files = {"video": tmp_path / "film.gif", "output": tmp_path / "one.rrd"}
+    result = run_replay(ReplayRequest(str(short_episode), size="96x64", **files))
+    assert (result.film.width, result.film.height) == (96, 64)
+    assert [episode.recording for episode in result.episodes] == [tmp_path / "one.rrd"]
+    assert files["output"].stat().st_size > 1000
+    assert files["video"].is_file()
+
+
+@pytest.mark.pybullet
+def test_a_filmed_and_recorded_episode_of_a_policy_repeats(tmp_path):
+    request = ReplayRequest("reach", baseline="zero", video=tmp_path / "film.gif", output=tmp_path, size="64x64")
+    (episode,) = run_replay(request).episodes
+    assert run_replay(ReplayRequest(verify=episode.episode)).verification.difference is None
+
+
+@pytest.mark.parametrize("size", ["640", "640x", "640x481", "10x10", "9000x64", "axb", "640x480x3"])
+def test_a_size_that_is_none(size):
+    with pytest.raises(UsageError, match=r"^--size .*: give WIDTHxHEIGHT, even numbers of pixels from 64 to 3840"):
+        read_size(size)
+
+
+def test_a_size_needs_a_film_of_a_camera(short_episode, tmp_path):
+    with pytest.raises(UsageError, match="--size is for films"):
+        run_replay(ReplayRequest(str(short_episode), size="640x480"))
+    rollout, _ = play("Pixels")
+    save_episode(tmp_path / "one.npz", rollout.episode)
+    with pytest.raises(UsageError, match="--size: this environment draws its own pictures of 60x40"):
+        run_replay(ReplayRequest(str(tmp_path / "one.npz"), video=tmp_path / "film.gif", size="640x480"))
+
+
+def test_steps_of_episodes_that_end_early_count_as_whole_ones():
+    shown = []
+    watch = count_steps(shown.append, 10)
+    for step in (0, 1, 2, 0, 1):
+        watch(step)
+    assert shown == [0, 1, 2, 10, 11]

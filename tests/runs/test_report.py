@@ -1,6 +1,8 @@
 """The report of runs: what must be in it, that it needs nothing else, and what it refuses."""
 
 import base64
+import csv
+import io
 import json
 import re
 import shlex
@@ -147,15 +149,99 @@ def test_a_bad_result_is_not_called_usual(write_run):
 
 def test_curves_of_seeds_are_averaged_at_common_steps():
     tables = [
-        [{"steps": 10.0, "x": 1.0}, {"steps": 30.0, "x": 3.0}],
+        [{"steps": 10.0, "x": 1.0}, {"steps": 39.0, "x": 3.9}],
         [{"steps": 20.0, "x": 6.0}, {"steps": 40.0, "x": 6.0}],
     ]
     curve = content.mean_curve(tables, "x")
-    assert curve["steps"].tolist() == [20, 30]
-    # The first curve has 2 and 3 there, the second 6.
-    assert curve["mean"].tolist() == [4, 4.5]
-    assert curve["low"].tolist() == [2, 3]
+    assert curve["steps"].tolist() == [20, 39]
+    # The first curve has 2 and 3.9 there, the second 6. That it ends one step before the other is not early.
+    assert curve["mean"].tolist() == pytest.approx([4, 4.95])
+    assert curve["low"].tolist() == pytest.approx([2, 3.9])
     assert curve["high"].tolist() == [6, 6]
+    assert curve["ended"] == []
+
+
+def test_a_seed_that_ended_early_does_not_cut_the_others():
+    tables = [
+        [],  # has no value yet
+        [{"steps": 10.0, "x": 1.0}, {"steps": 20.0, "x": 2.0}],
+        [{"steps": 10.0, "x": 5.0}, {"steps": 25.0, "x": 5.0}, {"steps": 40.0, "x": 8.0}],
+    ]
+    curve = content.mean_curve(tables, "x")
+    assert curve["steps"].tolist() == [10, 25, 40]
+    assert curve["mean"].tolist() == [3, 5, 8]
+    assert curve["low"].tolist() == [1, 5, 8]
+    assert curve["ended"] == [(1, 20.0, 2.0)]
+
+
+def write_two_recipes(write_run):
+    """Two folders, `ppo` and `a2c`, each with a group of two seeds that has a time for its name."""
+    for algo, offset in (("ppo", 0.0), ("a2c", 2.0)):
+        for seed in range(2):
+            folder = write_run(
+                f"reach/{algo}/2026-11-28_23-49-14_seeds/s{seed}",
+                seed=seed,
+                algo=algo,
+                status="interrupted" if algo == "a2c" and seed else "finished",
+                evals=[(1000 * k, 0.1 * k, k + seed + offset) for k in range(1, 4 - 2 * (algo == "a2c") * seed)],
+                metrics=[(250 * k, 0.02 * k, k / 4 + offset) for k in range(1, 13 - 8 * (algo == "a2c") * seed)],
+            )
+            RunDirectory(folder).write_recipe(resolve("reach", None, {"algo": algo}))
+    return ["runs/reach/ppo", "runs/reach/a2c/"]
+
+
+def test_curves_name_the_folders_that_the_user_named(write_run):
+    texts = write_two_recipes(write_run)
+    picture = write(*texts, form="svg", target=Path("curves.svg"))
+    assert picture.count(">ppo</text>") == picture.count(">a2c</text>") == 2  # legends of return and success
+    assert picture.count(">reach</text>") == 1
+    assert "Lines and dots: mean; bands and bars: lowest to highest of 2 seeds (ppo), 2 seeds (a2c)." in picture
+    assert "x: ended early (seed 1 of a2c at step 1,000)" in picture
+    assert "dots: evaluations" in picture  # three evaluations are no curve
+
+
+def test_labels_of_the_user(write_run):
+    texts = write_two_recipes(write_run)
+    picture = write(*texts, form="svg", target=Path("curves.svg"), labels=["ours", "theirs"])
+    assert picture.count(">ours</text>") == picture.count(">theirs</text>") == 2
+    with pytest.raises(UsageError, match="--label: 1 given, and there are 2 recipes: ppo, a2c"):
+        write(*texts, form="svg", labels=["ours"])
+
+
+def test_runs_in_folders_named_by_time_have_the_name_of_their_algorithm(write_run):
+    write_two_recipes(write_run)
+    report = content.collect(["runs/reach/*/*/*"])
+    assert sorted(recipe.label for recipe in report.recipes) == ["a2c", "ppo"]
+
+
+def test_results_have_the_mean_of_seeds_and_name_the_unfinished(write_run):
+    texts = write_two_recipes(write_run)
+    table = write(*texts, form="table", target=Path("table.md"))
+    assert "| mean of 2 seeds | ppo" in table
+    # Returns 3 and 4: 3.5, and t(0.975, 1) = 12.706 times 0.5 to each side.
+    assert "| 3.5 (-2.853 to 9.853) |" in table
+    assert re.search(r"_seeds/s1 \(stopped", table) or re.search(r"s1 \(stopped", table)
+    assert "| mean of 2 seeds (1 unfinished) | a2c" in table
+    rows = list(csv.DictReader(io.StringIO(write(*texts, target=Path("results.csv")))))
+    assert [row["seeds"] for row in rows] == ["1", "1", "2", "1", "1", "2"]
+    assert (rows[2]["run"], rows[2]["label"], float(rows[2]["return"])) == ("", "ppo", 3.5)
+    latex = write(*texts, target=Path("results.tex"), labels=["PPO_1", "50 %"])
+    assert "PPO\\_1 & 2 & 3,000 & " in latex
+    assert "50 \\% (1 unfinished) & 2 & " in latex
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"form": "pdf", "episodes": 5}, "--episodes has no effect with the format pdf"),
+        ({"form": "table", "pictures": False}, "--no-pictures has no effect with the format table"),
+        ({"form": "md", "labels": ["x"]}, "--label has no effect with the format md"),
+        ({"form": "pdf", "target": Path("x.png")}, "x.png is the name of another format than --format pdf"),
+    ],
+)
+def test_options_without_effect_are_refused(group, options, message):
+    with pytest.raises(UsageError, match=message):
+        write(group[0], **options)
 
 
 @pytest.mark.slow

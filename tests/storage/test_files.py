@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -217,3 +218,23 @@ def test_a_result_goes_into_a_pipe_and_through_a_link(tmp_path):
     files.write_result(link, b"behind the link")
     assert link.is_symlink()
     assert target.read_bytes() == b"behind the link"
+
+
+def test_what_a_killed_process_left_is_removed_before_the_next_write(tmp_path):
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    left, mine, other, fresh = (
+        tmp_path / name
+        for name in (
+            f".{ended.pid}.part.film.mp4",
+            f".{os.getpid()}.part.film.mp4",
+            f".{ended.pid}.part.film2.mp4",
+            f".{ended.pid + 100_000_000}.part.film.mp4",
+        )
+    )
+    for path in (left, mine, other, fresh):
+        path.write_bytes(b"part")
+    for path in (left, mine, other):
+        os.utime(path, (0, 0))
+    files.remove_abandoned(tmp_path / "film.mp4")
+    assert sorted(tmp_path.iterdir()) == sorted([mine, other, fresh])

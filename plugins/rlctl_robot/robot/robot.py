@@ -195,7 +195,7 @@ class _Test:
         set_stuck_joints(self._env, self._spec, faults.stuck)
         seeds = episode_seeds(self._request.seed, Stream.EVAL, self._request.episodes)
         begin = time.perf_counter()
-        with output.show_progress(faults.text or "playing", len(seeds)) as show:
+        with output.show_progress(faults.text or "playing", len(seeds), "episodes") as show:
             results, counts = await player.play(seeds, faults, show)
         return FaultScore(faults, summarize(results), results, counts, time.perf_counter() - begin)
 

@@ -79,10 +79,12 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
     source, target = find_source(request, "controller")
     limits = None if request.limits is None else read_limits(request.limits)
     pin_threads()
-    torch_actor = TorchActor.load(source.file)
+    with output.show_progress("loading the policy"):
+        torch_actor = TorchActor.load(source.file)
     spec = _choose_spec(source.locate(torch_actor.info.spec), request.sim)
     try:
-        env = spec.make()
+        with output.show_progress("building the environment"):
+            env = spec.make()
         built = describe(env)
     except (UsageError, TaskError) as error:
         raise explain_unverifiable(source.file, error) from None
@@ -151,7 +153,8 @@ class _Export:
         code = source.write()
         if compiler is not None:
             with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
-                library = compile_controller(code, Path(folder), compiler)
+                with output.show_progress("compiling"):
+                    library = compile_controller(code, Path(folder), compiler)
                 controller = CController(self.plan, library, has_target=source.target is not None)
                 fields, recorded = self._verify(path, controller, source.target, is_limited=self.limits is not None)
                 median, longest = verify.measure_step(controller, recorded)

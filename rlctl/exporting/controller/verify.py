@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl import output
 from rlctl.environments.dict_spaces import take_row
 from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.environments.registry import call_plugin
@@ -106,8 +107,14 @@ class ControllerAgreement:
 
 def record(player: TaskPlayer, reference: Actor) -> list[Recorded]:
     """Play `EPISODES` episodes, and more until `_MIN_OBSERVATIONS` are recorded."""
+    with output.show_progress("closed loop, policy", EPISODES, "episodes") as show:
+        return _record(player, reference, show)
+
+
+def _record(player: TaskPlayer, reference: Actor, show: Callable[[int], None]) -> list[Recorded]:
     recorded: list[Recorded] = []
     while len(recorded) < EPISODES or sum(len(episode.actions) for episode in recorded) < _MIN_OBSERVATIONS:
+        show(min(len(recorded), EPISODES))
         seed = episode_seeds(0, Stream.VERIFY, len(recorded) + 1)[-1]
         between: list[tuple[NDArray[Any] | None, NDArray[Any] | None]] = []
 
@@ -137,21 +144,33 @@ def verify_controller(
     In each step the policy's action is compared, and what the limits make of the recorded one.
     """
     agreement, worst = Agreement(), 0.0
-    for episode in recorded:
-        controller.begin()
-        steps = zip(episode.inputs, episode.requested, episode.actions, episode.targets, strict=True)
-        for inputs, requested, expected, bounded in steps:
-            own, action, targets = controller.follow(inputs, requested)
-            _compare(agreement, requested, own)
-            _compare(agreement, expected, action)
-            if target is not None and targets is not None:
-                wanted = target.find_targets(inputs, expected) if bounded is None else bounded
-                worst = max(worst, _compare(agreement, wanted, targets))
+    with output.show_progress("comparing, step by step", len(recorded), "episodes") as show:
+        for number, episode in enumerate(recorded):
+            show(number)
+            controller.begin()
+            steps = zip(episode.inputs, episode.requested, episode.actions, episode.targets, strict=True)
+            for inputs, requested, expected, bounded in steps:
+                own, action, targets = controller.follow(inputs, requested)
+                _compare(agreement, requested, own)
+                _compare(agreement, expected, action)
+                if target is not None and targets is not None:
+                    wanted = target.find_targets(inputs, expected) if bounded is None else bounded
+                    worst = max(worst, _compare(agreement, wanted, targets))
     agreement.observations = sum(len(episode.actions) for episode in recorded)
 
-    actual = [player.play(episode.episode.result.seed, controller).episode for episode in recorded[:EPISODES]]
-    loop = compare_episodes([episode.episode for episode in recorded[:EPISODES]], actual)
+    episodes = [episode.episode for episode in recorded[:EPISODES]]
+    loop = compare_episodes(episodes, _play_again(player, controller, episodes, "closed loop, controller"))
     return ControllerAgreement(agreement, loop, None if target is None else worst)
+
+
+def _play_again(player: TaskPlayer, actor: Actor, episodes: Sequence[Episode], what: str) -> list[Episode]:
+    """Play the seeds of episodes with an actor, and show the progress of `what`."""
+    played: list[Episode] = []
+    with output.show_progress(what, len(episodes), "episodes") as show:
+        for episode in episodes:
+            played.append(player.play(episode.result.seed, actor).episode)
+            show(len(played))
+    return played
 
 
 def check_conclusive(
@@ -164,7 +183,7 @@ def check_conclusive(
     episodes = [episode.episode for episode in recorded[:EPISODES]]
 
     def play_again(actor: Actor) -> ClosedLoop:
-        return compare_episodes(episodes, [player.play(episode.result.seed, actor).episode for episode in episodes])
+        return compare_episodes(episodes, _play_again(player, actor, episodes, "closed loop, policy again"))
 
     loop = play_again(reference)
     repeats = loop.agrees and loop.max_return_difference == 0.0

@@ -5,6 +5,7 @@ import json
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from rlctl.runs.tables import Rows, list_points
 
 _SETTINGS_NAMED = 3  # in the name of a recipe
 _GOOD_SUCCESS = 0.5
+_TIME = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d")  # what rlctl names runs and groups by
+_COMPLETE = 0.95  # of the steps of the longest seed: rollouts end at slightly different steps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,9 +59,15 @@ class RunReport:
         return f"{first.task}, {algorithms}, {'seed' if len(numbers) == 1 else 'seeds'} {', '.join(numbers)}"
 
 
-def collect(texts: Sequence[str]) -> RunReport:
-    """Read the runs that arguments name; raises `RlctlError` for runs that cannot be in one report."""
-    folders = {run.path.resolve(): run for text in texts for run in find_runs_of(text)}
+def collect(texts: Sequence[str], labels: Sequence[str] = ()) -> RunReport:
+    """Read the runs that arguments name; raises `RlctlError` for runs that cannot be in one report.
+
+    `labels` are names of the recipes in legends and tables, in the order of the arguments; by default those of the
+    arguments, where each has one recipe, or else what differs.
+    """
+    named = [(text, run) for text in texts for run in find_runs_of(text)]
+    folders = {run.path.resolve(): run for _, run in named}
+    arguments = {run.path.resolve(): text for text, run in reversed(named)}
     runs = [RunDescription(run) for run in folders.values()]
     for run in runs:
         if run.summary.state == "damaged":
@@ -69,9 +78,20 @@ def collect(texts: Sequence[str]) -> RunReport:
         raise ArtifactError(f"{runs[0].run.path}: nothing to report yet: no update is finished")
     notes = [note for run in runs for note in _find_notes(run)]
     try:
-        return RunReport(_group_by_recipe(runs), notes)
+        recipes = _group_by_recipe(runs, arguments)
     except RlctlError as error:
-        return RunReport([RecipeRuns("", runs)], [*notes, f"a recipe cannot be read: {error}"])
+        recipes = [RecipeRuns("", runs)]
+        notes.append(f"a recipe cannot be read: {error}")
+    if labels:
+        recipes = _label(recipes, labels)
+    return RunReport(recipes, notes)
+
+
+def _label(recipes: Sequence[RecipeRuns], labels: Sequence[str]) -> list[RecipeRuns]:
+    if len(labels) != len(recipes):
+        names = ", ".join(recipe.label or recipe.name or "the only one" for recipe in recipes)
+        raise UsageError(f"--label: {len(labels)} given, and there are {len(recipes)} recipes: {names}")
+    return [dataclasses.replace(recipe, label=label) for recipe, label in zip(recipes, labels, strict=True)]
 
 
 def _find_notes(run: RunDescription) -> list[str]:
@@ -83,8 +103,11 @@ def _find_notes(run: RunDescription) -> list[str]:
     return notes if run.evaluations else [*notes, f"{name} has no evaluation yet"]
 
 
-def _group_by_recipe(runs: Sequence[RunDescription]) -> list[RecipeRuns]:
-    """Group runs that differ only in the seed; raises `RlctlError` for a recipe that cannot be read."""
+def _group_by_recipe(runs: Sequence[RunDescription], arguments: Mapping[Path, str]) -> list[RecipeRuns]:
+    """Group runs that differ only in the seed; raises `RlctlError` for a recipe that cannot be read.
+
+    `arguments` are the texts that named the runs, by their resolved paths.
+    """
     groups: list[tuple[Recipe, list[RunDescription]]] = []
     for run in runs:
         recipe = run.run.recipe()
@@ -96,20 +119,41 @@ def _group_by_recipe(runs: Sequence[RunDescription]) -> list[RecipeRuns]:
     changes = [find_recipe_changes(recipe, groups[0][0]) for recipe, _ in groups]
     baseline = {key: before for change in changes for key, (_, before) in change.items()}
     names = [_name_recipe(baseline | {key: value for key, (value, _) in change.items()}) for change in changes]
-    labels = [_find_folder(group) for _, group in groups]
-    if "" in labels or len(set(labels)) < len(labels) or len(groups) == 1:
-        labels = names
+    labels = names
+    candidates = [
+        [_find_argument(group, arguments) for _, group in groups],
+        [_find_folder(group) for _, group in groups],
+        [_find_algorithm(group) for _, group in groups],
+    ]
+    if len(groups) > 1:
+        distinct = (texts for texts in candidates if "" not in texts and len(set(texts)) == len(texts))
+        labels = next(distinct, names)
     return [RecipeRuns(name, group, label) for name, label, (_, group) in zip(names, labels, groups, strict=True)]
 
 
+def _find_argument(runs: Sequence[RunDescription], arguments: Mapping[Path, str]) -> str:
+    """Return the last part of the argument that named all runs; empty for several, globs and `latest`."""
+    texts = {arguments[run.run.path.resolve()] for run in runs}
+    text = texts.pop()
+    is_pattern = any(character in text for character in "*?[")
+    return "" if texts or is_pattern or text == "latest" else Path(text).resolve().name
+
+
 def _find_folder(runs: Sequence[RunDescription]) -> str:
-    """Return the name of a single run's folder, or of the group that all are in; empty where they have none."""
+    """Return the name of a single run's folder, or of the group that all are in; empty for names that are times."""
     paths = [run.run.path.resolve() for run in runs]
     if len(paths) == 1:
-        return paths[0].name
-    folders = {path.parent for path in paths}
-    group = folders.pop()
-    return "" if folders or not is_group(group) else group.name
+        name = paths[0].name
+    else:
+        folders = {path.parent for path in paths}
+        group = folders.pop()
+        name = "" if folders or not is_group(group) else group.name
+    return "" if _TIME.match(name) else name
+
+
+def _find_algorithm(runs: Sequence[RunDescription]) -> str:
+    algorithms = {run.summary.algo for run in runs}
+    return algorithms.pop() if len(algorithms) == 1 else ""
 
 
 def _name_recipe(settings: Mapping[str, Any]) -> str:
@@ -119,21 +163,6 @@ def _name_recipe(settings: Mapping[str, Any]) -> str:
         for key, value in settings.items()
     ]
     return ", ".join(names[:_SETTINGS_NAMED]) + (", ..." if len(names) > _SETTINGS_NAMED else "")
-
-
-def list_rows(report: RunReport) -> list[tuple[str, ...]]:
-    """Return the results as a table, a row per run, below the names of the columns."""
-    rows: list[tuple[str, ...]] = [("run", "recipe", "algo", "seed", "steps", "minutes", "success", "return")]
-    for recipe in report.recipes:
-        for run in recipe.runs:
-            summary = run.summary
-            minutes = "" if summary.seconds is None else f"{summary.seconds / 60:.1f}"
-            success = "" if summary.best_success is None else f"{summary.best_success:.1%}"
-            value = "" if summary.best_return is None else f"{summary.best_return:.4g}"
-            steps = "" if summary.steps is None else f"{summary.steps:,}"
-            numbers = (str(summary.seed), steps, minutes, success, value)
-            rows.append((summary.name, recipe.name, summary.algo, *numbers))
-    return rows
 
 
 def list_facts(report: RunReport) -> list[tuple[str, str]]:
@@ -259,18 +288,30 @@ def _outcome(episode: RecordedEpisode) -> str:
 def mean_curve(tables: Sequence[Rows], column: str, points: int = 200) -> dict[str, Any] | None:
     """Return steps, mean, lowest and highest over several tables at common steps; None without a value.
 
-    All of one shape, at most (points,); the rows of a single table are averaged down to `points`.
+    All of one shape, at most (points,); the rows of a single table are averaged down to `points`. Where a table ends
+    early, the mean is that of the others from there on; `ended` has its number, last step and value.
     """
-    curves = [np.array(curve) for rows in tables if (curve := list_points(rows, column))]
+    curves = [np.array(list_points(rows, column)).reshape(-1, 2) for rows in tables]
+    numbers = [number for number, curve in enumerate(curves) if len(curve)]
+    curves = [curves[number] for number in numbers]
     if not curves:
         return None
     if len(curves) == 1:
         parts = np.array_split(curves[0], min(points, len(curves[0])))
         steps, values = np.array([part.mean(axis=0) for part in parts]).T
-        return {"steps": steps, "mean": values, "low": values, "high": values, "count": 1}
-    first, last = max(curve[0, 0] for curve in curves), min(curve[-1, 0] for curve in curves)
+        return {"steps": steps, "mean": values, "low": values, "high": values, "count": 1, "ended": []}
+    longest = max(curve[-1, 0] for curve in curves)
+    ended = [
+        (number, *curve[-1].tolist())
+        for number, curve in zip(numbers, curves, strict=True)
+        if curve[-1, 0] < _COMPLETE * longest
+    ]
+    first = max(curve[0, 0] for curve in curves)
+    last = min(curve[-1, 0] for curve in curves if curve[-1, 0] >= _COMPLETE * longest)
     if last < first:
         return None
     steps = np.linspace(first, last, min(points, max(map(len, curves))))
-    values = np.array([np.interp(steps, *curve.T) for curve in curves])
-    return {"steps": steps, "mean": values.mean(0), "low": values.min(0), "high": values.max(0), "count": len(curves)}
+    values = np.array([np.interp(steps, curve[:, 0], curve[:, 1], right=np.nan) for curve in curves])
+    low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+    mean = np.nanmean(values, axis=0)
+    return {"steps": steps, "mean": mean, "low": low, "high": high, "count": len(curves), "ended": ended}

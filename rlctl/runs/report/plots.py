@@ -35,6 +35,7 @@ _STYLE: dict[Any, Any] = {
 Picture = Literal["svg", "pdf", "png"]
 _PNG_RESOLUTION = 200  # [dots per inch]
 _UNDATED: dict[Picture, dict[Any, Any]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
+_FEW = 8  # evaluations; fewer make no curve, and the training's is drawn too
 _LONG = 40  # points of a curve that is smoothed
 _LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8}
 _NO_METADATA: dict[Any, Any] = dict.fromkeys(("Date", "Creator", "Format", "Type"))
@@ -49,14 +50,58 @@ def plot_learning(report: RunReport, column: str) -> str | None:
 
 
 def draw_learning(report: RunReport, form: Picture) -> bytes:
-    """Return the learning curves as a file for a paper; a quantity without values has no panel."""
+    """Return the learning curves as a file for a paper; a quantity without values has no panel.
+
+    Below them is what lines, bands and marks are, and which seeds ended early.
+    """
     with matplotlib.rc_context(_STYLE):
-        figure, file = Figure(figsize=(2 * _SIZE[0], _SIZE[1]), layout="constrained"), io.BytesIO()
+        figure, file = Figure(figsize=(2 * _SIZE[0], _SIZE[1] + 0.5), layout="constrained"), io.BytesIO()
+        figure.suptitle(report.runs[0].summary.task, fontsize=10, fontweight="bold")
         for axes, column in zip(figure.subplots(1, 2), _TITLES, strict=True):
-            if not _draw_learning(axes, report, column, for_paper=True):
+            if _draw_learning(axes, report, column, for_paper=True):
+                axes.set_title(_TITLES[column], loc="left", fontsize=9)
+            else:
                 axes.remove()
+        figure.supxlabel("\n".join(_explain_curves(report)), fontsize=7)
         _save(figure, file, form)
     return file.getvalue()
+
+
+def _explain_curves(report: RunReport) -> list[str]:
+    """Return what the marks of the curves mean, and which seeds ended early, as lines."""
+    several = [recipe for recipe in report.recipes if len(recipe.runs) > 1]
+    counts = []
+    for recipe in several:
+        of_recipe = f" ({recipe.label})" if len(report.recipes) > 1 else ""
+        counts.append(f"{len(recipe.runs)} seeds{of_recipe}")
+    sentences = []
+    if counts:
+        sentences.append(f"Lines and dots: mean; bands and bars: lowest to highest of {', '.join(counts)}.")
+    if any(_has_training_curve(recipe, column) for recipe in report.recipes for column in _TITLES):
+        sentences.append("Lines: episodes of the training; dots: evaluations.")
+    ended = {}
+    for recipe in several:
+        of_recipe = f" of {recipe.label}" if recipe.label else ""
+        for curve in [curve for column in _TITLES for curve in _list_curves(recipe, column)]:
+            for number, step, _ in curve["ended"]:
+                ended[f"seed {recipe.runs[number].summary.seed}{of_recipe}"] = step
+    if ended:
+        names = ", ".join(f"{name} at step {step:,.0f}" for name, step in ended.items())
+        sentences.append(f"x: ended early ({names}); from there on the mean of the others.")
+    return [line for sentence in sentences for line in textwrap.wrap(sentence, 130)]
+
+
+def _list_curves(recipe: RecipeRuns, column: str) -> list[dict[str, Any]]:
+    """Return the curves of a recipe that a picture for a paper has: evaluations, training, or both."""
+    training = mean_curve([run.metrics for run in recipe.runs], column)
+    evaluated = mean_curve([run.evaluations for run in recipe.runs], column)
+    if evaluated is not None and len(evaluated["steps"]) >= _FEW:
+        training = None  # readers expect one curve per recipe
+    return [curve for curve in (training, evaluated) if curve is not None]
+
+
+def _has_training_curve(recipe: RecipeRuns, column: str) -> bool:
+    return len(_list_curves(recipe, column)) == 2
 
 
 def _save(figure: Figure, file: io.BytesIO, form: Picture) -> None:
@@ -119,7 +164,7 @@ def _draw_learning(axes: Axes, report: RunReport, column: str, *, for_paper: boo
         evaluated = mean_curve([run.evaluations for run in recipe.runs], column)
         color = {"color": f"C{number}"} if recipe.name else {}  # a colour per recipe
         name = textwrap.fill(textwrap.shorten(recipe.label, 64, placeholder=" ..."), 34)
-        alone = for_paper and evaluated is not None  # readers expect one curve per recipe
+        alone = for_paper and evaluated is not None and not _has_training_curve(recipe, column)
         if training is not None and not alone:
             _draw_smoothed(axes, training, name or "training", color)
         if evaluated is not None:
@@ -170,7 +215,11 @@ def _scale_rates(axes: Axes) -> None:
 
 def _draw_curve(axes: Axes, curve: dict[str, Any], label: str, style: dict[str, Any]) -> None:
     (line,) = axes.plot(curve["steps"], curve["mean"], label=label, **style)
-    if curve["count"] > 1:
+    for _, step, value in curve.get("ended", ()):
+        axes.plot(step, value, marker="x", ms=5, color=line.get_color())
+    if curve["count"] > 1 and style.get("linestyle") == "none":
+        axes.vlines(curve["steps"], curve["low"], curve["high"], color=line.get_color(), linewidth=1.0)
+    elif curve["count"] > 1:
         axes.fill_between(curve["steps"], curve["low"], curve["high"], color=line.get_color(), alpha=0.2, linewidth=0)
 
 

@@ -64,9 +64,10 @@ def _list_warnings(status: Mapping[str, Any]) -> Iterator[str]:
 
 def describe_robustness(result: Robustness) -> Iterator[str]:
     """Yield lines about the worst cell of all maps and the nominal one, the push test, and the command."""
-    if (worst := result.find_worst()) is not None:
-        where = f"worst cell, {result.episodes} episodes at {worst[0].name_cell(worst[1])}"
-        for name, outcome in ((where, worst[1]), ("with nothing varied", result.nominal)):
+    if any(varied.played for varied in result.maps):
+        place, worst = result.name_worst()
+        where = f"worst cell, {result.episodes} episodes at {place}"
+        for name, outcome in ((where, worst), ("with nothing varied", result.nominal)):
             rate = "" if outcome.success_rate is None else f"success {outcome.success_rate:.1%}, "
             yield f"{name}: {rate}return {outcome.mean_return:.4g}"
     for line in result.list_failed():

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import jinja2
 
 from rlctl import output
-from rlctl.errors import RlctlError
+from rlctl.errors import RlctlError, UsageError
 from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.runs.compare.comparison import compare_runs
 from rlctl.runs.compare.report import describe_candidate, describe_seeds, describe_tests
@@ -19,26 +19,37 @@ from rlctl.runs.tables import Rows
 from rlctl.storage import files
 
 _PICTURES = 6  # of an episode
+PICTURES: tuple[Literal["svg", "pdf", "png"], ...] = ("svg", "pdf", "png")  # formats of curves alone
+
+
+Form = Literal["html", "md", "table", "csv", "latex", "svg", "pdf", "png"]
+_SUFFIXES: dict[str, Form] = {".html": "html", ".csv": "csv", ".tex": "latex"}
+_SUFFIXES |= {f".{form}": form for form in PICTURES}
+_EPISODES = 100
 
 
 def write_report(
     runs: Sequence[str],
-    form: Literal["html", "md", "table", "svg", "pdf", "png"] = "html",
+    form: Form | None = None,
     target: Path | None = None,
     *,
     pictures: bool = True,
-    episodes: int = 100,
+    episodes: int | None = None,
+    labels: Sequence[str] = (),
 ) -> Path | None:
-    """Write a report, its learning curves alone (svg, pdf, png), or its table of results alone (table, as Markdown).
+    """Write a report, its learning curves alone (svg, pdf, png), or its results alone (table, csv, latex).
 
-    Return its file; None for Markdown that was printed.
+    Return its file; None for a text that was printed. Without `form` the suffix of `target` chooses it.
 
-    Runs of several recipes are compared first, each plays `episodes` for it; 0 leaves it out.
+    Runs of several recipes are compared first, each plays `episodes` for it, by default 100; 0 leaves it out. `labels`
+    name the recipes in curves and tables. Raises `UsageError` for an option that has no effect.
     """
-    report = content.collect(runs)
+    form = _choose_form(form, target)
+    _refuse_options(form, pictures=pictures, episodes=episodes, labels=labels)
+    report = content.collect(runs, labels)
     path = target or Path(f"report.{form}")
-    if form == "table":
-        return _write_text(_format_table(content.list_rows(report)), target)
+    if form in ("table", "csv", "latex"):
+        return _write_text(_format_results(report, form), target)
     if form in ("svg", "pdf", "png"):
         from rlctl.runs.report import plots
 
@@ -50,8 +61,40 @@ def write_report(
         autoescape=is_html, trim_blocks=True, undefined=jinja2.StrictUndefined, finalize=finalize
     )
     template = environment.from_string(Path(__file__).with_name(f"report.{form}.jinja").read_text(encoding="utf-8"))
-    text = template.render(_values(report, is_html, pictures, episodes))
+    text = template.render(_values(report, is_html, pictures, _EPISODES if episodes is None else episodes))
     return _write_text(text, path if is_html else target)
+
+
+def _choose_form(form: Form | None, target: Path | None) -> Form:
+    suffix = None if target is None else _SUFFIXES.get(target.suffix)
+    if form is None:
+        return suffix or "html"
+    if suffix is not None and suffix != form:
+        raise UsageError(f"--output {target} is the name of another format than --format {form}: leave one of them out")
+    return form
+
+
+def _refuse_options(form: Form, *, pictures: bool, episodes: int | None, labels: Sequence[str]) -> None:
+    ignored = []
+    if not pictures and form != "html":
+        ignored.append("--no-pictures")
+    if episodes is not None and form not in ("html", "md"):
+        ignored.append("--episodes")
+    if labels and form == "md":
+        ignored.append("--label")
+    if ignored:
+        raise UsageError(f"{ignored[0]} has no effect with the format {form}: leave it out")
+
+
+def _format_results(report: RunReport, form: Form) -> str:
+    from rlctl.runs.report import results
+
+    rows = results.list_results(report)
+    if form == "csv":
+        return results.format_csv(rows)
+    if form == "latex":
+        return results.format_latex(report, rows)
+    return results.format_markdown(rows)
 
 
 def _write_text(text: str, target: Path | None) -> Path | None:
@@ -61,12 +104,6 @@ def _write_text(text: str, target: Path | None) -> Path | None:
         return None
     files.write_result(target, text.encode(errors="backslashreplace"))
     return target
-
-
-def _format_table(rows: Sequence[Sequence[str]]) -> str:
-    head, *body = rows
-    lines = [head, ["---"] * len(head), *body]
-    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
 
 
 def _escape_html(value: Any) -> Any:

@@ -284,14 +284,25 @@ class MujocoSim(Sim):
         up: Sequence[float] = (0.0, 0.0, 1.0),
         field_of_view: float = 45.0,
         sun: bool = False,
+        floor: float | None = None,
     ) -> NDArray[np.uint8]:
-        """Draw the world as `Sim.render` does; films have a `sun`, which policies that see pictures do not."""
+        """Draw the world as `Sim.render` does; films have a `sun` and a `floor`, which policies' pictures do not."""
         if self.world.batch is not None:
             self._refuse("pictures of many worlds")
         self.world.refresh()
         model, data = self._see()
         size = width, height
-        return draw(model, data, size, self._markers, eye=eye, target=target, field_of_view=field_of_view, sun=sun)
+        return draw(
+            model,
+            data,
+            size,
+            self._markers,
+            eye=eye,
+            target=target,
+            field_of_view=field_of_view,
+            sun=sun,
+            floor=floor,
+        )
 
     def _see(self) -> tuple[Any, Any]:
         """Return the model and the data that pictures show."""

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import functools
 import importlib
 import importlib.util
 import os
@@ -95,16 +96,68 @@ def draw_world(
     up: Sequence[float] = (0.0, 0.0, 1.0),
     field_of_view: float,
     sun: bool = False,
+    floor: float | None = None,
 ) -> NDArray[np.uint8]:
-    """Draw a client's world as `Sim.render` does; with `sun` there is more light from the side, and shadow."""
+    """Draw a client's world as `Sim.render` does.
+
+    With `sun` there is a sky, more light from the side, and shadow; and below it a floor at the height `floor` [m]
+    where the world has none.
+    """
     view = pybullet.computeViewMatrix(eye, target, up)
     projection = pybullet.computeProjectionMatrixFOV(field_of_view, width / height, 0.05, 10.0)
     light: dict[str, Any] = _SUN if sun else {"shadow": 0}
     image = pybullet.getCameraImage(
         width, height, view, projection, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=client, **light
     )
-    # PyBullet returns a flat tuple if it was built without numpy.
-    return np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[:, :, :3]
+    # PyBullet returns flat tuples if it was built without numpy.
+    picture = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)[:, :, :3]
+    if not sun:
+        return picture
+    is_empty = np.asarray(image[4]).reshape(height, width) < 0
+    background = _paint_background(width, height, tuple(eye), tuple(target), field_of_view, floor)
+    return np.where(is_empty[..., None], background, picture)
+
+
+_HORIZON, _ZENITH = ([242.0] * 3, [191.0, 212.0, 235.0])  # of the sky, as in MuJoCo
+_SQUARES = ([219.0, 224.0, 230.0], [189.0, 196.0, 204.0])
+_SQUARE = 0.5  # [m]
+_FADES_AT = 8.0  # [m]; a floor is lost in the haze beyond a few times this
+
+
+@functools.lru_cache(maxsize=1)  # the camera of an arm stands still
+def _paint_background(
+    width: int,
+    height: int,
+    eye: tuple[float, ...],
+    target: tuple[float, ...],
+    field_of_view: float,
+    floor: float | None,
+) -> NDArray[np.uint8]:
+    """Return a picture of a sky, and below the horizon of a floor of squares at a height [m]."""
+    forward = np.subtract(target, eye)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    pixel = 2.0 * np.tan(np.radians(field_of_view) / 2) / height
+    across = (pixel * (np.arange(width) + 0.5 - width / 2)).astype(np.float32)
+    above = (pixel * (height / 2 - np.arange(height) - 0.5)).astype(np.float32)[:, None]
+    # Rays through the pixels, 1 m deep; `right` is level.
+    x, y = (
+        np.float32(forward[axis]) + across * np.float32(right[axis]) + above * np.float32(up[axis]) for axis in (0, 1)
+    )
+    z = np.float32(forward[2]) + above * np.float32(up[2])
+    rise = np.clip(z / np.sqrt(1.0 + across**2 + above**2), 0.0, 1.0)
+    colors = np.asarray(_HORIZON, np.float32) + rise[..., None] * np.subtract(_ZENITH, _HORIZON).astype(np.float32)
+    below = int(np.count_nonzero(z[:, 0] > -1e-3))  # the first row below the horizon
+    if floor is not None and floor < eye[2] and below < height:
+        way = np.float32(floor - eye[2]) / z[below:]
+        x, y = x[below:] * way, y[below:] * way
+        columns, rows = np.floor((x + eye[0]) / _SQUARE), np.floor((y + eye[1]) / _SQUARE)
+        squares = np.asarray(_SQUARES, np.float32)[((columns + rows) % 2).astype(np.intp)]
+        haze = (1.0 - np.exp(-(x**2 + y**2) / np.float32(_FADES_AT**2)))[..., None]
+        colors[below:] = squares + haze * (np.asarray(_HORIZON, np.float32) - squares)
+    return colors.astype(np.uint8)
 
 
 def check_display() -> None:
