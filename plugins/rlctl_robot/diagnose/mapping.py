@@ -165,5 +165,5 @@ def _make(
     if factor is not None and not np.allclose(np.abs(factor), 1.0):
         content["scale"] = [float(f"{value:.5g}") for value in np.abs(factor)]
     if offset is not None and not np.allclose(offset, 0.0, atol=1e-4):
-        content["offset"] = [float(f"{value:.5g}") for value in offset]
+        content["offset"] = [float(f"{value:.5g}") + 0.0 for value in offset]  # no -0.0
     return TermMapping.model_validate(content)
