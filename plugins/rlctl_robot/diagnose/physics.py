@@ -124,9 +124,9 @@ class Physics:
         errors = []
         for row in range(len(observations) - 1):
             self._set_state(observations[row])
-            result = self._worlds.step(actions[row].astype(np.float32))
+            seen: Any = self._worlds.step(actions[row].astype(np.float32)).observation  # no log is of a Dict
             if row >= _SETTLING:
-                errors.append(result.observation[:, self._compared] - observations[row + 1][:, self._compared])
+                errors.append(seen[:, self._compared] - observations[row + 1][:, self._compared])
         return np.nan_to_num(np.stack(errors, axis=1), nan=1e3, posinf=1e3, neginf=-1e3)
 
     def _set_state(self, observed: Array) -> None:
