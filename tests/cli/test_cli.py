@@ -99,7 +99,8 @@ def test_no_arguments_show_the_help(rlctl):
         (
             ["runs", "report", "latest", "--format", "txt"],
             2,
-            "Invalid value for '--format': Value error, 'txt' is not one of 'html', 'md', 'table', 'svg', 'pdf', 'png'",
+            "Invalid value for '--format': Value error, 'txt' is not one of 'html', 'md', 'table', 'csv', "
+            "'latex', 'svg', 'pdf', 'png'",
         ),
         (
             ["runs", "compare", "a", "b", "--gate", "better"],

@@ -108,10 +108,6 @@ def test_a_number_below_1_or_not_whole_is_refused(rlctl, value, problem):
         ),
         (["--worst", "2", "-o", "y.rrd"], "--output y.rrd: a recording has one episode; give a folder for 2"),
         (["--video", "y.avi"], "--video y.avi: give a file that ends in .mp4 or .gif"),
-        (
-            ["--video", "y.gif", "-o", "y.rrd"],
-            "--video and --output exclude each other: leave out --output",
-        ),
     ],
 )
 def test_bad_requests(replay, arguments, message):

@@ -129,7 +129,7 @@ def test_noise_is_as_large_as_was_drawn(make):
     for seed in range(3):
         drawn = env.reset(seed=seed)[1]["events"]["noisy_angle"]["std"]
         assert 0.1 <= drawn <= 0.2
-    env.worlds.max_steps = 3000
+    env.worlds.shorten(np.zeros(1, np.int64), np.array([3000]))
     rows = play(env, steps=3000)
     drawn = env.reset(seed=0)[1]["events"]["noisy_angle"]["std"]
     angles = rows[:, 1:4]

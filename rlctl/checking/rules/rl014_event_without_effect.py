@@ -1,7 +1,6 @@
 """RL014: event without effect."""
 
 import dataclasses
-import pickle
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -36,7 +35,7 @@ PLAIN = (str, float, bool, np.ndarray, np.floating)
 class SpiedCalls:
     """What an event's function did with the world."""
 
-    calls: list[bytes] = dataclasses.field(default_factory=list)
+    calls: list[str] = dataclasses.field(default_factory=list)
     is_complete: bool = True  # False if it got at something whose use cannot be seen
 
 
@@ -53,7 +52,7 @@ class Spy:
             return value.copy() if isinstance(value, np.ndarray) else value
 
         def call(*arguments: Any, **keywords: Any) -> Any:
-            self._noted.calls.append(pickle.dumps((name, arguments, keywords)))
+            self._noted.calls.append(_describe((name, arguments, keywords)))
             result = value(*arguments, **keywords)
             return Spy(result, self._noted) if isinstance(result, Body) else result
 
@@ -62,6 +61,17 @@ class Spy:
     def __setattr__(self, name: str, value: Any) -> None:
         self._noted.is_complete = False
         setattr(self._target, name, value)
+
+
+def _describe(value: Any) -> str:
+    """Return a text that is equal for equal arguments; arrays are written with all of their digits."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{value.shape}{value.tobytes().hex()}"
+    if isinstance(value, tuple | list):
+        return f"({', '.join(map(_describe, value))})"
+    if isinstance(value, dict):
+        return f"({', '.join(f'{name}: {_describe(part)}' for name, part in value.items())})"
+    return repr(value)
 
 
 def _is_plain(value: Any) -> bool:

@@ -34,7 +34,7 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         The method that observes changes an attribute that reset draws and the reward uses, most often the goal:
-        noise or an offset is added to the attribute itself instead of to a copy. rlctl called the method twice
+        noise or an offset is added to the attribute itself instead of to a copy. The check called the method twice
         more after a reset, and gave the same random numbers to what follows: the rewards of the episode were others.
         So the goal drifts away while the episode lasts, and whoever looks at an observation changes the task.
     """,

@@ -15,7 +15,7 @@ RULE = Rule(
     "command is shown one step late",
     Severity.WARNING,
     meaning="""
-        The reward follows a new command, goal or phase one step before the observation shows it. rlctl put the
+        The reward follows a new command, goal or phase one step before the observation shows it. The check put the
         robot back to its start before every step, so that nothing but these could change: each time the reward
         jumped a step before the observation. In that step the policy is judged by what it cannot know; most often
         step observes before it draws the new command, and rewards after.

@@ -24,7 +24,7 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         The further away the goal is, the larger is the reward, to both sides; or every failure pays more than
-        success, which goes on. rlctl played the same steps again, and put the goal, or the command, where
+        success, which goes on. The check played the same steps again, and put the goal, or the command, where
         is_success is true, and at several distances from there. So the policy learns to keep away from the
         goal. Most often a sign is wrong, or an error is paid instead of a function that falls with it.
     """,

@@ -13,7 +13,7 @@ RULE = Rule(
     "moving to and fro pays",
     Severity.WARNING,
     meaning="""
-        Progress towards the goal is paid, and the way back is not taken back. rlctl moved the goal to and fro
+        Progress towards the goal is paid, and the way back is not taken back. The check moved the goal to and fro
         while the robot did nothing: each time the reward was larger than with either goal alone, in proportion
         to the way. A policy that shakes earns more than one that arrives.
     """,

@@ -18,7 +18,7 @@ from rlctl_robot.identify.log import Log, read_log, write_log
 from rlctl_robot.identify.search import Fit, _compute_cost, _find_fit, search
 from rlctl_robot.identify.targets import read_targets
 
-SPEC = EnvSpec("my-arm/my_arm/task.py:MyArm", sim=MUJOCO)
+SPEC = EnvSpec("log-arm/log_arm/task.py:LogArm", sim=MUJOCO)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def folder(tmp_path_factory):
     """A folder with the starter plugin, and a trajectory for it."""
     folder = tmp_path_factory.mktemp("starter")
     with contextlib.chdir(folder):
-        new.create("my-arm")
+        new.create("log-arm")
         write_excitation(SPEC, folder / "excite.csv", seconds=3.0, seed=0)
     return folder
 
