@@ -20,9 +20,7 @@ from rlctl.checking.instance import Budget, Context, EnvironmentRaised, describe
 from rlctl.checking.progress import CallProgress, Position, read_clock, read_clock_of
 from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finished, Mistake, Skipped
 from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding
-from rlctl.checking.rules import (
-    EXPERIMENTS,
-)
+from rlctl.checking.rules import EXPERIMENTS
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.printed_lines import LineReader, clean
@@ -40,7 +38,12 @@ def main(
     memory: int,
 ) -> None:
     """Run some experiments of one process and send what they yield. `memory`: the descriptor of the progress."""
-    for message in run(process, spec, experiments, seconds, CallProgress(memory), most_growth):
+    send_all(connection, run(process, spec, experiments, seconds, CallProgress(memory), most_growth))
+
+
+def send_all(connection: Connection, messages: Iterator[ChildMessage]) -> None:
+    """Send what a child process yields, and that this was all."""
+    for message in messages:
         send(connection, message)
     send(connection, End())
 

@@ -9,12 +9,11 @@ from rlctl.checking.audit.competitors import Competitor, Kind, Plays, check_inst
 from rlctl.checking.experiment import Experiment
 from rlctl.checking.instance import MOST_FAILURES, Context, EnvironmentRaised, describe_failure
 from rlctl.checking.progress import CallProgress
-from rlctl.checking.records import FIRST_SEED, ChildMessage, End, Fact, Skipped
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact, Skipped
 from rlctl.checking.rule import NotJudged
 from rlctl.checking.rules import EXPERIMENTS
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError
-from rlctl.processes.messages import send
 
 PLAYED, AUDIT = "played", "audit"
 PROCESSES = 2
@@ -46,10 +45,8 @@ def main(
         hooks=(),
     )
     known = {**EXPERIMENTS, AUDIT: own}
-    progress = CallProgress(memory)
-    for message in children.run(process, spec, experiments, seconds, progress, most_growth, known):
-        send(connection, message)
-    send(connection, End())
+    messages = children.run(process, spec, experiments, seconds, CallProgress(memory), most_growth, known)
+    children.send_all(connection, messages)
 
 
 def play_rounds(
