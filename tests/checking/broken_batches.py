@@ -152,7 +152,7 @@ class RL409Logs(Point):
 
 
 class CachesAndForgetsTheSeed(Point):
-    """The error is computed anew in each step, and the goals are not drawn from the seed."""
+    """The error is computed in each step, and the goals are not drawn from the seed."""
 
     rlctl_ignore = {"RL301": "it is what the test is about", "RL308": "a consequence"}
 

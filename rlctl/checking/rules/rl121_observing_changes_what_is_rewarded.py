@@ -169,7 +169,7 @@ def _decides(trials: Trials, look: _Look, name: str) -> bool:
 
 
 def _accumulates(trials: Trials, look: _Look, name: str) -> bool:
-    """Say whether looks add to the attribute, or scale it: what is computed anew in each, or fades, is a memory of the
+    """Say whether looks add to the attribute, or scale it: what is computed again in each, or fades, is a memory of the
     sensor."""
     first, last = look.first[name], look.last[name].numbers
     shift = 0.1 + 0.1 * np.abs(first.numbers).max()
