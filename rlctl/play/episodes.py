@@ -284,9 +284,10 @@ class _Segment(Actor):
         for key, part in segment.final.items():
             part[row, ended] = segment.observation[key][row + 1, ended]
         if asked.levels is not None:
-            for result in [result for result in results if not arrays.limit[result.env]]:
-                level = float(arrays.level[result.env])
-                arrays.level[result.env] = asked.levels.follow(level, result.success)
+            for result in results:
+                if not arrays.limit[result.env]:
+                    level = float(arrays.level[result.env])
+                    arrays.level[result.env] = asked.levels.follow(level, result.success)
         arrays.limit[envs] = 0  # only the first episodes are short
         self._rows[ended] = row + 1
         shown = self._episodes._begin(arrays, ended, [next(self._seeds[env]) for env in envs.tolist()])

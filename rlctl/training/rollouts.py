@@ -145,7 +145,7 @@ class WorkerVecEnv(VecEnv):
             self._actions[episode.env] = []
         for env, actions in enumerate(segment.action[:, :steps]):
             self._actions[env].append(actions[last_rows.get(env, -1) + 1 :].copy())
-        self.ended += [episode for episode in ended if not self._is_short(episode, ended)]
+        self.ended += self._leave_out_short(ended)
         self._limits = self.workers.arrays.limit.copy()
         last = segment.first(steps, ended)
         last = dataclasses.replace(last, observation=widen(last.observation), final=widen(last.final))
@@ -155,10 +155,19 @@ class WorkerVecEnv(VecEnv):
         self.last_segment = last
         return last
 
-    def _is_short(self, episode: EpisodeResult, ended: Sequence[EpisodeResult]) -> bool:
-        """Return whether an episode was shortened, which says little about the policy: the first of its environment."""
-        first = min(other.row for other in ended if other.env == episode.env)
-        return bool(self._limits[episode.env]) and episode.row == first
+    def _leave_out_short(self, ended: Sequence[EpisodeResult]) -> Sequence[EpisodeResult]:
+        """Leave out the first episode of each environment that was shortened: it says little about the policy.
+
+        `ended` has the episodes of an environment in their order.
+        """
+        short = set(np.flatnonzero(self._limits).tolist())
+        counted = []
+        for episode in ended:
+            if episode.env in short:
+                short.remove(episode.env)
+            else:
+                counted.append(episode)
+        return counted
 
     @property
     def steps_in_segment(self) -> int:
