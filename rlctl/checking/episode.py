@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -36,6 +37,14 @@ class Moment:
     def flags(self) -> tuple[bool, bool]:
         """What `terminated` and `truncated` mean, whatever their types."""
         return read_flag(self.terminated), read_flag(self.truncated)
+
+    @property
+    def reward_number(self) -> float:
+        """The reward as a number; NaN for what is none, which is RL204's matter."""
+        try:
+            return float(self.reward)
+        except (TypeError, ValueError):
+            return math.nan
 
 
 @dataclasses.dataclass(eq=False)

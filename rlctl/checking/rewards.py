@@ -123,7 +123,7 @@ def discounted_sum(rewards: NDArray[np.float64]) -> float:
     return float(rewards @ DISCOUNT ** np.arange(len(rewards)))
 
 
-def discounted_steps(reward: float, steps: int) -> float:
+def discounted_steps(reward: float, steps: float) -> float:
     """Return the discounted sum of the same reward for so many steps."""
     return float(reward * (1 - DISCOUNT**steps) / (1 - DISCOUNT))
 

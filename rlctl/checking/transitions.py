@@ -2,13 +2,14 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, Records
 from rlctl.checking.rule import NotJudged
-from rlctl.environments.leaves import Leaf
+from rlctl.environments.leaves import Leaf, pick
 from rlctl.environments.success import SUCCESS
 
 ROLES = ("episodes", "seeds", "starts", "search")  # each plays other states; the other roles repeat an episode
@@ -47,6 +48,12 @@ class Transitions:
 def find_float_leaves(leaves: Sequence[Leaf]) -> list[int]:
     """Return the places of the leaves that observations are read from."""
     return [index for index, leaf in enumerate(leaves) if leaf.supported and leaf.dtype.startswith("float")]
+
+
+def flatten_floats(leaves: Sequence[Leaf], observation: Any) -> NDArray[np.float64]:
+    """Return the numbers of an observation that rules read, shape (elements,)."""
+    parts = [np.ravel(pick(observation, leaves[index].path)) for index in find_float_leaves(leaves)]
+    return np.concatenate([np.zeros(0), *parts])
 
 
 def collect_transitions(records: Records, *, with_constants: bool = False) -> Transitions:

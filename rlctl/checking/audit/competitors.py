@@ -240,31 +240,23 @@ def _find_swing(plays: Plays) -> Actor | None:
     return Pattern(plays.world.space, points)
 
 
-def _lie(side: str) -> Prepare:
+def _lies_on(played: PlayedEpisode) -> bool:
+    return not played.is_terminated or played.steps > SHORTEST
+
+
+def _has_fallen(played: PlayedEpisode) -> bool:
+    return played.is_terminated and played.steps <= SHORTEST
+
+
+def _lie(side: str, accepts: Callable[[PlayedEpisode], bool] = _lies_on) -> Prepare:
     def prepare(plays: Plays, seed: int, number: int) -> Script | None:
         if plays.walker is None:
             return None
         walker, stance = plays.walker, plays.stance(seed, number)
         rotation = walking.SIDES[side]
-        return Script(plays.still(), lambda: walking.lay_down(walker, stance, rotation), accepts=_lies_on)
+        return Script(plays.still(), lambda: walking.lay_down(walker, stance, rotation), accepts=accepts)
 
     return prepare
-
-
-def _lies_on(played: PlayedEpisode) -> bool:
-    return not played.is_terminated or played.steps > SHORTEST
-
-
-def _fall(plays: Plays, seed: int, number: int) -> Script | None:
-    if plays.walker is None:
-        return None
-    walker, stance = plays.walker, plays.stance(seed, number)
-    back = walking.SIDES["on its back"]
-    return Script(plays.still(), lambda: walking.lay_down(walker, stance, back), accepts=_has_fallen)
-
-
-def _has_fallen(played: PlayedEpisode) -> bool:
-    return played.is_terminated and played.steps <= SHORTEST
 
 
 def _reach_by_actions(plays: Plays, seed: int, number: int) -> Script | None:
@@ -317,7 +309,7 @@ WANTED = (
 OTHERS = (
     Competitor("standing still", Kind.idle, _hold_still, is_moved=True),
     Competitor("doing nothing", Kind.idle, _do_nothing),
-    Competitor("falling at once", Kind.idle, _fall),
+    Competitor("falling at once", Kind.idle, _lie("on its back", _has_fallen)),
     Competitor("half of the commanded speed", Kind.part, _follow(0.5), is_moved=True),
     Competitor("the reversed command", Kind.idle, _follow(-1.0), is_moved=True),
     Competitor("hovering beside the goal", Kind.part, _hover, is_moved=True),

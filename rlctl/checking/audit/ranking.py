@@ -8,7 +8,7 @@ import numpy as np
 
 from rlctl.checking.audit.competitors import LEARNED, OTHERS, SHIPPED, WANTED, Kind
 from rlctl.checking.audit.play_world import PlayedEpisode
-from rlctl.checking.rewards import DISCOUNT
+from rlctl.checking.rewards import discounted_steps
 
 NEARLY = 0.9  # part of the wanted return that one who does not even try must not earn
 AS_MUCH = 0.99  # part of the wanted return that one who does less than is wanted must not earn
@@ -172,7 +172,7 @@ def _compare(played: Sequence[PlayedEpisode], row: MeanScore, wanted: str) -> Be
     saved, discounted = 0.0, 0.0
     if row.name in MOVED and KINDS[wanted] is Kind.wanted:
         saved = _sum_saved_costs(own, best)
-        discounted = saved / max(own.steps, 1.0) * (1.0 - DISCOUNT**own.steps) / (1.0 - DISCOUNT)
+        discounted = discounted_steps(saved / max(own.steps, 1.0), own.steps)
     pairs = ((own.mean_return - saved, best.mean_return), (own.discounted - discounted, best.discounted))
     if not all(_is_as_much(earned, needed, part) for earned, needed in pairs):
         return None

@@ -31,7 +31,6 @@ class Mover:
     """What is brought to a goal: a link of an arm, by its joints, or an object."""
 
     body: Body
-    what: str
 
     def solve(self, target: Array) -> Array | None:
         """Return the state in which it is at a target [m]; None if it does not get there. The world is changed."""
@@ -55,7 +54,7 @@ class LinkMover(Mover):
     """A link of an arm; the state is the positions of the joints."""
 
     def __init__(self, body: Body, link: str) -> None:
-        self.body, self.link, self.what = body, link, link
+        self.body, self.link = body, link
 
     def solve(self, target: Array) -> Array | None:
         """See `Mover`."""
@@ -86,7 +85,7 @@ class ObjectMover(Mover):
     """A body without joints; the state is its position."""
 
     def __init__(self, body: Body) -> None:
-        self.body, self.what = body, body.name
+        self.body = body
         self._orientation = body.base_orientation.copy()
 
     def solve(self, target: Array) -> Array | None:

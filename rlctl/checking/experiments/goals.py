@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -15,10 +14,9 @@ from rlctl.checking.experiments.starts import FIRST, STARTS
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, NotJudged
-from rlctl.checking.transitions import find_float_leaves
+from rlctl.checking.transitions import flatten_floats
 from rlctl.checking.values import Attribute, read_attributes, read_flag, shape_like
 from rlctl.checking.workspaces import Reach, find_chains, measure_reach
-from rlctl.environments.leaves import pick
 from rlctl.environments.success import SUCCESS
 
 SIZES = (1, 2, 3)  # of a place [numbers]
@@ -79,7 +77,7 @@ class GoalEpisode:
         moment = self._player.reset()
         self._attribute = read_attributes(self._instance.env)[trials.drawn.name]
         self.goal = self._attribute.numbers
-        self.observed = _flatten(self._instance, moment)  # Shape (elements,)
+        self.observed = flatten_floats(self._instance.leaves, moment.observation)  # Shape (elements,)
         self.has_succeeded = False  # whether any of its steps was a success
         self.play([None] * first)
 
@@ -94,10 +92,10 @@ class GoalEpisode:
             self._attribute.assign(shape_like(self._attribute.value, goal))
             self.goal = goal
         moment = self._player.step()
-        self.observed = _flatten(self._instance, moment)
+        self.observed = flatten_floats(self._instance.leaves, moment.observation)
         succeeds = _read_success(moment)
         self.has_succeeded |= bool(succeeds)
-        return GoalStep(_read_reward(moment), succeeds)
+        return GoalStep(moment.reward_number, succeeds)
 
     def play(self, goals: Iterable[Numbers | None]) -> list[GoalStep]:
         """Take a step for each goal; less if the episode ends."""
@@ -113,13 +111,6 @@ def _read_success(moment: Moment) -> bool | None:
     if not isinstance(moment.info, dict) or SUCCESS not in moment.info:
         return None
     return read_flag(moment.info[SUCCESS])
-
-
-def _read_reward(moment: Moment) -> float:
-    try:
-        return float(moment.reward)
-    except (TypeError, ValueError):  # its type is RL204's matter
-        return math.nan
 
 
 judges_goals = JudgeHook[GoalTrials]()
@@ -198,20 +189,15 @@ def _observe(instance: Instance, name: str, shift: float) -> Numbers:
     attribute = read_attributes(instance.env)[name]
     moved = attribute.numbers + shift * SHIFT[: attribute.numbers.size]
     attribute.assign(shape_like(attribute.value, moved))
-    return _flatten(instance, episode.step())
-
-
-def _flatten(instance: Instance, moment: Moment) -> Numbers:
-    leaves = [instance.leaves[index] for index in find_float_leaves(instance.leaves)]
-    parts = [np.ravel(pick(moment.observation, leaf.path)) for leaf in leaves]
-    return np.concatenate([np.zeros(0), *parts])
+    return flatten_floats(instance.leaves, episode.step().observation)
 
 
 def _find_reaches(instance: Instance, name: str, copies: Sequence[Source]) -> dict[Source, Reach]:
     """Return how far the links of fixed robots get whose places are observed, by where they are observed."""
     rows, goals, links = [], [], []
     for seed in range(FIRST_SEED, FIRST_SEED + COMPARED):
-        rows.append(_flatten(instance, EpisodePlayer(instance, seed, max_steps=0).reset()))
+        first = EpisodePlayer(instance, seed, max_steps=0).reset()
+        rows.append(flatten_floats(instance.leaves, first.observation))
         goals.append(read_attributes(instance.env)[name].numbers)
         chains = list(find_chains(instance.env))
         if not chains:

@@ -18,10 +18,9 @@ from rlctl.checking.experiments.episodes import record_episodes
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, NotJudged
-from rlctl.checking.transitions import find_float_leaves
+from rlctl.checking.transitions import flatten_floats
 from rlctl.environments.bullet_clients import ClientCalls, find_clients
 from rlctl.environments.info import find_mujoco
-from rlctl.environments.leaves import pick
 
 STEPS, STEPS_WITHOUT_LIMIT = 450, 1_100  # of an episode that declares a time limit, and of any other
 SEEDS = 3
@@ -77,9 +76,9 @@ def _play(instance: Instance, seed: int, longest: int, way: Sequence[float] = ()
         episode = EpisodePlayer(instance, seed, "held", max_steps=longest, sequence=holder.actions())
         observed, rewards = [], []
         for moment in episode:
-            observed.append(_flatten(instance, moment.observation))
+            observed.append(flatten_floats(instance.leaves, moment.observation))
             if moment.step:
-                rewards.append(_read_number(moment.reward))
+                rewards.append(moment.reward_number)
         if episode.ended == "time":
             raise NotJudged("time ran out")
         if holder.failed:
@@ -87,17 +86,6 @@ def _play(instance: Instance, seed: int, longest: int, way: Sequence[float] = ()
     if len({row.size for row in observed}) > 1:
         raise NotJudged("the observation has more than one size (RL101)")
     return HeldEpisode(seed, episode.ended, np.array(observed), np.array(rewards), holder.moves)
-
-
-def _flatten(instance: Instance, observation: Any) -> Rows:
-    leaves = [instance.leaves[index] for index in find_float_leaves(instance.leaves)]
-    return np.concatenate([np.zeros(0), *(np.ravel(pick(observation, leaf.path)) for leaf in leaves)])
-
-
-def _read_number(reward: Any) -> float:
-    with contextlib.suppress(TypeError, ValueError):  # its type is RL204's matter
-        return float(reward)
-    return float("nan")
 
 
 class _Holder:
