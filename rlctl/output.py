@@ -105,16 +105,16 @@ def confirm(question: str, refusal: str) -> bool:
     return typer.confirm(question, err=True)
 
 
-@contextlib.contextmanager
-def show_progress(what: str, total: int | None = None, unit: str = "") -> Iterator[Callable[[int], None]]:
+def show_progress(
+    what: str, total: int | None = None, unit: str = ""
+) -> contextlib.AbstractContextManager[Callable[[int], None]]:
     """Show the progress of work that may take longer than a few seconds, with the time that is left.
 
     Yields a function that takes how many of `total` are done, in `unit` (`episodes`); without `total` only the time is
     shown. On a terminal it is a bar, elsewhere a line on stderr after `_FIRST_LINE_S`, and then now and then.
     """
     display = _show_bar if err().is_terminal else _print_lines_of_progress
-    with display(what, total, unit) as show:
-        yield show
+    return display(what, total, unit)
 
 
 @contextlib.contextmanager

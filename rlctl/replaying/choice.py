@@ -18,7 +18,7 @@ def choose_episodes(
 ) -> tuple[list[EpisodeResult], str]:
     """Play the episodes that `rlctl eval` plays; return the chosen ones, the worst or best first, and a description."""
     seeds = episode_seeds(seed, Stream.EVAL, episodes)
-    progress = output.show_progress("playing episodes to choose from", episodes)
+    progress = output.show_progress("playing episodes to choose from", episodes, "episodes")
     with Workers(spec, count_envs(spec, episodes)) as workers, progress as show:
         policy.give_to(workers)
         results = [episode.result for episode in play_episodes(workers, seeds, watch=show)]

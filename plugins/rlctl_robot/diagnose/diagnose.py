@@ -136,12 +136,16 @@ class Doctor:
         self.likelihood = Likelihood(reference)
         statistics = reference.statistics
         self.joint_mistakes = list_joint_mistakes(policy.info.env, statistics)
-        self.physics = make_physics(spec, policy.info.env, statistics, reference.held_out)
         self.candidates = list_candidates(policy.info.env, statistics, self.actor.normalize)
+        self.physics = make_physics(spec, policy.info.env, statistics, reference.held_out)
         if self.physics is None:
             self.candidates += self.joint_mistakes
         report(f"trying {len(self.candidates):,} corrections on sound robots")
-        self.likelihood.learn_chances(self.candidates)
+        try:
+            self.likelihood.learn_chances(self.candidates)
+        except BaseException:  # it takes a minute, in which it may be interrupted
+            self.close()
+            raise
 
     def close(self) -> None:
         """Close the simulation."""

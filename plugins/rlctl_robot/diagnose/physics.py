@@ -154,10 +154,13 @@ def make_physics(
         return None
     physics = Physics(spec, terms, sound.sizes)
     std = np.concatenate([statistics[name].std for name in sound.sizes])
-    if physics.calibrate(sound, std):
-        return physics
-    physics.close()
-    return None
+    is_reliable = False
+    try:
+        is_reliable = physics.calibrate(sound, std)
+    finally:
+        if not is_reliable:
+            physics.close()
+    return physics if is_reliable else None
 
 
 def _find_state(info: EnvInfo, statistics: Mapping[str, TermStatistics]) -> _StateTerms | None:

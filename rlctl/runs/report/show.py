@@ -1,5 +1,6 @@
 """`rlctl runs show`: one run: what it was trained with, its curve, its evaluations, its files."""
 
+import shlex
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -115,7 +116,7 @@ def show(run: RunDescription, json: str | None) -> None:
     for line in () if run.audit is None else list_lines(run.audit):
         out.print(line)
     if run.audit is None and summary.best_success is not None and summary.best_success < _POOR_SUCCESS:
-        out.print(f"what has it learned instead? rlctl runs show {summary.path} --audit")
+        out.print(f"what has it learned instead? rlctl runs show {shlex.quote(str(summary.path))} --audit")
     for finding in run.findings:
         out.print("\n".join(format_finding(finding)))
     files = "  ".join(f"{name} {format_bytes(size)}" for name, size in sizes.items())
