@@ -61,6 +61,7 @@ def check_env(
     select: Sequence[str] = (),
     ignore: Sequence[str] = (),
     env_timeout_s: float = 10.0,
+    budget_s: float | None = None,
     baseline: str | os.PathLike[str] | None = None,
     sim: str | None = None,
     **parameters: Any,
@@ -70,23 +71,29 @@ def check_env(
     Keywords are parameters of the task. `sim` is the physics engine, as for `make`. `select` and `ignore` are
     prefixes of rule ids: `ignore=["RL5"]`. A finding has `rule`, `severity` ("error", "warning", "info"), `message`,
     `fix` and `evidence`; `str(finding)` is one line. Those of `baseline`, a report of `rlctl check-env --json` on the
-    task under the same name, are left out.
-    Raises `UsageError` for an unknown task or parameter, `ArtifactError` for a file that is no report, and `TaskError`
-    if no instance can be built and no finding says why.
+    task under the same name, are left out. `budget_s` is the computing time of each process of the check [s], like
+    `--budget`.
+    Raises `UsageError` for an unknown task or parameter, `ArtifactError` for a file that is no report, `TaskError` if
+    no instance can be built and no finding says why, and `AnswerIsNo`, with the findings, if a quarter or more of the
+    rules were not judged for lack of time.
     """
     from rlctl.checking.check import check
     from rlctl.checking.rules import choose_rules
     from rlctl.checking.tool_formats import read_baseline
-    from rlctl.errors import RlctlError, TaskError
+    from rlctl.errors import AnswerIsNo, RlctlError, TaskError
 
     rules, known = choose_rules(select, ignore), set() if baseline is None else read_baseline(Path(baseline))
-    report = check(_make_spec(task, parameters, sim), rules=rules, env_timeout_s=env_timeout_s, show_progress=False)
+    spec = _make_spec(task, parameters, sim)
+    report = check(spec, rules=rules, env_timeout_s=env_timeout_s, budget_s=budget_s, show_progress=False)
     report.subtract(known)
     if report.verdict.crashed:
         names, details = ", ".join(report.verdict.crashed), "\n".join(report.verdict.crashed.values())
         raise RlctlError(f"check_env: a bug in rlctl: {names} crashed on {task}; please report it", details=details)
     if report.records.built is None and not (report.verdict.findings or report.verdict.known):
         raise TaskError(f"{task}: no instance could be built, so nothing was checked; rlctl check-env {task} shows why")
+    if report.is_incomplete:
+        found = [str(finding) for finding in report.verdict.findings]
+        raise AnswerIsNo("\n".join([f"{report.summarize()}; here: budget_s={report.needed_budget}", *found]))
     return sorted(report.verdict.findings, key=lambda finding: (finding.severity.rank, finding.rule))
 
 

@@ -31,6 +31,8 @@ from rlctl.recipe import sources
 METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6": "step", "RL7": "step"}
 """The method that the findings of a family are about, where nothing more is known."""
 BUDGET_STEP_S = 10
+MOST_UNJUDGED = 0.25
+"""Part of the rules that may lack time in a check that passes."""
 
 
 @dataclasses.dataclass
@@ -65,21 +67,35 @@ class CheckReport:
         return [rule for rule in self.verdict.not_judged if rule in RULES and find_needs([rule]) & cut]
 
     @property
+    def is_incomplete(self) -> bool:
+        """Whether so many rules were not judged for lack of time that the check is no pass, whatever it found."""
+        late = len(self.out_of_time)
+        return late > 0 and late >= MOST_UNJUDGED * (late + len(self.verdict.judged))
+
+    @property
+    def needed_budget(self) -> int:
+        """The `--budget` that should be enough for the rules that were not judged for lack of time [s]."""
+        ends = self.records.finished.values()
+        needed_s = max([2 * self.budget_s, *(end.needed_s for end in ends)])
+        return math.ceil(needed_s / BUDGET_STEP_S) * BUDGET_STEP_S
+
+    @property
     def advice(self) -> str:
         """What more time would do: how many rules are not judged for lack of it; empty if all are."""
         late = len(self.out_of_time)
         if not late:
             return ""
-        ends = self.records.finished.values()
-        needed_s = max([2 * self.budget_s, *(end.needed_s for end in ends)])
-        seconds = math.ceil(needed_s / BUDGET_STEP_S) * BUDGET_STEP_S
-        return f"{output.format_count(late, 'rule')} not judged for lack of time: --budget {seconds} should judge them"
+        what = f"{output.format_count(late, 'rule')} not judged for lack of time"
+        advice = f"--budget {self.needed_budget} should judge them"
+        if not self.is_incomplete:
+            return f"{what}: {advice}"
+        return f"not passed: {what}: {advice}; --select RULES judges fewer"
 
     @property
     def exit_code(self) -> int:
-        """70 if a rule crashed, 3 if no instance could be built, 1 for errors, 0 otherwise.
+        """70 if a rule crashed, 3 if no instance could be built, 1 for errors and an incomplete check, 0 otherwise.
 
-        A strict check has 1 also for warnings, and for rules that it had no time to judge.
+        A strict check has 1 also for warnings, and for any rule that it had no time to judge.
         """
         if self.verdict.crashed:
             return 70
@@ -87,7 +103,12 @@ class CheckReport:
             return 3
         bad = (Severity.ERROR, Severity.WARNING) if self.strict else (Severity.ERROR,)
         is_bad = any(finding.severity in bad for finding in self.verdict.findings)
-        return int(is_bad or (self.strict and bool(self.out_of_time)))
+        return int(is_bad or self.fails_for_time)
+
+    @property
+    def fails_for_time(self) -> bool:
+        """Whether rules that the check had no time to judge are enough to fail it."""
+        return self.is_incomplete or (self.strict and bool(self.out_of_time))
 
     def locate(self, finding: RuleFinding) -> tuple[Path, int] | None:
         """Return file and line of what causes a finding: a call, else the method that it is about, else the class.
@@ -141,7 +162,8 @@ class CheckReport:
         if late := len(self.out_of_time):
             open_rules = f"{late} of {output.format_count(judged + late, 'rule')} not judged for lack of time"
             return (
-                f"{self.task}: not finished: {open_rules} (--budget SECONDS); {found} from the other {judged} "
+                f"{self.task}: not finished: {open_rules} (--budget {self.needed_budget}); "
+                f"{found} from the other {judged} "
                 f"in {self.seconds:.1f} s"
             )
         return f"{self.task}: {found}; {rules} judged in {self.seconds:.1f} s"

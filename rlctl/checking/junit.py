@@ -23,19 +23,19 @@ def make_suite(report: CheckReport) -> Suite:
     waivers = report.records.built.waivers if report.records.built else {}
     accepted = {finding.rule: "known from the baseline" for finding in verdict.known}
     accepted |= {finding.rule: f"waived: {waivers[finding.rule]}" for finding in verdict.waived}
+    skipped = {**verdict.not_applicable, **verdict.not_judged, **accepted}
+    known = {*verdict.judged, *findings, *skipped}
+    others = [name for name in skipped if name not in RULES]  # parts of the environment
     cases = []
-    for rule in dict.fromkeys([*verdict.judged, *accepted, *findings]):
-        outcomes = [_describe(finding, strict=report.strict) for finding in findings[rule]]
-        if rule in accepted and not findings[rule]:
-            outcomes.append(CaseEntry("skipped", message=accepted[rule]))
+    for rule in [*(rule for rule in RULES if rule in known), *others]:
+        outcomes = [_describe(finding, strict=report.strict) for finding in findings.get(rule, [])]
+        if rule in skipped and not outcomes:
+            outcomes.append(CaseEntry("skipped", message=skipped[rule]))
         cases.append(_make_case(report.task, rule, *outcomes))
-    for rule, reason in {**verdict.not_applicable, **verdict.not_judged}.items():
-        if not findings[rule]:
-            cases.append(_make_case(report.task, rule, CaseEntry("skipped", message=reason)))
     for name, trace in verdict.crashed.items():
         cases.append(_make_case(report.task, name, CaseEntry("error", message="a bug in rlctl", text=trace)))
-    if report.strict and (late := report.out_of_time):
-        message = f"no time to judge {', '.join(late)}: --budget SECONDS"
+    if report.fails_for_time:
+        message = f"no time to judge {', '.join(report.out_of_time)}: --budget {report.needed_budget}"
         cases.append(_make_case(report.task, "time ran out", CaseEntry("failure", message=message, type="error")))
     return Suite(f"rlctl check-env {report.task}", report.seconds, cases)
 

@@ -38,6 +38,7 @@ def describe(report: CheckReport) -> dict[str, Any]:
         "task": report.task,
         "exit_code": report.exit_code,
         "strict": report.strict,
+        "is_incomplete": report.is_incomplete,
         "findings": [_describe_finding(report, finding) for finding in verdict.findings],
         "known": [_describe_finding(report, finding) for finding in verdict.known],
         "waived": [{**_describe_finding(report, f), "reason": waivers[f.rule]} for f in verdict.waived],
@@ -51,6 +52,7 @@ def describe(report: CheckReport) -> dict[str, Any]:
         "steps": sum(trajectory.steps for trajectory in records.trajectories),
         "seconds": report.seconds,
         "budget_seconds": report.budget_s,
+        "needed_budget_seconds": report.needed_budget if report.out_of_time else None,
         "experiments": {name: end.seconds for name, end in records.finished.items()},
     }
 
@@ -177,6 +179,8 @@ def to_sarif(report: CheckReport) -> str:
         suppression = {"kind": "inSource", "justification": built.waivers[finding.rule] if built else ""}
         results.append({**_describe_result(report, finding, rules), "suppressions": [suppression]})
     notes = [("error", f"{name} crashed:\n{trace}") for name, trace in verdict.crashed.items()]
+    if report.advice:
+        notes.append(("error" if report.fails_for_time else "warning", report.advice))
     notes += [("note", f"{name} not judged: {reason}") for name, reason in verdict.not_judged.items()]
     notifications = [{"level": level, "message": {"text": text}} for level, text in notes]
     invocation = {"executionSuccessful": not verdict.crashed, "exitCode": report.exit_code}
@@ -233,10 +237,9 @@ def to_annotations(report: CheckReport) -> str:
         lines.append(f"{command}title={title}::{message}")
     lines += [f"::error title={name} crashed::a bug in rlctl" for name in report.verdict.crashed]
     if cut := report.out_of_time:
-        severity = "error" if report.strict else "warning"
-        lines.append(
-            f"::{severity} title={len(cut)} rules not judged::time ran out for {', '.join(cut)}: --budget SECONDS"
-        )
+        severity = "error" if report.fails_for_time else "warning"
+        advice = f"time ran out for {', '.join(cut)}: --budget {report.needed_budget}"
+        lines.append(f"::{severity} title={len(cut)} rules not judged::{advice}")
     return "\n".join([*lines, report.summarize()]) + "\n"
 
 

@@ -29,7 +29,14 @@ def gate(
     settings: Settings = [],
     sim: SimOption = None,
     strict: Annotated[bool, Option("Warnings of the check fail too.", ("--strict",))] = False,
-    budget: Annotated[float, Option("Computing time of the check in seconds.", min=1)] = 18.0,
+    budget: Annotated[
+        float | None,
+        Option(
+            "Computing time in seconds of each process of the check.",
+            min=1,
+            default_text="18, and up to 90 for slow environments",
+        ),
+    ] = None,
     min_success: MinSuccess = None,
     min_success_lower: MinSuccessLower = None,
     min_return: MinReturn = None,

@@ -53,7 +53,7 @@ def check_env(
     select: Annotated[list[str], Option("Check only these rules: RL3,RL501.", metavar="RULES")] = [],
     ignore: Annotated[list[str], Option("Skip these rules: RL106.", metavar="RULES")] = [],
     strict: Annotated[
-        bool, Option("Exit 1 for warnings, and for rules without time to judge them.", ("--strict",))
+        bool, Option("Exit 1 for warnings, and for any rule without time to judge it.", ("--strict",))
     ] = False,
     form: Annotated[
         list[ReportFormat],

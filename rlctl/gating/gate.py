@@ -36,7 +36,7 @@ class GateRequest:
     allow_no_success: bool = False  # whether two policies that never succeed pass the comparison
     export: Path | None = None  # file to write, .onnx or .c; None: nothing is exported
     strict: bool = False  # whether warnings of the check fail
-    budget_s: float = 18.0  # of the check
+    budget_s: float | None = None  # of each process of the check; None: as much as `check-env` takes
 
     def __post_init__(self) -> None:
         if self.gates == NO_GATES:
@@ -187,7 +187,8 @@ class _Findings:
             problems = [
                 f"{finding.rule} {finding.message.partition(chr(10))[0]}" for finding in report.verdict.findings
             ]
-            problems = problems or [report.summarize()]
+            if report.fails_for_time or not problems:
+                problems.insert(0, report.summarize())
         return report.summarize(), problems
 
     def play(self) -> tuple[str, list[str]]:

@@ -285,19 +285,42 @@ def test_a_strict_check_fails_for_rules_without_time_to_judge_them(report):
     cut = dataclasses.replace(report.records, finished={**report.records.finished})
     assert report.out_of_time == [] or any(end.is_cut for end in report.records.finished.values())
     cut.finished["episodes"] = Finished("episodes", 1.0, is_complete=True, is_cut=True)
-    verdict = CheckVerdict(not_judged={"RL501": "time ran out", "RL301": "reset takes no seed"})
+    others = ["RL101", "RL102", "RL103", "RL104"]
+    verdict = CheckVerdict(judged=others, not_judged={"RL501": "time ran out", "RL301": "reset takes no seed"})
     late = dataclasses.replace(report, records=cut, verdict=verdict)
     assert late.out_of_time == ["RL501"]
     assert (late.exit_code, dataclasses.replace(late, strict=True).exit_code) == (
         (3, 3) if cut.built is None else (0, 1)
     )
-    assert re.search(r": not finished: 1 of 1 rule not judged for lack of time .*; no findings", late.summarize())
+    assert re.search(r": not finished: 1 of 5 rules not judged for lack of time .*; no findings", late.summarize())
     assert "::warning title=1 rules not judged::time ran out for RL501" in FORMATS["github"](late)
     assert "time ran out" not in [case.get("name") for case in junit_cases(late)]
     (case,) = [
         each for each in junit_cases(dataclasses.replace(late, strict=True)) if each.get("name") == "time ran out"
     ]
-    assert case.find("failure").get("message") == "no time to judge RL501: --budget SECONDS"
+    assert case.find("failure").get("message") == "no time to judge RL501: --budget 40"
+
+
+def test_a_check_without_a_quarter_of_the_rules_is_no_pass(broken):
+    finished = {**broken.records.finished, "episodes": Finished("episodes", 1.0, is_complete=True, is_cut=True)}
+    verdict = CheckVerdict(judged=["RL101", "RL102", "RL103"], not_judged={"RL501": "time ran out"})
+    late = dataclasses.replace(broken, records=dataclasses.replace(broken.records, finished=finished), verdict=verdict)
+    assert late.exit_code == 1
+    assert to_text(late).splitlines()[-1] == (
+        "not passed: 1 rule not judged for lack of time: --budget 40 should judge them; --select RULES judges fewer"
+    )
+    content = json.loads(tool_formats.to_json(late))
+    assert (content["exit_code"], content["is_incomplete"], content["needed_budget_seconds"]) == (1, True, 40)
+    assert "::error title=1 rules not judged::time ran out for RL501: --budget 40" in FORMATS["github"](late)
+    assert [case.find("failure") is not None for case in junit_cases(late)][-1]
+    (run,) = json.loads(FORMATS["sarif"](late))["runs"]
+    notification = run["invocations"][0]["toolExecutionNotifications"][0]
+    assert (notification["level"], notification["message"]["text"][:10]) == ("error", "not passed")
+
+
+def test_the_cases_of_junit_are_in_the_order_of_the_rules(report):
+    rules = [case.get("name")[:5] for case in junit_cases(report) if case.get("name")[:5] in RULES]
+    assert rules == sorted(rules)
 
 
 @pytest.mark.parametrize(
