@@ -172,16 +172,21 @@ def zero_action(space: spaces.Space[Any]) -> Any:
     return build_action(space, lambda leaf: np.clip(0, leaf.low, leaf.high) if leaf.supported else None)
 
 
+def find_action_range(leaf: Leaf) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lowest and the highest numbers of an action, of the leaf's shape; [-1, 1] without bounds."""
+    low, high = np.asarray(leaf.low, np.float64), np.asarray(leaf.high, np.float64)
+    return np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
+
+
 def action_at(space: spaces.Space[Any], numbers: NDArray[np.float64]) -> Any:
     """Return an action whose numbers are given as fractions of their range, [-1, 1] for numbers without bounds."""
     rest = iter(numbers)
 
     def value_of(leaf: Leaf) -> NDArray[Any]:
         point = np.array([next(rest) for _ in range(int(np.prod(leaf.shape)))]).reshape(leaf.shape)
-        low, high = np.asarray(leaf.low, np.float64), np.asarray(leaf.high, np.float64)
+        low, high = find_action_range(leaf)
         if np.dtype(leaf.dtype).kind in "iub":
             return np.minimum(np.floor(low + point * (high - low + 1)), high)
-        low, high = np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
         return low + point * (high - low)
 
     return build_action(space, value_of)

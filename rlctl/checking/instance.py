@@ -295,6 +295,11 @@ class Context:
         self.reached_limit = False  # whether one of them was truncated
         self.generators: dict[str, str] | None = None  # State of each after the first watched reset; None before
 
+    def note_episode(self, steps: int, ended: str) -> None:
+        """Note how long an episode of the kept instance lasted, and how it ended."""
+        self.longest_episode = max(self.longest_episode or 0, steps)
+        self.reached_limit |= ended in ("truncated", "both")
+
     def build(self, render_mode: Literal["rgb_array"] | None = None, spec: EnvSpec | None = None) -> Instance:
         """Return a new instance; what its import or constructor raises is an `EnvironmentRaised`."""
         self.budget.require_time(self.least_s)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.rule import NotJudged, RuleFinding
+from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding
 from rlctl.environments.leaves import Leaf, name_element
 from rlctl.errors import UsageError
 
@@ -217,7 +217,7 @@ class Records:
     findings: list[RuleFinding] = dataclasses.field(default_factory=list)  # of the experiments
     facts: dict[str, Any] = dataclasses.field(default_factory=dict)  # by experiment
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)  # experiment, role or rule -> reason
-    not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)  # rule -> reason
+    not_applicable: dict[str, str] = dataclasses.field(default_factory=dict)  # experiment or rule -> reason
     finished: dict[str, Finished] = dataclasses.field(default_factory=dict)  # by experiment
     shortened: dict[str, str] = dataclasses.field(default_factory=dict)  # experiment -> `12 of 16 episodes`
     normalizes: Callable[[str], bool] = lambda _: False  # says whether the recipe normalises `reward` or `observation`
@@ -284,7 +284,10 @@ class Records:
         return episodes[0]
 
     def require_fact(self, experiment: str) -> Any:
-        """Return what an experiment found out; raises `NotJudged` with the reason where it did not."""
+        """Return what an experiment found out; raises `NotApplicable` where it has nothing to look at, and `NotJudged`
+        with the reason where it found nothing out."""
+        if experiment in self.not_applicable:
+            raise NotApplicable(self.not_applicable[experiment])
         if experiment not in self.facts:
             raise NotJudged(self.why_missing(experiment))
         return self.facts[experiment]

@@ -219,6 +219,12 @@ class RL815ArmOldTip(MujocoArm):
         mujoco.mj_step(self.model, self.data, nstep=5)
 
 
+class ArmOldTipAtRandom(RL815ArmOldTip):
+    def start(self):
+        super().start()
+        self.data.qpos[0] += 0.01 * np.random.default_rng().standard_normal()
+
+
 class RL815ArmOldSensor(RL815ArmOldTip):
     def tip(self):
         return self.data.sensordata[:3]

@@ -39,6 +39,13 @@ def test_the_first_late_command_is_placed():
 
 
 @pytest.mark.pybullet
+def test_a_robot_is_held_without_another_experiment():
+    records = shared_records_of(f"{HELD}:FallingCrawler", "held")
+    assert len(records.facts["held"]) == 3
+    assert records.trajectories == []
+
+
+@pytest.mark.pybullet
 def test_what_lives_by_itself_is_not_held():
     verdict = verdict_of("robots.py:Crawler", "RL122")
     assert verdict.not_applicable["RL122"] == "it lives long enough by itself"

@@ -2,7 +2,8 @@
 
 import pytest
 
-from tests.checking.judging import case, check_case, findings, found, mark_slow, rules_of
+from rlctl.checking.check import judge
+from tests.checking.judging import case, check_case, findings, found, mark_slow, records_of, rules_of
 
 pytest.importorskip("mujoco")
 
@@ -108,3 +109,10 @@ def test_finding_names_what_is_wrong(name, rule, words):
     task = f"broken_mujoco_{name}" if name.startswith("joints.py") else f"broken_mujoco.py:{name}"
     messages = " ".join(finding.message for finding in findings(task, rule))
     assert [word for word in words if word not in messages] == []
+
+
+def test_rules_that_compare_repeated_episodes_say_why_they_could_not():
+    """RL815 would be a pass that nobody judged."""
+    verdict = judge(records_of("broken_mujoco.py:ArmOldTipAtRandom", "build", "worlds"), ["RL815"])
+    assert verdict.judged == []
+    assert verdict.not_judged == {"RL815": "an episode with the same seed and actions is not the same again (RL302)"}

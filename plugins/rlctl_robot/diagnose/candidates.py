@@ -174,6 +174,14 @@ def list_joint_mistakes(info: EnvInfo, statistics: Mapping[str, TermStatistics])
     return found
 
 
+def list_joint_orders(
+    info: EnvInfo, statistics: Mapping[str, TermStatistics], candidates: Sequence[Correction]
+) -> list[Correction]:
+    """Return the candidates that say that a program exchanges joints in one observation, or in the actions."""
+    terms = {name for name, values in statistics.items() if is_of_joints(name, values, info)}
+    return [one for one in candidates if one.kind == "order" and one.term in {*terms, ACTIONS}]
+
+
 def is_of_joints(name: str, values: TermStatistics, info: EnvInfo) -> bool:
     """Return whether an observation has a quantity of each joint that its driver measures."""
     joints = info.joints

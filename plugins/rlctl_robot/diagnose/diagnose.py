@@ -13,11 +13,16 @@ from rlctl.errors import AnswerIsNo, ArtifactError
 from rlctl.limits.limits import Limits, read_limits
 from rlctl.policy.file import PolicyFile
 from rlctl_robot.diagnose.actor import RIGHT, LoggedActor
-from rlctl_robot.diagnose.candidates import list_candidates, list_joint_mistakes, make_normalised
+from rlctl_robot.diagnose.candidates import (
+    list_candidates,
+    list_joint_mistakes,
+    list_joint_orders,
+    make_normalised,
+)
 from rlctl_robot.diagnose.correction import JOINTS, Correction, correct
 from rlctl_robot.diagnose.evidence import Likelihood, Scorer
 from rlctl_robot.diagnose.frozen import Frozen, find_frozen
-from rlctl_robot.diagnose.joints import Judgement, judge
+from rlctl_robot.diagnose.joints import FEWEST_ROWS, Judgement, judge
 from rlctl_robot.diagnose.limited import find_limited_rows
 from rlctl_robot.diagnose.log import RobotLog, read_robot_log
 from rlctl_robot.diagnose.mapping import CorrectedMapping, build_mapping
@@ -43,6 +48,11 @@ _LARGE_LOSS = 2.0  # the same of the simulation's prediction, relative to the wo
 _FEWEST_FREE = 20  # rows in which a server has not limited the action, to compare it with the policy's
 _FALLEN = 0.2  # by which the direction of gravity leaves what sound robots measure
 _FALLEN_SHARE = 0.02  # of the rows
+_SIMULATED = ("order", "sign", "scale", "offset")  # what the simulation judges, where it can follow a log
+_TOO_SHORT = (
+    f"the log cannot tell: no part of it has {FEWEST_ROWS} rows without a gap, which the simulation needs. "
+    f"Record episodes of {FEWEST_ROWS} rows or more, from a stance in which the robot does not fall at once"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,6 +148,9 @@ class Doctor:
         self.joint_mistakes = list_joint_mistakes(policy.info.env, statistics)
         self.candidates = list_candidates(policy.info.env, statistics, self.actor.normalize)
         self.physics = make_physics(spec, policy.info.env, statistics, reference.held_out)
+        # Relations are linear near what sound robots do; far from it only the simulation tells orders of joints apart.
+        orders = list_joint_orders(policy.info.env, statistics, self.candidates)
+        self._simulated_mistakes = [*self.joint_mistakes, *orders]
         if self.physics is None:
             self.candidates += self.joint_mistakes
         report(f"trying {len(self.candidates):,} corrections on sound robots")
@@ -183,11 +196,17 @@ class Doctor:
         used = len(match.corrections) + bool(match.variant.text) + len(frozen)
         self._report("searching for corrections with which the signals depend on each other as in simulation")
         found = self._search(corrected, stuck, max(0, 2 - used))
-        judgement = None
+        judgement, is_too_short = None, False
         if self.physics is not None and not frozen:
-            self._report(f"simulating the log step by step, with {len(self.joint_mistakes):,} mistakes of the joints")
-            judgement = judge(self.physics, corrected, found, self.joint_mistakes)
-            found = found if judgement is None else list(judgement.found)
+            self._report(
+                f"simulating the log step by step, with {len(self._simulated_mistakes):,} mistakes of the joints"
+            )
+            judgement = judge(self.physics, corrected, found, self._simulated_mistakes)
+            if judgement is None:
+                certain = [one for one in found if one.correction.kind not in _SIMULATED]
+                is_too_short, found = len(certain) < len(found), certain
+            else:
+                found = list(judgement.found)
         for one in found:
             findings.append(
                 MappingFinding(
@@ -209,7 +228,10 @@ class Doctor:
         if is_unknown:
             answers = dataclasses.replace(answers, policy_difference=None, policy_difference_corrected=None)
         if not any(finding.is_mistake for finding in findings):
-            answers = dataclasses.replace(answers, unexplained=self._describe_unexplained(answers, signals, judgement))
+            unexplained = self._describe_unexplained(answers, signals, judgement)
+            if is_too_short:
+                unexplained = _TOO_SHORT
+            answers = dataclasses.replace(answers, unexplained=unexplained)
         mapped = [one for one in of_robot if one not in weak and not _has_large_gain(one)]
         env = self.policy.info.env
         mapping = build_mapping(

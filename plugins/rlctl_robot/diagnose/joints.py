@@ -11,7 +11,9 @@ from rlctl_robot.diagnose.physics import Physics
 from rlctl_robot.diagnose.search import LEAST_SHARE, Found
 from rlctl_robot.diagnose.signals import Array, LoggedSignals
 
-_FIRST_ROWS, _FIRST_PARTS = 36, 2  # of a log, for all mistakes of the joints
+FEWEST_ROWS = 36
+"""Rows without a gap that the simulation needs: so many of each of `_FIRST_PARTS` for all mistakes of the joints."""
+_FIRST_PARTS = 2
 _ROWS, _PARTS = 60, 10  # for the best of them
 _BEST = 8  # mistakes of the joints that are compared in more rows
 _LEAST_DEVIATION = 5.0  # standard errors by which a mistake of the joints must be better than without it
@@ -33,8 +35,8 @@ def judge(
 ) -> Judgement | None:
     """Return the corrections that make the simulation follow the log; None if no part of the log is long enough.
 
-    `found` is what the relations of signals say, `mistakes` are those of the joints' driver, at most one of which is
-    added. What the simulation contradicts is removed.
+    `found` is what the relations of signals say, `mistakes` are those of the joints, by their driver or in one term, at
+    most one of which is added. What the simulation contradicts is removed.
     """
     corrections = [one.correction for one in found]
     subsets = [
@@ -42,15 +44,15 @@ def judge(
     ]
     bases = [[], *([one] for one in corrections[:1])]
     of_joints = [[*base, mistake] for base in bases for mistake in mistakes]
-    first = physics.choose_starts(signals, _FIRST_ROWS, _FIRST_PARTS)
+    first = physics.choose_starts(signals, FEWEST_ROWS, _FIRST_PARTS)
     if not first:
         return None
-    losses = _measure(physics, signals, of_joints, first, _FIRST_ROWS).mean(axis=1)
+    losses = _measure(physics, signals, of_joints, first, FEWEST_ROWS).mean(axis=1)
     best = [of_joints[index] for index in np.argsort(losses)[:_BEST]]
     explanations = [*subsets, *best]
     rows, starts = _ROWS, physics.choose_starts(signals, _ROWS, _PARTS)
     if not starts:
-        rows, starts = _FIRST_ROWS, physics.choose_starts(signals, _FIRST_ROWS, _PARTS)
+        rows, starts = FEWEST_ROWS, physics.choose_starts(signals, FEWEST_ROWS, _PARTS)
     blocks = _measure(physics, signals, explanations, starts, rows)
     plain = _choose_plain(blocks[: len(subsets)], subsets)
     chosen = _choose_joints(blocks, plain, len(subsets), explanations)

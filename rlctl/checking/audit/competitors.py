@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.audit import reaching, walking
 from rlctl.checking.audit.play_world import Array, PlayedEpisode, PlayWorld, Script
-from rlctl.checking.episode import action_at
+from rlctl.checking.episode import action_at, find_action_range
 from rlctl.checking.instance import Context, Instance
 from rlctl.environments.info import describe_worlds
 from rlctl.environments.leaves import find_leaves
@@ -99,6 +99,8 @@ class Competitor:
     kind: Kind
     prepare: Prepare
     is_moved: bool = False  # by the engine, without any effort
+    lesson: str = ""  # what a policy has learned that plays so: `to stand`
+    does_nothing: bool = False  # what others earn beyond it, they earn by what they do
 
 
 class Pattern(Actor):
@@ -119,8 +121,7 @@ def find_middle(space: Any) -> Array:
     """Return the fractions of the range that are no action, shape (numbers,); see `action_at`."""
     points = []
     for leaf in find_leaves(space):
-        low, high = np.ravel(np.asarray(leaf.low, float)), np.ravel(np.asarray(leaf.high, float))
-        low, high = np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
+        low, high = (np.ravel(bound) for bound in find_action_range(leaf))
         points.append((np.clip(0.0, low, high) - low) / np.maximum(high - low, 1e-9))
     return np.concatenate(points)
 
@@ -301,25 +302,35 @@ def play_policy(file: Path) -> Prepare:
 
 
 WANTED = (
-    Competitor("following the command", Kind.moved, _follow(1.0)),
-    Competitor("following the command with steps", Kind.moved, _follow(1.0, steps=True)),
-    Competitor("reaching the goal", Kind.wanted, _reach_by_actions),
-    Competitor("being at the goal", Kind.moved, _reach_by_engine),
+    Competitor("following the command", Kind.moved, _follow(1.0), lesson="to follow the command"),
+    Competitor(
+        "following the command with steps", Kind.moved, _follow(1.0, steps=True), lesson="to follow the command"
+    ),
+    Competitor("reaching the goal", Kind.wanted, _reach_by_actions, lesson="to reach the goal"),
+    Competitor("being at the goal", Kind.moved, _reach_by_engine, lesson="to be at the goal"),
 )
 OTHERS = (
-    Competitor("standing still", Kind.idle, _hold_still, is_moved=True),
-    Competitor("doing nothing", Kind.idle, _do_nothing),
-    Competitor("falling at once", Kind.idle, _lie("on its back", _has_fallen)),
-    Competitor("half of the commanded speed", Kind.part, _follow(0.5), is_moved=True),
-    Competitor("the reversed command", Kind.idle, _follow(-1.0), is_moved=True),
-    Competitor("hovering beside the goal", Kind.part, _hover, is_moved=True),
-    Competitor("stepping in place", Kind.idle, _step_in_place, is_moved=True),
-    *(Competitor(f"lying {side}", Kind.idle, _lie(side)) for side in walking.SIDES),
-    Competitor("trembling", Kind.idle, _act(_tremble)),
-    Competitor("saturating", Kind.idle, _act(_saturate)),
-    Competitor("sliding slowly aside", Kind.idle, _slide, is_moved=True),
-    Competitor("drifting", Kind.idle, _act(_drift)),
-    Competitor("acting randomly", Kind.idle, _act_randomly),
+    Competitor("standing still", Kind.idle, _hold_still, is_moved=True, lesson="to stand", does_nothing=True),
+    Competitor("doing nothing", Kind.idle, _do_nothing, lesson="to do nothing", does_nothing=True),
+    Competitor("falling at once", Kind.idle, _lie("on its back", _has_fallen), lesson="to fall at once"),
+    Competitor(
+        "half of the commanded speed",
+        Kind.part,
+        _follow(0.5),
+        is_moved=True,
+        lesson="to follow at half of the speed",
+    ),
+    Competitor(
+        "the reversed command", Kind.idle, _follow(-1.0), is_moved=True, lesson="to do the reverse of the command"
+    ),
+    Competitor("hovering beside the goal", Kind.part, _hover, is_moved=True, lesson="to hover beside the goal"),
+    Competitor("stepping in place", Kind.idle, _step_in_place, is_moved=True, lesson="to step in place"),
+    *(Competitor(f"lying {side}", Kind.idle, _lie(side), lesson=f"to be lying {side}") for side in walking.SIDES),
+    Competitor("trembling", Kind.idle, _act(_tremble), lesson="to tremble"),
+    Competitor("saturating", Kind.idle, _act(_saturate), lesson="to saturate its actions"),
+    Competitor("sliding slowly aside", Kind.idle, _slide, is_moved=True, lesson="to slide aside"),
+    Competitor("drifting", Kind.idle, _act(_drift), lesson="to drift"),
+    Competitor("acting randomly", Kind.idle, _act_randomly, lesson="nothing yet: it earns what random actions earn"),
 )
 """In the order in which they play, the simple ones first: of two that earn as much the first is named."""
 SHIPPED, LEARNED = "the shipped policy", "the learned policy"

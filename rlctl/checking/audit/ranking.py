@@ -88,6 +88,8 @@ class Ranking:
 
 KINDS = {one.name: one.kind for one in (*WANTED, *OTHERS)} | {SHIPPED: Kind.wanted, LEARNED: Kind.learned}
 MOVED = {one.name for one in OTHERS if one.is_moved}
+DOING_NOTHING = [one.name for one in OTHERS if one.does_nothing]
+LESSONS = {one.name: one.lesson for one in (*WANTED, *OTHERS)} | {SHIPPED: "what the shipped policy does"}
 
 
 def rank(played: Sequence[PlayedEpisode], has_success: bool) -> Ranking:
@@ -176,7 +178,7 @@ def _compare(played: Sequence[PlayedEpisode], row: MeanScore, wanted: str) -> Be
     pairs = ((own.mean_return - saved, best.mean_return), (own.discounted - discounted, best.discounted))
     if not all(_is_as_much(earned, needed, part) for earned, needed in pairs):
         return None
-    idle = _select(played, "standing still", shared) or _select(played, "doing nothing", shared)
+    idle = next((found for name in DOING_NOTHING if (found := _select(played, name, shared))), [])
     term, pays = find_term(own, best, _summarize("", Kind.idle, idle) if idle else None)
     return Beaten(row.name, wanted, own.mean_return, best.mean_return, term, pays)
 
@@ -222,21 +224,6 @@ def _order(beaten: Sequence[Beaten]) -> list[Beaten]:
     return [first, *sorted(rest, key=lambda one: -one.mean_return)]
 
 
-LESSONS = {
-    "standing still": "to stand",
-    "doing nothing": "to do nothing",
-    "falling at once": "to fall at once",
-    "half of the commanded speed": "to follow at half of the speed",
-    "the reversed command": "to do the reverse of the command",
-    "hovering beside the goal": "to hover beside the goal",
-    "stepping in place": "to step in place",
-    "trembling": "to tremble",
-    "saturating": "to saturate its actions",
-    "sliding slowly aside": "to slide aside",
-    "drifting": "to drift",
-}
-
-
 def _describe_learned(rows: Mapping[str, MeanScore], wanted: str) -> str:
     """Return what the policy of a run has learned: the competitor whose terms its own are nearest to."""
     own = rows.get(LEARNED)
@@ -252,10 +239,7 @@ def _describe_learned(rows: Mapping[str, MeanScore], wanted: str) -> str:
         return f"it has learned what is wanted ({against})"
     if _distance(own, nearest) > FAR:
         return f"what it has learned is like no competitor ({against})"
-    if nearest.name == "acting randomly":
-        return f"it has learned nothing yet: it earns what random actions earn ({against})"
-    lesson = LESSONS.get(nearest.name) or f"to be {nearest.name}"
-    return f"it has learned {lesson} ({against}, {nearest.name} {nearest.mean_return:.4g})"
+    return f"it has learned {LESSONS[nearest.name]} ({against}, {nearest.name} {nearest.mean_return:.4g})"
 
 
 def _distance(one: MeanScore, other: MeanScore) -> float:

@@ -39,8 +39,7 @@ def record_episodes(context: Context) -> Iterator[ChildMessage]:
             episode = EpisodePlayer(instance, seed, kind, number=number, max_steps=longest, longest_s=longest_s)
             yield from Recording("episodes", episode).run()
             steps += episode.steps
-            context.longest_episode = max(context.longest_episode or 0, episode.steps)
-            context.reached_limit |= episode.ended in ("truncated", "both")
+            context.note_episode(episode.steps, episode.ended)
             longest = LATER_ENDLESS_STEPS if episode.ended == "steps" else longest
             if steps >= MOST_STEPS:
                 return

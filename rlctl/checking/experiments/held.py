@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, zero_action
 from rlctl.checking.experiment import PROBE, experiment
-from rlctl.checking.experiments.episodes import record_episodes
+from rlctl.checking.experiments.episodes import ENDLESS_STEPS, ENOUGH_EPISODES, EPISODES
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, NotJudged
@@ -54,9 +54,8 @@ def hold_robot(context: Context) -> Iterator[ChildMessage]:
     if find_mujoco(instance.env) is None and not find_clients():
         raise NotApplicable("no world of PyBullet or MuJoCo")
     longest = STEPS if instance.max_steps else STEPS_WITHOUT_LIMIT
-    if context.longest_episode is None:  # no other rule needs the episodes
-        for _ in record_episodes.run(context):
-            pass
+    if context.longest_episode is None:  # the process of the experiment `episodes` ended
+        _play_freely(context)
     if context.reached_limit or (context.longest_episode or 0) >= longest:
         raise NotApplicable("it lives long enough by itself")
     episodes: list[HeldEpisode] = []
@@ -69,6 +68,15 @@ def hold_robot(context: Context) -> Iterator[ChildMessage]:
         carried = [_play(instance, FIRST_SEED, longest, way) for way in WAYS]
         episodes += [episode for episode in carried if episode.moves]
     yield Fact("held", episodes)
+
+
+def _play_freely(context: Context) -> None:
+    """Play an episode of each kind, to see how long the robot lives by itself."""
+    for number, kind in enumerate(EPISODES[:ENOUGH_EPISODES]):
+        episode = EpisodePlayer(context.instance, FIRST_SEED + number, kind, number=number, max_steps=ENDLESS_STEPS)
+        for _ in episode:
+            pass
+        context.note_episode(episode.steps, episode.ended)
 
 
 def _play(instance: Instance, seed: int, longest: int, way: Sequence[float] = ()) -> HeldEpisode:

@@ -17,7 +17,7 @@ from rlctl.checking.mujoco_calls import MujocoCalls, join_calls
 from rlctl.checking.mujoco_trials import Look, are_equal, play
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.readings import join_logs
-from rlctl.checking.records import FIRST_SEED, ChildMessage, Shortened
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Shortened, Skipped
 from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.world_logs import LoggedWorld, WorldLog, WorldLogger
 from rlctl.checking.worlds import Array
@@ -149,16 +149,27 @@ def _try_mujoco(
     instance: Instance, calls: MujocoCalls, worlds: Sequence[LoggedWorld], found: list[str]
 ) -> Iterator[ChildMessage]:
     readers = [world.reader for world in worlds if isinstance(world.reader, MujocoStateReader)]
-    if not readers or not instance.accepts_seed or instance.context.budget.is_over():
+    if not readers or instance.context.budget.is_over():
+        return
+    if not instance.accepts_seed:
+        yield from _skip_trials("reset takes no seed (RL202)", found)
         return
     with contextlib.suppress(EnvironmentRaised):  # an episode that was logged raised it too
         yield from judges_resets.judge(instance)
         plain = play(instance, calls)
         plain = play(instance, calls)  # an instance's first episode may differ from all others
         if not are_equal(plain, play(instance, calls)):
+            yield from _skip_trials("an episode with the same seed and actions is not the same again (RL302)", found)
             return
         trials = MujocoTrials(instance, calls, readers[0], plain, found)
         for message in judges_trials.judge(trials):
             if isinstance(message, RuleFinding):
                 found.append(message.rule)
             yield message
+
+
+def _skip_trials(reason: str, found: Sequence[str]) -> Iterator[Skipped]:
+    """Say why the rules that compare repeated episodes were not judged, but for those that found something before."""
+    for rule in judges_trials.decided:
+        if rule not in found:
+            yield Skipped(rule, reason)

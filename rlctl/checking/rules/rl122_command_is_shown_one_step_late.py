@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.held import HeldEpisode
 from rlctl.checking.records import Records
-from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
+from rlctl.checking.rule import Rule, RuleFinding, Severity
 
 RULE = Rule(
     "RL122",
@@ -36,8 +36,6 @@ Flags = NDArray[np.bool_]
 def _find_late_commands(records: Records) -> Iterator[RuleFinding]:
     if any(finding.rule == "RL115" for finding in records.findings):
         return  # all that is observed is late
-    if "held" in records.not_applicable:
-        raise NotApplicable(records.not_applicable["held"])
     episodes: Sequence[HeldEpisode] = records.require_fact("held")
     late = 0
     shown: list[tuple[HeldEpisode, int]] = []

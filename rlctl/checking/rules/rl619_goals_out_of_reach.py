@@ -10,7 +10,7 @@ from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.goals import DrawnGoal, Numbers, Source, find_sources, read_place
 from rlctl.checking.records import Records
 from rlctl.checking.regression import action_terms, fit_terms
-from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
+from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
 from rlctl.checking.transitions import Transitions, collect_transitions, sample_ordinary_steps
 from rlctl.checking.workspaces import Reach, find_reach
 
@@ -39,8 +39,6 @@ FEWEST_FAR, FEWEST_SUCCESSES = 2, 3
 @judges_records(RULE, *rewards.WITH_SEARCH, "goals")
 def _find_goals_out_of_reach(records: Records) -> Iterator[RuleFinding]:
     rewards.require_rewarded(records)
-    if "goals" in records.not_applicable:
-        raise NotApplicable(records.not_applicable["goals"])
     drawn: DrawnGoal = records.require_fact("goals")
     steps = collect_transitions(records, with_constants=True)
     steps = steps.select(np.isin(steps.seeds, list(drawn.goals)))
