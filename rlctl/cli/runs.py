@@ -12,7 +12,6 @@ from rlctl.errors import UsageError
 from rlctl.options import (
     TASK_FORMS,
     Argument,
-    EnvTimeout,
     EpisodeSeed,
     Json,
     Junit,
@@ -65,16 +64,23 @@ def show_run(
     audit: Annotated[
         bool, Option("First play its policy against scripted competitors: what has it learned?", ("--audit",))
     ] = False,
-    env_timeout: EnvTimeout = 10.0,
+    env_timeout: Annotated[
+        float | None,
+        Option(
+            "How long a step or reset of --audit may take.", metavar="SECONDS", min=0.1, max=1e6, default_text="10.0"
+        ),
+    ] = None,
 ) -> None:
     """Show a run: its recipe, curve, evaluations, warnings and files."""
     from rlctl.runs.lookup import find_run
     from rlctl.runs.report.audited import audit_run
     from rlctl.runs.report.show import RunDescription, show
 
+    if env_timeout is not None and not audit:
+        raise UsageError("--env-timeout: nothing is played without --audit")
     found = find_run(run)
     if audit:
-        audit_run(found, env_timeout_s=env_timeout)
+        audit_run(found, env_timeout_s=10.0 if env_timeout is None else env_timeout)
     show(RunDescription(found), json)
 
 

@@ -12,6 +12,8 @@ from rlctl.entry_points import find_module_file
 
 _MOST_FILES = 400  # of the current folder, and of each installed package
 _DEEPEST = 4  # folders below the current one
+_FORMATTED_ID = re.compile(rb"""f["']([^"'\n]*\{[^"'\n]*)["']""")
+_LEAST_NAME = 4  # letters of a formatted id, so that `f"{name}-v0"` is not any id
 
 
 def find_registering_module(name: str) -> str:
@@ -40,14 +42,14 @@ def find_class_file(name: str) -> Path | None:
 
 def _list_modules(name: str) -> Iterator[str]:
     """Yield the modules whose text has the id in quotes and that can be imported, first those of the current folder."""
-    quoted = re.compile(rf"""["']{re.escape(name)}["']""".encode())
+    is_registered = _Registering(name)
     here = Path()
     depths = (here.glob("/".join(["*"] * depth + ["*.py"])) for depth in range(_DEEPEST))
     for file in itertools.islice(itertools.chain.from_iterable(depths), _MOST_FILES):
-        if _has(file, quoted) and (module := _name_module(file)):
+        if is_registered.in_file(file) and (module := _name_module(file)):
             yield module
     for package, folder in _list_packages():
-        if any(_has(file, quoted) for file in itertools.islice(folder.rglob("*.py"), _MOST_FILES)):
+        if any(is_registered.in_file(file) for file in itertools.islice(folder.rglob("*.py"), _MOST_FILES)):
             yield package
 
 
@@ -63,11 +65,28 @@ def _name_module(file: Path) -> str:
     return name if parts and find_module_file(name, in_current_folder=True) is not None else ""
 
 
-def _has(file: Path, quoted: re.Pattern[bytes]) -> bool:
-    with contextlib.suppress(OSError):
-        text = file.read_bytes()
-        return b"register" in text and quoted.search(text) is not None
-    return False
+class _Registering:
+    """Whether the text of a file registers an id: in quotes, or as `f"Fetch{reward}-v4"`, which the id fits."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._quoted = re.compile(rf"""["']{re.escape(name)}["']""".encode())
+
+    def in_file(self, file: Path) -> bool:
+        """Return whether a file does; False if it cannot be read."""
+        with contextlib.suppress(OSError):
+            text = file.read_bytes()
+            return b"register" in text and (self._quoted.search(text) is not None or self._has_pattern(text))
+        return False
+
+    def _has_pattern(self, text: bytes) -> bool:
+        for match in _FORMATTED_ID.finditer(text):
+            parts = re.split(r"\{[^{}]*\}", match[1].decode(errors="replace"))
+            letters = max(len(re.sub(r"-v\d*$", "", part)) for part in parts)
+            form = r"[\w.-]*".join(map(re.escape, parts))
+            if letters >= _LEAST_NAME and re.fullmatch(form, self._name) is not None:
+                return True
+        return False
 
 
 def _list_packages() -> Iterator[tuple[str, Path]]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import UsageError
+from rlctl.task.rotations import look_along
 
 Array = NDArray[np.float64]
 
@@ -59,10 +60,7 @@ def find_distance(
 
     `low` and `high` are its corners [m]; `size` is width and height of the picture.
     """
-    forward = -(view or Viewpoint()).direction
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(right, forward), forward])
+    axes = look_along(-(view or Viewpoint()).direction)
     middle = (low + high) / 2 if target is None else target
     corners = np.array(list(itertools.product(*np.stack([low, high], axis=1)))) - middle
     across, up, depth = axes @ corners.T

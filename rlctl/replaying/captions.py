@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rlctl.replaying.camera import FIELD_OF_VIEW
 from rlctl.task.body import Body
 from rlctl.task.env import TaskEnv
-from rlctl.task.rotations import roll_pitch_yaw
+from rlctl.task.rotations import look_along, roll_pitch_yaw
 
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -34,35 +34,38 @@ class CameraPose:
 
     def project(self, point: Array, size: tuple[int, int]) -> tuple[float, float, float] | None:
         """Return column and row of a point in a picture of a size, and pixels per metre there; None behind it."""
-        forward = np.subtract(self.target, self.eye)
-        forward = forward / np.linalg.norm(forward)
-        right = np.cross(forward, (0.0, 0.0, 1.0))
-        right /= np.linalg.norm(right)
-        way = np.subtract(point, self.eye)
-        depth = float(way @ forward)
+        axes = look_along(np.subtract(self.target, self.eye))
+        right, up, depth = (axes @ np.subtract(point, self.eye)).tolist()
         if depth <= 0:
             return None
         scale = size[1] / 2 / math.tan(math.radians(FIELD_OF_VIEW) / 2) / depth
-        up = np.cross(right, forward)
-        return size[0] / 2 + scale * float(way @ right), size[1] / 2 - scale * float(way @ up), scale
+        return size[0] / 2 + scale * right, size[1] / 2 - scale * up, scale
 
 
-def draw_rings(picture: Picture, markers: Mapping[str, Any], look: CameraPose) -> Picture:
-    """Return a picture with a ring and the name of each marker; `markers` are positions by name [m], shape (3,)."""
+def annotate(picture: Picture, markers: Mapping[str, Any], look: CameraPose, lines: Sequence[str] = ()) -> Picture:
+    """Return a picture with a ring and the name of each marker, and lines of text in its upper left corner.
+
+    `markers` are positions by name [m], shape (3,).
+    """
     height, width = picture.shape[:2]
     places = {name: look.project(np.asarray(position), (width, height)) for name, position in markers.items()}
-    if not any(places.values()):
+    if not any(places.values()) and not lines:
         return picture
-    image, draw, font_size = _begin(picture)
-    line = max(1, height // 240)
+    from PIL import Image, ImageDraw
+
+    image, font_size = Image.fromarray(np.ascontiguousarray(picture)), max(9, height // _LINES)
+    draw = ImageDraw.Draw(image)
+    line_width = max(1, height // 240)
     for name, place in places.items():
         if place is None:
             continue
         column, row, scale = place
         radius = max(3.0, _RING_RADIUS * scale)
         box = (column - radius, row - radius, column + radius, row + radius)
-        draw.ellipse(box, outline=_RING_COLOR, width=line)
+        draw.ellipse(box, outline=_RING_COLOR, width=line_width)
         _write(draw, (column + 1.2 * radius, row - font_size), name, font_size)
+    for number, line in enumerate(lines):
+        _write(draw, (font_size / 2, font_size * (0.4 + 1.3 * number)), line, font_size)
     return np.asarray(image)
 
 
@@ -112,22 +115,6 @@ def _read_velocities(robot: Body) -> dict[str, float]:
         "lin_vel_y": math.cos(yaw) * y - math.sin(yaw) * x,
         "ang_vel_z": float(robot.base_angular_velocity[2]),
     }
-
-
-def write_lines(picture: Picture, lines: Sequence[str]) -> Picture:
-    """Return a picture with lines of text in its upper left corner."""
-    image, draw, font_size = _begin(picture)
-    for number, line in enumerate(lines):
-        _write(draw, (font_size / 2, font_size * (0.4 + 1.3 * number)), line, font_size)
-    return np.asarray(image)
-
-
-def _begin(picture: Picture) -> tuple[Any, Any, int]:
-    """Return an image of a picture, what draws on it, and the size of its text [pixels]."""
-    from PIL import Image, ImageDraw
-
-    image = Image.fromarray(np.ascontiguousarray(picture))
-    return image, ImageDraw.Draw(image), max(9, picture.shape[0] // _LINES)
 
 
 @functools.cache

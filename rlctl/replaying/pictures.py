@@ -10,7 +10,7 @@ import fractions
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from rlctl.errors import ArtifactError, UsageError, explain_missing_package
 from rlctl.play.episode import RecordedEpisode
 from rlctl.replaying.bullet_camera import Picture
 from rlctl.replaying.camera import Viewpoint
-from rlctl.replaying.captions import Caption, write_lines
+from rlctl.replaying.captions import Caption
 from rlctl.replaying.recorder import (
     DEFAULT_DT,
     Choose,
@@ -38,6 +38,7 @@ from rlctl.storage import files
 from rlctl.task import Sim
 from rlctl.task.env import TaskEnv
 
+Kept = TypeVar("Kept")
 _SIZE = {".mp4": (640, 480), ".gif": (400, 300)}  # [pixels], of a film
 _SMALLEST, _LARGEST = 64, 3840  # [pixels], of a side of a film
 _RATE = {".mp4": 30.0, ".gif": 20.0}  # [1/s], at most
@@ -118,31 +119,34 @@ def film_episodes(
     begin: Callable[[int], Choose],
     *,
     policy: str,
+    keep: Callable[[int, Rollout], Kept],
     watch: Watch = lambda step: None,
     viewpoint: Viewpoint | None = None,
     size: tuple[int, int] | None = None,
     draw: Warn | None = None,
-) -> tuple[list[Rollout], FilmReport]:
+) -> tuple[list[Kept], FilmReport]:
     """Play an episode per seed and write one film of all of them, atomically; `watch` is called after every step.
 
-    `size` is width and height [pixels], by default that of the kind of file. With `draw` the rollouts have scenes, as
-    in `play_episode`. Raises `UsageError` for an environment that makes no pictures, or none of that size.
+    `keep` is called with the number of each episode and its rollout, and what it returns is returned: a rollout is
+    large, and is forgotten before the next one. `size` is width and height [pixels], by default that of the kind of
+    file. With `draw` the rollouts have scenes, as in `play_episode`. Raises `UsageError` for an environment that makes
+    no pictures, or none of that size.
     """
-    rollouts: list[Rollout] = []
+    kept: list[Kept] = []
     reports: list[FilmReport] = []
 
     def write(part: Path) -> None:
         film = _Film(env, part, viewpoint, size)
         both = join_watches(watch, film.watch)
-        for seed in seeds:
-            rollouts.append(play_episode(env, spec, seed, begin(seed), policy=policy, watch=both, draw=draw))
+        for number, seed in enumerate(seeds):
+            kept.append(keep(number, play_episode(env, spec, seed, begin(seed), policy=policy, watch=both, draw=draw)))
             film.pause()
         film.writer.close()
         reports.append(film.report(path))
 
     files.remove_abandoned(path)
     files.write_with(path, write)
-    return rollouts, reports[0]
+    return kept, reports[0]
 
 
 class _Film:
@@ -178,12 +182,11 @@ class _Film:
 
     def _take(self) -> None:
         start = time.perf_counter()
-        self._last = self._view.draw()
+        lines = [] if self._caption is None else self._caption.list_lines(self._step * self._dt)
+        self._last = self._view.draw(lines)
         height, width = self._last.shape[:2]
         if self._size not in (None, (width, height)):
             raise UsageError(f"--size: this environment draws its own pictures of {width}x{height}: leave out --size")
-        if self._caption is not None:
-            self._last = write_lines(self._last, self._caption.list_lines(self._step * self._dt))
         self._seconds += time.perf_counter() - start
         self._count += 1
         self.writer.add(self._last)

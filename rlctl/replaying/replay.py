@@ -11,7 +11,7 @@ from rlctl.replaying.camera import read_viewpoint
 from rlctl.replaying.pictures import check_file, film_episodes, read_size
 from rlctl.replaying.recorder import Rollout, join_watches
 from rlctl.replaying.replay_request import ReplayRequest
-from rlctl.replaying.report import ReplayResult
+from rlctl.replaying.report import ReplayedEpisode, ReplayResult
 from rlctl.replaying.reproduce import print_warning, verify_episode
 from rlctl.replaying.sources import PolicySource, RecordedSource, TaskSource, load_located, show_steps, summarize
 from rlctl.replaying.views import make_filmable
@@ -39,32 +39,37 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
     viewpoint, size = read_viewpoint(request.camera), read_size(request.size)
     source = _choose_source(request)
     spec, seeds, film = source.spec, source.seeds, None
-    rollouts: list[Rollout] = []
+    episodes: list[ReplayedEpisode] = []
     if request.video is not None and seeds:
-        draw = None if request.output is None else print_warning
+        draw, keep = None, _summarize
+        if request.output is not None:
+            draw, keep = print_warning, source.record_rollout
         with closing(make_filmable(spec)) as env, show_steps("filming", env, source) as show:
             begin = functools.partial(source.begin, env)
-            rollouts, film = film_episodes(
+            episodes, film = film_episodes(
                 request.video,
                 env,
                 spec,
                 seeds,
                 begin,
                 policy=source.name,
+                keep=keep,
                 watch=join_watches(source.watch, show),
                 viewpoint=viewpoint,
                 size=size,
                 draw=draw,
             )
-        if draw is not None:
-            episodes = [source.record_rollout(number, rollout) for number, rollout in enumerate(rollouts)]
-            return dataclasses.replace(source.report(episodes), film=film)
     elif request.gui and seeds:
         with closing(open_window(spec)) as env:
             rollouts = show_episodes(env, spec, seeds, functools.partial(source.begin, env), watch=source.watch)
+        episodes = [summarize(rollout) for rollout in rollouts]
     elif seeds:
         return source.report(source.record())
-    return dataclasses.replace(source.report([summarize(rollout) for rollout in rollouts]), film=film)
+    return dataclasses.replace(source.report(episodes), film=film)
+
+
+def _summarize(number: int, rollout: Rollout) -> ReplayedEpisode:
+    return summarize(rollout)
 
 
 def _choose_source(request: ReplayRequest) -> RecordedSource | PolicySource | TaskSource:

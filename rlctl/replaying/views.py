@@ -1,5 +1,7 @@
 """Where the pictures of an environment come from: a camera in its PyBullet world, or the environment itself."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rlctl.environments import registry
@@ -8,7 +10,7 @@ from rlctl.errors import UsageError, describe_exception
 from rlctl.replaying.bullet_bodies import read_body
 from rlctl.replaying.bullet_camera import BulletCamera, Picture, find_world
 from rlctl.replaying.camera import FIELD_OF_VIEW, FilmCamera, Viewpoint
-from rlctl.replaying.captions import CameraPose, draw_rings
+from rlctl.replaying.captions import CameraPose, annotate
 from rlctl.replaying.drawable import DrawableEnv, make_drawable
 from rlctl.replaying.mujoco_scene import find_missing_floor, find_mujoco_bounds
 from rlctl.replaying.scene import Env
@@ -36,8 +38,8 @@ class _PlainView:
         if self._reason and self._camera is None:
             raise UsageError(self._reason)
 
-    def draw(self) -> Picture:
-        """Return a picture of the present state, shape (height, width, 3)."""
+    def draw(self, lines: Sequence[str] = ()) -> Picture:
+        """Return a picture of the present state, shape (height, width, 3); `lines` are written into those of tasks."""
         if self._camera is None:
             try:
                 return self._render()
@@ -77,10 +79,10 @@ class _TaskView:
         points = [np.asarray(position) for position in markers.values()]
         self._camera = BulletCamera(bodies, points, self._size, self._viewpoint)
 
-    def draw(self) -> Picture:
+    def draw(self, lines: Sequence[str] = ()) -> Picture:
         self._env.move_markers()
         picture = self._camera.draw()
-        return draw_rings(picture, self._env.markers(), self._camera.look)
+        return annotate(picture, self._env.markers(), self._camera.look, lines)
 
 
 class _MujocoTaskView:
@@ -104,7 +106,7 @@ class _MujocoTaskView:
         self._camera = FilmCamera(low, high, self._size, self._viewpoint)
         self._floor = find_missing_floor(sim)
 
-    def draw(self) -> Picture:
+    def draw(self, lines: Sequence[str] = ()) -> Picture:
         self._env.move_markers()
         sim, moving, followed = self._env.sim, self._moving, None
         assert isinstance(sim, MujocoSim)
@@ -115,7 +117,7 @@ class _MujocoTaskView:
         picture = sim.render(
             *self._size, eye=eye, target=target, field_of_view=FIELD_OF_VIEW, sun=True, floor=self._floor
         )
-        return draw_rings(picture, self._env.markers(), CameraPose(eye, target))
+        return annotate(picture, self._env.markers(), CameraPose(eye, target), lines)
 
 
 def look_at(

@@ -32,6 +32,7 @@ class RunSummary:
     best_success: float | None = None
     best_return: float | None = None
     changes: dict[str, Any] = dataclasses.field(default_factory=dict)  # recipe keys that differ from the task's
+    changed_from: dict[str, Any] = dataclasses.field(default_factory=dict)  # the task's values of these keys
     versions: dict[str, str] = dataclasses.field(default_factory=dict)
     folder: str = ""  # the working folder of the training; a relative path of a task starts there
     source_sha256: str = ""  # of the task's file when the training began
@@ -109,6 +110,7 @@ def _summarize(run: RunDirectory, status: dict[str, Any]) -> RunSummary:
         best_success=best["success"] if best else None,
         best_return=best["return"] if best else None,
         changes=dict(status.get("recipe_changes") or {}),
+        changed_from=dict(status.get("recipe_before") or {}),
         versions=dict(status.get("versions") or {}),
         folder=str(status.get("folder") or ""),
         source_sha256=str(status.get("source_sha256") or ""),

@@ -26,6 +26,14 @@ def invert(quaternions: ArrayLike) -> Array:
     return np.asarray(quaternions, np.float64) * (-1.0, -1.0, -1.0, 1.0)
 
 
+def look_along(direction: ArrayLike) -> Array:
+    """Return the axes of a camera that looks along a direction of any length, which is not vertical: to the right,
+    which is level, up, and forward, as rows of shape (3, 3)."""
+    forward = normalize(direction)
+    right = normalize(_cross(forward, np.array([0.0, 0.0, 1.0])))
+    return np.stack([right, _cross(right, forward), forward])
+
+
 def multiply(first: ArrayLike, second: ArrayLike) -> Array:
     """Return the rotations that rotate by `second`, then by `first`; shapes (..., 4)."""
     one, two = np.asarray(first, np.float64), np.asarray(second, np.float64)

@@ -26,6 +26,7 @@ def write_start(run: RunDirectory, start: Start, device: str) -> None:
     """Write the recipe, the status `running`, and the device on which the network learns."""
     recipe = start.recipe
     run.write_recipe(recipe)
+    changed = find_recipe_changes(start.task, recipe)
     changes: dict[str, Any] = {
         "status": "running",
         "error": None,
@@ -34,7 +35,8 @@ def write_start(run: RunDirectory, start: Start, device: str) -> None:
         "callbacks": {name: identify_task(name) for name in recipe.callbacks},
         "algo": recipe.algo,
         "seed": recipe.seed,
-        "recipe_changes": find_recipe_changes(start.task, recipe),
+        "recipe_changes": {key: value for key, (value, _) in changed.items()},
+        "recipe_before": {key: before for key, (_, before) in changed.items()},
         "device": device,
         "versions": collect_versions(),
         "git_commit": find_git_commit(),
@@ -53,15 +55,17 @@ def write_start(run: RunDirectory, start: Start, device: str) -> None:
     run.write_status(changes)
 
 
-def find_recipe_changes(task: str, recipe: Recipe) -> dict[str, Any]:
-    """Return the keys and values in which a recipe differs from the task's own, without values derived from these."""
+def find_recipe_changes(task: str, recipe: Recipe) -> dict[str, tuple[Any, Any]]:
+    """Return the keys in which a recipe differs from the task's own, each with its value and the task's, without keys
+    derived from these."""
     chosen = {key: getattr(recipe, key) for key in ("algo", "n_envs", "total_timesteps")}
     try:
         packaged, adapted = resolve_with_stages(task), resolve_with_stages(task, None, chosen)
     except RlctlError:  # the packaged recipe is invalid; --config or --set corrected it
         return {}
-    own = {key: value for key, value in chosen.items() if value != getattr(packaged, key)}
-    return own | {key: value for key, (value, _) in find_difference(recipe, adapted).items()}
+    pairs = {key: (value, getattr(packaged, key)) for key, value in chosen.items()}
+    own = {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
+    return own | find_difference(recipe, adapted)
 
 
 def write_failure(run: RunDirectory, error: BaseException) -> None:

@@ -2,8 +2,11 @@
 
 import inspect
 
+import numpy as np
 import pytest
 
+from rlctl.checking.rules.rl804_joint_beyond_its_limits import measure_outside
+from rlctl.checking.worlds import Joint
 from rlctl.environments.bullet_calls import record_calls
 from rlctl.task.pybullet.library import pybullet
 from tests.checking.judging import case, check_case, findings, found, mark_slow, rules_of
@@ -130,3 +133,10 @@ def test_impossible_inertia_is_named():
     (finding,) = findings("broken_models.py:RL809HeavyInertia", "RL809")
     # An arm of 0.2 kg, 0.04 m x 0.04 m x 0.2 m, can have at most 0.2 * (0.04^2 + 0.04^2 + 0.2^2) = 0.0087 kg m^2.
     assert "a moment of 1 kg m^2 is more than 0.2 kg within 0.21 m can have" in finding.message
+
+
+@pytest.mark.parametrize(("beyond", "is_outside"), [(0.11, False), (0.25, True)])
+def test_a_wide_range_does_not_excuse_a_joint_beyond_its_limit(beyond, is_outside):
+    """A tenth of the range of joint 6 of the KUKA iiwa, 2 * 2.094 rad, is more than PyBullet lets a motor push it."""
+    joint = Joint(5, "joint_6", True, -2.094, 2.094)
+    assert (measure_outside(joint, np.array([2.094 + beyond]))[0] > 0) == is_outside

@@ -478,6 +478,12 @@ def test_an_id_that_an_installed_package_registers(write_module, install, monkey
     (folder / "elsewhere").mkdir()
     monkeypatch.chdir(folder / "elsewhere")
     assert error(UsageError, "Crane-v3").endswith("write gym_crane:Crane-v3")
+    # As gymnasium-robotics does: for each kind of reward another id.
+    formatted = 'register(id=f"CraneReach{suffix}-v4")\nregister(id=f"{name}-v4")\n'
+    (folder / "gym_crane/ids.py").write_text(formatted)
+    assert error(UsageError, "CraneReachDense-v4").endswith("write gym_crane:CraneReachDense-v4")
+    assert error(UsageError, "CraneReach-v4").endswith("write gym_crane:CraneReach-v4")
+    assert "gym_crane" not in error(UsageError, "Lift-v4")
 
 
 def test_a_package_that_an_installed_one_hides(write_module):

@@ -7,7 +7,7 @@ import pytest
 
 from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
-from rlctl.replaying.captions import CameraPose, Caption, draw_rings, write_lines
+from rlctl.replaying.captions import CameraPose, Caption, annotate
 from rlctl.replaying.views import look_at, make_filmable
 
 
@@ -23,11 +23,11 @@ def test_a_point_in_the_picture_by_hand():
 def test_a_ring_is_seen_where_a_hand_hides_the_marker():
     picture = np.full((240, 320, 3), 90, np.uint8)
     look = CameraPose((1.0, 0.0, 0.5), (0.0, 0.0, 0.5))
-    ringed = draw_rings(picture, {"goal": np.array([0.0, 0.0, 0.5])}, look)
+    ringed = annotate(picture, {"goal": np.array([0.0, 0.0, 0.5])}, look)
     changed = (ringed != picture).any(axis=2)
     assert changed[105, 160] or changed[106, 160]  # 0.05 m above the middle: 14.5 pixels
     assert not changed[120, 160]
-    assert draw_rings(picture, {}, look) is picture
+    assert annotate(picture, {}, look) is picture
 
 
 def test_a_walking_robot_names_commanded_and_measured_velocities():
@@ -51,7 +51,8 @@ def test_coordinates_of_a_marker_are_drawn_and_not_written():
 
 def test_lines_are_in_the_corner():
     picture = np.full((240, 320, 3), 90, np.uint8)
-    written = (write_lines(picture, ["1.50 s", "two"]) != picture).any(axis=2)
+    look = CameraPose((1.0, 0.0, 0.5), (0.0, 0.0, 0.5))
+    written = (annotate(picture, {}, look, ["1.50 s", "two"]) != picture).any(axis=2)
     assert written[:40, :80].any()
     assert not written[60:].any()
     assert not written[:, 160:].any()

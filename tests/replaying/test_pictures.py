@@ -1,7 +1,10 @@
 """`rlctl replay --video` and `--gui`: films without a display, and windows."""
 
+import contextlib
 import dataclasses
+import gc
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -11,11 +14,12 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.play.episode import save_episode
 from rlctl.replaying.camera import find_distance
-from rlctl.replaying.pictures import read_size
+from rlctl.replaying.pictures import film_episodes, read_size
 from rlctl.replaying.recorder import count_steps
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.report import ReplayResult, show
+from rlctl.replaying.views import make_filmable
 from rlctl.replaying.window import show_episodes
 from rlctl.task.pybullet.library import pybullet
 from tests.replaying.conftest import play
@@ -130,6 +134,36 @@ def test_a_filmed_and_recorded_episode_of_a_policy_repeats(tmp_path):
     request = ReplayRequest("reach", baseline="zero", video=tmp_path / "film.gif", output=tmp_path, size="64x64")
     (episode,) = run_replay(request).episodes
     assert run_replay(ReplayRequest(verify=episode.episode)).verification.difference is None
+
+
+@pytest.mark.pybullet
+def test_a_rollout_is_forgotten_before_the_next_episode(tmp_path):
+    """The scenes of many episodes would fill the memory until the film is done."""
+    spec = EnvSpec("reach")
+    earlier = []
+
+    def choose(observation, step):
+        return np.zeros(7, np.float32) if step < 2 else None
+
+    def keep(number, rollout):
+        gc.collect()
+        assert [reference() for reference in earlier] == [None] * number
+        earlier.append(weakref.ref(rollout))
+        return number
+
+    with contextlib.closing(make_filmable(spec)) as env:
+        kept, _ = film_episodes(
+            tmp_path / "film.gif",
+            env,
+            spec,
+            [1, 2],
+            lambda seed: choose,
+            policy="zero",
+            keep=keep,
+            size=(64, 64),
+            draw=print,
+        )
+    assert kept == [0, 1]
 
 
 @pytest.mark.parametrize("size", ["640", "640x", "640x481", "10x10", "9000x64", "axb", "640x480x3"])

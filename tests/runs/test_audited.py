@@ -41,3 +41,17 @@ def test_a_policy_that_has_learned_nothing_is_not_called_good(rlctl, tmp_path):
     (line,) = [line for line in shown.stdout.splitlines() if line.startswith("audit: it has learned")]
     assert "what is wanted" not in line
     assert "reaching the goal" in line or "the shipped policy" in line
+
+
+def test_a_time_limit_without_anything_to_play_is_refused(write_run, rlctl):
+    done = rlctl("runs", "show", write_run("reach/a"), "--env-timeout", 5)
+    assert (done.returncode, done.stderr.splitlines()[0]) == (
+        2,
+        "error: --env-timeout: nothing is played without --audit",
+    )
+
+
+def test_the_value_of_the_recipe_is_beside_the_changed_one(write_run, rlctl):
+    changed = {"recipe_changes": {"algo_kwargs.gamma": 0.97}, "recipe_before": {"algo_kwargs.gamma": 0.99}}
+    shown = rlctl("runs", "show", write_run("reach/a", **changed)).stdout
+    assert "differs from the task's recipe: algo_kwargs.gamma = 0.97 (recipe: 0.99)\n" in shown

@@ -93,7 +93,7 @@ def test_a_replayed_episode_is_not_one_of_the_evaluation(group):
 
 def test_command_for_another_algorithm_trains_the_same_recipe(write_run):
     other = resolve("reach", None, {"algo": "sac", "task": {"tolerance": 0.1}, "seed": 3})
-    changes = find_recipe_changes("reach", other)
+    changes = {key: value for key, (value, _) in find_recipe_changes("reach", other).items()}
     # What follows from another algorithm, its own defaults, is no choice of the user's.
     assert changes == {"algo": "sac", "task.tolerance": 0.1}
     run = write_run("reach/2026-11-21_10-00-00_s3", seed=3, recipe_changes=changes)
@@ -206,6 +206,17 @@ def test_labels_of_the_user(write_run):
     assert picture.count(">ours</text>") == picture.count(">theirs</text>") == 2
     with pytest.raises(UsageError, match="--label: 1 given, and there are 2 recipes: ppo, a2c"):
         write(*texts, form="svg", labels=["ours"])
+    with pytest.raises(UsageError, match="--label ours is given twice"):
+        write(*texts, form="csv", labels=["ours", "ours"])
+
+
+def test_a_seed_that_still_trains_has_not_ended_early(write_run, hold_lock):
+    texts = write_two_recipes(write_run)
+    run = next(Path("runs/reach/a2c").glob("*/s1"))
+    RunDirectory(run).write_status({"status": "running"})
+    hold_lock(run)
+    picture = write(*texts, form="svg", target=Path("curves.svg"))
+    assert "x: still trains (seed 1 of a2c at step 1,000)" in picture
 
 
 def test_runs_in_folders_named_by_time_have_the_name_of_their_algorithm(write_run):

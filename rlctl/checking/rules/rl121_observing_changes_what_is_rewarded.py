@@ -122,26 +122,30 @@ def _find_other_reward(plain: Sequence[Frame], looked: Sequence[Frame]) -> int |
 class _Look:
     """Calls the method that observes twice, and sets random generators back: to be called after a reset."""
 
-    def __init__(self, instance: Instance, observe: Callable[[], Any], name: str = "") -> None:
-        """If a name is given, that attribute is set back too."""
-        self._instance, self._observe, self._name = instance, observe, name
-        self.assigned: Any = None  # what the attribute is before the first call, if it is not what reset made
+    def __init__(self, instance: Instance, observe: Callable[[], Any]) -> None:
+        self._instance, self._observe = instance, observe
 
     def __call__(self) -> None:
         self.first = read_attributes(self._instance.env)
-        if self.assigned is not None:
-            self.first[self._name].assign(self.assigned)
         with _keep_generators([attribute.value for attribute in self.first.values()]):
             self._instance.call("step", self._observe)
             self.second = read_attributes(self._instance.env)
             self._instance.call("step", self._observe)
             self.last = read_attributes(self._instance.env)
-        if self._name:
-            self.first[self._name].assign(self.first[self._name].value)
 
-    def again(self, name: str) -> "_Look":
-        """Return another look, which sets an attribute back."""
-        return _Look(self._instance, self._observe, name)
+    def and_restore(self, name: str) -> None:
+        """Look, and set an attribute back."""
+        self()
+        self.first[name].assign(self.first[name].value)
+
+    def at(self, name: str, value: Any) -> None:
+        """Look after an attribute was set to a value."""
+        read_attributes(self._instance.env)[name].assign(value)
+        self()
+
+    def again(self) -> "_Look":
+        """Return another look."""
+        return _Look(self._instance, self._observe)
 
     def is_clock(self, name: str) -> bool:
         """Say whether all numbers of an attribute advance by the same, as counters and phases do."""
@@ -164,7 +168,8 @@ def _is_drawn(look: _Look, other: _Look, name: str) -> bool:
 
 def _decides(trials: Trials, look: _Look, name: str) -> bool:
     """Say whether all rewards are as without a look if only this attribute is set back after it."""
-    restored = trials.play(FIRST_SEED, trials.actions(FIRST_SEED, STEPS), look.again(name))
+    restore = functools.partial(look.again().and_restore, name)
+    restored = trials.play(FIRST_SEED, trials.actions(FIRST_SEED, STEPS), restore)
     return _find_other_reward(trials.plain(FIRST_SEED, STEPS), restored) is None
 
 
@@ -174,9 +179,8 @@ def _accumulates(trials: Trials, look: _Look, name: str) -> bool:
     first, last = look.first[name], look.last[name].numbers
     shift = 0.1 + 0.1 * np.abs(first.numbers).max()
     for numbers, expected in ((first.numbers + shift, last + shift), (2 * first.numbers, 2 * last)):
-        again = look.again(name)
-        again.assigned = shape_like(first.value, numbers)
-        trials.play(FIRST_SEED, [], again)
+        again = look.again()
+        trials.play(FIRST_SEED, [], functools.partial(again.at, name, shape_like(first.value, numbers)))
         if np.abs(again.last[name].numbers - expected).max() <= SAME * np.abs(expected).max():
             return True
     return False

@@ -31,6 +31,9 @@ RULE = Rule(
 
 PART_OF_RANGE, LEAST_ANGLE, LEAST_LENGTH = 0.1, 0.05, 0.01
 """How far outside its limits a joint may be: part of the range, and at least so much [rad], [m]."""
+MOST_ANGLE = 0.12
+"""And at most so much [rad]: strong motors hold a light link of PyBullet 0.25 rad beyond its limit (joint 6 of the KUKA
+iiwa, 300 N m), and a limit that is far from the other one is as hard."""
 RADIANS = 'Write <compiler angle="radian"/> into the model file: angles in MJCF are degrees unless it says so.'
 
 
@@ -44,7 +47,7 @@ def _find_joints_beyond_limits(world: LoggedWorld) -> Iterator[ChildMessage]:
         for body, states in log.bodies:
             for j, joint in enumerate(body.joints):
                 positions = states[:, JOINTS + j]
-                outside = _outside(joint, positions)
+                outside = measure_outside(joint, positions)
                 steps, row = int((outside > 0).sum()), int(outside.argmax())
                 if _is_kept_there(log, outside):
                     name, place = f"{joint.name} of {body.name}", log.places[row]
@@ -84,11 +87,13 @@ def _is_kept_there(log: WorldLog, outside: Array) -> bool:
     return steps >= LASTING_STEPS
 
 
-def _outside(joint: Joint, values: Array) -> Array:
+def measure_outside(joint: Joint, values: Array) -> Array:
     """Return how far a joint is outside its limits, in parts of their width; 0 where that is little."""
     if not joint.has_limits:
         return np.zeros(len(values))
     width = joint.high - joint.low
-    allowed = max(PART_OF_RANGE * width, LEAST_ANGLE if joint.is_angle else LEAST_LENGTH)
+    allowed = max(PART_OF_RANGE * width, LEAST_LENGTH)
+    if joint.is_angle:
+        allowed = min(max(PART_OF_RANGE * width, LEAST_ANGLE), MOST_ANGLE)
     outside = np.maximum(joint.low - values, values - joint.high)
     return np.where(np.isfinite(outside) & (outside > allowed), outside / width, 0.0)

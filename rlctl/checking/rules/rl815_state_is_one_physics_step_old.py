@@ -99,32 +99,44 @@ def _find_stale(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -
 
 def _find_unforwarded(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> Iterator[RuleFinding]:
     """Reset with other values in what is derived from positions, which a correct reset computes again."""
-
-    def pollute(_: Any, data: Any) -> None:
-        for name in DERIVED:
-            getattr(data, name)[:] += POLLUTION
-
-    def pollute_stale(_: Any, data: Any) -> None:
-        for name, is_stale in stale.items():
-            getattr(data, name)[is_stale] += POLLUTION
-
-    if (simulation := find_mujoco(instance.env)) is None:
+    simulation = find_mujoco(instance.env)
+    if simulation is None:
         return
-    pollute(*simulation)
-    pair = pair_rows(plain, play(instance, calls, 0, after_reset=pollute))
-    columns = [] if pair is None else np.flatnonzero(pair[0][0] != pair[1][0]).tolist()
-    if not columns:  # there is a call of mj_forward, but it may come too early
-        play(instance, calls, 0)
-        if stale := find_stale_fields(instance):
-            pair = pair_rows(plain, play(instance, calls, 0, after_forward=pollute_stale))
-            columns = [] if pair is None else np.flatnonzero(pair[0][0] != pair[1][0]).tolist()
-    if columns and pair is not None:
-        size = pair[0].shape[1] - 1
+    _pollute(*simulation)
+    columns = _find_changed(plain, play(instance, calls, 0, after_reset=_pollute))
+    columns = columns or _find_forwarded_too_early(instance, calls, plain)
+    if columns:
+        size = plain[0].observation.size
         verb = "is" if len(columns) == 1 else "are"
         what = f"{name_columns(columns, size)} of reset {verb} computed before mj_forward"
         message = f"{what}: from poses and sensors as they were before qpos was written"
         evidence = {"element": name_columns(columns[:1], size), "call": "reset", "seed": FIRST_SEED}
         yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=FORWARD_AT_RESET)
+
+
+def _pollute(_: Any, data: Any) -> None:
+    for name in DERIVED:
+        getattr(data, name)[:] += POLLUTION
+
+
+def _find_forwarded_too_early(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> list[int]:
+    """Return the columns of a reset that follow from what is not up to date after its last mj_forward."""
+    play(instance, calls, 0)
+    stale = find_stale_fields(instance)
+    if not stale:
+        return []
+
+    def pollute(_: Any, data: Any) -> None:
+        for name, is_stale in stale.items():
+            getattr(data, name)[is_stale] += POLLUTION
+
+    return _find_changed(plain, play(instance, calls, 0, after_forward=pollute))
+
+
+def _find_changed(plain: Sequence[Look], changed: Sequence[Look]) -> list[int]:
+    """Return the columns of `pair_rows` in which what a reset returned is another one."""
+    pair = pair_rows(plain, changed)
+    return [] if pair is None else np.flatnonzero(pair[0][0] != pair[1][0]).tolist()
 
 
 def _find_old_elements(world: LoggedWorld) -> Iterator[RuleFinding]:

@@ -91,6 +91,9 @@ def _label(recipes: Sequence[RecipeRuns], labels: Sequence[str]) -> list[RecipeR
     if len(labels) != len(recipes):
         names = ", ".join(recipe.label or recipe.name or "the only one" for recipe in recipes)
         raise UsageError(f"--label: {len(labels)} given, and there are {len(recipes)} recipes: {names}")
+    twice = next((label for label in labels if labels.count(label) > 1), None)
+    if twice is not None:
+        raise UsageError(f"--label {twice} is given twice; rows and curves need different names")
     return [dataclasses.replace(recipe, label=label) for recipe, label in zip(recipes, labels, strict=True)]
 
 

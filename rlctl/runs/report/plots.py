@@ -1,5 +1,6 @@
 """The plots of a report, as SVG texts for an HTML page or as a file of their own."""
 
+import dataclasses
 import functools
 import io
 import math
@@ -43,10 +44,40 @@ _TITLES = {"return": "Return", "success": "Success rate"}
 _UNITS = {"return": "return of an episode", "success": "success rate"}
 
 
+@dataclasses.dataclass(frozen=True)
+class _Curves:
+    """The curves of a recipe over training steps, of one quantity; None without values."""
+
+    recipe: RecipeRuns
+    training: dict[str, Any] | None
+    evaluated: dict[str, Any] | None
+
+    @property
+    def has_few_evaluations(self) -> bool:
+        """Whether the evaluations make no curve of their own: a picture for a paper then has the training's too."""
+        return self.evaluated is None or len(self.evaluated["steps"]) < _FEW
+
+    def list_of_paper(self) -> list[dict[str, Any]]:
+        """Return the curves that a picture for a paper has; readers expect one per recipe."""
+        training = self.training if self.has_few_evaluations else None
+        return [curve for curve in (training, self.evaluated) if curve is not None]
+
+
+def _list_curves(report: RunReport, column: str) -> list[_Curves]:
+    return [
+        _Curves(
+            recipe,
+            training=mean_curve([run.metrics for run in recipe.runs], column),
+            evaluated=mean_curve([run.evaluations for run in recipe.runs], column),
+        )
+        for recipe in report.recipes
+    ]
+
+
 def plot_learning(report: RunReport, column: str) -> str | None:
     """Return the curve of a quantity over training steps, with evaluations; None where there is none."""
     figure, axes = _make_figure()
-    return _finish(figure, axes) if _draw_learning(axes, report, column) else None
+    return _finish(figure, axes) if _draw_learning(axes, _list_curves(report, column), column) else None
 
 
 def draw_learning(report: RunReport, form: Picture) -> bytes:
@@ -54,54 +85,47 @@ def draw_learning(report: RunReport, form: Picture) -> bytes:
 
     Below them is what lines, bands and marks are, and which seeds ended early.
     """
+    curves = {column: _list_curves(report, column) for column in _TITLES}
     with matplotlib.rc_context(_STYLE):
         figure, file = Figure(figsize=(2 * _SIZE[0], _SIZE[1] + 0.5), layout="constrained"), io.BytesIO()
         figure.suptitle(report.runs[0].summary.task, fontsize=10, fontweight="bold")
         for axes, column in zip(figure.subplots(1, 2), _TITLES, strict=True):
-            if _draw_learning(axes, report, column, for_paper=True):
+            if _draw_learning(axes, curves[column], column, for_paper=True):
                 axes.set_title(_TITLES[column], loc="left", fontsize=9)
             else:
                 axes.remove()
-        figure.supxlabel("\n".join(_explain_curves(report)), fontsize=7)
+        drawn = [one for column in _TITLES for one in curves[column]]
+        figure.supxlabel("\n".join(_explain_curves(report.recipes, drawn)), fontsize=7)
         _save(figure, file, form)
     return file.getvalue()
 
 
-def _explain_curves(report: RunReport) -> list[str]:
-    """Return what the marks of the curves mean, and which seeds ended early, as lines."""
-    several = [recipe for recipe in report.recipes if len(recipe.runs) > 1]
+def _explain_curves(recipes: Sequence[RecipeRuns], drawn: Sequence[_Curves]) -> list[str]:
+    """Return what the marks of the curves mean, and which seeds ended early or still train, as lines."""
     counts = []
-    for recipe in several:
-        of_recipe = f" ({recipe.label})" if len(report.recipes) > 1 else ""
-        counts.append(f"{len(recipe.runs)} seeds{of_recipe}")
+    for recipe in recipes:
+        of_recipe = f" ({recipe.label})" if len(recipes) > 1 else ""
+        if len(recipe.runs) > 1:
+            counts.append(f"{len(recipe.runs)} seeds{of_recipe}")
     sentences = []
     if counts:
         sentences.append(f"Lines and dots: mean; bands and bars: lowest to highest of {', '.join(counts)}.")
-    if any(_has_training_curve(recipe, column) for recipe in report.recipes for column in _TITLES):
+    if any(len(curves.list_of_paper()) == 2 for curves in drawn):
         sentences.append("Lines: episodes of the training; dots: evaluations.")
-    ended = {}
-    for recipe in several:
-        of_recipe = f" of {recipe.label}" if recipe.label else ""
-        for curve in [curve for column in _TITLES for curve in _list_curves(recipe, column)]:
-            for number, step, _ in curve["ended"]:
-                ended[f"seed {recipe.runs[number].summary.seed}{of_recipe}"] = step
-    if ended:
-        names = ", ".join(f"{name} at step {step:,.0f}" for name, step in ended.items())
-        sentences.append(f"x: ended early ({names}); from there on the mean of the others.")
+    ended, training = {}, {}
+    for curves in drawn:
+        of_recipe = f" of {curves.recipe.label}" if curves.recipe.label else ""
+        for number, step, _ in [end for curve in curves.list_of_paper() for end in curve["ended"]]:
+            run = curves.recipe.runs[number].summary
+            steps = training if run.state == "running" else ended
+            steps[f"seed {run.seed}{of_recipe}"] = step
+    parts = []
+    for what, steps in (("ended early", ended), ("still trains", training)):
+        if steps:
+            parts.append(f"{what} ({', '.join(f'{name} at step {step:,.0f}' for name, step in steps.items())})")
+    if parts:
+        sentences.append(f"x: {', '.join(parts)}; from there on the mean of the others.")
     return [line for sentence in sentences for line in textwrap.wrap(sentence, 130)]
-
-
-def _list_curves(recipe: RecipeRuns, column: str) -> list[dict[str, Any]]:
-    """Return the curves of a recipe that a picture for a paper has: evaluations, training, or both."""
-    training = mean_curve([run.metrics for run in recipe.runs], column)
-    evaluated = mean_curve([run.evaluations for run in recipe.runs], column)
-    if evaluated is not None and len(evaluated["steps"]) >= _FEW:
-        training = None  # readers expect one curve per recipe
-    return [curve for curve in (training, evaluated) if curve is not None]
-
-
-def _has_training_curve(recipe: RecipeRuns, column: str) -> bool:
-    return len(_list_curves(recipe, column)) == 2
 
 
 def _save(figure: Figure, file: io.BytesIO, form: Picture) -> None:
@@ -158,13 +182,12 @@ def _draw_difference(figure: Figure, axes: Axes, names: tuple[str, str], compare
     _label(axes, columns.name, rows.name, title)
 
 
-def _draw_learning(axes: Axes, report: RunReport, column: str, *, for_paper: bool = False) -> bool:
-    for number, recipe in enumerate(report.recipes):
-        training = mean_curve([run.metrics for run in recipe.runs], column)
-        evaluated = mean_curve([run.evaluations for run in recipe.runs], column)
+def _draw_learning(axes: Axes, curves: Sequence[_Curves], column: str, *, for_paper: bool = False) -> bool:
+    for number, of_recipe in enumerate(curves):
+        recipe, training, evaluated = of_recipe.recipe, of_recipe.training, of_recipe.evaluated
         color = {"color": f"C{number}"} if recipe.name else {}  # a colour per recipe
         name = textwrap.fill(textwrap.shorten(recipe.label, 64, placeholder=" ..."), 34)
-        alone = for_paper and evaluated is not None and not _has_training_curve(recipe, column)
+        alone = for_paper and evaluated is not None and (training is None or not of_recipe.has_few_evaluations)
         if training is not None and not alone:
             _draw_smoothed(axes, training, name or "training", color)
         if evaluated is not None:

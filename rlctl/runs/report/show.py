@@ -104,7 +104,10 @@ def show(run: RunDescription, json: str | None) -> None:
     if isinstance(source := run.status.get("from"), dict):
         out.print(f"started from {source.get('policy')}, step {source.get('training_steps')}")
     for key, value in summary.changes.items():
-        out.print(f"differs from the task's recipe: {key} = {format_value(key, value)}")
+        before = ""
+        if key in summary.changed_from:
+            before = f" (recipe: {format_value(key, summary.changed_from[key])})"
+        out.print(f"differs from the task's recipe: {key} = {format_value(key, value)}{before}")
     for warning in run.warnings:
         out.print(f"warning: {warning}")
     for name in ("success", "return"):

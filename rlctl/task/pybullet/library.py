@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import UsageError
+from rlctl.task.rotations import look_along
 
 _NO_WHEELS = sys.version_info >= (3, 12)
 INSTALL_PYBULLET = f"pip install {'setuptools && pip install --no-build-isolation ' if _NO_WHEELS else ''}pybullet"
@@ -134,11 +135,7 @@ def _paint_background(
     floor: float | None,
 ) -> NDArray[np.uint8]:
     """Return a picture of a sky, and below the horizon of a floor of squares at a height [m]."""
-    forward = np.subtract(target, eye)
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    up = np.cross(right, forward)
+    right, up, forward = look_along(np.subtract(target, eye))
     pixel = 2.0 * np.tan(np.radians(field_of_view) / 2) / height
     across = (pixel * (np.arange(width) + 0.5 - width / 2)).astype(np.float32)
     above = (pixel * (height / 2 - np.arange(height) - 0.5)).astype(np.float32)[:, None]
