@@ -31,7 +31,8 @@ INDEX = """# The rules of check-env
 `rlctl check-env TASK` builds an environment in child processes, plays a few dozen episodes, and checks the results with
 these {count} rules. An **error** makes training wrong or impossible (exit code 1), a **warning** is likely wrong
 (exit code 1 with `--strict`), an **info** is worth knowing. The text of a rule says when its findings are less severe.
-A check that had no time for a quarter or more of the rules is no pass (exit code 1); its last line says which `--budget` should be enough.
+A check that had no time for a quarter or more of the rules is no pass (exit code 1); its last line says which
+`--budget` should be enough.
 
 `--select RL3,RL501` checks only these rules, `--ignore RL106` skips a rule, `--explain RL304` prints one. If a finding
 is intended, waive its rule in the environment's class, with the reason:

@@ -12,7 +12,7 @@ from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.exporting.c_source import find_compiler
 from rlctl.exporting.controller.controllers import OnnxController
 from rlctl.exporting.controller.graph import build_graph
-from rlctl.exporting.controller.plan import ControllerPlan
+from rlctl.exporting.controller.plan import ControllerPlan, JointTarget
 from rlctl.exporting.controller.source import ControllerSource
 from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.onnx_policy import OnnxActor, encode
@@ -281,3 +281,13 @@ def test_what_cannot_be_a_controller():
     unknown = Limits.model_validate({"sensors": {"gravity": {"range": [-1, 1]}}})
     with pytest.raises(RecipeError, match="limits: sensors: no observation 'gravity'"):
         write_code(commanding(), unknown)
+
+
+@pytest.mark.parametrize(
+    ("joint_unit", "kind", "unit"),
+    [("", "position", "rad or m"), ("rad", "step", "rad"), ("m", "speed", "m/s"), ("rad", "torque", "N m")],
+)
+def test_the_unit_of_a_command_is_that_of_the_joints(joint_unit, kind, unit):
+    ones = np.ones(2)
+    target = JointTarget(kind, ones, ones, 0, "", "", ones, ones, joint_unit=joint_unit)
+    assert target.unit == unit

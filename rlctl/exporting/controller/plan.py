@@ -65,11 +65,14 @@ class JointTarget:
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     tracks: bool = False  # whether limits bound the targets themselves, from one to the next
+    joint_unit: str = ""  # of the measured positions of all joints: `rad`, `m`, or another word where it is unknown
 
     @property
     def unit(self) -> str:
-        """Unit, for people."""
-        return _UNITS[self.kind]
+        """Unit, for people; one where it is known whether all joints turn or all slide."""
+        of_turning, of_sliding = _UNITS[self.kind].split(" or ")
+        known = {"rad": of_turning, "m": of_sliding}
+        return known.get(self.joint_unit, _UNITS[self.kind])
 
     @property
     def interface(self) -> str:
@@ -240,7 +243,10 @@ class ControllerPlan:
         if joints.clips_target:
             clips = "towards" if fitted is not None and kind == "step" else "exact"
         low, high = (np.array(ends or [0.0] * count) for ends in (joints.low, joints.high))
-        return JointTarget(kind, factor, default, measured, name, clips, low, high, tracks=steps is not None)
+        unit = self.env.observation_units.get(joints.measured, "")
+        return JointTarget(
+            kind, factor, default, measured, name, clips, low, high, tracks=steps is not None, joint_unit=unit
+        )
 
     def describe_internal(self) -> list[str]:
         """Return what the controller computes from the inputs, for people."""
