@@ -112,7 +112,8 @@ def _explain_curves(recipes: Sequence[RecipeRuns], drawn: Sequence[_Curves]) -> 
         sentences.append(f"Lines and dots: mean; bands and bars: lowest to highest of {', '.join(counts)}.")
     if any(len(curves.list_of_paper()) == 2 for curves in drawn):
         sentences.append("Lines: episodes of the training; dots: evaluations.")
-    ended, training = {}, {}
+    ended: dict[str, float] = {}
+    training: dict[str, float] = {}
     for curves in drawn:
         of_recipe = f" of {curves.recipe.label}" if curves.recipe.label else ""
         for number, step, _ in [end for curve in curves.list_of_paper() for end in curve["ended"]]:
