@@ -63,7 +63,9 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
 
             return changes.apply(make_spec(task).observe_as(self.spec))
         own = self.spec.replace_missing_engine()
-        return changes.apply(dataclasses.replace(own, named_by=POLICY if task is None else ""))
+        # Policies of older versions may have the level of the last stage of their training.
+        own = dataclasses.replace(own, level=1.0, named_by=POLICY if task is None else "")
+        return changes.apply(own)
 
     def check_fits(self, env: EnvInfo, file: Path) -> None:
         """Raise `ArtifactError` if the policy in `file` was made for other spaces than `env` has."""

@@ -1,5 +1,6 @@
 """The learner: model, environments, curriculum and progress of a training."""
 
+import dataclasses
 import statistics
 import time
 import warnings
@@ -27,13 +28,21 @@ from rlctl.training.rollouts import Rollouts
 from rlctl.training.snapshot import pack
 
 
+def make_goal_spec(stages: Sequence[EnvSpec]) -> EnvSpec:
+    """Return the spec in which evaluations are played and which policies store: the last stage, at level 1.
+
+    A lower level is for training: it may make some episodes easier, and a score of these would say nothing.
+    """
+    return dataclasses.replace(stages[-1], level=1.0)
+
+
 class Curriculum:
     """The stages of a training, with their state in `progress`; without any, no stage is ever due."""
 
     def __init__(self, stages: Sequence[Stage], specs: Sequence[EnvSpec], goal: EnvInfo, progress: Progress) -> None:
         self.stages = stages
         self.specs = list(specs) if stages else []  # of each stage
-        self.goal_spec = specs[-1]  # the last stage, in which evaluations are played and which policies store
+        self.goal_spec = make_goal_spec(specs)
         self.goal = goal  # description of the environments of `goal_spec`
         self._progress = progress
         if stages and not progress.stage:

@@ -91,8 +91,9 @@ def set_up(
         if not lock.keeps_out:
             display.message(f"warning: {run.path}: this file system has no locks: let only one process train this run")
         checkpoints = _open_run(run, start, learner, display, observers)
-        n_envs = count_envs(specs[-1], recipe.eval.episodes)
-        episodes = EvaluationEpisodes(learner, functools.partial(make_workers, specs[-1], n_envs), checkpoints)
+        goal_spec = learner.curriculum.goal_spec
+        n_envs = count_envs(goal_spec, recipe.eval.episodes)
+        episodes = EvaluationEpisodes(learner, functools.partial(make_workers, goal_spec, n_envs), checkpoints)
         stack.callback(episodes.close)
         evaluator = Evaluator(learner, episodes, checkpoints, display)
         if start.run is not None:

@@ -1,6 +1,7 @@
 """Levels that follow the success of each environment's own episodes."""
 
 import csv
+import dataclasses
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from rlctl.errors import RecipeError, TaskError
 from rlctl.play.episode import load_episode
 from rlctl.play.messages import LevelRule
+from rlctl.policy.file import PolicyFile
 from rlctl.runs.directory import RunDirectory
 from rlctl.training import checkpoint_file
 
@@ -91,3 +93,14 @@ def test_what_is_not_supported_is_refused(train, task, settings, message):
     with pytest.raises(RecipeError) as caught:
         train(task, settings, **({} if task == "Line" else {"envs": ""}))
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("task", [TASK, BATCH])
+def test_a_level_is_for_training_only(train, task):
+    run = train(task, {**SMALL, "stages": [{"level": 0.4}]}, envs="").run
+    (first, *_) = [load_episode(file) for file in sorted(run.episodes.glob("*.npz"))]
+    assert first.observations[0, 0] == 1.0  # of an evaluation
+    policy = PolicyFile.read(run.best_policy)
+    assert policy.info.derive_spec().level == 1.0
+    stored = policy.with_info(spec=dataclasses.replace(policy.info.spec, level=0.4))
+    assert stored.info.derive_spec().level == 1.0
