@@ -208,22 +208,65 @@ def _compare_maps(
 @app.command("import")
 @command
 def import_run(
-    model: Annotated[Path, Argument("Model of Stable-Baselines3 or rl-zoo3.", metavar="MODEL.zip")],
-    task: Annotated[str, Option(f"The task it was trained on. {TASK_FORMS}", metavar="TASK")],
+    model: Annotated[
+        Path,
+        Argument(
+            "Model of Stable-Baselines3 or rl-zoo3; with --deploy or --model ONNX or TorchScript.", metavar="MODEL"
+        ),
+    ],
+    task: Annotated[
+        str | None, Argument(f"The task it was trained on. {TASK_FORMS}", metavar="[TASK]", default_text="")
+    ] = None,
     vecnormalize: Annotated[Path | None, Option("Its normalisation, if it has one.", metavar="FILE.pkl")] = None,
     algo: Annotated[str | None, Option("Its algorithm, if the file does not name it.")] = None,
+    deploy: Annotated[
+        Path | None, Option("How a policy of another project is deployed: that project's YAML.", metavar="FILE")
+    ] = None,
+    robot: Annotated[
+        str | None, Option("The robot of a policy of another project: URDF or MJCF.", ("--model",), metavar="ROBOT")
+    ] = None,
+    terrain: Annotated[str | None, Option("Its ground: URDF or MJCF.", metavar="FILE", default_text="flat")] = None,
     settings: Settings = [],
     output: Annotated[
         Path | None, Option("Policy file to write. Default: MODEL.safetensors.", ("--output", "-o"), metavar="FILE")
     ] = None,
     json: Json = None,
 ) -> None:
-    """Convert a model of Stable-Baselines3 to a policy file. Nothing in the model is unpickled."""
+    """Convert a model of Stable-Baselines3, or a policy of another project. Nothing in the model is executed."""
+    if deploy is not None or robot is not None or terrain is not None:
+        if task is not None or vecnormalize is not None or algo is not None:
+            raise UsageError("--deploy and --model are of a policy of another project: leave out TASK and its options")
+        _import_foreign(model, deploy, robot, terrain, settings, output, json)
+        return
+    if task is None:
+        raise UsageError(
+            "give the task that the model was trained on: rlctl runs import MODEL.zip TASK; "
+            "or of a policy of another project: --deploy FILE --model ROBOT"
+        )
     from rlctl.importing.import_model import find_normalizations, import_model, show
 
     changes = parse_changes(settings)
     policy = import_model(model, task, normalization=vecnormalize, algo=algo, output=output, changes=changes)
     show(policy, json, find_normalizations(model) if vecnormalize is None else [])
+
+
+def _import_foreign(
+    policy: Path,
+    deploy: Path | None,
+    robot: str | None,
+    terrain: str | None,
+    settings: list[str],
+    output: Path | None,
+    json: str | None,
+) -> None:
+    if robot is None:
+        raise UsageError("--deploy needs the robot: --model ROBOT.urdf or ROBOT.xml")
+    from rlctl.importing.foreign.import_policy import import_policy, show
+    from rlctl.recipe.sources import parse_settings
+
+    values = parse_settings(settings)
+    imported = import_policy(policy, deploy, robot, terrain=terrain or "", settings=values, output=output)
+    show(imported, json)
 
 
 @app.command("rm")

@@ -21,7 +21,16 @@ from rlctl.task.commands import CommandTerm
 from rlctl.task.history import Start
 from rlctl.task.joints import Joints
 from rlctl.task.layout import Layout
-from rlctl.task.terms import Displacement, Distance, Gravity, LastAction, PhaseClock, Scaled, find_quantity_sizes
+from rlctl.task.terms import (
+    Displacement,
+    Distance,
+    Euler,
+    Gravity,
+    LastAction,
+    PhaseClock,
+    Scaled,
+    find_quantity_sizes,
+)
 
 if TYPE_CHECKING:
     import mujoco
@@ -31,7 +40,7 @@ if TYPE_CHECKING:
     from rlctl.task.worlds import TaskWorlds
 
 AnyTerm = Annotated[
-    Scaled | Gravity | Displacement | Distance | LastAction | PhaseClock, pydantic.Field(discriminator="kind")
+    Scaled | Gravity | Euler | Displacement | Distance | LastAction | PhaseClock, pydantic.Field(discriminator="kind")
 ]
 _SHOWN_JOINTS = 8
 _ONE_HOT = 10  # each value of a discrete space counts as this many elements of a Box

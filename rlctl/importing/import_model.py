@@ -72,7 +72,7 @@ def import_model(
         raise ArtifactError(f"{file}: its policy_kwargs do not make a network for {task}: {error}") from None
     source = f"{file} with {normalization}" if normalization else str(file)
     policy = PolicyFile(info, model.tensors | (statistics.tensors if statistics else {}), target)
-    _write_checked(target, source, policy)
+    write_checked(target, source, policy)
     return policy
 
 
@@ -125,7 +125,7 @@ def _describe_shape(space: spaces.Space[Any]) -> Any:
     return str(space) if counts else f"{type(space).__name__}{space.shape}"
 
 
-def _write_checked(target: Path, source: str, policy: PolicyFile) -> None:
+def write_checked(target: Path, source: str, policy: PolicyFile) -> None:
     """Write the file under a temporary name, and rename it if it loads and acts; errors name `source`."""
     from rlctl.policy.torch_policy import TorchActor
 

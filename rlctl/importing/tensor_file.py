@@ -20,6 +20,7 @@ _STORAGES = {
     "DoubleStorage": "f8", "FloatStorage": "f4", "HalfStorage": "f2", "LongStorage": "i8", "IntStorage": "i4",
     "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "?",
 }  # fmt: skip
+_MOST_DEEP = 20  # modules in modules
 _MAGIC_NUMBER = 0x1950A86A20F9469CFC6C  # begins a file of torch before 1.6
 
 
@@ -60,6 +61,57 @@ def read_tensors(content: bytes) -> dict[str, NDArray[Any]]:
             raise NotPlainData("tensors of a big-endian machine")
         state = _describe_tensors(pickle_data.read(read_member(archive, f"{prefix}data.pkl")))
         return _read_all(state, lambda storage: read_member(archive, f"{prefix}data/{storage}"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Module:
+    """A module of a TorchScript archive: its class, tensors and other values by name, the modules in it, its code."""
+
+    name: str
+    tensors: dict[str, NDArray[Any]]
+    values: dict[str, Any]
+    modules: dict[str, "Module"]
+    code: str
+    """Of all classes in the file of its class; nothing of it is executed."""
+
+
+def read_torchscript(content: bytes) -> Module:
+    """Return the module that `torch.jit.save` wrote, as data.
+
+    Raises `NotPlainData` for other content, and for tensors that are too large or read outside their storage.
+    """
+    stream = io.BytesIO(content)
+    if not zipfile.is_zipfile(stream):
+        raise NotPlainData("not an archive of TorchScript")
+    with zipfile.ZipFile(stream) as archive:
+        prefix = next((name[: -len("data.pkl")] for name in archive.namelist() if name.endswith("/data.pkl")), "")
+        if not any(name.startswith(f"{prefix}code/") for name in archive.namelist()):
+            raise NotPlainData("weights without a network: it was written by torch.save, not by torch.jit.save")
+        if f"{prefix}byteorder" in archive.namelist() and read_member(archive, f"{prefix}byteorder") != b"little":
+            raise NotPlainData("tensors of a big-endian machine")
+        described = pickle_data.read(read_member(archive, f"{prefix}data.pkl"))
+        return _read_module(archive, prefix, described, _MOST_DEEP)
+
+
+def _read_module(archive: zipfile.ZipFile, prefix: str, described: Any, depth: int) -> Module:
+    if not isinstance(described, Call) or not isinstance(described.state, dict) or not depth:
+        raise NotPlainData("something other than a module of torch")
+    tensors: dict[str, _Tensor] = {}
+    values: dict[str, Any] = {}
+    modules: dict[str, Module] = {}
+    for name, value in described.state.items():
+        if isinstance(value, Call) and str(value.function).startswith("__torch__."):
+            modules[str(name)] = _read_module(archive, prefix, value, depth - 1)
+        elif isinstance(value, Call) and str(value.function).startswith("torch._utils."):
+            tensors[str(name)] = _describe_tensor(value)
+        else:
+            values[str(name)] = value
+    arrays = _read_all(tensors, lambda storage: read_member(archive, f"{prefix}data/{storage}"))
+    file = f"{prefix}code/{described.function.module.replace('.', '/')}.py"
+    code = ""
+    if file in archive.namelist():
+        code = read_member(archive, file).decode(errors="replace")
+    return Module(str(described.function), arrays, values, modules, code)
 
 
 def _read_stream(stream: io.BytesIO) -> dict[str, NDArray[Any]]:

@@ -27,12 +27,15 @@ class _Dumper(yaml.SafeDumper):
 
 class _Loader(yaml.SafeLoader):
     depth = 0
+    ignores_tags = False
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # filled below: no dates
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
         if getattr(event, "anchor", None) is not None:  # of an alias too
             raise _make_error("anchors and aliases (&name, *name) are not supported: write the values out", event)
+        if self.ignores_tags and getattr(event, "tag", None) is not None:
+            event.tag, event.implicit = None, _UNTAGGED.get(type(event), True)  # type: ignore[attr-defined]
         if getattr(event, "tag", None) is not None:  # bytes, sets, objects of Python
             raise _make_error("tags (!!int, !name) are not supported: write the value alone", event)
         if self.depth >= _DEEPEST:
@@ -60,6 +63,13 @@ class _Loader(yaml.SafeLoader):
 
     def construct_float(self, node: yaml.ScalarNode) -> float:
         return float(self.construct_scalar(node).replace("_", "").lower().replace(".inf", "inf").replace(".nan", "nan"))
+
+
+class _UntaggedLoader(_Loader):
+    ignores_tags = True
+
+
+_UNTAGGED: dict[type[Any], Any] = {yaml.ScalarEvent: (True, False)}
 
 
 def _make_error(message: str, node: Any) -> yaml.YAMLError:
@@ -99,10 +109,14 @@ def read_text(path: Path) -> str:
         raise RecipeError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start:,}; save it as UTF-8") from None
 
 
-def load(text: str, source: str) -> Any:
-    """Parse YAML without anchors and aliases; raises `RecipeError` with `source` and the line."""
+def load(text: str, source: str, *, ignore_tags: bool = False) -> Any:
+    """Parse YAML without anchors and aliases; raises `RecipeError` with `source` and the line.
+
+    With `ignore_tags` a value with a tag, such as an object of Python, is read as the text, list or mapping that it is
+    written as; nothing is constructed of it.
+    """
     try:
-        loader = _Loader(text)
+        loader = _UntaggedLoader(text) if ignore_tags else _Loader(text)
         try:
             return loader.get_single_data()
         finally:

@@ -228,13 +228,14 @@ class Body:
         stiffness: float | Sequence[float] | Array,
         damping: float | Sequence[float] | Array,
         *,
-        armature: float | Sequence[float] | Array = 0.0,
+        armature: float | Sequence[float] | Array | None = 0.0,
     ) -> None:
         """Make `drive_to` a spring and a damper, as the position controllers of real robots are. Call it in `build`.
 
         `stiffness` [N m/rad or N/m], `damping` [N m s/rad or N s/m] and `armature`, the inertia of motor and gears at
-        the joint [kg m^2 or kg], are one number for all joints or one per joint. The torque on a joint is
-        `stiffness * (target - position) - damping * velocity`, within its force limit, computed in every physics step.
+        the joint [kg m^2 or kg], are one number for all joints or one per joint; an armature of None is the model
+        file's. The torque on a joint is `stiffness * (target - position) - damping * velocity`, within its force limit,
+        computed in every physics step.
         PyBullet's joints have no armature: it is left out there. Raises `TaskError` for a damping that PyBullet's
         explicit steps cannot have.
         """

@@ -54,16 +54,19 @@ def _as_vector(value: Any) -> NDArray[np.float64]:
 
 @dataclasses.dataclass(frozen=True)
 class Scaled(Term):
-    """`(quantity - offset) * scale`: joint positions from the default pose, for example."""
+    """`(quantity - offset) * scale` within `clip`: joint positions from the default pose, for example."""
 
     quantity: str
     offset: Numbers = ()  # one number per element, or one for all, in the quantity's unit; none: 0
     scale: Numbers = ()  # none: 1
+    clip: Numbers = ()  # lowest and highest value of the result; none: no limits
     kind: Literal["scaled"] = "scaled"
 
     def __post_init__(self) -> None:
-        for key in ("offset", "scale"):
+        for key in ("offset", "scale", "clip"):
             object.__setattr__(self, key, _read_numbers(getattr(self, key), f"Scaled({self.quantity!r}).{key}"))
+        if len(self.clip) not in (0, 2):
+            raise TaskError(f"Scaled({self.quantity!r}).clip must be the lowest and the highest value")
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -75,13 +78,16 @@ class Scaled(Term):
         return [np.array(numbers) for numbers in (self.offset, self.scale)]
 
     def compute(self, *quantities: Any) -> list[Any]:
-        """Return the shifted and scaled quantity."""
+        """Return the shifted, scaled and clipped quantity."""
         (value,), (offset, scale) = quantities, self._arrays
         for numbers in (offset, scale):
             if len(numbers) not in (0, 1, value.shape[-1]):
                 raise ValueError(f"{len(numbers)} numbers for {value.shape[-1]} elements")
         value = value - offset if len(offset) else value
-        return [value * scale if len(scale) else value]
+        value = value * scale if len(scale) else value
+        if self.clip:
+            value = np.minimum(np.maximum(value, self.clip[0]), self.clip[1])
+        return [value]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +114,36 @@ class Gravity(Term):
             0.0 - w * (2.0 * x) - z * (2.0 * y),
             x * (2.0 * x) + y * (2.0 * y) - 1.0,
         ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Euler(Term):
+    """Roll, pitch and yaw [rad], shape (3,), from a body's orientation as a unit quaternion (x, y, z, w)."""
+
+    orientation: str = "orientation"
+    kind: Literal["euler"] = "euler"
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The orientation."""
+        return (self.orientation,)
+
+    def compute(self, *quantities: Any) -> list[Any]:
+        """Return the angles about x, y and z."""
+        (orientation,) = quantities
+        if orientation.shape[-1] != 4:
+            raise ValueError(f"a quaternion of {orientation.shape[-1]} elements")
+        x, y, z, w = (orientation[..., index : index + 1] for index in range(4))
+        sine = np.minimum(np.maximum(2.0 * (w * y - z * x), -1.0), 1.0)
+        roll = _find_angle(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+        yaw = _find_angle(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        return [roll, np.arcsin(sine), yaw]
+
+
+def _find_angle(sine: Any, cosine: Any) -> Any:
+    """Return the angle in (-pi, pi] of a point; ONNX has no function of both coordinates."""
+    length = np.sqrt(sine * sine + cosine * cosine)
+    return 2.0 * np.arctan(sine / (length + cosine + 1e-12))  # the angle itself would divide by 0 at pi
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,24 +195,32 @@ class LastAction(Term):
 @dataclasses.dataclass(frozen=True)
 class PhaseClock(Term):
     """Sine and cosine of a phase that runs through a circle in `period_s`; `observe` returns the time of the episode,
-    shape (1,) [s]: 0 at the first observation, one `control_dt` more in each step."""
+    shape (1,) [s]: 0 at the first observation, one `control_dt` more in each step.
+
+    With several `offsets`, in parts of the period, these are all sines and then all cosines: of each leg, for example.
+    """
 
     period_s: float
+    offsets: Numbers = (0.0,)
     kind: Literal["phase_clock"] = "phase_clock"
     internal: ClassVar[Internal] = "time"
 
     def __post_init__(self) -> None:
         if not 0.0 < self.period_s < math.inf:
             raise TaskError(f"PhaseClock: period_s is {self.period_s}; it must be a time above 0 [s]")
+        object.__setattr__(self, "offsets", _read_numbers(self.offsets, "PhaseClock: offsets"))
 
     def compute(self, *quantities: Any) -> list[Any]:
-        """Return sine and cosine."""
+        """Return the sines, then the cosines."""
         (time,) = quantities
         if time.shape[-1] != 1:
             raise ValueError(f"a time of {time.shape[-1]} elements")
-        turns = time / self.period_s
-        angle = (turns - np.floor(turns)) * (2.0 * math.pi)
-        return [np.sin(angle), np.cos(angle)]
+        angles = []
+        for offset in self.offsets:
+            turns = time / self.period_s
+            turns = turns + offset if offset else turns
+            angles.append((turns - np.floor(turns)) * (2.0 * math.pi))
+        return [*(np.sin(angle) for angle in angles), *(np.cos(angle) for angle in angles)]
 
 
 def find_quantity_sizes(terms: Mapping[str, Term], measured: Mapping[str, Any]) -> dict[str, int]:

@@ -17,8 +17,20 @@ _C = {
     "sin": "sin({})",
     "cos": "cos({})",
     "floor": "floor({})",
+    "arctan": "atan({})",
+    "arcsin": "asin({})",
+    "minimum": "fmin({}, {})",
+    "maximum": "fmax({}, {})",
 }
-_ONNX = {"subtract": "Sub", "multiply": "Mul", "divide": "Div"}
+_ONNX = {
+    "subtract": "Sub",
+    "multiply": "Mul",
+    "divide": "Div",
+    "arctan": "Atan",
+    "arcsin": "Asin",
+    "minimum": "Min",
+    "maximum": "Max",
+}
 
 
 class Symbol(np.lib.mixins.NDArrayOperatorsMixin, abc.ABC):

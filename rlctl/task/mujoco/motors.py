@@ -64,7 +64,7 @@ class MujocoMotors(Body):
         self.parts.active.clear()
         self._cap = self.parts.speed_cap
         if self.parts.drives is not None:
-            self._sim.model.dof_armature[self.parts.velocities] = self.parts.drives[2]
+            self._write_armature(self.parts.drives[2])
 
     def measure_inertia(self) -> None:
         """Compute the inertia that a torque on each joint moves in the present pose [kg m^2 or kg], shape (joints,)."""
@@ -93,13 +93,16 @@ class MujocoMotors(Body):
         stiffness: float | Sequence[float] | Array,
         damping: float | Sequence[float] | Array,
         *,
-        armature: float | Sequence[float] | Array = 0.0,
+        armature: float | Sequence[float] | Array | None = 0.0,
     ) -> None:
-        given = {"stiffness": stiffness, "damping": damping, "armature": armature}
-        spread = [self._spread(name, value) for name, value in given.items()]
-        self.parts.drives = (spread[0], spread[1], spread[2])
-        self._sim.model.dof_armature[self.parts.velocities] = spread[2]
+        inertia = None if armature is None else self._spread("armature", armature)
+        self.parts.drives = (self._spread("stiffness", stiffness), self._spread("damping", damping), inertia)
+        self._write_armature(inertia)
         self._modes.clear()
+
+    def _write_armature(self, armature: Array | None) -> None:
+        if armature is not None:
+            self._sim.model.dof_armature[self.parts.velocities] = armature
 
     def drive_to(
         self,

@@ -43,7 +43,7 @@ class Parts:
         self.links: dict[str, int] = {}
         speeds = [file.max_speed.get(joint, 0.0) for joint in self.joint_names]
         self.speed_cap = max(speeds) if fixed and speeds and min(speeds) > 0 else math.inf
-        self.drives: tuple[Array, Array, Array] | None = None
+        self.drives: tuple[Array, Array, Array | None] | None = None
         self.inertia: Array | None = None
         self.active: dict[int, object] = {}
         """By joint, the kind of command that is written into the model."""

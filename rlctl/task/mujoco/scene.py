@@ -64,10 +64,14 @@ class MujocoScene:
         fixed: bool,
         self_collision: bool,
         inertia: Literal["file", "shape"],
+        floor: bool = True,
     ) -> Parts:
         """Add what a model file describes, with a motor for each joint; raises `TaskError` if it cannot be read."""
         source = read_model_file(find_model_file(file), fixed=fixed, inertia=inertia, visuals=self._visuals)
         child = source.spec
+        if not floor:
+            for geom in list(child.worldbody.geoms):
+                child.delete(geom)
         for joint in child.joints:
             joint.actfrclimited = False  # the force limits are those of the motors
         is_urdf = source.path.suffix == ".urdf"

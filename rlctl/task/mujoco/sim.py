@@ -112,6 +112,7 @@ class MujocoSim(Sim):
         flags: int = 0,
         self_collision: bool = False,
         inertia: Literal["file", "shape"] = "file",
+        floor: bool = True,
     ) -> MujocoBody:
         self._check_new(name)
         return self._add_body(
@@ -123,6 +124,7 @@ class MujocoSim(Sim):
                 fixed=fixed,
                 self_collision=self_collision,
                 inertia=inertia,
+                floor=floor,
             )
         )
 

@@ -110,10 +110,11 @@ class Motors(Body):
         stiffness: float | Sequence[float] | Array,
         damping: float | Sequence[float] | Array,
         *,
-        armature: float | Sequence[float] | Array = 0.0,
+        armature: float | Sequence[float] | Array | None = 0.0,
     ) -> None:
         self.drives = Drives(self._spread("stiffness", stiffness), self._spread("damping", damping))
-        self._spread("armature", armature)  # raises for what cannot be; PyBullet's joints have none
+        if armature is not None:
+            self._spread("armature", armature)  # raises for what cannot be; PyBullet's joints have none
         self.disable_motors()
         self._check_damping(self.drives.damping)
 

@@ -82,8 +82,11 @@ class PybulletSim(Constraints):
         flags: int = 0,
         self_collision: bool = False,
         inertia: Literal["file", "shape"] = "file",
+        floor: bool = True,
     ) -> PybulletBody:
         self._check_new(name)
+        if not floor:
+            self._refuse("load(floor=False)")
         path = find_model_file(file)
         wheels: dict[str, float] = {}
         if path.suffix == ".urdf":

@@ -1,0 +1,115 @@
+"""`Draft`: what a file says of a deployment, before what it lacks is asked for or guessed."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rlctl.environments.spec import merge
+from rlctl.errors import UsageError, check_name
+from rlctl.importing.foreign.network import ForeignNetwork
+from rlctl.importing.foreign.robot import Robot
+from rlctl.storage import validation
+from rlctl.task.deployment import Deployment
+
+_OF_JOINTS = ("default_positions", "action_scale", "stiffness", "damping", "max_torque", "armature")
+_REQUIRED = ("default_positions", "action_scale", "stiffness", "damping", "control_dt", "observations")
+_USUAL_COMMANDS = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.3, 0.3], "ang_vel_z": [-0.5, 0.5]}
+_USUAL_ARMATURE = 0.01  # [kg m^2], of motors and gears of walking robots
+_FORMS = {
+    "default_positions": "[0.1, 0.8, ..]",
+    "control_dt": "0.02",
+    "action_scale": "0.25",
+    "stiffness": "40",
+    "damping": "1",
+    "observations": "'[{kind: gyroscope, scale: 0.25}, {kind: gravity}, ..]'",
+}
+
+
+@dataclasses.dataclass
+class Draft:
+    """Values of a `Deployment` by name, with notes about what was guessed."""
+
+    source: str  # the file, for errors
+    values: dict[str, Any]
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+    def complete(self, settings: Mapping[str, Any], robot: Robot, network: ForeignNetwork) -> Deployment:
+        """Return the deployment; `settings` override what the file says.
+
+        Raises `UsageError` for what is missing, for joints that the robot does not have, and for sizes that do not fit
+        the network.
+        """
+        for name in settings:
+            check_name(name, Deployment.model_fields, "--set: a deployment has no", UsageError)
+        values = merge(self.values, settings)
+        self._guess_joints(values, robot, network)
+        joints = values["joints"]
+        for name in joints:
+            check_name(name, robot.joints, f"{self.source}: {robot.path.name} has no joint", UsageError)
+        self._guess_pose(values, robot)
+        if missing := [name for name in _REQUIRED if values.get(name) is None]:
+            forms = " ".join(f"--set {name}={_FORMS[name]}" for name in missing)
+            raise UsageError(f"{self.source} does not say: {', '.join(missing)}. Give {forms}")
+        for name in _OF_JOINTS:
+            if isinstance(values.get(name), int | float) and not isinstance(values[name], bool):
+                values[name] = [values[name]] * len(joints)
+        self._guess_others(values, robot)
+        if "start_height" not in values:
+            pose = dict(zip(joints, values["default_positions"], strict=False))
+            values["start_height"] = round(robot.measure_start(pose), 4)
+        deployment = validation.build(Deployment, values, UsageError, self.source)
+        self._check_sizes(deployment, network)
+        return deployment
+
+    def _guess_joints(self, values: dict[str, Any], robot: Robot, network: ForeignNetwork) -> None:
+        if "joints" in values:
+            return
+        if len(robot.joints) != network.action_size:
+            raise UsageError(
+                f"{self.source} does not say which joints the {network.action_size} actions move, and "
+                f"{robot.path.name} has {len(robot.joints)}. Give --set joints='[{robot.joints[0]}, ..]'"
+            )
+        values["joints"] = list(robot.joints)
+        self.notes.append(f"joints: the file does not name them; guessed the order of {robot.path.name}")
+
+    def _guess_pose(self, values: dict[str, Any], robot: Robot) -> None:
+        if values.get("default_positions") is None and robot.pose:
+            values["default_positions"] = [robot.pose[name] for name in values["joints"]]
+            self.notes.append(f"default_positions: guessed keyframe {robot.keyframe!r} of {robot.path.name}")
+
+    def _guess_others(self, values: dict[str, Any], robot: Robot) -> None:
+        if not values.get("commands"):
+            values["commands"] = _USUAL_COMMANDS
+            ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in _USUAL_COMMANDS.items())
+            self.notes.append(f"commands: the file has no ranges; guessed {ranges} [m/s, rad/s]")
+        if not values.get("armature") and not robot.has_armature:
+            values["armature"] = [_USUAL_ARMATURE] * len(values["joints"])
+            self.notes.append(f"armature: neither file has it; guessed {_USUAL_ARMATURE:g} kg m^2 for every joint")
+        endless = [name for name in values["joints"] if not robot.limits.get(name)]
+        if not values.get("max_torque") and endless:
+            self.notes.append(f"max_torque: {robot.path.name} has no limit for {endless[0]}; it is not limited")
+
+    def _check_sizes(self, deployment: Deployment, network: ForeignNetwork) -> None:
+        if len(deployment.joints) != network.action_size:
+            raise UsageError(
+                f"{self.source}: {len(deployment.joints)} joints, and the network has {network.action_size} actions"
+            )
+        if deployment.observation_size != network.observation_size:
+            sizes = [
+                f"{part.kind} {deployment.find_size(part)}" + (f" x {part.history}" if part.history > 1 else "")
+                for part in deployment.observations
+            ]
+            raise UsageError(
+                f"{self.source}: observations of {deployment.observation_size} numbers ({', '.join(sizes)}), and the "
+                f"network takes {network.observation_size}"
+            )
+
+
+def pick(values: Sequence[Any], order: Sequence[int], source: str, name: str) -> list[Any]:
+    """Return values in another order; raises `UsageError` for an index that is not there."""
+    for index in order:
+        if not isinstance(index, int) or not 0 <= index < len(values):
+            raise UsageError(f"{source}: {name} has the index {index!r}, and there are {len(values)} values")
+    return [values[index] for index in order]

@@ -1,0 +1,150 @@
+"""`rlctl runs import POLICY --deploy FILE --model ROBOT`: write a policy of another project as a policy file."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from rlctl import output
+from rlctl.environments.info import describe_worlds
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import ArtifactError, RecipeError, UsageError
+from rlctl.importing.foreign import metadata, own, rl_sar, unitree_gym, unitree_lab
+from rlctl.importing.foreign.draft import Draft
+from rlctl.importing.foreign.network import ForeignNetwork
+from rlctl.importing.foreign.onnx_network import read_onnx
+from rlctl.importing.foreign.robot import Robot, read_robot
+from rlctl.importing.foreign.torchscript import read_torchscript_network
+from rlctl.importing.import_model import write_checked
+from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.storage import yaml_text
+from rlctl.task.deployment import Deployment
+from rlctl.task.model_files import find_model_file
+from rlctl.version import collect_versions
+
+TASK = "rlctl_locomotion.deployed:Deployed"
+
+
+class _Reader(Protocol):
+    TITLE: str
+
+    def matches(self, content: Mapping[str, Any]) -> bool:
+        """Return whether a file has this form."""
+
+    def read(self, content: Mapping[str, Any], source: str, robot: Robot, network: ForeignNetwork) -> Draft:
+        """Return what the file says."""
+
+
+READERS: Sequence[_Reader] = (unitree_lab, unitree_gym, rl_sar, own)
+"""Modules that read files; each has `TITLE`, `matches` and `read`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportedPolicy:
+    """A policy file that was written, and what was guessed for it."""
+
+    policy: PolicyFile
+    deployment: Deployment
+    form: str  # what the deployment was read from
+    notes: tuple[str, ...]
+
+
+def import_policy(
+    file: Path,
+    deploy: Path | None,
+    model: str,
+    *,
+    terrain: str = "",
+    settings: Mapping[str, Any] | None = None,
+    output: Path | None = None,
+) -> ImportedPolicy:
+    """Read network, deployment and robot; write them as a policy file, after a test that it acts.
+
+    Raises `UsageError` for what a file lacks and `settings` do not give, and for parts that do not fit each other;
+    `ArtifactError` for a file that is missing or damaged, or a network that is not imported.
+    """
+    target = output or Path(f"{file.stem}.safetensors")
+    if target.suffix != ".safetensors":
+        raise UsageError(f"--output {output}: the name of a policy file ends in .safetensors")
+    if output is None and target.exists():
+        raise UsageError(f"{target} exists already; give another name: --output FILE")
+    network, own_metadata = read_network(file)
+    robot = read_robot(find_model_file(model))
+    draft, form = read_draft(file, deploy, own_metadata, robot, network)
+    deployment = draft.complete(settings or {}, robot, network)
+    ground = str(find_model_file(terrain).resolve()) if terrain else ""
+    policy = make_policy(network, deployment, {"robot_file": str(robot.path), "terrain": ground}, target)
+    write_checked(target, str(file), policy)
+    return ImportedPolicy(policy, deployment, form, tuple(draft.notes))
+
+
+def read_network(file: Path) -> tuple[ForeignNetwork, dict[str, str]]:
+    """Return the network of an ONNX or TorchScript file, and the metadata of ONNX."""
+    if file.suffix == ".onnx":
+        return read_onnx(file)
+    if file.suffix in (".pt", ".pth", ".jit", ".ts"):
+        return read_torchscript_network(file), {}
+    raise UsageError(f"{file}: a policy from elsewhere is an ONNX (.onnx) or TorchScript (.pt) file")
+
+
+def read_draft(
+    file: Path, deploy: Path | None, own_metadata: Mapping[str, str], robot: Robot, network: ForeignNetwork
+) -> tuple[Draft, str]:
+    """Return what a file, or else the metadata of the policy itself, says of the deployment, and the file's form."""
+    if deploy is None:
+        if metadata.matches(own_metadata):
+            return metadata.read(own_metadata, str(file), robot, network), metadata.TITLE
+        return Draft(str(file), {}), "--set alone"
+    content = yaml_text.load(yaml_text.read_text(deploy), str(deploy), ignore_tags=True)
+    if not isinstance(content, dict):
+        raise RecipeError(f"{deploy}: expected a mapping of names to values")
+    for reader in READERS:
+        if reader.matches(content):
+            try:
+                return reader.read(content, str(deploy), robot, network), reader.TITLE
+            except (TypeError, ValueError, KeyError, AttributeError) as error:
+                raise ArtifactError(f"{deploy}: not as {reader.TITLE} is: {type(error).__name__}: {error}") from None
+    known = "; ".join(reader.TITLE for reader in READERS)
+    raise UsageError(f"{deploy}: in none of the known forms: {known}. Describe it as docs/foreign-policies.md says")
+
+
+def make_policy(network: ForeignNetwork, deployment: Deployment, places: Mapping[str, str], path: Path) -> PolicyFile:
+    """Return the policy of a network for the task that its deployment and `places`, the model files, describe."""
+    from rlctl.policy.torch_policy import build_network, describe_network, policy_name
+
+    parameters = {"deployment": deployment.dump(), **{name: value for name, value in places.items() if value}}
+    spec = EnvSpec(TASK, parameters).resolve()
+    with contextlib.closing(spec.make_worlds(1)) as worlds:
+        env = describe_worlds(worlds)
+    info = PolicyInfo(
+        algo=network.algo,
+        policy=policy_name(network.algo, env.spaces()[0]),
+        policy_kwargs=network.arguments,
+        env=env,
+        spec=spec,
+        versions=collect_versions(),
+    )
+    info = info.model_copy(update={"policy_kwargs": describe_network(build_network(info))})
+    return PolicyFile(info, network.observe_as(deployment).write_tensors(), path)
+
+
+def show(imported: ImportedPolicy, json: str | None) -> None:
+    """Print what was imported, what was guessed and the next commands, or only JSON for `-`."""
+    policy, deployment = imported.policy, imported.deployment
+    content = {
+        "policy": policy.path,
+        "form": imported.form,
+        "deployment": deployment.dump(),
+        "guessed": list(imported.notes),
+        "versions": policy.info.versions,
+    }
+    if output.present(content, json):
+        return
+    out = output.out()
+    out.print(f"{policy.path}: {policy.info.env.action_space['shape'][0]} joints, from {imported.form}")
+    for note in imported.notes:
+        out.print(f"  {note}", soft_wrap=True)
+    out.print(f"next:\n  rlctl eval {policy.path}\n  rlctl diagnose --policy {policy.path}")

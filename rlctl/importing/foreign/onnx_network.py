@@ -1,0 +1,212 @@
+"""Reads the network of an ONNX graph of another project; the graph is not executed before it is understood."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.errors import ArtifactError, short_repr
+from rlctl.importing.foreign.network import ForeignNetwork, Layer, Linear, NotImportable, assemble
+from rlctl.policy.layers import ACTIVATIONS
+from rlctl.policy.onnx_policy import check, open_session
+from rlctl.storage import untrusted
+
+if TYPE_CHECKING:
+    import onnx
+
+_PASSED_ON = ("Identity", "Flatten", "Cast", "Squeeze", "Unsqueeze", "Dropout")
+_ACTIVATIONS = {"Elu": "elu", "Relu": "relu", "Tanh": "tanh"}
+_SIGMOID = "sigmoid"
+_RECURRENT = ("LSTM", "GRU", "RNN")
+_MOST_NODES = 2000
+_COMPARED, _TOLERANCE = 16, 1e-4  # random observations with which the network is compared with the graph
+
+
+def read_onnx(path: Path) -> tuple[ForeignNetwork, dict[str, str]]:
+    """Return the network of a graph and the graph's metadata; raises `ArtifactError` for one that is not imported."""
+    content = untrusted.read_bytes(path)
+    try:
+        check(content)
+        network, metadata = _read(content)
+        _compare(content, network)
+    except ValueError as error:
+        raise ArtifactError(f"{path}: {short_repr(str(error), 300)}") from None
+    return network, metadata
+
+
+def _read(content: bytes) -> tuple[ForeignNetwork, dict[str, str]]:
+    import onnx
+
+    model = onnx.ModelProto.FromString(content)
+    graph = model.graph
+    constants = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
+    _check_form(graph, constants)
+    reader = _ChainReader(constants)
+    (given,) = [value.name for value in graph.input if value.name not in constants]
+    reader.values[given] = []
+    for node in graph.node:
+        reader.read(node)
+    layers = reader.values.get(graph.output[0].name)
+    if layers is None:
+        raise NotImportable("its output does not depend on its input")
+    metadata = {str(entry.key): str(entry.value) for entry in model.metadata_props}
+    return assemble(layers, ACTIVATIONS), metadata
+
+
+def _check_form(graph: onnx.GraphProto, constants: dict[str, Any]) -> None:
+    """Raise `NotImportable` for a graph that is not from one vector to one other."""
+    if len(graph.node) > _MOST_NODES:
+        raise NotImportable(f"its graph has {len(graph.node):,} nodes; the limit is {_MOST_NODES:,}")
+    own = [node.op_type for node in graph.node if node.domain not in ("", "ai.onnx")]
+    if own:
+        raise NotImportable(f"its graph has the custom operator {own[0]}; export it with standard operators")
+    recurrent = [node.op_type for node in graph.node if node.op_type in _RECURRENT]
+    inputs = [value for value in graph.input if value.name not in constants]
+    names = ", ".join(value.name for value in inputs)
+    if recurrent:
+        raise NotImportable(
+            f"its graph has hidden states ({recurrent[0]}; inputs {names}); "
+            "recurrent policies are imported from TorchScript (.pt)"
+        )
+    if len(inputs) != 1:
+        hint = ""
+        if "time_step" in names:
+            hint = "; it plays a motion, and rlctl imports policies that follow velocity commands"
+        raise NotImportable(f"its graph has {len(inputs)} inputs ({names}), expected one: the observation{hint}")
+    shape = [dimension.dim_value or 0 for dimension in inputs[0].type.tensor_type.shape.dim]
+    if len(shape) not in (1, 2):
+        raise NotImportable(f"its input {names} has {len(shape)} axes, expected (batch, size)")
+    if not shape[-1]:
+        raise NotImportable(f"the size of its input {names} is dynamic; export it with a fixed observation size")
+
+
+class _ChainReader:
+    """Reads nodes in a row: each value that depends on the input has the layers that compute it."""
+
+    def __init__(self, constants: dict[str, NDArray[Any]]) -> None:
+        self.constants = constants
+        self.values: dict[str, list[Layer]] = {}
+
+    def read(self, node: onnx.NodeProto) -> None:
+        """Read a node; raises `NotImportable` for an operator that no perceptron has."""
+        import onnx
+
+        attributes = {attribute.name: onnx.helper.get_attribute_value(attribute) for attribute in node.attribute}
+        if node.op_type == "Constant":
+            value = attributes.get("value")
+            self.constants[node.output[0]] = np.asarray(
+                onnx.numpy_helper.to_array(value) if value is not None else next(iter(attributes.values()))
+            )
+            return
+        moving = [name for name in node.input if name in self.values]
+        if not moving:
+            self._fold(node)
+            return
+        layers = self.values[moving[0]]
+        if len(moving) == 2:
+            self.values[node.output[0]] = self._join(node, moving)
+            return
+        self.values[node.output[0]] = [*layers, *self._describe(node, moving[0], attributes)]
+
+    def _fold(self, node: onnx.NodeProto) -> None:
+        """Compute a value that is constant, as far as exporters write such: transposed weights, reshaped sizes."""
+        known = [self.constants.get(name) for name in node.input]
+        if node.op_type in ("Identity", "Cast") and known[0] is not None:
+            self.constants[node.output[0]] = known[0]
+        elif node.op_type == "Transpose" and known[0] is not None:
+            self.constants[node.output[0]] = known[0].T
+        else:
+            raise NotImportable(f"its graph has the operator {node.op_type} on constants")
+
+    def _join(self, node: onnx.NodeProto, moving: list[str]) -> list[Layer]:
+        one, other = (self.values[name] for name in moving)
+        for plain, gate in ((one, other), (other, one)):
+            if node.op_type == "Mul" and gate == [*plain, (_SIGMOID, None)]:
+                return [*plain, ("silu", None)]
+        raise NotImportable(f"its graph joins two branches with {node.op_type}")
+
+    def _describe(self, node: onnx.NodeProto, given: str, attributes: dict[str, Any]) -> list[Layer]:
+        kind = node.op_type
+        others = [self._get(name) for name in node.input if name not in (given, "")]
+        if kind in _PASSED_ON or (kind == "Reshape" and len(others) == 1):
+            return []
+        if kind in _ACTIVATIONS:
+            if kind == "Elu" and attributes.get("alpha", 1.0) != 1.0:
+                raise NotImportable("its Elu has an alpha other than 1")
+            return [(_ACTIVATIONS[kind], None)]
+        if kind == "Sigmoid":
+            return [(_SIGMOID, None)]
+        if kind == "Gemm":
+            return [("linear", _read_gemm(others, attributes))]
+        if kind == "MatMul" and node.input[0] == given:
+            weight = np.asarray(others[0], float).T
+            return [("linear", Linear(weight, np.zeros(len(weight))))]
+        if kind in ("Add", "Sub", "Mul", "Div"):
+            return [("affine", _read_affine(kind, np.ravel(others[0]).astype(float), is_first=node.input[0] == given))]
+        if kind == "Split":
+            # What is read is the first output: the means of actions; standard deviations follow.
+            sizes = attributes.get("split") or (np.ravel(others[0]).tolist() if others else [])
+            if sizes:
+                return [("first", int(sizes[0]))]
+            return [("part", len(node.output))]
+        raise NotImportable(
+            f"its graph has the operator {kind}; rlctl imports perceptrons: linear layers, factors and shifts, "
+            f"{', '.join(ACTIVATIONS)}"
+        )
+
+    def _get(self, name: str) -> NDArray[Any]:
+        if name not in self.constants:
+            raise NotImportable(f"its graph uses {name!r}, which it does not define")
+        return self.constants[name]
+
+
+def _read_gemm(others: list[NDArray[Any]], attributes: dict[str, Any]) -> Linear:
+    if attributes.get("transA") or attributes.get("alpha", 1.0) != 1.0 or attributes.get("beta", 1.0) != 1.0:
+        raise NotImportable("its Gemm is scaled or transposed")
+    weight = np.asarray(others[0], float)
+    weight = weight if attributes.get("transB") else weight.T
+    bias = np.zeros(len(weight))
+    if len(others) > 1:
+        bias = np.broadcast_to(np.ravel(others[1]).astype(float), len(weight))
+    return Linear(weight, bias)
+
+
+def _read_affine(kind: str, number: Any, *, is_first: bool) -> tuple[Any, Any]:
+    if kind == "Add":
+        return np.ones(1), number
+    if kind == "Mul":
+        return number, np.zeros(1)
+    if kind == "Sub":
+        return (np.ones(1), -number) if is_first else (-np.ones(1), number)
+    if not is_first:
+        raise NotImportable("its graph divides by what it has observed")
+    return 1.0 / number, np.zeros(1)
+
+
+def _compare(content: bytes, network: ForeignNetwork) -> None:
+    """Raise `NotImportable` if the graph computes something else than the network that was read from it."""
+    session = open_session(content)
+    given = session.get_inputs()[0]
+    rows = np.random.default_rng(0).normal(size=(_COMPARED, network.observation_size)).astype(np.float32)
+    for row in rows:
+        shaped = row[None] if len(given.shape) == 2 else row
+        try:
+            expected = np.ravel(session.run([session.get_outputs()[0].name], {given.name: shaped})[0])
+        except Exception as error:  # onnxruntime's own errors have no public base class
+            raise NotImportable(f"its graph does not run: {short_repr(str(error), 150)}") from None
+        value = compute(network, row)
+        if expected.shape != value.shape or not np.allclose(value, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
+            raise NotImportable("its graph computes something else than the layers that were read from it")
+
+
+def compute(network: ForeignNetwork, row: NDArray[Any]) -> NDArray[Any]:
+    """Return the action of a network without an LSTM, shape (actions,), for an observation of shape (size,)."""
+    value = np.asarray(row, np.float64)
+    for number, linear in enumerate(network.linears):
+        if number:
+            value = ACTIVATIONS[network.activation](value)
+        value = linear.weight @ value + linear.bias
+    return np.tanh(value) if network.ends_with_tanh else value
