@@ -103,10 +103,8 @@ class Deployed(Walk):
         limits = np.where(body.joint_max_force > 0, body.joint_max_force, ENDLESS)
         if described.max_torque:
             limits[self.joints] = described.max_torque
-        self.max_force = limits
-        self.wheels = [self.joint_order.index(name) for name in described.wheels]
-        self.driven = [name for name in body.joint_names if name not in described.wheels]
-        self.driven_numbers = body.find_joints(self.driven)
+        self.max_force = limits.tolist()
+        self.is_wheel = np.isin(self.joint_order, described.wheels)
 
     def _spread(self, values: tuple[float, ...], of_others: float, count: int) -> np.ndarray:
         """Return values of the policy's joints as an array of all joints of the model."""
@@ -122,13 +120,10 @@ class Deployed(Walk):
         """Set the joints' target angles, and the speeds of wheels."""
         commanded = self.reach * action
         targets = np.tile(self.stance, (self.worlds, 1))
-        targets[:, self.joints] += commanded
-        limits = self.max_force[self.driven_numbers].tolist()
-        self.body.drive_to(targets[:, self.driven_numbers], max_force=limits, joints=self.driven)
-        if self.wheels:
-            names = self.described.wheels
-            limits = self.max_force[self.body.find_joints(names)].tolist()
-            self.body.drive_at(commanded[:, self.wheels], max_force=limits, joints=names)
+        speeds = np.zeros_like(targets)
+        speeds[:, self.joints] = np.where(self.is_wheel, commanded, 0.0)
+        targets[:, self.joints] += np.where(self.is_wheel, 0.0, commanded)
+        self.body.drive_to(targets, velocities=speeds, max_force=self.max_force)
         self.action_change = action - self.last_action
         self.last_action = action.astype(float)
         self.steps += 1
@@ -160,7 +155,7 @@ class Deployed(Walk):
 
     def describe_joints(self) -> Joints:
         """The robot's, in the order of the policy."""
-        if self.wheels:  # `Joints` has one kind of command for all joints
+        if self.described.wheels:  # `Joints` has one kind of command for all joints
             return self.body.describe_joints(self.joint_order)
         described = self.described
         observed = {part.kind for part in described.observations}

@@ -249,10 +249,13 @@ class Body:
         max_force: float | Sequence[float] | None = None,
         gain: float = 0.1,
         joints: Sequence[str] = (),
+        velocities: Array | None = None,
     ) -> None:
         """Set position targets [rad or m]; the default limits of speed and force are those of the model file.
 
         With `set_drives` joints are springs and dampers, without a limit of speed unless `max_speed` is given.
+        Their dampers resist the difference from `velocities` [rad/s or m/s], by default 0: with a stiffness of 0 a
+        joint follows that speed, as a wheel does. PyBullet's springs have no such targets.
         Otherwise `gain` is the fraction of the position error that one physics step removes, in (0, 1].
         """
         raise NotImplementedError

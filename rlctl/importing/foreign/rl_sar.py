@@ -32,6 +32,7 @@ _SCALES = {
     "dof_pos": "dof_pos_scale",
     "dof_vel": "dof_vel_scale",
 }
+_MOST_ABOVE = 4  # folders
 _WIDE = 100.0  # clips from here on never act
 
 
@@ -73,9 +74,12 @@ def read(content: Mapping[str, Any], source: str, robot: Robot, network: Foreign
 
 
 def _read_base(config: Path, robot: str) -> dict[str, Any]:
-    file = config.parent.parent / "base.yaml"
-    if not file.is_file():
-        raise UsageError(f"{config}: rl_sar has names and rate of the joints in {file}, which does not exist")
+    above = config.absolute().parents[1:_MOST_ABOVE]
+    file = next((folder / "base.yaml" for folder in above if (folder / "base.yaml").is_file()), None)
+    if file is None:
+        raise UsageError(
+            f"{config}: rl_sar has the joints' names and the rate in base.yaml, in a folder above, where there is none"
+        )
     content = yaml_text.load(yaml_text.read_text(file), str(file), ignore_tags=True)
     inner = content.get(robot) if isinstance(content, dict) else None
     if not isinstance(inner, dict):

@@ -112,6 +112,7 @@ class MujocoMotors(Body):
         max_force: float | Sequence[float] | None = None,
         gain: float = 0.1,
         joints: Sequence[str] = (),
+        velocities: Array | None = None,
     ) -> None:
         mode = self._find_mode("position", joints, max_force, gain, max_speed)
         targets = self._read(positions, mode)
@@ -124,6 +125,8 @@ class MujocoMotors(Body):
             force = self._limit_approach(mode, targets, force)
         if self.parts.drives is None:
             force = force + self._hold(mode)
+        elif velocities is not None:
+            force = force + mode.damping * self._read(velocities, mode)
         self._fields.data("ctrl")[..., mode.motors] = force
 
     @property

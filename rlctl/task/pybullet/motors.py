@@ -68,7 +68,10 @@ class Motors(Body):
         max_force: float | Sequence[float] | None = None,
         gain: float = 0.1,
         joints: Sequence[str] = (),
+        velocities: Array | None = None,
     ) -> None:
+        if velocities is not None:
+            self._refuse("drive_to(velocities=..)")
         limits = (_as_key(max_speed), _as_key(max_force), gain)
         plan = self._plans.get(tuple(joints))
         if plan is None or plan.limits != limits:
