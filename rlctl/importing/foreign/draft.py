@@ -49,6 +49,7 @@ class Draft:
         for name in joints:
             check_name(name, robot.joints, f"{self.source}: {robot.path.name} has no joint", UsageError)
         self._guess_pose(values, robot)
+        self._guess_gains(values, robot)
         if missing := [name for name in _REQUIRED if values.get(name) is None]:
             forms = " ".join(f"--set {name}={_FORMS[name]}" for name in missing)
             raise UsageError(f"{self.source} does not say: {', '.join(missing)}. Give {forms}")
@@ -56,6 +57,8 @@ class Draft:
             if isinstance(values.get(name), int | float) and not isinstance(values[name], bool):
                 values[name] = [values[name]] * len(joints)
         self._guess_others(values, robot)
+        if network.ends_with_tanh:  # a wider clip would never act; and the policy file scales tanh to this range
+            values["action_clip"] = [-1.0, 1.0]
         if "start_height" not in values:
             pose = dict(zip(joints, values["default_positions"], strict=False))
             values["start_height"] = round(robot.measure_start(pose), 4)
@@ -78,6 +81,14 @@ class Draft:
         if values.get("default_positions") is None and robot.pose:
             values["default_positions"] = [robot.pose[name] for name in values["joints"]]
             self.notes.append(f"default_positions: guessed keyframe {robot.keyframe!r} of {robot.path.name}")
+
+    def _guess_gains(self, values: dict[str, Any], robot: Robot) -> None:
+        if not all(name in robot.gains for name in values["joints"]):
+            return
+        for number, key in enumerate(("stiffness", "damping")):
+            if values.get(key) is None:
+                values[key] = [robot.gains[name][number] for name in values["joints"]]
+                self.notes.append(f"{key}: guessed that of the position actuators of {robot.path.name}")
 
     def _guess_others(self, values: dict[str, Any], robot: Robot) -> None:
         if not values.get("commands"):

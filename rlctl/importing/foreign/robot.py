@@ -26,7 +26,8 @@ class Robot:
     has_armature: bool
     keyframe: str = ""  # name of the file's keyframe `home`, or of its first
     pose: Mapping[str, float] = dataclasses.field(default_factory=dict)  # [rad], of the keyframe
-    terrain: str = ""
+    gains: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    """Stiffness [N m/rad] and damping [N m s/rad] by joint, of the file's position actuators."""
 
     def measure_start(self, positions: Mapping[str, float]) -> float:
         """Return the height of the trunk's centre of mass [m] at which the feet are just above flat ground."""
@@ -66,7 +67,23 @@ def read_robot(path: Path) -> Robot:
         has_armature=bool(armature.any()),
         keyframe=keyframe,
         pose=pose,
+        gains=_read_gains(path),
     )
+
+
+def _read_gains(path: Path) -> dict[str, tuple[float, float]]:
+    """Return the gains of the actuators of an MJCF file that drive joints to positions."""
+    if path.suffix != ".xml":
+        return {}
+    import mujoco
+
+    spec = mujoco.MjSpec.from_file(str(path))
+    gains: dict[str, tuple[float, float]] = {}
+    for actuator in spec.actuators:
+        stiffness, damping = float(actuator.gainprm[0]), -float(actuator.biasprm[2])
+        if int(actuator.biastype) == int(mujoco.mjtBias.mjBIAS_AFFINE) and actuator.biasprm[1] == -stiffness:
+            gains[str(actuator.target)] = stiffness, max(damping, 0.0)
+    return gains
 
 
 def _list_motors(path: Path, joints: Sequence[str]) -> tuple[str, ...]:
