@@ -1,24 +1,28 @@
 """`rlctl diagnose`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from rlctl.arguments import choose_checkpoint, command
 from rlctl.options import Argument, Json, SimOption
 from rlctl_robot.diagnose.diagnose_request import DiagnoseRequest
 
+if TYPE_CHECKING:
+    from rlctl_robot.diagnose.source import PolicyOrigin
+
 
 @command
 def diagnose(
+    request: DiagnoseRequest,
     log: Annotated[
-        Path,
+        Path | None,
         Argument(
             "Observations and actions, a row per action: .csv or .npz with columns NAME_0, .., action_0, .., or what "
-            "`rlctl serve --rerun` wrote.",
-            metavar="LOG",
+            "`rlctl serve --rerun` wrote. Without it: an imported policy is played with changes of its mapping.",
+            metavar="[LOG]",
+            default_text="",
         ),
-    ],
-    request: DiagnoseRequest,
+    ] = None,
     sim: SimOption = None,
     json: Json = None,
 ) -> None:
@@ -33,6 +37,9 @@ def diagnose(
         request.policy, choose_checkpoint(request.checkpoint, request.pretrained), parse_changes([], sim)
     )
     output.print_notes(source.notes)
+    if log is None:
+        _diagnose_deployment(source, request.seed, json)
+        return
     result = diagnose_log(
         log,
         source.policy,
@@ -44,5 +51,16 @@ def diagnose(
         report=lambda line: output.err().print(f"diagnose: {line}"),
     )
     output.print_notes(result.notes)
+    show(result, json)
+    result.check()
+
+
+def _diagnose_deployment(source: "PolicyOrigin", seed: int, json: str | None) -> None:
+    from rlctl import output
+    from rlctl_robot.diagnose.deployed import diagnose_deployment, show
+
+    result = diagnose_deployment(
+        source.policy, source.spec, seed, report=lambda line: output.err().print(f"diagnose: {line}")
+    )
     show(result, json)
     result.check()
