@@ -18,6 +18,7 @@ Model = TypeVar("Model", bound="BaseModel")
 _PREFIX = "tag:yaml.org,2002:"
 _DEEPEST = 50
 _LONGEST = 2**20  # [bytes] of a file
+_MOST_VALUES = 100_000  # of a file of another project
 _MOST_DIGITS = 100  # of a whole number; Python itself refuses thousands
 
 
@@ -27,14 +28,14 @@ class _Dumper(yaml.SafeDumper):
 
 class _Loader(yaml.SafeLoader):
     depth = 0
-    ignores_tags = False
+    is_foreign = False
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # filled below: no dates
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
-        if getattr(event, "anchor", None) is not None:  # of an alias too
+        if getattr(event, "anchor", None) is not None and not self.is_foreign:  # of an alias too
             raise _make_error("anchors and aliases (&name, *name) are not supported: write the values out", event)
-        if self.ignores_tags and getattr(event, "tag", None) is not None:
+        if self.is_foreign and getattr(event, "tag", None) is not None:
             event.tag, event.implicit = None, _UNTAGGED.get(type(event), True)  # type: ignore[attr-defined]
         if getattr(event, "tag", None) is not None:  # bytes, sets, objects of Python
             raise _make_error("tags (!!int, !name) are not supported: write the value alone", event)
@@ -65,8 +66,31 @@ class _Loader(yaml.SafeLoader):
         return float(self.construct_scalar(node).replace("_", "").lower().replace(".inf", "inf").replace(".nan", "nan"))
 
 
-class _UntaggedLoader(_Loader):
-    ignores_tags = True
+class _ForeignLoader(_Loader):
+    is_foreign = True
+
+    def get_single_node(self) -> yaml.Node | None:
+        node = super().get_single_node()
+        if node is not None:
+            _count_values(node, {})
+        return node
+
+
+def _count_values(node: yaml.Node, sizes: dict[int, int]) -> int:
+    """Return how many values a node has, those of aliases each time; raises an error for too many."""
+    known = sizes.get(id(node))
+    if known is not None:
+        return known
+    sizes[id(node)] = _MOST_VALUES  # until its parts are counted: one that contains itself has too many
+    parts: list[yaml.Node] = []
+    if isinstance(node, yaml.MappingNode):
+        parts = [part for pair in node.value for part in pair]
+    elif isinstance(node, yaml.SequenceNode):
+        parts = node.value
+    sizes[id(node)] = 1 + sum(_count_values(part, sizes) for part in parts)
+    if sizes[id(node)] > _MOST_VALUES:
+        raise _make_error(f"anchors and aliases make more than {_MOST_VALUES:,} values of it", node)
+    return sizes[id(node)]
 
 
 _UNTAGGED: dict[type[Any], Any] = {yaml.ScalarEvent: (True, False)}
@@ -109,14 +133,15 @@ def read_text(path: Path) -> str:
         raise RecipeError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start:,}; save it as UTF-8") from None
 
 
-def load(text: str, source: str, *, ignore_tags: bool = False) -> Any:
+def load(text: str, source: str, *, foreign: bool = False) -> Any:
     """Parse YAML without anchors and aliases; raises `RecipeError` with `source` and the line.
 
-    With `ignore_tags` a value with a tag, such as an object of Python, is read as the text, list or mapping that it is
-    written as; nothing is constructed of it.
+    A `foreign` file, of another project, may have them, as long as they do not multiply its values. In it a value with
+    a tag, such as an object of Python, is read as the text, list or mapping that it is written as; nothing is
+    constructed of it.
     """
     try:
-        loader = _UntaggedLoader(text) if ignore_tags else _Loader(text)
+        loader = _ForeignLoader(text) if foreign else _Loader(text)
         try:
             return loader.get_single_data()
         finally:

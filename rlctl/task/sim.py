@@ -56,12 +56,12 @@ class Sim:
         """Load the body of a URDF, MJCF (`.xml`) or SDF file: a path, or a name as of `find_model_file`.
 
         `position` [m] and `orientation` of the base's origin, and `fixed`, are for URDF files; other formats contain
-        them. Meshes of a URDF are found as `rlctl.task.mesh_paths` says; frames and impossible inertias are changed as
-        `rlctl.task.urdf` says, the same in each engine. `flags` are PyBullet's URDF_* flags. With `self_collision`
+        them. Meshes of a URDF are found as `rlctl.task.mesh_paths` says; frames and impossible inertias are changed
+        as `rlctl.task.urdf` says, the same in each engine. `flags` are PyBullet's URDF_* flags. With `self_collision`
         links collide, except with their ancestors. Without `floor` the shapes of the world that an MJCF file has,
         such as a floor, are left out, which only MuJoCo can. `inertia="shape"` is for a URDF whose inertias are wrong
-        (see `rlctl.task.model_faults`): the engine computes them from the collision shapes and the file's masses. Raises
-        `TaskError` for a file that is missing, or that the engine refuses.
+        (see `rlctl.task.model_faults`): the engine computes them from the collision shapes and the file's masses.
+        Raises `TaskError` for a file that is missing, or that the engine refuses.
         """
         self._refuse("load")
 

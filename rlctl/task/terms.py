@@ -142,8 +142,10 @@ class Euler(Term):
 
 def _find_angle(sine: Any, cosine: Any) -> Any:
     """Return the angle in (-pi, pi] of a point; ONNX has no function of both coordinates."""
-    length = np.sqrt(sine * sine + cosine * cosine)
-    return 2.0 * np.arctan(sine / (length + cosine + 1e-12))  # the angle itself would divide by 0 at pi
+    length = np.maximum(np.sqrt(sine * sine + cosine * cosine), 1e-12)
+    ratio = np.minimum(np.maximum(cosine / length, -1.0), 1.0)
+    sign = 1.0 + 2.0 * np.minimum(np.floor(sine / length), 0.0)  # -1 for sines below 0, else 1
+    return sign * np.arccos(ratio)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,9 +31,24 @@ TERMS = {
     "far": terms.Distance("goal", "hand"),
     "last": terms.LastAction(),
     "clock": terms.PhaseClock(0.35),
+    "legs": terms.PhaseClock(0.35, offsets=(0.0, 0.5)),
+    "euler": terms.Euler("orientation"),
+    "clipped": terms.Scaled("angles", clip=(-0.2, 0.3)),
 }
 QUANTITIES = {"orientation": 4, "angles": 2, "goal": 3, "hand": 3}
-SIZES = {"gravity": 3, "angles": 2, "hand": 3, "to_goal": 3, "far": 1, "last": 2, "clock": 2, "int": 1}
+SIZES = {
+    "gravity": 3,
+    "angles": 2,
+    "hand": 3,
+    "to_goal": 3,
+    "far": 1,
+    "last": 2,
+    "clock": 2,
+    "legs": 4,
+    "euler": 3,
+    "clipped": 2,
+    "int": 1,
+}
 JOINTS = Joints(["a", "b"], default_positions=[0.5, -0.5], low=[-0.4, -0.4], high=[0.4, 0.4])
 STEPS = 12
 

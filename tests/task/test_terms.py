@@ -10,7 +10,7 @@ from rlctl.errors import RecipeError, TaskError
 from rlctl.task import Joints, terms
 from rlctl.task.env import TaskEnv
 from rlctl.task.events import EventSettings
-from rlctl.task.rotations import normalize, rotate_inverse
+from rlctl.task.rotations import normalize, roll_pitch_yaw, rotate_inverse
 from rlctl.task.worlds import TaskWorlds
 from tests.task.batches import Stool
 from tests.task.tasks import Slider
@@ -56,6 +56,25 @@ def test_terms_by_hand():
     # A quarter of a turn, and one turn more.
     assert terms.PhaseClock(4.0)(1.0) == pytest.approx([1.0, 0.0], abs=1e-12)
     assert terms.PhaseClock(4.0)(np.array([[5.0], [2.0]])) == pytest.approx(np.array([[1.0, 0.0], [0.0, -1.0]]))
+
+
+def test_terms_of_other_projects_by_hand():
+    clipped = terms.Scaled("q", offset=1.0, clip=(-0.5, 0.5))
+    assert clipped(np.array([1.2, 9.0, -9.0])) == pytest.approx([0.2, 0.5, -0.5])
+    # Two legs, half a period apart, after a quarter: sines 1 and -1, cosines 0 and 0.
+    assert terms.PhaseClock(4.0, offsets=(0.0, 0.5))(1.0) == pytest.approx([1.0, -1.0, 0.0, 0.0], abs=1e-12)
+    half = np.sqrt(0.5)
+    # A quarter of a turn about x, y, z; and half a turn about z.
+    assert terms.Euler()(np.array([half, 0.0, 0.0, half])) == pytest.approx([np.pi / 2, 0.0, 0.0], abs=1e-6)
+    assert terms.Euler()(np.array([0.0, np.sin(0.5), 0.0, np.cos(0.5)])) == pytest.approx([0.0, 1.0, 0.0], abs=1e-6)
+    assert terms.Euler()(np.array([0.0, 0.0, 1.0, 0.0])) == pytest.approx([0.0, 0.0, np.pi], abs=1e-6)
+    with pytest.raises(TaskError, match="clip must be the lowest and the highest"):
+        terms.Scaled("q", clip=(1.0,))
+
+
+def test_euler_angles_are_those_of_a_rotation():
+    for quaternion in normalize(np.random.default_rng(1).normal(size=(50, 4))):
+        assert terms.Euler()(quaternion) == pytest.approx(roll_pitch_yaw(quaternion), abs=1e-6)
 
 
 def test_a_history_begins_with_the_first_value():

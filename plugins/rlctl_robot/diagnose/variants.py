@@ -66,12 +66,15 @@ def _change(deployment: Deployment, **values: Any) -> Deployment:
 def _list_joint_orders(deployment: Deployment, robot: Robot) -> Iterator[tuple[tuple[int, ...], str]]:
     """Yield orders of all joints that projects use, with what they are: joint k is the present one `order[k]`."""
     joints = list(deployment.joints)
-    own = [name for name in robot.joints if name in joints]
-    if sorted(own) == sorted(joints):
-        yield tuple(joints.index(name) for name in own), f"the order of {robot.path.name}"
-    motors = [name for name in robot.motors if name in joints]
-    if sorted(motors) == sorted(joints):
-        yield tuple(joints.index(name) for name in motors), f"the order of the motors of {robot.path.name}"
+    of_robot = {
+        f"the order of {robot.path.name}": robot.joints,
+        f"the order of the motors of {robot.path.name}": robot.motors,
+        "Isaac Lab's order, by the distance from the base": robot.breadth_first,
+    }
+    for text, names in of_robot.items():
+        own = [name for name in names if name in joints]
+        if sorted(own) == sorted(joints):
+            yield tuple(joints.index(name) for name in own), text
     yield tuple(sorted(range(len(joints)), key=lambda index: joints[index])), "alphabetical order"
     yield tuple(_exchange_sides(joints)), "left and right exchanged"
     front = [_exchange(name, "F", "R") if name[:1] in "FR" and name[1:2] in "LR" else name for name in joints]
@@ -104,9 +107,8 @@ def _list_orders(deployment: Deployment, robot: Robot) -> Iterator[Variant]:
     joints = deployment.joints
     for order, text in _list_joint_orders(deployment, robot):
         names = tuple(joints[index] for index in order)
-        yield Variant(
-            "joint order", f"the policy's joints are in another order: {text}", _change(deployment, joints=names)
-        )
+        what = f"the policy's joints are in another order: {text}"
+        yield Variant("joint order", what, _change(deployment, joints=names), moves_world=True)
         moved = {
             name: tuple(values[index] for index in order)
             for name in ("default_positions", "action_scale", "stiffness", "damping", "max_torque", "armature")

@@ -98,7 +98,7 @@ def read_draft(
         if metadata.matches(own_metadata):
             return metadata.read(own_metadata, str(file), robot, network), metadata.TITLE
         return Draft(str(file), {}), "--set alone"
-    content = yaml_text.load(yaml_text.read_text(deploy), str(deploy), ignore_tags=True)
+    content = yaml_text.load(yaml_text.read_text(deploy), str(deploy), foreign=True)
     if not isinstance(content, dict):
         raise RecipeError(f"{deploy}: expected a mapping of names to values")
     for reader in READERS:

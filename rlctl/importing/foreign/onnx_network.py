@@ -147,6 +147,8 @@ class _ChainReader:
         if kind in ("Add", "Sub", "Mul", "Div"):
             return [("affine", _read_affine(kind, np.ravel(others[0]).astype(float), is_first=node.input[0] == given))]
         if kind == "Split":
+            if attributes.get("axis", 0) not in (-1, 1):
+                raise NotImportable("its Split is along the batch")
             # What is read is the first output: the means of actions; standard deviations follow.
             sizes = attributes.get("split") or (np.ravel(others[0]).tolist() if others else [])
             if sizes:

@@ -80,7 +80,7 @@ def _read_base(config: Path, robot: str) -> dict[str, Any]:
         raise UsageError(
             f"{config}: rl_sar has the joints' names and the rate in base.yaml, in a folder above, where there is none"
         )
-    content = yaml_text.load(yaml_text.read_text(file), str(file), ignore_tags=True)
+    content = yaml_text.load(yaml_text.read_text(file), str(file), foreign=True)
     inner = content.get(robot) if isinstance(content, dict) else None
     if not isinstance(inner, dict):
         raise UsageError(f"{file}: it has nothing about {robot!r}")

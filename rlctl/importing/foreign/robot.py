@@ -5,10 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rlctl.errors import TaskError, UsageError
+
+if TYPE_CHECKING:
+    from rlctl.task.mujoco.body import MujocoBody
 
 _HIGH = 5.0  # [m], where the robot is placed to measure how far its feet are below its trunk
 _CLEARANCE = 0.005  # [m], between feet and ground at the start
@@ -22,6 +26,7 @@ class Robot:
     path: Path
     joints: tuple[str, ...]  # in the order of the file
     motors: tuple[str, ...]  # joints in the order of the file's actuators; empty if not all have one
+    breadth_first: tuple[str, ...]  # joints by their distance from the base, as Isaac Lab orders them
     limits: Mapping[str, float]  # torque by joint [N m]; 0: none
     has_armature: bool
     keyframe: str = ""  # name of the file's keyframe `home`, or of its first
@@ -63,6 +68,7 @@ def read_robot(path: Path) -> Robot:
         path=path.resolve(),
         joints=tuple(body.joint_names),
         motors=_list_motors(path, body.joint_names),
+        breadth_first=_sort_by_depth(body),
         limits=dict(zip(body.joint_names, body.joint_max_force.tolist(), strict=True)),
         has_armature=bool(armature.any()),
         keyframe=keyframe,
@@ -84,6 +90,17 @@ def _read_gains(path: Path) -> dict[str, tuple[float, float]]:
         if int(actuator.biastype) == int(mujoco.mjtBias.mjBIAS_AFFINE) and actuator.biasprm[1] == -stiffness:
             gains[str(actuator.target)] = stiffness, max(damping, 0.0)
     return gains
+
+
+def _sort_by_depth(body: MujocoBody) -> tuple[str, ...]:
+    model = body._sim.model
+    depths: dict[str, int] = {}
+    for name, joint in zip(body.joint_names, body.parts.joints, strict=True):
+        link, depth = int(model.jnt_bodyid[joint]), 0
+        while link:
+            link, depth = int(model.body_parentid[link]), depth + int(model.body_jntnum[link] > 0)
+        depths[name] = depth
+    return tuple(sorted(body.joint_names, key=lambda name: depths[name]))
 
 
 def _list_motors(path: Path, joints: Sequence[str]) -> tuple[str, ...]:

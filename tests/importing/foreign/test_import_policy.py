@@ -1,0 +1,255 @@
+"""Files of each project become a policy that acts as in that project; what they lack is asked for by name."""
+
+import itertools
+import re
+
+import numpy as np
+import pytest
+
+from rlctl.errors import ArtifactError, RecipeError, UsageError
+from rlctl.importing.foreign.import_policy import import_policy
+from rlctl.policy.load import load_policy
+from rlctl.task.deployment import Deployment
+from rlctl_locomotion.quadruped import JOINTS
+from tests.importing.foreign.policies import (
+    A1,
+    STANCE,
+    describe_walk,
+    expect_as,
+    read_walk,
+    write_onnx,
+    write_torchscript,
+    write_yaml,
+)
+
+UNTAGGED = re.compile(r"joint_ids:\n\s+- null")
+LAB = {
+    "joint_ids_map": list(range(12)),
+    "step_dt": 0.02,
+    "stiffness": [float(number) for number in range(1, 13)],
+    "damping": [1.0] * 12,
+    "default_joint_pos": STANCE,
+    "commands": {"base_velocity": {"ranges": {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": None, "heading": None}}},
+    "actions": {"JointPositionAction": {"clip": None, "scale": [0.25] * 12, "offset": STANCE, "joint_ids": [None]}},
+    "observations": {
+        "base_ang_vel": {"scale": [0.2] * 3, "clip": [-10.0, 10.0], "history_length": 2},
+        "projected_gravity": {"scale": [1.0] * 3, "history_length": 1},
+        "velocity_commands": {"scale": None, "history_length": 0},
+        "joint_pos_rel": {"scale": [1.0] * 12},
+        "joint_vel_rel": {"scale": [0.05] * 12},
+        "last_action": {"scale": [1.0] * 12},
+    },
+}
+GYM = {
+    "simulation_dt": 0.005,
+    "control_decimation": 4,
+    "kps": [35.0] * 12,
+    "kds": [1.0] * 12,
+    "default_angles": STANCE,
+    "ang_vel_scale": 0.25,
+    "dof_pos_scale": 1.0,
+    "dof_vel_scale": 0.05,
+    "action_scale": 0.25,
+    "cmd_scale": [2.0, 2.0, 0.25],
+    "num_actions": 12,
+    "num_obs": 47,
+}
+SAR = {
+    "observations": ["ang_vel", "gravity_vec", "commands", "dof_pos", "dof_vel", "actions"],
+    "observations_history": [0, 1],
+    "observations_history_priority": "time",
+    "clip_actions_lower": [-3.0] * 12,
+    "clip_actions_upper": [3.0] * 12,
+    "rl_kp": [35.0] * 12,
+    "rl_kd": [1.0] * 12,
+    "action_scale": [0.25] * 12,
+    "wheel_indices": [],
+    "ang_vel_scale": 0.25,
+    "dof_pos_scale": 1.0,
+    "dof_vel_scale": 0.05,
+    "commands_scale": [2.0, 2.0, 0.25],
+    "torque_limits": [33.5] * 12,
+    "default_dof_pos": STANCE,
+    "joint_mapping": [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8],
+}
+
+
+@pytest.fixture
+def run_import(tmp_path, monkeypatch):
+    """Import a policy of so many observations with a deployment file."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(content, size, settings=None, name="deploy.yaml"):
+        write_torchscript(tmp_path / "policy.pt", [size, 8, 12])
+        deploy = write_yaml(tmp_path / name, content)
+        return import_policy(tmp_path / "policy.pt", deploy, A1, settings=settings)
+
+    return run
+
+
+def test_deploy_yaml_of_unitree_rl_lab_has_two_orders(run_import):
+    imported = run_import(LAB, 3 * 2 + 3 + 3 + 36)
+    deployment = imported.deployment
+    assert imported.form == "deploy.yaml of unitree_rl_lab"
+    # The motors of Unitree's quadrupeds: each leg in the order FR, FL, RR, RL, as in the A1's file.
+    assert list(deployment.joints) == JOINTS
+    assert deployment.stiffness == tuple(LAB["stiffness"])
+    gyroscope = deployment.observations[0]
+    assert (gyroscope.kind, gyroscope.scale, gyroscope.clip, gyroscope.history) == ("gyroscope", 0.2, (-10.0, 10.0), 2)
+    assert dict(deployment.commands) == {"lin_vel_x": (-1.0, 1.0)}
+    assert "joint_ids_map: guessed the order FR, FL, RR, RL of Unitree's quadrupeds" in imported.notes
+
+
+def test_stiffness_follows_joint_ids_map(run_import):
+    order = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
+    deployment = run_import({**LAB, "joint_ids_map": order}, 48).deployment
+    assert deployment.stiffness == tuple(float(index + 1) for index in order)
+    assert list(deployment.joints) == [JOINTS[index] for index in order]
+
+
+def test_yaml_of_unitree_rl_gym_gets_what_its_scripts_say(run_import):
+    imported = run_import(GYM, 47)
+    deployment = imported.deployment
+    assert deployment.control_dt == pytest.approx(0.02)
+    assert deployment.observations[-1].period_s == 0.8
+    assert deployment.observations[2].scale == (2.0, 2.0, 0.25)
+    assert list(deployment.joints) == JOINTS
+    guessed = [note.partition(":")[0] for note in imported.notes]
+    assert guessed == ["observations", "joints", "commands", "armature"]
+
+
+def test_config_of_rl_sar_with_its_base(run_import, tmp_path):
+    folder = tmp_path / "a1" / "himloco"
+    folder.mkdir(parents=True)
+    write_yaml(tmp_path / "a1" / "base.yaml", {"a1": {"dt": 0.005, "decimation": 4, "joint_names": JOINTS}})
+    deployment = run_import({"a1/himloco": SAR}, 90, name="a1/himloco/config.yaml").deployment
+    assert deployment.joints[:3] == tuple(JOINTS[3:6])
+    assert (deployment.history_order, deployment.newest_first) == ("frames", True)
+    assert deployment.action_clip == ((-3.0,) * 12, (3.0,) * 12)
+    assert deployment.max_torque == (33.5,) * 12
+
+
+def test_rl_sar_without_its_base(run_import, tmp_path):
+    (tmp_path / "a1" / "himloco").mkdir(parents=True)
+    with pytest.raises(UsageError, match=r"base\.yaml, in a folder above, where there is none"):
+        run_import({"a1/himloco": SAR}, 90, name="a1/himloco/config.yaml")
+
+
+def test_metadata_of_an_onnx_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    metadata = {
+        "joint_names": ",".join(JOINTS),
+        "joint_stiffness": ",".join(["35.0"] * 12),
+        "joint_damping": ",".join(["1.0"] * 12),
+        "default_joint_pos": ",".join(map(str, STANCE)),
+        "action_scale": "0.25",
+        "observation_names": "base_ang_vel,projected_gravity,command,joint_pos,joint_vel,actions",
+    }
+    file = write_onnx(tmp_path / "policy.onnx", read_walk(), metadata=metadata)
+    with pytest.raises(UsageError, match=r"does not say: control_dt\. Give --set control_dt=0.02"):
+        import_policy(file, None, A1)
+    deployment = import_policy(file, None, A1, settings={"control_dt": 0.02}).deployment
+    assert deployment.action_scale == (0.25,) * 12
+
+
+def test_a_policy_acts_as_in_its_own_project(tmp_path, monkeypatch):
+    """Alphabetical joints, scales, and histories by frames with the newest first: the action is the same."""
+    monkeypatch.chdir(tmp_path)
+    network = read_walk()
+    foreign = describe_walk()
+    foreign["observations"][0]["scale"] = 0.25
+    foreign["observations"][3]["scale"] = 2.0
+    file = write_onnx(tmp_path / "policy.onnx", expect_as(network, foreign))
+    deploy = write_yaml(tmp_path / "deploy.yaml", foreign)
+    import_policy(file, deploy, A1)
+    imported = load_policy(tmp_path / "policy.safetensors")
+    observation = np.random.default_rng(0).normal(size=45).astype(np.float32)
+    value = observation.astype(float)
+    for number, linear in enumerate(network.linears):
+        value = linear.weight @ (np.tanh(value) if number else value) + linear.bias
+    assert imported.predict(observation) == pytest.approx(np.clip(value, -4.0, 4.0), abs=1e-4)
+
+
+def test_columns_of_histories():
+    parts = [{"kind": "gyroscope", "history": 2, "scale": 2.0}, {"kind": "gravity", "history": 2}]
+    newest = Deployment(**describe_walk(observations=parts, history_order="frames", newest_first=True))
+    columns, factors = newest.find_columns()
+    # rlctl has the gyroscope's last two values, oldest first, then gravity's; this policy gyroscope and gravity of now,
+    # then those of the step before.
+    assert columns.tolist() == [3, 4, 5, 9, 10, 11, 0, 1, 2, 6, 7, 8]
+    assert factors.tolist() == [2.0, 2.0, 2.0, 1.0, 1.0, 1.0] * 2
+
+
+@pytest.mark.parametrize(
+    ("content", "size", "settings", "message"),
+    [
+        (GYM, 50, None, "12 joints make 45 observations, with a phase 47, and the network takes 50"),
+        (LAB, 99, None, r"observations of 48 numbers \(gyroscope 3 x 2, .*\), and the network takes 99"),
+        (describe_walk(joints=["FR_hip", *JOINTS[1:]]), 45, None, "a1.urdf has no joint 'FR_hip'. Did you mean"),
+        (describe_walk(stiffness=[1.0]), 45, None, "stiffness has 1 numbers for 12 joints"),
+        (describe_walk(stiffness=None), 45, None, "does not say: stiffness. Give --set stiffness=40"),
+        (GYM, 47, {"stifness": 1}, "a deployment has no 'stifness'. Did you mean 'stiffness'"),
+        (LAB | {"observations": {"motion_command": {}}}, 48, None, "it tracks a motion"),
+        (LAB | {"observations": {"height_scan": {}}}, 48, None, "no observation of rlctl is 'height_scan'"),
+        (LAB | {"joint_ids_map": [99] * 12}, 48, None, "joint_ids_map has the index 99, and there are 12 values"),
+        ({"a": 1}, 45, None, "in none of the known forms"),
+    ],
+)
+def test_what_does_not_fit_is_a_line(run_import, content, size, settings, message):
+    with pytest.raises(UsageError, match=message) as raised:
+        run_import(content, size, settings)
+    assert str(raised.value).count("\n") == 0
+
+
+def test_tags_of_python_are_not_constructed(run_import, tmp_path):
+    write_torchscript(tmp_path / "policy.pt", [48, 8, 12])
+    text = write_yaml(tmp_path / "plain.yaml", LAB).read_text()
+    marker = tmp_path / "constructed"
+    call = f"!!python/object/apply:os.mkdir ['{marker}']"
+    (tmp_path / "deploy.yaml").write_text(UNTAGGED.sub(f"joint_ids: {call}", text))
+    with pytest.raises(UsageError, match="the actions move some joints only"):
+        import_policy(tmp_path / "policy.pt", tmp_path / "deploy.yaml", A1, output=tmp_path / "a.safetensors")
+    assert not marker.exists()
+    tagged = UNTAGGED.sub("joint_ids: !!python/object/apply:builtins.slice [null, null, null]", text)
+    (tmp_path / "deploy.yaml").write_text(tagged)
+    deploy = tmp_path / "deploy.yaml"
+    imported = import_policy(tmp_path / "policy.pt", deploy, A1, output=tmp_path / "a.safetensors")
+    assert imported.deployment.control_dt == 0.02
+
+
+def test_anchors_and_large_files_are_refused(tmp_path):
+    write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
+    bomb = tmp_path / "bomb.yaml"
+    names = "abcdefghijklmnopqr"
+    lines = [f"{name}: &{name} [*{before}, *{before}]" for before, name in itertools.pairwise(names)]
+    bomb.write_text("\n".join(["a: &a [x, x]", *lines]))
+    with pytest.raises(RecipeError, match="anchors and aliases make more than 100,000 values"):
+        import_policy(tmp_path / "policy.pt", bomb, A1)
+    with (tmp_path / "large.yaml").open("wb") as file:
+        file.truncate(10**9)
+    with pytest.raises(ArtifactError, match="too large"):
+        import_policy(tmp_path / "policy.pt", tmp_path / "large.yaml", A1)
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(UsageError, match="is an ONNX"):
+        import_policy(tmp_path / "policy.zip", None, A1)
+    write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
+    with pytest.raises(UsageError, match="--model: MuJoCo cannot load"):
+        import_policy(tmp_path / "policy.pt", None, "kuka_iiwa.urdf")
+
+
+def test_the_command_names_what_it_needs(rlctl, tmp_path):
+    write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
+    write_yaml(tmp_path / "deploy.yaml", describe_walk())
+    result = rlctl("runs", "import", "policy.pt", "--deploy", "deploy.yaml")
+    assert (result.returncode, result.stderr.strip()) == (
+        2,
+        "error: --deploy needs the robot: --model ROBOT.urdf or ROBOT.xml",
+    )
+    result = rlctl("runs", "import", "policy.pt")
+    assert result.returncode == 2
+    assert "--deploy FILE --model ROBOT" in result.stderr
+    result = rlctl("runs", "import", "policy.pt", "--deploy", "deploy.yaml", "--model", A1)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith("policy.safetensors: 12 joints, from deployment of rlctl")

@@ -1,0 +1,128 @@
+"""Networks of other projects are read as data, act as the originals, and are refused where they cannot."""
+
+import numpy as np
+import pytest
+import torch
+from onnx import helper
+
+from rlctl.errors import ArtifactError
+from rlctl.importing.foreign.network import ForeignNetwork, Linear
+from rlctl.importing.foreign.onnx_network import compute, read_onnx
+from rlctl.importing.foreign.torchscript import read_torchscript_network
+from tests.importing.foreign.policies import Concatenated, write_onnx, write_torchscript
+
+
+@pytest.fixture
+def network():
+    """A perceptron of 5 observations and 2 actions."""
+    rng = np.random.default_rng(0)
+    sizes = [(4, 5), (2, 4)]
+    linears = tuple(Linear(rng.normal(size=size), rng.normal(size=size[0])) for size in sizes)
+    return ForeignNetwork(linears, "elu")
+
+
+def test_an_onnx_graph_is_read_as_layers(network, tmp_path):
+    read, metadata = read_onnx(write_onnx(tmp_path / "a.onnx", network, metadata={"joint_names": "a,b"}))
+    assert (read.observation_size, read.action_size, read.activation) == (5, 2, "elu")
+    assert metadata == {"joint_names": "a,b"}
+    row = np.linspace(-1.0, 1.0, 5)
+    assert compute(read, row) == pytest.approx(compute(network, row), abs=1e-6)
+
+
+def test_the_means_of_a_distribution_are_what_acts(network, tmp_path):
+    # Brax's graphs end so: means and standard deviations, of which the first half goes through tanh.
+    split = [
+        helper.make_node("Split", ["y1"], ["mean", "std"], num_outputs=2, axis=-1),
+        helper.make_node("Tanh", ["mean"], ["actions"]),
+    ]
+    path = write_onnx(tmp_path / "a.onnx", network, extra=split)
+    import onnx
+
+    model = onnx.load(path)
+    model.opset_import[0].version = 18
+    onnx.save(model, path)
+    read, _ = read_onnx(path)
+    assert (read.action_size, read.ends_with_tanh, read.algo) == (1, True, "td3")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"inputs": [("obs", [1, 5]), ("time_step", [1, 1])]}, r"2 inputs \(obs, time_step\).* plays a motion"),
+        ({"inputs": [("obs", ["batch", "size"])]}, "the size of its input obs is dynamic"),
+        ({"inputs": [("obs", [1, 5, 1])]}, "has 3 axes"),
+        ({"extra": [helper.make_node("Fancy", ["y1"], ["actions"], domain="their.own")]}, "custom operator Fancy"),
+        ({"extra": [helper.make_node("Softmax", ["y1"], ["actions"])]}, "the operator Softmax"),
+        ({"extra": [helper.make_node("Add", ["y1", "y1"], ["actions"])]}, "joins two branches with Add"),
+        (
+            {
+                "inputs": [("obs", [1, 5]), ("h_in", [1, 1, 4])],
+                "extra": [helper.make_node("LSTM", ["y1"], ["actions"])],
+            },
+            r"hidden states \(LSTM; inputs obs, h_in\)",
+        ),
+    ],
+)
+def test_graphs_that_are_no_perceptron_are_a_line(network, tmp_path, change, message):
+    with pytest.raises(ArtifactError, match=message) as raised:
+        read_onnx(write_onnx(tmp_path / "a.onnx", network, **change))
+    assert "\n" not in str(raised.value)
+
+
+def test_text_is_no_graph(tmp_path):
+    file = tmp_path / "a.onnx"
+    file.write_text("not a graph")
+    with pytest.raises(ArtifactError, match=r"a\.onnx: "):
+        read_onnx(file)
+
+
+def test_torchscript_is_read_without_running_it(tmp_path):
+    module = write_torchscript(tmp_path / "a.pt", [5, 8, 2])
+    network = read_torchscript_network(tmp_path / "a.pt")
+    row = np.linspace(-1.0, 1.0, 5)
+    with torch.no_grad():
+        expected = module(torch.tensor(row[None], dtype=torch.float32))[0].numpy()
+    assert compute(network, row) == pytest.approx(expected, abs=1e-5)
+
+
+def test_torchscript_with_an_lstm(tmp_path):
+    class Recurrent(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.memory = torch.nn.LSTM(5, 8, 1)
+            self.actor = torch.nn.Sequential(torch.nn.Linear(8, 4), torch.nn.ELU(), torch.nn.Linear(4, 2))
+            self.register_buffer("hidden_state", torch.zeros(1, 1, 8))
+            self.register_buffer("cell_state", torch.zeros(1, 1, 8))
+
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            out, (h, c) = self.memory(x.unsqueeze(0), (self.hidden_state, self.cell_state))
+            self.hidden_state[:] = h
+            self.cell_state[:] = c
+            return self.actor(out.squeeze(0))
+
+    torch.jit.script(Recurrent()).save(str(tmp_path / "a.pt"))
+    network = read_torchscript_network(tmp_path / "a.pt")
+    assert network.lstm is not None
+    assert (network.observation_size, network.lstm.hidden_size, network.algo) == (5, 8, "recurrent_ppo")
+
+
+def test_torchscript_that_does_more_is_refused_with_the_way_to_onnx(tmp_path):
+    write_torchscript(tmp_path / "a.pt", [10, 8, 2], kind=Concatenated)
+    with pytest.raises(ArtifactError, match=r"its forward calls cat; .*torch\.onnx\.export"):
+        read_torchscript_network(tmp_path / "a.pt")
+
+
+def test_weights_alone_are_no_network(tmp_path):
+    torch.save({"actor.0.weight": torch.zeros(2, 5)}, tmp_path / "a.pt")
+    with pytest.raises(ArtifactError, match=r"written by torch\.save"):
+        read_torchscript_network(tmp_path / "a.pt")
+
+
+def test_a_layer_for_an_input_in_another_order():
+    linear = Linear(np.array([[1.0, 2.0]]), np.array([0.5]))
+    # The layer reads 3 * element 2 and 10 * element 0 of three: 1 * 3 * x[2] + 2 * 10 * x[0].
+    taken = linear.take_columns(np.array([2, 0]), np.array([3.0, 10.0]), 3)
+    assert taken.weight.tolist() == [[20.0, 0.0, 3.0]]
+    # With mean 2 and factor 3: weight * 3 * (x - 2).
+    standardized = Linear(np.array([[1.0]]), np.array([0.5])).standardize(np.array([2.0]), np.array([3.0]))
+    assert (standardized.weight.tolist(), standardized.bias.tolist()) == ([[3.0]], [-5.5])

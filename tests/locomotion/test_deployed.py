@@ -1,0 +1,145 @@
+"""An imported policy walks, is evaluated and exported as rlctl's own, and its mistakes are named."""
+
+import numpy as np
+import pytest
+
+from rlctl.environments.spec import EnvSpec
+from rlctl.errors import AnswerIsNo, TaskError
+from rlctl.exporting.c_source import find_compiler
+from rlctl.importing.foreign.import_policy import TASK, import_policy
+from rlctl.policy.file import PolicyFile
+from rlctl.policy.load import check_playable
+from rlctl.task.deployment import Deployment
+from rlctl_robot.diagnose.deployed import diagnose_deployment
+from rlctl_robot.diagnose.mapped_actor import map_action, map_observation
+from tests.importing.foreign.policies import A1, describe_walk, expect_as, read_walk, write_onnx, write_yaml
+
+FOREIGN = {
+    "observations": [
+        {"kind": "command"},
+        {"kind": "gyroscope", "scale": 0.25},
+        {"kind": "gravity"},
+        {"kind": "joint_positions"},
+        {"kind": "joint_velocities", "scale": 0.05},
+        {"kind": "last_action"},
+    ]
+}
+
+
+@pytest.fixture
+def import_walk(tmp_path):
+    """Import rlctl's policy `walk` from an ONNX file, described with some mistakes."""
+
+    def run(**mistakes):
+        right = describe_walk()
+        file = write_onnx(tmp_path / "walk.onnx", expect_as(read_walk(), right))
+        deploy = write_yaml(tmp_path / "deploy.yaml", {**right, **mistakes})
+        return import_policy(file, deploy, A1, output=tmp_path / "walk.safetensors").policy
+
+    return run
+
+
+def diagnose(policy):
+    own = check_playable(PolicyFile.read(policy.path)).actor_only()
+    return diagnose_deployment(own, own.info.spec)
+
+
+def test_the_task_needs_a_deployment():
+    with pytest.raises(TaskError, match="rlctl runs import POLICY --deploy FILE --model ROBOT"):
+        EnvSpec(TASK).make_worlds(1)
+
+
+def test_observations_follow_the_deployment():
+    parts = [
+        {"kind": "command"},
+        {"kind": "velocity", "frame": "world"},
+        {"kind": "euler"},
+        {"kind": "phase", "period_s": 0.08, "offsets": [0.0, 0.5]},
+        {"kind": "joint_positions", "clip": [-0.001, 0.001]},
+    ]
+    deployment = describe_walk(observations=parts)
+    spec = EnvSpec(TASK, {"deployment": deployment, "robot_file": A1})
+    worlds = spec.make_worlds(2)
+    first = worlds.reset(np.arange(2), [0, 1])
+    assert first.shape == (2, 3 + 3 + 3 + 4 + 12)
+    second = worlds.step(np.zeros((2, 12), np.float32)).observation
+    # A quarter of the period: sines 1 and -1, cosines 0.
+    assert second[0, 9:13] == pytest.approx([1.0, -1.0, 0.0, 0.0], abs=1e-6)
+    assert np.abs(second[:, 13:]).max() <= 0.001 + 1e-6
+    low, high = np.array([-0.5, -0.4, -0.8]), np.array([1.0, 0.4, 0.8])
+    assert ((first[:, :3] >= low - 1e-6) & (first[:, :3] <= high + 1e-6)).all()
+    worlds.close()
+
+
+def test_wheels_follow_speeds():
+    deployment = describe_walk(wheels=["FR_lower_joint"], stiffness=[35.0, 35.0, 0.0] + [35.0] * 9)
+    deployment["observations"] = [{"kind": "joint_velocities"}]
+    worlds = EnvSpec(TASK, {"deployment": deployment, "robot_file": A1}).make_worlds(1)
+    worlds.reset(np.arange(1), [0])
+    action = np.zeros((1, 12), np.float32)
+    action[0, 2] = 4.0
+    observation = worlds.step(action).observation
+    # The damper of 1 N m s/rad pushes towards 0.25 * 4 = 1 rad/s.
+    assert 0.2 < observation[0, 2] < 1.5
+    worlds.close()
+
+
+def test_variants_read_and_send_what_another_deployment_says():
+    own = Deployment(**describe_walk(**FOREIGN))
+    swapped = [*own.joints[3:6], *own.joints[:3], *own.joints[6:]]
+    other = Deployment(
+        **describe_walk(**FOREIGN, joints=swapped, default_positions=[0.1] * 12, action_scale=[0.5] * 12)
+    )
+    action = map_action(own, other)
+    # Joint 0 gets element 3: 0.1 + 0.5 * 1 = 0.6 rad, which is 0.6 / 0.25 = 2.4 from its own default of 0.
+    assert (action.source[0], action.factor[0] * 1.0 + action.offset[0]) == (3, pytest.approx(2.4))
+    seen = map_observation(own, other, own)
+    place = own.layout.columns["joint_positions"].start
+    # Its element 0 is joint 3, from 0.1 rad instead of 0.
+    assert (seen.source[place], seen.factor[place], seen.offset[place]) == (place + 3, 1.0, pytest.approx(-0.1))
+    assert map_observation(own, own, own).source.tolist() == list(range(own.layout.size))
+
+
+@pytest.mark.slow
+def test_an_imported_policy_walks(import_walk, rlctl, tmp_path):
+    policy = import_walk()
+    result = rlctl("eval", policy.path, "--episodes", "8", "--json", "-")
+    assert result.returncode == 0, result.stderr
+    assert '"success_rate": 1.0' in result.stdout
+    diagnosis = diagnose(policy)
+    assert diagnosis.best is None
+    diagnosis.check()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+def test_it_is_exported_as_a_controller(import_walk, rlctl, tmp_path):
+    policy = import_walk()
+    result = rlctl("export", policy.path, "--controller", "--c")
+    assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mistakes", "kind"),
+    [
+        (
+            {
+                "joints": [
+                    *describe_walk()["joints"][3:6],
+                    *describe_walk()["joints"][:3],
+                    *describe_walk()["joints"][6:],
+                ]
+            },
+            "joint order",
+        ),
+        ({"action_scale": [1.0] * 12}, "scale"),
+        ({"stiffness": [1.0] * 12, "damping": [35.0] * 12}, "gains"),
+    ],
+)
+def test_a_mistake_is_named(import_walk, mistakes, kind):
+    diagnosis = diagnose(import_walk(**mistakes))
+    assert diagnosis.best is not None
+    assert diagnosis.best.kind == kind
+    with pytest.raises(AnswerIsNo, match="a mistake in the mapping"):
+        diagnosis.check()
