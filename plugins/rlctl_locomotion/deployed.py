@@ -72,8 +72,10 @@ class Deployed(Walk):
         vars(self).update(values)
 
     def _list_units(self) -> dict[str, str]:
-        observed = {part.kind for part in self.described.observations}
-        return {name: unit for name, unit in UNITS.items() if name in observed or name == ORIENTATION}
+        observed: set[str] = {part.kind for part in self.described.observations}
+        if observed & {"gravity", "euler"}:  # computed from it
+            observed.add(ORIENTATION)
+        return {name: unit for name, unit in UNITS.items() if name in observed}
 
     def _choose_events(self) -> dict[str, Event]:
         observed = {part.kind for part in self.described.observations}

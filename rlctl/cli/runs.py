@@ -214,9 +214,7 @@ def import_run(
             "Model of Stable-Baselines3 or rl-zoo3; with --deploy or --model ONNX or TorchScript.", metavar="MODEL"
         ),
     ],
-    task: Annotated[
-        str | None, Argument(f"The task it was trained on. {TASK_FORMS}", metavar="[TASK]", default_text="")
-    ] = None,
+    task: Annotated[str | None, Option(f"The task it was trained on. {TASK_FORMS}", metavar="TASK")] = None,
     vecnormalize: Annotated[Path | None, Option("Its normalisation, if it has one.", metavar="FILE.pkl")] = None,
     algo: Annotated[str | None, Option("Its algorithm, if the file does not name it.")] = None,
     deploy: Annotated[
@@ -235,13 +233,15 @@ def import_run(
     """Convert a model of Stable-Baselines3, or a policy of another project. Nothing in the model is executed."""
     if deploy is not None or robot is not None or terrain is not None:
         if task is not None or vecnormalize is not None or algo is not None:
-            raise UsageError("--deploy and --model are of a policy of another project: leave out TASK and its options")
+            raise UsageError(
+                "--deploy and --model are of a policy of another project: leave out --task, --vecnormalize and --algo"
+            )
         _import_foreign(model, deploy, robot, terrain, settings, output, json)
         return
     if task is None:
         raise UsageError(
-            "give the task that the model was trained on: rlctl runs import MODEL.zip TASK; "
-            "or of a policy of another project: --deploy FILE --model ROBOT"
+            "give the task that the model was trained on, --task TASK; "
+            "or of a policy of another project --deploy FILE --model ROBOT"
         )
     from rlctl.importing.import_model import find_normalizations, import_model, show
 
