@@ -141,7 +141,12 @@ def is_mapping(block) -> bool:
     return block.text.startswith("observations:")
 
 
-RECIPES = [each for each in find_blocks("yaml") if not is_limits(each) and not is_mapping(each)]
+def is_deployment(block) -> bool:
+    return "- kind: gyroscope" in block.text
+
+
+OTHERS = (is_limits, is_mapping, is_deployment)
+RECIPES = [each for each in find_blocks("yaml") if not any(is_other(each) for is_other in OTHERS)]
 
 
 @pytest.mark.parametrize("block", RECIPES, ids=str)
@@ -154,6 +159,15 @@ def test_mappings_have_known_keys():
 
     (block,) = [each for each in find_blocks("yaml") if is_mapping(each)]
     MappingFile.model_validate(yaml_text.load(block.text, str(block)))
+
+
+def test_deployments_are_complete_but_for_what_the_model_has():
+    from rlctl.task.deployment import Deployment
+
+    (block,) = [each for each in find_blocks("yaml") if is_deployment(each)]
+    content = yaml_text.load(block.text, str(block))
+    of_model = {"joints": list("abcdefghijkl"), "stiffness": [35.0] * 12, "damping": [0.5] * 12, "start_height": 0.3}
+    Deployment(**{**content, "action_scale": [content["action_scale"]] * 12, **of_model})
 
 
 def test_limits_are_limits_of_reach():

@@ -25,6 +25,8 @@ Kind = Literal[
     "last_action",
     "phase",
 ]
+TASK = "rlctl_locomotion.deployed:Deployed"
+"""The task that plays deployed policies."""
 COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 """What the observation `command` consists of [m/s, m/s, rad/s], in this order."""
 ORIENTATION = "orientation"  # the quantity from which gravity and Euler angles are computed

@@ -6,10 +6,10 @@ import pytest
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, TaskError
 from rlctl.exporting.c_source import find_compiler
-from rlctl.importing.foreign.import_policy import TASK, import_policy
+from rlctl.importing.foreign.import_policy import import_policy
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.load import check_playable
-from rlctl.task.deployment import Deployment
+from rlctl.task.deployment import TASK, Deployment
 from rlctl_robot.diagnose.deployed import diagnose_deployment
 from rlctl_robot.diagnose.mapped_actor import map_action, map_observation
 from tests.importing.foreign.policies import A1, describe_walk, expect_as, read_walk, write_onnx, write_yaml

@@ -15,13 +15,12 @@ import numpy as np
 from rlctl import output
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
-from rlctl.importing.foreign.import_policy import TASK
-from rlctl.importing.foreign.robot import Robot, read_robot
 from rlctl.play.playing import Playing
 from rlctl.policy.actor import Actor, Rows
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_actor import NumpyActor
-from rlctl.task.deployment import Deployment
+from rlctl.task.deployment import TASK, Deployment
+from rlctl.task.mujoco.robot import Robot, read_robot
 from rlctl_robot.diagnose.mapped_actor import MappedActor
 from rlctl_robot.diagnose.variants import Variant, list_variants
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.importing.foreign.robot import Robot
 from rlctl.task.deployment import Deployment, ObservedPart
+from rlctl.task.mujoco.robot import Robot
 from rlctl_robot.diagnose.candidates import list_permutations
 
 _FACTORS = (0.05, 0.1, 0.2, 0.25, 0.5, 2.0, 4.0, 5.0, 10.0, 20.0)

@@ -9,9 +9,9 @@ from typing import Any
 from rlctl.environments.spec import merge
 from rlctl.errors import UsageError, check_name
 from rlctl.importing.foreign.network import ForeignNetwork
-from rlctl.importing.foreign.robot import Robot
 from rlctl.storage import validation
 from rlctl.task.deployment import Deployment
+from rlctl.task.mujoco.robot import Robot
 
 _OF_JOINTS = ("default_positions", "action_scale", "stiffness", "damping", "max_torque", "armature")
 _REQUIRED = ("default_positions", "action_scale", "stiffness", "damping", "control_dt", "observations")

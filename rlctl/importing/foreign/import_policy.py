@@ -16,19 +16,19 @@ from rlctl.importing.foreign import metadata, own, rl_sar, unitree_gym, unitree_
 from rlctl.importing.foreign.draft import Draft
 from rlctl.importing.foreign.network import ForeignNetwork
 from rlctl.importing.foreign.onnx_network import read_onnx
-from rlctl.importing.foreign.robot import Robot, read_robot
 from rlctl.importing.foreign.torchscript import read_torchscript_network
 from rlctl.importing.import_model import write_checked
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.storage import yaml_text
-from rlctl.task.deployment import Deployment
+from rlctl.task.deployment import TASK, Deployment
 from rlctl.task.model_files import find_model_file
+from rlctl.task.mujoco.robot import Robot, read_robot
 from rlctl.version import collect_versions
 
-TASK = "rlctl_locomotion.deployed:Deployed"
 
+class DeploymentReader(Protocol):
+    """A module that reads the files of a project."""
 
-class _Reader(Protocol):
     TITLE: str
 
     def matches(self, content: Mapping[str, Any]) -> bool:
@@ -38,7 +38,7 @@ class _Reader(Protocol):
         """Return what the file says."""
 
 
-READERS: Sequence[_Reader] = (unitree_lab, unitree_gym, rl_sar, own)
+READERS: Sequence[DeploymentReader] = (unitree_lab, unitree_gym, rl_sar, own)
 """Modules that read files; each has `TITLE`, `matches` and `read`."""
 
 

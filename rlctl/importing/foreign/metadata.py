@@ -7,8 +7,8 @@ from typing import Any
 
 from rlctl.importing.foreign.draft import Draft
 from rlctl.importing.foreign.network import ForeignNetwork
-from rlctl.importing.foreign.robot import Robot
 from rlctl.importing.foreign.unitree_lab import read_term
+from rlctl.task.mujoco.robot import Robot
 
 TITLE = "metadata of ONNX files of mjlab and Isaac Lab"
 _NUMBERS = {

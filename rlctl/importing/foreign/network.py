@@ -17,26 +17,26 @@ _LSTM_PARTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Linear:
+class ForeignLinear:
     """`weight @ x + bias`."""
 
     weight: Array  # shape (outputs, inputs)
     bias: Array
 
-    def take_columns(self, columns: NDArray[np.int64], factors: Array, size: int) -> Linear:
+    def take_columns(self, columns: NDArray[np.int64], factors: Array, size: int) -> ForeignLinear:
         """Return the layer for another input of `size`: its own element k is `factors[k]` times one of that input."""
         weight = np.zeros((len(self.weight), size))
         weight[:, columns] = self.weight * factors
-        return Linear(weight, self.bias)
+        return ForeignLinear(weight, self.bias)
 
-    def standardize(self, mean: Array, scale: Array) -> Linear:
+    def standardize(self, mean: Array, scale: Array) -> ForeignLinear:
         """Return the layer for inputs from which `mean` is not yet subtracted, and which are not yet times `scale`."""
         weight = self.weight * scale
-        return Linear(weight, self.bias - weight @ mean)
+        return ForeignLinear(weight, self.bias - weight @ mean)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Lstm:
+class ForeignLstm:
     """Layers of an LSTM with torch's order of gates: input, forget, cell, output."""
 
     layers: tuple[tuple[Array, Array, Array, Array], ...]  # of each: weights of input and hidden state, both biases
@@ -51,10 +51,10 @@ class Lstm:
 class ForeignNetwork:
     """A network from one vector of observations to one of actions: an LSTM if it has one, then a perceptron."""
 
-    linears: tuple[Linear, ...]
+    linears: tuple[ForeignLinear, ...]
     activation: str  # between the linear layers; one of `rlctl.policy.layers.ACTIVATIONS`
     ends_with_tanh: bool = False
-    lstm: Lstm | None = None
+    lstm: ForeignLstm | None = None
 
     @property
     def observation_size(self) -> int:
@@ -69,20 +69,20 @@ class ForeignNetwork:
         return len(self.linears[-1].weight)
 
     @property
-    def first(self) -> Linear:
+    def first(self) -> ForeignLinear:
         """The layer that reads the observation."""
         if self.lstm is None:
             return self.linears[0]
         weight, _, bias, _ = self.lstm.layers[0]
-        return Linear(weight, bias)
+        return ForeignLinear(weight, bias)
 
-    def with_first(self, first: Linear) -> ForeignNetwork:
+    def with_first(self, first: ForeignLinear) -> ForeignNetwork:
         """Return the network with another layer that reads the observation."""
         if self.lstm is None:
             return dataclasses.replace(self, linears=(first, *self.linears[1:]))
         _, weight_hh, _, bias_hh = self.lstm.layers[0]
         layers = ((first.weight, weight_hh, first.bias, bias_hh), *self.lstm.layers[1:])
-        return dataclasses.replace(self, lstm=Lstm(layers))
+        return dataclasses.replace(self, lstm=ForeignLstm(layers))
 
     def observe_as(self, deployment: Deployment) -> ForeignNetwork:
         """Return the network for observations as rlctl's task has them: in its order, in SI units."""
@@ -128,7 +128,7 @@ class ForeignNetwork:
         return {f"policy/{name}": np.asarray(values, np.float32) for name, values in tensors.items()}
 
 
-def _add(tensors: dict[str, Any], name: str, linear: Linear) -> None:
+def _add(tensors: dict[str, Any], name: str, linear: ForeignLinear) -> None:
     tensors[f"{name}.weight"], tensors[f"{name}.bias"] = linear.weight, linear.bias
 
 
@@ -137,16 +137,18 @@ class NotImportable(ValueError):
 
 
 Layer = tuple[str, Any]
-"""`("linear", Linear)`, `("affine", (factor, shift))`, an activation's name and None, `("first", count)` for so many of
-the values, or `("part", count)` for the first of so many equal parts of them."""
+"""`("linear", ForeignLinear)`, `("affine", (factor, shift))`, an activation's name and None, `("first", count)` for so
+many of the values, or `("part", count)` for the first of so many equal parts of them."""
 
 
-def assemble(layers: Sequence[Layer], activations: Mapping[str, Any], lstm: Lstm | None = None) -> ForeignNetwork:
+def assemble(
+    layers: Sequence[Layer], activations: Mapping[str, Any], lstm: ForeignLstm | None = None
+) -> ForeignNetwork:
     """Return the network of layers in a row; raises `NotImportable` where they are no perceptron.
 
     Factors and shifts before or after a linear layer become part of it.
     """
-    linears: list[Linear] = []
+    linears: list[ForeignLinear] = []
     used: list[str] = []
     before: tuple[Any, Any] | None = None
     for kind, content in layers:
@@ -158,7 +160,7 @@ def assemble(layers: Sequence[Layer], activations: Mapping[str, Any], lstm: Lstm
             if before is not None:
                 factor, shift = before
                 ones = np.ones(linear.weight.shape[1])
-                linear = Linear(linear.weight * (factor * ones), linear.bias + linear.weight @ (shift * ones))
+                linear = ForeignLinear(linear.weight * (factor * ones), linear.bias + linear.weight @ (shift * ones))
                 before = None
             linears.append(linear)
         elif kind == "affine":
@@ -166,7 +168,7 @@ def assemble(layers: Sequence[Layer], activations: Mapping[str, Any], lstm: Lstm
             if follows_linear:
                 last = linears.pop()
                 column = np.broadcast_to(np.asarray(factor, float), len(last.weight))
-                linears.append(Linear(column[:, None] * last.weight, factor * last.bias + shift))
+                linears.append(ForeignLinear(column[:, None] * last.weight, factor * last.bias + shift))
             elif before is None:
                 before = factor, shift
             else:
@@ -174,7 +176,7 @@ def assemble(layers: Sequence[Layer], activations: Mapping[str, Any], lstm: Lstm
         elif kind in ("first", "part") and follows_linear:
             last = linears.pop()
             count = content if kind == "first" else len(last.weight) // content
-            linears.append(Linear(last.weight[:count], last.bias[:count]))
+            linears.append(ForeignLinear(last.weight[:count], last.bias[:count]))
         elif kind in activations and follows_linear:
             used.append(kind)
         else:

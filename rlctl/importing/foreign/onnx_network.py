@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError, short_repr
-from rlctl.importing.foreign.network import ForeignNetwork, Layer, Linear, NotImportable, assemble
+from rlctl.importing.foreign.network import ForeignLinear, ForeignNetwork, Layer, NotImportable, assemble
 from rlctl.policy.layers import ACTIVATIONS
 from rlctl.policy.onnx_policy import check, open_session
 from rlctl.storage import untrusted
@@ -143,7 +143,7 @@ class _ChainReader:
             return [("linear", _read_gemm(others, attributes))]
         if kind == "MatMul" and node.input[0] == given:
             weight = np.asarray(others[0], float).T
-            return [("linear", Linear(weight, np.zeros(len(weight))))]
+            return [("linear", ForeignLinear(weight, np.zeros(len(weight))))]
         if kind in ("Add", "Sub", "Mul", "Div"):
             return [("affine", _read_affine(kind, np.ravel(others[0]).astype(float), is_first=node.input[0] == given))]
         if kind == "Split":
@@ -165,7 +165,7 @@ class _ChainReader:
         return self.constants[name]
 
 
-def _read_gemm(others: list[NDArray[Any]], attributes: dict[str, Any]) -> Linear:
+def _read_gemm(others: list[NDArray[Any]], attributes: dict[str, Any]) -> ForeignLinear:
     if attributes.get("transA") or attributes.get("alpha", 1.0) != 1.0 or attributes.get("beta", 1.0) != 1.0:
         raise NotImportable("its Gemm is scaled or transposed")
     weight = np.asarray(others[0], float)
@@ -173,7 +173,7 @@ def _read_gemm(others: list[NDArray[Any]], attributes: dict[str, Any]) -> Linear
     bias = np.zeros(len(weight))
     if len(others) > 1:
         bias = np.broadcast_to(np.ravel(others[1]).astype(float), len(weight))
-    return Linear(weight, bias)
+    return ForeignLinear(weight, bias)
 
 
 def _read_affine(kind: str, number: Any, *, is_first: bool) -> tuple[Any, Any]:

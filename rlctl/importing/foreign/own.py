@@ -7,7 +7,7 @@ from typing import Any
 
 from rlctl.importing.foreign.draft import Draft
 from rlctl.importing.foreign.network import ForeignNetwork
-from rlctl.importing.foreign.robot import Robot
+from rlctl.task.mujoco.robot import Robot
 
 TITLE = "deployment of rlctl"
 

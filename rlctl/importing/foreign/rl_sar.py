@@ -12,8 +12,8 @@ from typing import Any
 from rlctl.errors import UsageError, check_name
 from rlctl.importing.foreign.draft import Draft, pick
 from rlctl.importing.foreign.network import ForeignNetwork
-from rlctl.importing.foreign.robot import Robot
 from rlctl.storage import yaml_text
+from rlctl.task.mujoco.robot import Robot
 
 TITLE = "config.yaml and base.yaml of rl_sar"
 _TERMS = {

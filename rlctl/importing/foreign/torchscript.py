@@ -12,7 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from rlctl.errors import ArtifactError, short_repr
-from rlctl.importing.foreign.network import Array, ForeignNetwork, Layer, Linear, Lstm, NotImportable, assemble
+from rlctl.importing.foreign.network import (
+    Array,
+    ForeignLinear,
+    ForeignLstm,
+    ForeignNetwork,
+    Layer,
+    NotImportable,
+    assemble,
+)
 from rlctl.importing.pickle_data import NotPlainData
 from rlctl.importing.tensor_file import Module, read_torchscript
 from rlctl.policy.layers import ACTIVATIONS
@@ -94,7 +102,8 @@ def _list_layers(module: Module) -> list[Layer]:
         elif kind == "Linear":
             weight = part.tensors["weight"].astype(float)
             bias = part.tensors.get("bias")
-            layers.append(("linear", Linear(weight, np.zeros(len(weight)) if bias is None else bias.astype(float))))
+            bias = np.zeros(len(weight)) if bias is None else bias.astype(float)
+            layers.append(("linear", ForeignLinear(weight, bias)))
         elif kind in _ACTIVATIONS:
             if kind == "ELU" and re.search(r"\belu\(\w+, (?!1\.0*[,)])", part.code):
                 raise NotImportable("its ELU has an alpha other than 1")
@@ -110,7 +119,7 @@ def _read_number(name: str) -> int:
     return int(name)
 
 
-def _read_lstm(module: Module) -> Lstm:
+def _read_lstm(module: Module) -> ForeignLstm:
     if _find_class(module) != "LSTM":
         raise NotImportable(f"its recurrent part is a {_find_class(module)}; rlctl imports LSTM")
     layers: list[tuple[Array, Array, Array, Array]] = []
@@ -121,10 +130,10 @@ def _read_lstm(module: Module) -> Lstm:
         layers.append((weight_ih, weight_hh, bias_ih, bias_hh))
     if not layers:
         raise NotImportable("its LSTM has no weights")
-    return Lstm(tuple(layers))
+    return ForeignLstm(tuple(layers))
 
 
-def _standardize(first: Linear, module: Module) -> Linear:
+def _standardize(first: ForeignLinear, module: Module) -> ForeignLinear:
     """Return the layer that reads the observation, for one that is not normalised yet."""
     tensors = module.tensors
     mean, std = tensors.get("_mean"), tensors.get("_std")

@@ -8,7 +8,7 @@ from typing import Any
 from rlctl.errors import UsageError
 from rlctl.importing.foreign.draft import Draft
 from rlctl.importing.foreign.network import ForeignNetwork
-from rlctl.importing.foreign.robot import Robot
+from rlctl.task.mujoco.robot import Robot
 
 TITLE = "YAML of unitree_rl_gym"
 _PERIOD = 0.8  # [s], in the project's scripts

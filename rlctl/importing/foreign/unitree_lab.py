@@ -12,7 +12,7 @@ from typing import Any
 from rlctl.errors import UsageError, check_name
 from rlctl.importing.foreign.draft import Draft, pick
 from rlctl.importing.foreign.network import ForeignNetwork
-from rlctl.importing.foreign.robot import Robot
+from rlctl.task.mujoco.robot import Robot
 
 TITLE = "deploy.yaml of unitree_rl_lab"
 TERMS = {

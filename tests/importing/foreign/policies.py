@@ -9,7 +9,7 @@ import torch
 import yaml
 from onnx import TensorProto, helper, numpy_helper
 
-from rlctl.importing.foreign.network import ForeignNetwork, Linear
+from rlctl.importing.foreign.network import ForeignLinear, ForeignNetwork
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.network import Network
 from rlctl.task.deployment import Deployment
@@ -46,7 +46,9 @@ def read_walk():
     network = Network(PolicyFile.read(SHIPPED))
     (normalize,) = network.parts[""]
     hidden = [layer for layer in network.trunk if hasattr(layer, "weight")]
-    linears = [Linear(layer.weight.astype(float), layer.bias.astype(float)) for layer in (*hidden, network.head[0])]
+    linears = [
+        ForeignLinear(layer.weight.astype(float), layer.bias.astype(float)) for layer in (*hidden, network.head[0])
+    ]
     scale = 1.0 / np.sqrt(normalize.variance.astype(float) + 1e-8)
     linears[0] = linears[0].standardize(normalize.mean.astype(float), scale)
     return ForeignNetwork(tuple(linears), "tanh")
@@ -56,7 +58,7 @@ def expect_as(network, deployment):
     """Return a network that takes what another project's file says, for one that takes what rlctl observes."""
     columns, factors = Deployment(**deployment).find_columns()
     first = network.first
-    return network.with_first(Linear(first.weight[:, columns] / factors, first.bias))
+    return network.with_first(ForeignLinear(first.weight[:, columns] / factors, first.bias))
 
 
 def write_onnx(path, network, *, inputs=None, metadata=None, extra=()):

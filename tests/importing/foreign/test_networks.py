@@ -6,7 +6,7 @@ import torch
 from onnx import helper
 
 from rlctl.errors import ArtifactError
-from rlctl.importing.foreign.network import ForeignNetwork, Linear
+from rlctl.importing.foreign.network import ForeignLinear, ForeignNetwork
 from rlctl.importing.foreign.onnx_network import compute, read_onnx
 from rlctl.importing.foreign.torchscript import read_torchscript_network
 from tests.importing.foreign.policies import Concatenated, write_onnx, write_torchscript
@@ -17,7 +17,7 @@ def network():
     """A perceptron of 5 observations and 2 actions."""
     rng = np.random.default_rng(0)
     sizes = [(4, 5), (2, 4)]
-    linears = tuple(Linear(rng.normal(size=size), rng.normal(size=size[0])) for size in sizes)
+    linears = tuple(ForeignLinear(rng.normal(size=size), rng.normal(size=size[0])) for size in sizes)
     return ForeignNetwork(linears, "elu")
 
 
@@ -119,10 +119,10 @@ def test_weights_alone_are_no_network(tmp_path):
 
 
 def test_a_layer_for_an_input_in_another_order():
-    linear = Linear(np.array([[1.0, 2.0]]), np.array([0.5]))
+    linear = ForeignLinear(np.array([[1.0, 2.0]]), np.array([0.5]))
     # The layer reads 3 * element 2 and 10 * element 0 of three: 1 * 3 * x[2] + 2 * 10 * x[0].
     taken = linear.take_columns(np.array([2, 0]), np.array([3.0, 10.0]), 3)
     assert taken.weight.tolist() == [[20.0, 0.0, 3.0]]
     # With mean 2 and factor 3: weight * 3 * (x - 2).
-    standardized = Linear(np.array([[1.0]]), np.array([0.5])).standardize(np.array([2.0]), np.array([3.0]))
+    standardized = ForeignLinear(np.array([[1.0]]), np.array([0.5])).standardize(np.array([2.0]), np.array([3.0]))
     assert (standardized.weight.tolist(), standardized.bias.tolist()) == ([[3.0]], [-5.5])
