@@ -137,15 +137,16 @@ class Euler(Term):
         sine = np.minimum(np.maximum(2.0 * (w * y - z * x), -1.0), 1.0)
         roll = _find_angle(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
         yaw = _find_angle(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        return [roll, np.arcsin(sine), yaw]
+        pitch = np.arctan(sine / np.sqrt(np.maximum(1.0 - sine * sine, 1e-24)))
+        return [roll, pitch, yaw]
 
 
 def _find_angle(sine: Any, cosine: Any) -> Any:
     """Return the angle in (-pi, pi] of a point; ONNX has no function of both coordinates."""
     length = np.maximum(np.sqrt(sine * sine + cosine * cosine), 1e-12)
-    ratio = np.minimum(np.maximum(cosine / length, -1.0), 1.0)
     sign = 1.0 + 2.0 * np.minimum(np.floor(sine / length), 0.0)  # -1 for sines below 0, else 1
-    return sign * np.arccos(ratio)
+    # Half the angle; the small numbers decide at pi, where both others are 0.
+    return sign * 2.0 * np.arctan((sign * sine + 1e-12) / np.maximum(length + cosine, 1e-24))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -97,6 +97,9 @@ def play(policy, controllers, env):
                 "far": [np.linalg.norm(inputs["goal"].astype(float) - inputs["hand"])],
                 "last": last,
                 "clock": [np.sin(2 * np.pi * step * 0.1 / 0.35), np.cos(2 * np.pi * step * 0.1 / 0.35)],
+                "legs": TERMS["legs"](step * 0.1),
+                "euler": TERMS["euler"](inputs["orientation"]),
+                "clipped": np.clip(inputs["angles"], -0.2, 0.3),
                 "int": inputs["int"],
             }
             stacked = history.add({name: np.asarray(part)[None] for name, part in parts.items()}, slice(None))

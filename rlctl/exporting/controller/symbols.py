@@ -17,8 +17,7 @@ _C = {
     "sin": "sin({})",
     "cos": "cos({})",
     "floor": "floor({})",
-    "arccos": "acos({})",
-    "arcsin": "asin({})",
+    "arctan": "atan({})",
     "minimum": "fmin({}, {})",
     "maximum": "fmax({}, {})",
 }
@@ -26,11 +25,12 @@ _ONNX = {
     "subtract": "Sub",
     "multiply": "Mul",
     "divide": "Div",
-    "arccos": "Acos",
-    "arcsin": "Asin",
+    "arctan": "Atan",
     "minimum": "Min",
     "maximum": "Max",
 }
+
+_IN_SINGLE = ("arctan",)  # functions that onnxruntime has in float32 only
 
 
 class Symbol(np.lib.mixins.NDArrayOperatorsMixin, abc.ABC):
@@ -98,7 +98,12 @@ class GraphSymbol(Symbol):
                 numbers = np.atleast_1d(np.asarray(operand, np.float64))
                 names.append(graph.constant(f"term/{graph.count_constants()}", numbers))
                 sizes.append(len(numbers))
-        return GraphSymbol(graph, graph.add(_ONNX.get(function, function.capitalize()), *names), max(sizes))
+        if function in _IN_SINGLE:
+            names = [graph.cast(name, np.float32) for name in names]
+        value = graph.add(_ONNX.get(function, function.capitalize()), *names)
+        if function in _IN_SINGLE:
+            value = graph.cast(value, np.float64)
+        return GraphSymbol(graph, value, max(sizes))
 
     def take(self, elements: range) -> "GraphSymbol":
         """Add a node that selects elements."""
